@@ -177,6 +177,7 @@ def test_photographs_pass_all_stages_once(reconstruct: Reconstruct, pretended: P
     assert again.code == 0, again.err
     assert pretended.names == ALL
     assert again.out.count(" is kept (delete the file to repeat the stage)") == len(ALL)
+    assert again.out.endswith(f"report: {pretended.out}/report/report.html\npage: {pretended.out}/page.html\n")
 
 
 def test_what_changed_is_followed_by_what_is_made_of_it(
@@ -260,6 +261,16 @@ def test_a_stage_that_fails_is_named_and_the_others_wait(
     pretended.ends["preprocess"] = 0
     assert "preprocess failed" in reconstruct(*given(photos), f"out={pretended.out}").err, "no result was written"
     assert pretended.names == ["calibrate", "preprocess", "preprocess"]
+
+
+def test_a_page_that_cannot_be_made_does_not_fail_the_reconstruction(
+    reconstruct: Reconstruct, pretended: Pretended, photos: Path
+) -> None:
+    pretended.ends["export"] = 1
+    done = reconstruct(*given(photos), f"out={pretended.out}", "trial_steps=0")
+    assert done.code == 0, done.err
+    assert "nerfro: warning: no page was written" in done.out
+    assert done.out.endswith(f"report: {pretended.out}/report/report.html\n")
 
 
 def test_what_was_found_chooses_the_experiment(

@@ -14,6 +14,7 @@ from nerfro.capture.overlaps import SHEET
 from nerfro.capture.overrides import as_overrides, is_given
 from nerfro.capture.preprocess_options import FOUND, MESH
 from nerfro.capture.video import extract_frames
+from nerfro.cli import warn
 from nerfro.data.frames import list_images
 from nerfro.errors import NerfroError
 from nerfro.evaluation.results import FULL, read_metrics_json
@@ -137,9 +138,16 @@ def _run_training(options: list[str], inputs: list[Path], run: Path) -> None:
 
 
 def report(out: Path) -> None:
-    """Write the report and the interactive page."""
+    """Write the report and the interactive page, and print where they are; a page that cannot be made is a warning."""
     report, page, run = out / "report" / "report.html", out / "page.html", out / "run"
     options = [*as_overrides({"runs": [run], "out": report.parent}), "report=true", "overwrite=true"]
     Stage("summary", options, report, report, [run / "metrics.json"]).run()
     options = as_overrides({"checkpoint": run, "what": "page", "out": page, "overwrite": True})
-    Stage("export", options, page, page, [run / "metrics.json"]).run()
+    try:
+        Stage("export", options, page, page, [run / "metrics.json"]).run()
+    except NerfroError:
+        warn("no page was written, for the reason in the line above")
+        page.unlink(missing_ok=True)  # of an earlier run
+    print(f"\nreport: {report}")
+    if page.is_file():
+        print(f"page: {page}")
