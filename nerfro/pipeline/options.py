@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Optional
 
-from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf import MISSING, DictConfig
 
 from nerfro.allowed import Count, Natural, Range
 from nerfro.capture.overrides import is_given
@@ -63,7 +63,7 @@ def have_poses(config: DictConfig, overrides: list[str]) -> bool:
     if config.images is not None and config.video is not None:
         raise NerfroError("images= and video= are both given; give one of the two")
     posed = config.images is None and config.video is None
-    if config.out is None or (posed and OmegaConf.is_missing(config.data, "root")):
+    if config.out is None or (posed and not is_given("data.root", overrides)):
         raise NerfroError(
             "set out=FOLDER, and images=PHOTOS, video=FILE or, for images with poses, data=FORMAT data.root=FOLDER"
         )
