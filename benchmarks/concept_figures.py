@@ -1,9 +1,13 @@
-"""The figures of docs/concepts/{background,sampling,one_volume}.md: `python benchmarks/concept_figures.py`, seconds."""
+"""Draw the figures of docs/concepts/{background,sampling,one_volume,inverse_problems}.md in a few minutes.
+
+python benchmarks/concept_figures.py
+"""
 
 from __future__ import annotations
 
 import argparse
 import math
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +16,12 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
+from nerfro.capture.index_search import find_indices
+from nerfro.capture.surroundings import divide_pixels, learn_surroundings
 from nerfro.data.blender import BlenderData
 from nerfro.files import lat_long
 from nerfro.geometry.contraction import contract
+from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.light import to_srgb
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.paths import ASSETS_DIR
@@ -23,6 +30,7 @@ from nerfro.samplers.snell import Snell
 from nerfro.samplers.stratified import Stratified
 from nerfro.types import Path as RayPath
 
+MESH = ASSETS_DIR / "torus" / "mesh.ply"
 IMAGES = Path(__file__).resolve().parent.parent / "docs" / "images"
 BOX = [[-0.8] * 3, [0.8] * 3]
 ROWS = {38: "tab:red", 64: "tab:orange", 90: "tab:cyan"}  # rows of the image, and colours of their marks
@@ -33,12 +41,15 @@ def main() -> None:
     """Draw all figures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--folder", type=Path, default=IMAGES)
-    folder = parser.parse_args().folder
-    medium = SdfGrid(str(ASSETS_DIR / "torus" / "mesh.ply"), 1.5, resolution=64)
+    parser.add_argument("--downscale", type=float, default=1, help="factor of the photographs of the index search")
+    options = parser.parse_args()
+    folder = options.folder
+    medium = SdfGrid(str(MESH), 1.5, resolution=64)
     with torch.no_grad():
         draw_exits(medium, folder / "concept_background.png")
         draw_samples(medium, folder / "concept_sampling.png")
         draw_contraction(medium, folder / "concept_contraction.png")
+    draw_index_search(BlenderData(downscale=options.downscale), folder / "concept_index.png")
 
 
 def canvas(width: float, height: float) -> Figure:
@@ -127,6 +138,26 @@ def draw_contraction(medium: SdfGrid, file: Path) -> None:
     contracted.add_patch(Circle((0, 0), 2 * radius, fill=False, color="black"))
     world.set(title="world", xlim=(-5, 5), ylim=(-5, 5))
     contracted.set(title="contracted", xlim=(-2.1, 2.1), ylim=(-2.1, 2.1))
+    figure.savefig(file, dpi=90)
+
+
+def draw_index_search(data: BlenderData, file: Path) -> None:
+    """Plot the error of candidate indices for the true surface of the embedded scene and for a scaled one."""
+    mesh = load_mesh(MESH)
+    beside, through = divide_pixels(data.load("train"), mesh)
+    surroundings = learn_surroundings(beside, mesh, None)
+    figure = canvas(7, 3.2)
+    axes = figure.subplots()
+    axes.axvline(1.5, color="0.6", linestyle=":", label="true index")
+    with tempfile.TemporaryDirectory() as folder:
+        for name, scale in (("true surface", 1.0), ("surface larger by 3 %", 1.03)):
+            scaled = Path(folder) / f"{scale}.ply"
+            TriangleMesh(scale * mesh.vertices, mesh.faces).save(scaled)
+            found = find_indices(SdfGrid(str(scaled), 1.5, cache=False), through, surroundings)
+            label = f"{name}: {found.values[0]:.3f} ± {found.standard_errors[0]:.3f}"
+            axes.plot(*found.coarse.T, "o-", markersize=3, linewidth=1, label=label)
+    axes.set(xlabel="candidate index", ylabel="mean robust error")
+    axes.legend()
     figure.savefig(file, dpi=90)
 
 

@@ -1,5 +1,7 @@
 """`python -m nerfro.preprocess data.root=DIR`: reconstruct the surface and the refractive index of an object.
 
+The refractive index is estimated from the photographs unless `medium.ior` is given.
+
 Examples:
     nerfro preprocess data=opencv data.root=data/glass medium.ior=1.33
     nerfro preprocess data=opencv data.root=data/glass refine=true

@@ -1,5 +1,7 @@
 """`python -m nerfro.reconstruct images=PHOTOS masks=MASKS out=DIR`: reconstruct a scene from photographs.
 
+The refractive index is estimated from the photographs unless `medium.ior` is given.
+
 Examples:
     nerfro reconstruct images=photographs masks=masks out=outputs/glass
     nerfro reconstruct video=glass.mp4 masks=masks out=outputs/glass train='trainer.max_time=10m'

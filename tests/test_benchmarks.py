@@ -146,8 +146,8 @@ def test_tables_of_optics_and_kernels_are_complete(arguments: tuple, num_rows: i
 def test_pictures_of_optics_are_drawn(run: Run, tmp_path: Path) -> None:
     run("optics_pictures", "--folder", tmp_path, "--resolution", 48, "--side", 8)
     assert len(list(tmp_path.glob("optics_*.png"))) == 5
-    run("concept_figures", "--folder", tmp_path)
-    assert len(list(tmp_path.glob("concept_*.png"))) == 3
+    run("concept_figures", "--folder", tmp_path, "--downscale", 8)
+    assert len(list(tmp_path.glob("concept_*.png"))) == 4
 
 
 def test_errors_of_a_run_are_put_into_classes(run: Run, trained_run: Path) -> None:

@@ -98,7 +98,7 @@ def next_steps(folder: Path, split: str | None) -> str:
     if split is None:
         lines.append(f"scores: python -m nerfro.evaluate {shlex.quote(f'checkpoint={folder}')}")
     else:
-        lines.insert(0, f"picture: {folder / 'images' / f'{split}_000.png'}")
+        lines.insert(0, f"image: {folder / 'images' / f'{split}_000.png'}")
         lines.append(f"tables: {folder}/metrics.md, .csv and .tex for each view, and metrics.json")
     if in_sweep():
         lines.append(f"table of the sweep: python -m nerfro.summary {shlex.quote(f'runs={folder.parent}')}")

@@ -161,7 +161,7 @@ def test_training_ends_with_the_table_of_means_and_the_files(train: Callable[...
     table = finished.out.partition("2 steps in ")[2]
     full = next(line for line in table.splitlines() if line.strip().startswith("full"))
     assert f"{scores['test']['psnr']:.2f}" in full
-    assert "test_000" not in table.partition("picture: ")[0]
+    assert "test_000" not in table.partition("image: ")[0]
     picture, page, tables = (line.partition(": ")[2] for line in finished.out.splitlines()[-3:])
     assert Path(picture).is_file()
     assert page == f"python -m nerfro.view checkpoint={tmp_path / 'run'}"
