@@ -17,7 +17,6 @@ from nerfro.capture.boards import TagBoard, print_sheets
 from nerfro.capture.calibrate_options import CalibrateConfig, check_options, make_board
 from nerfro.capture.calibrated_data import FILES, ray_range, relative, split_views, write_calibrated
 from nerfro.capture.calibration import Calibration, calibrate
-from nerfro.capture.overrides import print_next
 from nerfro.capture.photographs import list_photographs, luminance, outside
 from nerfro.capture.reconstruction import SfmSettings, find_model, import_model
 from nerfro.cli import entry_point, warn
@@ -25,6 +24,7 @@ from nerfro.data.masks import find_mask, require_used
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import refuse_existing
 from nerfro.files.folder_lock import lock_folder
+from nerfro.overrides import print_next
 from nerfro.paths import user_path
 from nerfro.progress import track
 
@@ -72,7 +72,7 @@ def _calibrate(config: DictConfig, out: Path) -> None:
     reach = ray_range(calibration, seen)
     written = write_calibrated(out, images, size, calibration, splits, config.target, quads, points, reach)
     print(f"wrote {', '.join(written)}")
-    options = ["data=opencv", f"data.root={out}", *reach]
+    options = ["data=opencv", f"data.root={out}"]
     if any(masks):
         print_next("next", "preprocess", [*options, "medium.ior=1.33"])
     else:

@@ -16,6 +16,7 @@ import sys
 import tempfile
 import traceback
 from collections.abc import Callable, Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NoReturn, cast
 
@@ -27,6 +28,7 @@ from hydra._internal.sources_registry import SourcesRegistry
 from hydra._internal.utils import get_args_parser
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException, OverrideParseException
@@ -38,6 +40,7 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, MissingMandat
 from nerfro.allowed import check_names, check_settings
 from nerfro.errors import NerfroError, nearest_of
 from nerfro.options import ADDED_GROUPS, Described, describe_command, recall, remember, usage
+from nerfro.overrides import is_scene_file
 from nerfro.paths import CONF_DIR, refuse_root, user_path
 from nerfro.registry import MOVED_CLASSES, SEVERAL, discover, plugins
 from nerfro.trust import MAX_YAML_CHARACTERS, GuardedConfigLoader, leave_current_directory, require_bounded_yaml
@@ -107,6 +110,7 @@ RENAMED: dict[str, str | None] = {
     "medium[SdfGrid].smoothing_sigma": None,
     "medium[SdfGrid].smoothing_size": None,
 }
+_STAGES: dict[str, Callable[[], None]] = {}  # start of each imported command as a part of another command
 # Short names of settings, on the command line and in YAML files.
 SHORT_NAMES = {"bodies": "medium.bodies"}
 
@@ -117,6 +121,7 @@ def entry_point(
     config_dir: Path = CONF_DIR,
     verbatim: tuple[str, ...] = (),
     check: Callable[[DictConfig], None] | None = None,
+    expand: Callable[[list[str], list[str]], list[str]] | None = None,
 ) -> Callable[[Callable[[DictConfig], float | None]], Callable[[], None]]:
     """Decorate the main function of a command, which receives a checked configuration.
 
@@ -129,6 +134,8 @@ def entry_point(
         config_dir: conf/, or a folder in it for a command that must not see the groups of conf/.
         verbatim: keys whose values are texts that may contain commas and equals signs, which Hydra would parse.
         check: further check of the configuration.
+        expand: function that replaces arguments that stand for several settings; it also receives the names of the
+            settings of the root.
     """
 
     def decorate(task: Callable[[DictConfig], float | None]) -> Callable[[], None]:
@@ -138,27 +145,31 @@ def entry_point(
                 if check is not None:
                     check(config)
 
-        @functools.wraps(task)
-        def job(config: DictConfig) -> float | None:
-            if HydraConfig.get().mode != RunMode.MULTIRUN:
-                # Caught here as well, because Hydra prints an additional line for errors of the job.
-                with errors_in_one_line(), _missing_with_example(config_name):
-                    return task(config)
-            discover()  # the process may be a launcher's worker
-            try:
-                return task(config)
-            except Exception as error:  # Hydra's sweepers continue with the other jobs
-                if os.environ.get("NERFRO_DEBUG"):
-                    raise
-                line = f"{Path(HydraConfig.get().runtime.output_dir).name}: {in_one_line(error)}"
-                print(f"nerfro: error: {line}", file=sys.stderr, flush=True)
-                raise NerfroError(line) from None
+        def start() -> None:
+            failures: list[Exception] = []
 
-        @functools.wraps(task)
-        def run() -> None:
+            @functools.wraps(task)
+            def job(config: DictConfig) -> float | None:
+                if HydraConfig.get().mode != RunMode.MULTIRUN:
+                    try:
+                        with _missing_with_example(config_name):
+                            return task(config)
+                    except Exception as error:  # raised later, because Hydra prints an additional line for it
+                        failures.append(error)
+                        return None
+                discover()  # the process may be a launcher's worker
+                try:
+                    return task(config)
+                except Exception as error:  # Hydra's sweepers continue with the other jobs
+                    if os.environ.get("NERFRO_DEBUG"):
+                        raise
+                    line = f"{Path(HydraConfig.get().runtime.output_dir).name}: {in_one_line(error)}"
+                    print(f"nerfro: error: {line}", file=sys.stderr, flush=True)
+                    raise NerfroError(line) from None
+
             # Otherwise Hydra prints its own report and exits.
             os.environ["HYDRA_FULL_ERROR"] = "1"
-            with errors_in_one_line(), _composed_with(check_all):
+            with _composed_with(check_all):
                 if _HELP & set(sys.argv) and "hydra" in sys.argv:
                     sys.argv[1:] = ["--hydra-help"]
                 sys.argv[1:] = _flags_first(sys.argv[1:])
@@ -171,6 +182,8 @@ def entry_point(
                     remember(config_name, described)
                     answer(described, sys.argv[1:])
                 sys.argv[1:] = [_quoted(renamed_override(argument), verbatim) for argument in sys.argv[1:]]
+                if expand is not None:
+                    sys.argv[1:] = expand(sys.argv[1:], [field.name for field in dataclasses.fields(schema)])
                 if config_name == "train":
                     sys.argv[1:] = map(_added, sys.argv[1:])
                 try:
@@ -186,10 +199,38 @@ def entry_point(
                     raise NerfroError(
                         "the name of a folder contains a null byte; choose another hydra.run.dir"
                     ) from error
+            if failures:
+                raise failures[0]
 
+        @functools.wraps(task)
+        def run() -> None:
+            with errors_in_one_line():
+                start()
+
+        _STAGES[config_name] = start
         return run
 
     return decorate
+
+
+def call(command: str, arguments: list[str]) -> None:
+    """Run a command as a part of this program. Meanwhile it is the main program for records and for Lightning.
+
+    Args:
+        command: name of the command.
+        arguments: its command line.
+
+    Raises:
+        Exception: any error of the command.
+    """
+    importlib.import_module(f"nerfro.{command}")
+    program, main, composed = sys.argv, sys.modules["__main__"], GlobalHydra.instance()
+    spec, outer = main.__spec__, composed.hydra
+    sys.argv, main.__spec__, composed.hydra = [command, *arguments], find_spec(f"nerfro.{command}"), None
+    try:
+        _STAGES[command]()
+    finally:
+        sys.argv, main.__spec__, composed.hydra = program, spec, outer
 
 
 @contextlib.contextmanager
@@ -252,6 +293,7 @@ def answer(described: Described, arguments: list[str]) -> None:
     unknown = any(argument.startswith(("--config", "-c", "hydra.searchpath")) for argument in arguments)
     if not unknown:  # other folders of configurations may have other groups
         current = [text for text in arguments if not any(f"{text.lstrip('+~')}.".startswith(old) for old in RENAMED)]
+        current = [text for text in current if not is_scene_file(text)]
         described.require_known([_full_key(text) for text in current])
 
 

@@ -16,22 +16,23 @@ from omegaconf import DictConfig
 import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
 from nerfro.capture.mask_files import MaskConfig, MaskTask, read_outlines
 from nerfro.capture.masking import Segmentation
-from nerfro.capture.overrides import is_given, of_groups, print_next
 from nerfro.cli import entry_point
 from nerfro.data.base import DataSource
 from nerfro.data.frames import require_root
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
 from nerfro.files.folder_lock import lock_folder
+from nerfro.overrides import is_given, of_groups, print_next
 from nerfro.paths import EMBEDDED_PREFIX
 from nerfro.progress import progress_bar
 from nerfro.registry import build
+from nerfro.rendering.scene_file import with_scene
 from nerfro.viewing.outline_page import OutlinePage
 
 _OUTLINES = "outlines.json"
 
 
-@entry_point("mask", MaskConfig)
+@entry_point("mask", MaskConfig, expand=with_scene)
 @torch.no_grad()
 def main(config: DictConfig) -> None:
     """Segment the outlined views, then all other views, and write the missing masks."""

@@ -19,7 +19,7 @@ import nerfro.startup  # noqa: F401 - before the other imports, which take secon
 from nerfro.capture.index_search import find_medium
 from nerfro.capture.overlaps import choose_wrong_masks, report_overlaps
 from nerfro.capture.pose_conventions import require_consistent_poses
-from nerfro.capture.preprocess_options import MESH, PreprocessConfig, Request, conclude, surface_settings
+from nerfro.capture.preprocess_options import MESH, PreprocessConfig, Request, surface_settings, write_scene
 from nerfro.capture.refinement import refine
 from nerfro.capture.surface import make_mesh, read_silhouettes
 from nerfro.capture.surroundings import Observations
@@ -34,9 +34,10 @@ from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.paths import resolve_path
 from nerfro.registry import build
+from nerfro.rendering.scene_file import SceneFile, with_scene
 
 
-@entry_point("preprocess", PreprocessConfig)
+@entry_point("preprocess", PreprocessConfig, expand=with_scene)
 @torch.no_grad()
 def main(config: DictConfig) -> None:
     """Reconstruct the surface, search the index, refine the surface if requested, and print the next command."""
@@ -55,7 +56,7 @@ def _preprocess(config: DictConfig, request: Request) -> None:
     if mesh is None or outlined.masks is not None:
         mesh, outlined, silhouettes = _reconstruct(request, outlined, mesh)
     location = config.mesh or str(request.folder / MESH)
-    settings = surface_settings(request, views.cameras, mesh, location)
+    settings = surface_settings(request, views.cameras, mesh)
     observations = Observations(views, mesh, config.room)
     found = find_medium(request, observations, location, settings)
     if config.refine:
@@ -66,14 +67,15 @@ def _preprocess(config: DictConfig, request: Request) -> None:
             medium = cast(SdfGrid, found.medium)  # see Request.check
             mesh = refine(observations, mesh, medium, silhouettes, request.searches_index, request.folder)
         mesh.save(request.folder / MESH)
-        settings = surface_settings(request, views.cameras, mesh, location)
+        settings = surface_settings(request, views.cameras, mesh)
         if mesh is not given:
             if silhouettes is not None:
                 report_overlaps(outlined, mesh, silhouettes, None, request.folder, list_all=False)
             found = find_medium(request, observations, location, settings)
-    index, is_doubtful = found.index_settings, found.is_doubtful
     vessel = find_vessel(cast(SdfGrid, found.medium), location, mesh, observations) if config.vessel else {}
-    conclude(request, settings, index, is_doubtful, observations.near, views.cameras, vessel)
+    estimated = settings | {"mesh": location} | found.index_settings
+    scene = SceneFile(medium=estimated, vessel=vessel, surroundings=observations.distance, provenance=found.provenance)
+    write_scene(request, scene, views.cameras, mesh)
 
 
 def _reconstruct(request: Request, views: Views, mesh: TriangleMesh | None) -> tuple[TriangleMesh, Views, Silhouettes]:

@@ -13,11 +13,13 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
-from nerfro.capture.overrides import is_given, of_groups
 from nerfro.cli import entry_point
+from nerfro.data.lazy_images import decoded_once
 from nerfro.files.folder_lock import lock_folder
+from nerfro.overrides import is_given, of_groups
 from nerfro.paths import resolve_path, user_path
 from nerfro.pipeline.options import ReconstructConfig, have_poses
+from nerfro.pipeline.stages import terminated_in_one_line
 from nerfro.pipeline.steps import calibrate, preprocess, report, segment, train
 
 
@@ -26,7 +28,7 @@ def main(config: DictConfig) -> None:
     """Run all stages that are not done."""
     overrides = list(HydraConfig.get().overrides.task)
     posed, out = have_poses(config, overrides), user_path(config.out)
-    with lock_folder(out, "out"):
+    with lock_folder(out, "out"), terminated_in_one_line(), decoded_once():
         root = resolve_path(config.data.root) if posed else out
         data = of_groups(("data",), overrides)
         if not posed:
@@ -34,8 +36,8 @@ def main(config: DictConfig) -> None:
         if not is_given("data", data):
             data = ["data=opencv", *data]
         segment(config, [*data, *of_groups(("outlines",), overrides)], root)
-        preprocess(config, [*data, *of_groups(("medium",), overrides)], root, out / "surface")
-        train(config, overrides, out / "surface", out)
+        scene = preprocess(config, [*data, *of_groups(("medium",), overrides)], root, out / "surface")
+        train(config, overrides, scene, out)
         report(out)
 
 

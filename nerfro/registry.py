@@ -196,7 +196,7 @@ def build(node: object, **parts: object) -> Any:
         except (InstantiationException, OmegaConfBaseException) as error:
             cause = error.__cause__ or error
             raise NerfroError(f"{target}: {_first_line(cause)}; check this object's fields in conf/") from error
-    plugin = _plugin_of(node)
+    plugin = plugin_of(node)
     return create(plugin, node, **{name: parts[name] for name in plugin.parts if name in parts})
 
 
@@ -207,7 +207,7 @@ def check_node(node: object) -> type:
         NerfroError: as `build`.
     """
     node = _settings_of(node)
-    plugin = _plugin_of(node)
+    plugin = plugin_of(node)
     keys = [str(key) for key in node]
     if not any(OmegaConf.is_interpolation(node, key) for key in keys):
         configure(plugin, node)
@@ -227,7 +227,7 @@ def require_lightning(node: object) -> None:
     node = _settings_of(node)
     target = node.get("_target_")
     if target not in _LIGHTNING_TARGETS:
-        _plugin_of(node)
+        plugin_of(node)
         return
     for nested in _targets(OmegaConf.to_container(node, resolve=True)):  # Hydra instantiates nested nodes too
         if nested not in _LIGHTNING_TARGETS:
@@ -242,7 +242,12 @@ def _settings_of(node: object) -> DictConfig:
     return node if isinstance(node, DictConfig) else OmegaConf.create(dict(node))
 
 
-def _plugin_of(node: DictConfig) -> Plugin:
+def plugin_of(node: DictConfig) -> Plugin:
+    """Return the plugin that a configuration node names.
+
+    Raises:
+        NerfroError: the class is not registered.
+    """
     target = str(node.get("_target_"))
     place = MOVED_CLASSES.get(target, target)
     plugin = next((plugin for plugin in _plugins.values() if plugin.target == place), None)

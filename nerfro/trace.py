@@ -19,13 +19,14 @@ from nerfro.files.atomic import refuse_existing
 from nerfro.files.cache import save_arrays
 from nerfro.paths import user_path
 from nerfro.registry import build
+from nerfro.rendering.scene_file import with_scene
 from nerfro.samplers.snell import Snell
 from nerfro.samplers.traced_file import TraceConfig, leave_box, make_rays, read_rays
 
 _PLOTTED_RAYS = 24
 
 
-@entry_point("trace", TraceConfig)
+@entry_point("trace", TraceConfig, expand=with_scene)
 def main(config: DictConfig) -> None:
     """Read rays, trace the rays, and write exit positions and directions."""
     out = user_path(config.out)

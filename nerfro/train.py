@@ -3,6 +3,7 @@
 Examples:
     nerfro train trainer.max_time=2m hydra.run.dir=outputs/first
     nerfro train experiment=glass data.root=data/glass medium.mesh=data/glass/mesh.ply medium.ior=1.5
+    nerfro train experiment=glass scene=data/glass/scene.json
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from nerfro.evaluation.results import RunMetrics, optimized
 from nerfro.evaluation.tables import report
 from nerfro.evaluation.treatments import score_split
 from nerfro.fields.mlp import compile_networks
+from nerfro.rendering.scene_file import with_scene
 from nerfro.subdivision import Subdivision
 from nerfro.training.build import build_training, check_first_batch
 from nerfro.training.callbacks import StopOnSignal, Throughput, steps_by_phase
@@ -34,7 +36,7 @@ from nerfro.training.viewer import Viewer
 from nerfro.viewing.camera_files import write_cameras
 
 
-@entry_point("train", TrainConfig, check=check_run)
+@entry_point("train", TrainConfig, check=check_run, expand=with_scene)
 def main(config: DictConfig) -> float | None:
     """Train one experiment, evaluate it, and return `optimized_metric`, which sweepers of Hydra optimize."""
     folder = Path(HydraConfig.get().runtime.output_dir)

@@ -14,6 +14,8 @@ from PIL import Image
 from nerfro.capture.silhouettes import mesh_silhouettes
 from nerfro.data.base import Views
 from nerfro.geometry.mesh import load_mesh
+from nerfro.media.bodies import BodySettings
+from nerfro.rendering.scene_file import read_scene_file
 from tests.ball_photographs import NUM_VIEWS, RADIUS, SIZE, cameras, mesh, save
 
 
@@ -66,19 +68,15 @@ def test_ball_from_its_silhouettes(preprocess: Callable[..., str], capture: Path
     assert all(f"train/r_{view}\n" in printed for view in range(NUM_VIEWS))
     with Image.open(capture / "overlays.png") as sheet:
         assert np.array(sheet).std() > 10
-    command = shlex.split(printed.split("train on it: ")[1])
-    assert command[:3] == ["python", "-m", "nerfro.train"]
-    assert {f"data.root={capture}", "medium.ior=1.33"} <= set(command)
-    assert not any(text.startswith(("data.near", "data.far")) for text in command), "the data set's bounds suffice"
-    narrow = preprocess("data.near=2.5", "data.far=3.1", "smoothing=0", "overwrite=true").split("train on it: ")[1]
-    near, far = map(float, re.findall(r"data\.(?:near|far)=([\d.]+)", narrow))
-    assert near < 2.3 < 3.7 < far, "bounds that cut the object are replaced"
-    box = [
-        json.loads(next(a for a in command if a.startswith(f"medium.{n}=")).split("=")[1])
-        for n in ("box_min", "box_max")
-    ]
-    assert (np.array(box[0]) < surface.bounds[0]).all()
-    assert (np.array(box[1]) > surface.bounds[1]).all()
+    assert f"train on it: python -m nerfro.train scene={capture / 'scene.json'}\n" in printed
+    scene = read_scene_file(capture / "scene.json")
+    assert scene.data == {"type": "blender", "root": str(capture)}, "the data set's bounds of rays suffice"
+    assert scene.bodies == {"object": BodySettings(mesh=str(capture / "mesh.ply"), ior=1.33)}
+    assert (np.array(scene.medium["box_min"]) < surface.bounds[0]).all()
+    assert (np.array(scene.medium["box_max"]) > surface.bounds[1]).all()
+    preprocess("data.near=2.5", "data.far=3.1", "smoothing=0", "overwrite=true")
+    narrow = read_scene_file(capture / "scene.json").data
+    assert narrow["near"] < 2.3 < 3.7 < narrow["far"], "bounds that cut the object are replaced"
 
 
 def test_printed_command_trains(
@@ -90,17 +88,18 @@ def test_printed_command_trains(
     assert finished.code == 0, finished.err
 
 
-def test_a_vessel_stands_upright_in_a_world_whose_z_points_elsewhere(preprocess: Callable[..., str]) -> None:
+def test_a_vessel_stands_upright_in_a_world_whose_z_points_elsewhere(
+    preprocess: Callable[..., str], capture: Path
+) -> None:
     lengths = ["medium=vessel", "medium.wall=0.1", "medium.level=1.0"]
     printed = preprocess(*lengths)
     # The cameras' right-hand axes are perpendicular to it, see `capture`.
     held = np.array([0.3, 0.9, 0.1]) / np.linalg.norm([0.3, 0.9, 0.1])
-    (found,) = (part for part in shlex.split(printed.split("train on it: ")[1]) if part.startswith("medium.up="))
-    assert np.array(json.loads(found.split("=")[1])) @ held > 0.99
+    scene = read_scene_file(capture / "scene.json")
+    assert np.array(scene.medium["up"]) @ held > 0.99
+    assert scene.settings()["medium"] == "vessel"
     assert "set medium.up= to change the direction" in printed
-    given = preprocess(*lengths, "medium.up=[0,0,1]", "overwrite=true")
-    assert "medium.up=[0,0,1]" in given
-    assert "set medium.up=" not in given
+    assert "set medium.up=" not in preprocess(*lengths, "medium.up=[0,0,1]", "overwrite=true")
 
 
 def test_a_body_of_revolution_is_fitted_where_it_is_asked_for(preprocess: Callable[..., str], capture: Path) -> None:
@@ -108,14 +107,13 @@ def test_a_body_of_revolution_is_fitted_where_it_is_asked_for(preprocess: Callab
     assert abs(radii(capture).mean() - RADIUS) < 0.06
 
 
-def test_a_vessel_is_fitted_where_it_is_asked_for(preprocess: Callable[..., str]) -> None:
+def test_a_vessel_is_fitted_where_it_is_asked_for(preprocess: Callable[..., str], capture: Path) -> None:
     printed = preprocess("medium.ior=1.33", "smoothing=0", "vessel=true", "room=false", "data.downscale=2")
     command = shlex.split(printed.split("train on the vessel: ")[1])
-    assert {"medium=vessel", "medium.ior=1.52"} <= set(command)
-    assert "medium.ior=1.33" not in command
-    for name in ("wall", "foot", "fillet"):
-        (given,) = (float(text.split("=")[1]) for text in command if text.startswith(f"medium.{name}="))
-        assert 0 < given < RADIUS
+    assert command[3:] == [f"scene={capture / 'scene.json'}", "medium=vessel"]
+    scene = read_scene_file(capture / "scene.json")
+    assert (scene.settings()["medium.ior"], scene.settings("vessel")["medium.ior"]) == (1.33, 1.52)
+    assert all(0 < scene.vessel[name] < RADIUS for name in ("wall", "foot", "fillet"))
 
 
 def test_nothing_is_overwritten_unasked(preprocess: Callable[..., str], capture: Path) -> None:
@@ -129,7 +127,8 @@ def test_nothing_is_overwritten_unasked(preprocess: Callable[..., str], capture:
 def test_supplied_mesh_is_compared_and_kept(preprocess: Callable[..., str], capture: Path, tmp_path: Path) -> None:
     mesh().save(tmp_path / "my ball.ply")
     printed = preprocess(f"mesh='{tmp_path / 'my ball.ply'}'")
-    assert f'medium.mesh="{tmp_path / "my ball.ply"}"' in printed
+    assert "train on it" in printed
+    assert read_scene_file(capture / "scene.json").bodies["object"].mesh == str(tmp_path / "my ball.ply")
     assert not (capture / "mesh.ply").exists()
     assert json.loads((capture / "overlaps.json").read_text())["mean"] > 0.97
 

@@ -1,32 +1,30 @@
 """`python -m nerfro.reconstruct`: stages in their order, what is kept, what is made again, and how it fails."""
 
 import functools
-import importlib
 import json
 import os
+import shlex
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
-from hydra.core.global_hydra import GlobalHydra
 from PIL import ExifTags, Image
 
 import nerfro.reconstruct
 import nerfro.train
 from nerfro.capture import refinement
-from nerfro.capture.overrides import print_next
-from nerfro.files.folder_lock import STAGE
+from nerfro.errors import NerfroError
 from nerfro.files.images import save_png
 from nerfro.files.reading import open_image
+from nerfro.overrides import print_next, without_hints
 from nerfro.pipeline import stages
 from nerfro.pipeline.hypotheses import Hypothesis
-from nerfro.pipeline.stages import run_command
+from nerfro.pipeline.stages import terminated_in_one_line
+from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
 from tests.ball_photographs import mesh, photographs, save, soft_masks
 from tests.conftest import Finished
 
@@ -86,14 +84,15 @@ class Pretended:
 
     Attributes:
         ran: name of each command with its options.
-        ends: exit status of commands that do not reach their end, by name.
+        ends: how commands end that do not reach their end, by name.
     """
 
     def __init__(self, out: Path) -> None:
-        self.out, self.near, self.doubtful = out, False, []
+        self.out, self.near = out, False
+        self.doubts, self.medium = list[str](), {"type": "object"}
         self.psnr = {"straight": 20.0, "unknown": 22.0, "glass": 21.0, "glass_room": 21.0}  # by experiment
         self.ran: list[tuple[str, list[str]]] = []
-        self.ends: dict[str, int] = {}
+        self.ends: dict[str, BaseException | None] = {}
         self._now = time.time() - 1000
 
     @property
@@ -107,23 +106,28 @@ class Pretended:
         self._now += 1
         os.utime(path, (self._now, self._now))
 
-    def __call__(self, command: list[str]) -> int:
-        name, options = command[2].removeprefix("nerfro."), command[3:]
+    def __call__(self, name: str, options: list[str]) -> None:
         self.ran.append((name, options))
         if name == "train":
             folder = options[-1 - (options[-1] == "ckpt_path=last")].removeprefix(f"hydra.run.dir={self.out}/")
             self.write(f"{folder}/config.yaml")
         if name in self.ends:
-            return self.ends[name]
+            if (end := self.ends[name]) is not None:
+                raise end
+            return
         if name == "calibrate":
             self.write("transforms_train.json")
-            self.write("calibration.json", {"options": ["data.near=0.1", "data.far=7"]})
+            self.write("calibration.json", {})
         if name == "mask":
             self.write("masks.png")
         if name == "preprocess":
-            found = {"options": ["data=opencv", "medium.ior=1.4"], "doubtful": self.doubtful, "near": self.near}
+            bodies, distance = {"object": {"mesh": "mesh.ply", "ior": 1.4}}, "near" if self.near else "far"
             self.write("surface/mesh.ply")
-            self.write("surface/preprocess.json", {**found, "pixels": [512, 384], "vessel": VESSEL})
+            self.write("surface/scene.json", {
+                "data": {"type": "opencv", "root": ".."}, "medium": self.medium, "bodies": bodies,
+                "vessel": {"wall": 0.01}, "surroundings": distance, "photograph": [512, 384],
+                "provenance": {"doubts": self.doubts},
+            })  # fmt: skip
         if name == "train":
             psnr = next(self.psnr[text.split("=")[1]] for text in options if text.startswith("+experiment="))
             view = {"name": "val_000", "psnr": psnr, "regions": {"mask": {"psnr": psnr - 2}}}
@@ -134,18 +138,15 @@ class Pretended:
             self.write("report/report.html")
         if name == "export":
             self.write("page.html")
-        return 0
 
 
 @pytest.fixture
 def pretended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pretended:
     made = Pretended(tmp_path / "out")
-    monkeypatch.setattr(stages, "command_of_module", lambda name: [sys.executable, "-m", name])
-    monkeypatch.setattr(stages, "run_command", made)
+    monkeypatch.setattr(stages, "call", made)
     return made
 
 
-VESSEL = ["data=opencv", "medium=vessel", "medium.wall=0.01"]
 TRIALS = ["train"] * 3  # straight rays, solid body, vessel
 ALL = ["calibrate", "preprocess", *TRIALS, "train", "summary", "export"]
 
@@ -159,20 +160,20 @@ def test_photographs_pass_all_stages_once(reconstruct: Reconstruct, pretended: P
     assert links == [f"{folder}/IMG_{i}.png" for folder in ("images", "masks") for i in range(3)]
     calibrate, preprocess, straight, solid, vessel, train, *_ = (options for _, options in pretended.ran)
     assert "target=colmap" in calibrate
-    data = ["data=opencv", f"data.root={pretended.out}", "data.near=0.1", "data.far=9"]
-    assert preprocess[:5] == [*data, "medium.resolution=64"]
+    data = ["data=opencv", f"data.root={pretended.out}", "data.far=9"]
+    assert preprocess[:4] == [*data, "medium.resolution=64"]
     assert preprocess[-1] == "keep=1"
-    assert train == ["+experiment=unknown", "data=opencv", "medium.ior=1.4", "camera.exposure=true", "data.downscale=2",
+    scene = f"scene={pretended.out / 'surface' / 'scene.json'}"
+    assert train == ["+experiment=unknown", scene, "camera.exposure=true", "data.downscale=2",
                      "trainer.max_steps=3", "logger=none", f"hydra.run.dir={pretended.out / 'run'}"]  # fmt: skip
     assert f"python -m nerfro.train {' '.join(train)}" in done.out
     trials = {"straight_rays": straight, "solid_body": solid, "vessel": vessel}
     for folder, trial in trials.items():
         assert {"evaluation.split=val", "trainer.max_time=null", "camera.exposure=true"} <= set(trial)
         assert trial[-1] == f"hydra.run.dir={pretended.out / 'trials' / folder}"
-    assert straight[:2] == ["+experiment=straight", "data=opencv"]
-    assert "medium.ior=1.4" not in straight
+    assert straight[:2] == ["+experiment=straight", scene]
     assert solid[: len(train) - 1] == train[:-1]
-    assert set(VESSEL) <= set(vessel)
+    assert vessel[:3] == ["+experiment=glass", "medium=vessel", scene]
     again = reconstruct(*asked)
     assert again.code == 0, again.err
     assert pretended.names == ALL
@@ -198,25 +199,25 @@ def test_what_changed_is_followed_by_what_is_made_of_it(
 
 
 @pytest.mark.parametrize(
-    ("doubtful", "psnr", "chosen", "printed"),
+    ("doubts", "psnr", "chosen", "printed"),
     [
         ([], {"straight": 21.6}, "straight rays", "bent rays are not clearly better: the surface or the index"),
         ([], {"straight": 21.4}, "solid body", "training continues with: solid body"),
         ([], {"glass": 23.0}, "vessel", "training continues with: vessel"),
-        (["medium.ior=1.0"], {"straight": 23.0}, "straight rays", "the photographs do not determine its index"),
-        (["medium.ior=1.0"], {}, "solid body, water", "training continues with: solid body, water"),
+        (["shallow"], {"straight": 23.0}, "straight rays", "the photographs do not determine its index"),
+        (["shallow"], {}, "solid body, water", "training continues with: solid body, water"),
     ],
 )
 def test_training_continues_with_the_hypothesis_that_the_validation_photographs_prefer(
     reconstruct: Reconstruct,
     pretended: Pretended,
     photos: Path,
-    doubtful: list[str],
+    doubts: list[str],
     psnr: dict[str, float],
     chosen: str,
     printed: str,
 ) -> None:
-    pretended.doubtful = doubtful
+    pretended.doubts = doubts
     pretended.psnr |= psnr
     done = reconstruct(*given(photos), f"out={pretended.out}", "trial_steps=70")
     assert done.code == 0, done.err
@@ -225,18 +226,22 @@ def test_training_continues_with_the_hypothesis_that_the_validation_photographs_
     best = next(trial for trial in trials if Hypothesis(chosen, []).folder in trial[-1])
     assert best[: len(train) - 1] == train[:-1], "the same options as in its trial"
     assert f"trainer.max_steps={105 if chosen == 'straight rays' else 70}" in best
-    assert "medium.ior=1.0" not in [option for trial in trials for option in trial], "an index in doubt is never known"
+    learned = [option for trial in trials for option in trial if option.startswith("medium.ior=")]
+    assert learned == ["medium.ior=1.333", "medium.ior=1.52"] * bool(doubts), "an index in doubt is never known"
 
 
-def test_stages_print_no_next_command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_stages_print_no_next_command(capsys: pytest.CaptureFixture[str]) -> None:
     print_next("next", "mask", [])
-    monkeypatch.setenv(STAGE, "")
-    print_next("next", "preprocess", [])
+    with without_hints():
+        print_next("next", "preprocess", [])
     assert capsys.readouterr().out == "next: python -m nerfro.mask\n"
 
 
-def test_an_interrupted_training_goes_on(reconstruct: Reconstruct, pretended: Pretended, photos: Path) -> None:
-    pretended.ends["train"] = 130
+@pytest.mark.parametrize("end", [SystemExit(130), KeyboardInterrupt()])  # from training, and from any other stage
+def test_an_interrupted_training_goes_on(
+    end: BaseException, reconstruct: Reconstruct, pretended: Pretended, photos: Path
+) -> None:
+    pretended.ends["train"] = end
     asked = *given(photos), f"out={pretended.out}", "trial_steps=0"
     stopped = reconstruct(*asked)
     assert stopped.code == 130
@@ -251,25 +256,25 @@ def test_an_interrupted_training_goes_on(reconstruct: Reconstruct, pretended: Pr
 def test_a_stage_that_fails_is_named_and_the_others_wait(
     reconstruct: Reconstruct, pretended: Pretended, photos: Path
 ) -> None:
-    pretended.ends["preprocess"] = 1
+    pretended.ends["preprocess"] = NerfroError("the masks are empty")
     failed = reconstruct(*given(photos), f"out={pretended.out}")
     assert failed.code == 1
-    assert failed.err.startswith("nerfro: error: preprocess failed for the reason in the line above; ")
+    assert failed.err.startswith("nerfro: error: preprocess failed: the masks are empty; correct the input, ")
     assert "set preprocess='OPTIONS'" in failed.err
     assert failed.err.count("\n") == 1
     assert pretended.names == ["calibrate", "preprocess"]
-    pretended.ends["preprocess"] = 0
-    assert "preprocess failed" in reconstruct(*given(photos), f"out={pretended.out}").err, "no result was written"
+    pretended.ends["preprocess"] = None
+    assert "scene.json was not written" in reconstruct(*given(photos), f"out={pretended.out}").err
     assert pretended.names == ["calibrate", "preprocess", "preprocess"]
 
 
 def test_a_page_that_cannot_be_made_does_not_fail_the_reconstruction(
     reconstruct: Reconstruct, pretended: Pretended, photos: Path
 ) -> None:
-    pretended.ends["export"] = 1
+    pretended.ends["export"] = NerfroError("the index varies in space")
     done = reconstruct(*given(photos), f"out={pretended.out}", "trial_steps=0")
     assert done.code == 0, done.err
-    assert "nerfro: warning: no page was written" in done.out
+    assert "nerfro: warning: no page was written: export failed: the index varies in space; " in done.out
     assert done.out.endswith(f"report: {pretended.out}/report/report.html\n")
 
 
@@ -277,15 +282,14 @@ def test_what_was_found_chooses_the_experiment(
     reconstruct: Reconstruct, pretended: Pretended, tiny_scene: Path
 ) -> None:
     asked = "data=blender", f"data.root={tiny_scene}", "outlines={r_0:[1,2,9,9]}", "medium=vessel", "medium.wall=0.1"
-    (pretended.near, pretended.doubtful) = True, ["medium.ior=1.37"]
+    pretended.near, pretended.doubts, pretended.medium = True, ["shallow"], {"type": "vessel", "wall": 0.1}
     done = reconstruct(*asked, f"out={pretended.out}")
     assert pretended.names == ["mask"], "its sheet lies in the data's folder"
     assert "mask failed" in done.err
     done = reconstruct(*asked[:2], *asked[3:], f"out={pretended.out}")
     assert pretended.names[1:] == ["preprocess", "train", "train", "train", "summary", "export"]
     assert pretended.ran[1][1][:4] == ["data=blender", f"data.root={tiny_scene}", "medium=vessel", "medium.wall=0.1"]
-    train = pretended.ran[4][1]
-    assert train[:3] == ["+experiment=glass_room", "data=opencv", "medium.ior=1.4"]
+    assert pretended.ran[4][1][:2] == ["+experiment=glass_room", f"scene={pretended.out / 'surface' / 'scene.json'}"]
 
 
 @pytest.mark.parametrize(
@@ -319,43 +323,26 @@ def test_what_contradicts_itself_is_refused(
 def test_a_result_that_was_spoilt_is_refused(reconstruct: Reconstruct, pretended: Pretended, photos: Path) -> None:
     asked = *given(photos), f"out={pretended.out}"
     reconstruct(*asked)
-    pretended.write("surface/preprocess.json", {"options": []})
-    assert "lacks one of doubtful, near, options, pixels; delete the file to repeat" in reconstruct(*asked).err
+    pretended.write("surface/scene.json", {"data": {}})
+    assert "scene.json lacks the text data.type; write" in reconstruct(*asked).err
 
 
-def test_a_command_is_left_time_to_save_when_this_process_is_asked_to_end() -> None:
-    run = "run_command([sys.executable, '-c', '''{}'''])"
-    program = f"import sys; from nerfro.pipeline.stages import run_command; print({run})"
-    saving = "import signal,time; signal.signal(15, lambda *_: exit(130)); print(0, flush=True); time.sleep(60)"
-    process = subprocess.Popen([sys.executable, "-c", program.format(saving)], stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    assert process.stdout.readline() == "0\n"
-    process.send_signal(signal.SIGINT)  # Ctrl-C would have reached the command too
-    process.send_signal(signal.SIGTERM)
-    assert process.communicate(timeout=30)[0] == "130\n"
-    assert run_command([sys.executable, "-c", "exit(3)"]) == 3
+def test_sigterm_ends_a_stage_like_ctrl_c() -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(KeyboardInterrupt), terminated_in_one_line():
+        signal.raise_signal(signal.SIGTERM)
+    assert signal.getsignal(signal.SIGTERM) == before
 
 
 def test_posed_photographs_of_a_ball_become_a_scene(
-    reconstruct: Reconstruct, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    reconstruct: Reconstruct, run_here: Reconstruct, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """All stages but that of poses, each in this process."""
+    """All stages but that of poses; each gives the same result alone, and leaves nothing behind."""
     data, out = tmp_path / "ball", tmp_path / "out"
     save(photographs([1.45]), data)
     for view, mask in enumerate(soft_masks(mesh())):
         save_png(data / "masks" / "train" / f"r_{view}.png", mask[..., None].expand(-1, -1, 3))
 
-    def here(command: list[str]) -> int:
-        GlobalHydra.instance().clear()
-        monkeypatch.setattr(sys, "argv", command[2:])
-        try:
-            importlib.import_module(command[2]).main()
-        except SystemExit as end:
-            return int(end.code or 0)
-        return 0
-
-    monkeypatch.setattr(stages, "command_of_module", lambda name: [sys.executable, "-m", name])
-    monkeypatch.setattr(stages, "run_command", here)
     monkeypatch.setattr(nerfro.train, "find_lpips_networks", lambda: ({}, {}))
     short = refinement.RefinementSettings((refinement.Stage(20, 1e-4, (3.0, 1.0)),), 1000)
     fast = functools.partial(refinement.refine_surface, settings=short)
@@ -367,15 +354,16 @@ def test_posed_photographs_of_a_ball_become_a_scene(
              "optimizer.boundary_steps=100"]  # fmt: skip
     asked = ["data=blender", f"data.root={data}", "data.near=0.5", f"out={out}", "medium.resolution=32",
              "medium.cache=false", "preprocess=resolution=24", f"train={' '.join(train)}", "trial_steps=2"]  # fmt: skip
+    before = torch.initial_seed(), signal.getsignal(signal.SIGTERM)
     done = reconstruct(*asked)
     assert done.code == 0, done.err
     index = json.loads((out / "surface" / "index.json").read_text())
     assert index["ior"] == [pytest.approx(1.45, rel=0.02)]
     assert 0 < index["standard_error"][0] < 0.02
-    found = json.loads((out / "surface" / "preprocess.json").read_text())
-    assert found["near"] is False
-    assert found["doubtful"] == []
-    assert f"medium.ior={index['ior'][0]:.4f}".rstrip("0") in found["options"]
+    scene = json.loads((out / "surface" / "scene.json").read_text())
+    assert scene["surroundings"] == "far"
+    assert scene["bodies"] == {"object": {"mesh": "mesh.ply", "ior": round(index["ior"][0], 4)}}
+    assert scene["provenance"]["standard_error"] == index["standard_error"]
     assert (out / "surface" / "refinement.json").is_file()
     assert json.loads((out / "run" / "metrics.json").read_text())["steps"] == 2
     assert (out / "report" / "report.html").is_file()
@@ -383,3 +371,11 @@ def test_posed_photographs_of_a_ball_become_a_scene(
     assert (out / "page.html").is_file()
     # Surface, three trials, training, report and page.
     assert reconstruct(*asked).out.count(" is kept (delete the file to repeat the stage)") == 7
+    assert (torch.initial_seed(), signal.getsignal(signal.SIGTERM)) == before
+    command = next(line for line in done.out.splitlines() if line.endswith(f"hydra.run.dir={out}/run"))
+    alone = run_here("train", *shlex.split(command)[4:], f"hydra.run.dir={tmp_path / 'alone'}")
+    assert alone.code == 0, alone.err
+    runs = out / "run", tmp_path / "alone"
+    chained, separate = (load_checkpoint(run / LAST_CHECKPOINT)[0]["state_dict"] for run in runs)
+    assert all(torch.equal(chained[name], separate[name]) for name in chained)
+    assert json.loads((out / "run" / "run.json").read_text())["command"].split()[1:3] == ["-m", "nerfro.train"]

@@ -38,7 +38,7 @@ def write_calibrated(
     target: str,
     quads: list[Float[np.ndarray, "4 3"]],
     points: Float[np.ndarray, "P 3"],
-    options: list[str],
+    bounds: dict[str, float],
 ) -> list[str]:
     """Write the data set (see docs/guides/data_formats.md), calibration.json and cameras.png.
 
@@ -51,14 +51,14 @@ def write_calibrated(
         target: name of the calibration target.
         quads: corners of the sheets of the board, for the plot.
         points: scene points, for the plot.
-        options: command-line options for the following commands, such as data.near and data.far.
+        bounds: bounds `near` and `far` of the rays; empty if unknown.
 
     Returns:
         Descriptions of the written files.
     """
     files = {image.name: image for image in images}
     lens = calibration.intrinsics
-    document: dict[str, object] = {"cam_mat": lens.matrix.tolist(), "w": size[0], "h": size[1]}
+    document: dict[str, object] = {"cam_mat": lens.matrix.tolist(), "w": size[0], "h": size[1], **bounds}
     if lens.distortion:
         document["dist"] = list(lens.distortion)
     written = []
@@ -75,7 +75,6 @@ def write_calibrated(
         written.append(f"{path} ({len(names)} views)")
     report = {
         "target": target,
-        "options": options,
         **document,
         "focal_deviation": lens.focal_deviation,
         "images": {
@@ -101,14 +100,14 @@ def relative(file: Path, folder: Path) -> str:
     return Path(os.path.relpath(file, folder)).as_posix()
 
 
-def ray_range(calibration: Calibration, seen: Float[np.ndarray, "P 3"]) -> list[str]:
-    """Return options `data.near` and `data.far` that enclose all points for all cameras; none without points."""
+def ray_range(calibration: Calibration, seen: Float[np.ndarray, "P 3"]) -> dict[str, float]:
+    """Return bounds `near` and `far` that enclose all points for all cameras; none without points."""
     if len(seen) == 0:
-        return []
+        return {}
     centres = np.stack([pose.camera_to_world[:, 3] for pose in calibration.poses.values()])
     distances = np.linalg.norm(centres[:, None] - seen[None, :: max(1, len(seen) // 2000)], axis=-1)
     near, far = 0.5 * np.quantile(distances, 0.001), 1.5 * np.quantile(distances, 0.999)
-    return [f"data.near={near:.3g}", f"data.far={far:.3g}"]
+    return {"near": float(f"{near:.3g}"), "far": float(f"{far:.3g}")}
 
 
 def _plot_cameras(

@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,6 +26,7 @@ from nerfro.files.atomic import write_atomically
 from nerfro.media.base import Medium
 from nerfro.media.solid import Solid
 from nerfro.progress import bar
+from nerfro.rendering.scene_file import Provenance
 from nerfro.samplers.snell import Snell
 
 LOWEST, HIGHEST = 1.0, 2.5  # range of the search
@@ -295,13 +296,29 @@ class FoundMedium:
 
     Attributes:
         medium: the medium.
-        index_settings: options of the indices that were searched.
-        is_doubtful: whether the photographs do not determine these indices.
+        estimate: the indices that were searched; None if they are known.
     """
 
     medium: Medium
-    index_settings: dict[str, object] = field(default_factory=dict)
-    is_doubtful: bool = False
+    estimate: Estimate | None = None
+
+    @property
+    def index_settings(self) -> dict[str, object]:
+        """Settings of the medium for the indices that were searched."""
+        return {} if self.estimate is None else index_settings(self.estimate.values)
+
+    @property
+    def provenance(self) -> Provenance:
+        """Accuracy of the indices, for the scene file."""
+        if self.estimate is None:
+            return Provenance()
+        errors = [round(float(error), 5) for error in self.estimate.standard_errors]
+        return Provenance(standard_error=errors, doubts=self.estimate.doubts)
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether the photographs do not determine the indices."""
+        return self.estimate is not None and bool(self.estimate.doubts)
 
 
 def find_medium(
@@ -313,17 +330,16 @@ def find_medium(
         request: options of the command.
         observations: observations of the object and its surroundings.
         location: file of the surface.
-        settings: options of the surface (see `surface_settings`).
+        settings: settings of the medium for the surface (see `surface_settings`).
     """
     if not request.searches_index:
-        return FoundMedium(build_medium(request, settings, location, {}))
+        return FoundMedium(build_medium(request, settings | {"mesh": location}))
     num_bodies = 1 + len(request.config.medium.get("inner_meshes", []))
-    medium = build_medium(request, settings, location, index_settings([1.5] * num_bodies))
+    medium = build_medium(request, settings | {"mesh": location} | index_settings([1.5] * num_bodies))
     if not isinstance(medium, Solid):
         raise NerfroError("the index of this type of medium cannot be searched for; set medium.ior=, or medium=object")
     found = _search_index(observations, medium, request.folder)
-    options: dict[str, object] = {f"medium.{name}": value for name, value in index_settings(found.values).items()}
-    return FoundMedium(medium.with_indices(torch.from_numpy(found.values)), options, bool(found.doubts))
+    return FoundMedium(medium.with_indices(torch.from_numpy(found.values)), found)
 
 
 def _search_index(observations: Observations, medium: Solid, folder: Path) -> Estimate:

@@ -1,33 +1,33 @@
-"""Options of `python -m nerfro.preprocess`, the output folder, and the command that trains on the results."""
+"""Options of `python -m nerfro.preprocess`, the output folder, and the scene file."""
 
 from __future__ import annotations
 
-import json
 import typing
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Optional
 
 import numpy as np
+from hydra.core.hydra_config import HydraConfig
 from jaxtyping import Float
 from omegaconf import MISSING, DictConfig, OmegaConf
 
 from nerfro.allowed import Count, Natural, NotNegative, Range, corners_of_box
 from nerfro.cameras import Cameras
 from nerfro.capture.overlaps import REPORT, SHEET
-from nerfro.capture.overrides import as_overrides, is_given, of_groups, print_hint, print_next
 from nerfro.capture.revolution import Symmetry
 from nerfro.capture.upright import find_up
 from nerfro.data.frames import require_root
 from nerfro.errors import NerfroError
-from nerfro.files.atomic import write_atomically
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.media.base import Medium
+from nerfro.overrides import as_overrides, is_given, print_hint, print_next
 from nerfro.paths import EMBEDDED_PREFIX, resolve_path, user_path
 from nerfro.registry import build
+from nerfro.rendering.scene_file import SCENE, SceneFile, described, take_bodies
 
-MESH, FOUND = "mesh.ply", "preprocess.json"
+MESH = "mesh.ply"
 INDEX, FIGURES = "index.json", "refinement.json"
 # Margin of the index grid around the object, as a fraction of the object's size.
 _MARGIN = 0.15
@@ -111,7 +111,7 @@ class Request:
         names += [SHEET, REPORT]
         names += [INDEX] if self.searches_index else []
         names += [FIGURES] if config.refine else []
-        return [self.folder / name for name in [*names, FOUND]]
+        return [self.folder / name for name in [*names, SCENE]]
 
     def check(self) -> None:
         """Check the options and the output folder.
@@ -134,84 +134,71 @@ class Request:
             require_root(self.folder)
 
 
-def surface_settings(request: Request, cameras: Cameras, mesh: TriangleMesh, location: str) -> dict[str, object]:
-    """Determine the options of medium and data set that a surface needs beside the given ones.
+def surface_settings(request: Request, cameras: Cameras, mesh: TriangleMesh) -> dict[str, object]:
+    """Determine the settings of the medium that a surface needs beside the given ones.
 
     Args:
         request: options of the command.
         cameras: cameras of the photographs.
         mesh: the surface.
-        location: file of the surface.
     """
     settings: dict[str, object] = {}
-    if location != f"{request.config.data.root}/{MESH}":
-        settings["medium.mesh"] = location
     names = ("medium.box_min", "medium.box_max", "medium.bodies")  # each of several bodies has a box of its own
     if not any(is_given(name, request.overrides) for name in names):
         centre, half_side = mesh.bounds.mean(0), (0.5 + _MARGIN) * float(np.ptp(mesh.bounds, axis=0).max())
         digits = max(0, 3 - int(np.floor(np.log10(half_side))))
         for name, corner in (("box_min", centre - half_side), ("box_max", centre + half_side)):
-            settings[f"medium.{name}"] = [round(float(x), digits) for x in corner]
-    offsets = cameras.camera_to_world[:, None, :, 3].double().numpy() - mesh.vertices[::16]
-    distance = np.linalg.norm(offsets, axis=-1)
-    if cameras.near >= distance.min():
-        settings["data.near"] = float(f"{0.8 * distance.min():.3g}")
-    if cameras.far <= distance.max():
-        settings["data.far"] = float(f"{1.2 * distance.max():.3g}")
+            settings[name] = [round(float(x), digits) for x in corner]
     is_vessel = "wall" in request.config.medium
     if is_vessel and not is_given("medium.up", request.overrides) and (found := find_up(cameras, mesh)) is not None:
         up, origin = found
-        settings["medium.up"] = [round(float(x), 4) for x in up]
-        print(f"up is {settings['medium.up']}, {origin}; set medium.up= to change the direction")
+        settings["up"] = [round(float(x), 4) for x in up]
+        print(f"up is {settings['up']}, {origin}; set medium.up= to change the direction")
     return settings
 
 
-def build_medium(request: Request, settings: dict[str, object], location: str, numbers: dict[str, object]) -> Medium:
-    """Build the medium with a surface and indices, so that an unsuitable surface is refused before training."""
+def _ray_bounds(cameras: Cameras, mesh: TriangleMesh) -> dict[str, object]:
+    """Determine bounds of the rays that enclose a surface, where those of the cameras cut it."""
+    offsets = cameras.camera_to_world[:, None, :, 3].double().numpy() - mesh.vertices[::16]
+    distance = np.linalg.norm(offsets, axis=-1)
+    bounds: dict[str, object] = {}
+    if cameras.near >= distance.min():
+        bounds["near"] = float(f"{0.8 * distance.min():.3g}")
+    if cameras.far <= distance.max():
+        bounds["far"] = float(f"{1.2 * distance.max():.3g}")
+    return bounds
+
+
+def build_medium(request: Request, settings: dict[str, object]) -> Medium:
+    """Build the medium with further settings, so that an unsuitable surface is refused before training."""
     medium = typing.cast(dict[str, object], OmegaConf.to_container(request.config.medium, resolve=True))
-    medium |= {name.removeprefix("medium."): value for name, value in settings.items() if name.startswith("medium.")}
-    return typing.cast(Medium, build(medium | {"mesh": location} | numbers))
+    return typing.cast(Medium, build(medium | settings))
 
 
 def index_settings(iors: Iterable[float]) -> dict[str, object]:
-    """Return the options of the medium that set the indices of the bodies."""
+    """Return the settings of the medium for the indices of the bodies."""
     first, *inner = (round(float(ior), 4) for ior in iors)
     return {"ior": first} | ({"inner_iors": inner} if inner else {})
 
 
-def conclude(
-    request: Request,
-    settings: dict[str, object],
-    index: dict[str, object],
-    index_is_doubtful: bool,
-    near: bool | None,
-    cameras: Cameras,
-    vessel: dict[str, object],
-) -> None:
-    """Write preprocess.json with the options for training, and print the result files and the next command.
+def write_scene(request: Request, found: SceneFile, cameras: Cameras, mesh: TriangleMesh) -> None:
+    """Write the scene file, and print the result files and the next command.
 
     Args:
         request: options of the command.
-        settings: options of surface and cameras.
-        index: options of the indices that were searched.
-        index_is_doubtful: whether to leave the indices to the user, because the photographs do not determine them.
-        near: whether the surroundings are near; None if unknown.
+        found: estimated values; they have precedence over the options.
         cameras: cameras of the photographs.
-        vessel: options of a vessel that was fitted; empty without one.
+        mesh: the surface.
     """
-    settings = settings if index_is_doubtful else settings | index
-    given = of_groups(("data", "medium"), request.overrides)
-    given = [text for text in given if not any(is_given(name, [text]) for name in (*settings, "medium.mesh"))]
-    options = [*given, *as_overrides(settings)]
-    doubtful = as_overrides(index) if index_is_doubtful else []
-    found = {"options": options, "doubtful": doubtful, "near": near, "pixels": [cameras.width, cameras.height]}
-    without = [text for text in options if not any(is_given(name, [text]) for name in vessel)]
-    found["vessel"] = as_vessel = [*without, *as_overrides(vessel)] if vessel else []
-    write_atomically(request.folder / FOUND, json.dumps(found, indent=1) + "\n")
+    config, chosen = request.config, HydraConfig.get().runtime.choices
+    medium = described(config.medium, chosen["medium"]) | found.medium
+    data = described(config.data, chosen["data"]) | {"root": str(config.data.root)} | _ray_bounds(cameras, mesh)
+    size = [cameras.width, cameras.height]
+    scene = replace(found, data=data, bodies=take_bodies(medium), medium=medium, photograph=size)
+    file = request.folder / SCENE
+    scene.save(file)
     print(f"results: {', '.join(str(file) for file in request.files if file.exists())}")
-    if doubtful:
-        print_hint(f"the photographs do not determine the index; add {' '.join(f'{name}=N' for name in index)}")
-    print_hint("for near surroundings, add +experiment=refractive_room; for straight rays, +experiment=mipnerf_sky")
-    print_next("train on it", "train", options)
-    if as_vessel:
-        print_next("train on the vessel", "train", as_vessel)
+    print_hint("for near surroundings, add experiment=refractive_room; for straight rays, experiment=mipnerf_sky")
+    print_next("train on it", "train", as_overrides({"scene": file}))
+    if scene.vessel:
+        print_next("train on the vessel", "train", as_overrides({"scene": file, "medium": "vessel"}))

@@ -218,10 +218,10 @@ class Observations:
         self.views, self._mesh, self._room = views, mesh, room
 
     @property
-    def near(self) -> bool | None:
-        """Whether the surroundings are near; None if they have not been reconstructed."""
+    def distance(self) -> str | None:
+        """Distance of the surroundings, `near` or `far`; None if they have not been reconstructed."""
         known = self.__dict__.get("surroundings")
-        return None if known is None else isinstance(known.boundary, Room)
+        return None if known is None else "near" if isinstance(known.boundary, Room) else "far"
 
     @cached_property
     def through(self) -> Pixels:

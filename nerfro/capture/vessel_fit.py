@@ -59,7 +59,7 @@ class VesselFit:
 
 
 def find_vessel(medium: SdfGrid, location: str, mesh: TriangleMesh, observations: Observations) -> dict[str, object]:
-    """Fit a vessel to the photographs, print its lengths, and return the options of the medium.
+    """Fit a vessel to the photographs, print its lengths, and return the settings of the medium.
 
     Args:
         medium: solid body with the outer surface.
@@ -68,7 +68,7 @@ def find_vessel(medium: SdfGrid, location: str, mesh: TriangleMesh, observations
         observations: observations of the object and its surroundings.
 
     Returns:
-        Options of the vessel; empty if the surface leaves no cavity.
+        Settings of the vessel except its mesh; empty if the surface leaves no cavity.
     """
     found_up = find_up(observations.views.cameras, mesh)
     up = [0.0, 0.0, 1.0] if found_up is None else [round(float(x), 4) for x in found_up[0]]
@@ -100,9 +100,8 @@ def find_vessel(medium: SdfGrid, location: str, mesh: TriangleMesh, observations
     print(f"vessel, {'partly filled' if 'level' in fit.lengths else 'empty'}: {', '.join(values)} world units")
     if fit.unknown:
         warn(f"the photographs do not determine {' and '.join(fit.unknown)}, which keep typical values")
-    options = {"medium.up": up, "medium.ior": _GLASS, "medium.liquid_ior": _WATER if "level" in fit.lengths else 1.0}
-    lengths = {f"medium.{name}": float(f"{length:.4g}") for name, length in fit.lengths.items()}
-    return {"medium": "vessel"} | options | lengths
+    lengths = {name: float(f"{length:.4g}") for name, length in fit.lengths.items()}
+    return {"up": up, "ior": _GLASS, "liquid_ior": _WATER if "level" in fit.lengths else 1.0} | lengths
 
 
 def fit_vessel(

@@ -38,6 +38,8 @@ class OpenCVData(PosedImages):
     the paper's authors.
 
     Args:
+        near, far: bounds of the rays, arc lengths in world units; by default `near` and `far` of the file, or 0.2 and
+            12.
         options: see `PosedImages`.
         eval_crop: fraction of each side that is kept around the centre, for the images of every split except train.
     """
@@ -45,8 +47,8 @@ class OpenCVData(PosedImages):
     def __init__(
         self,
         root: str,
-        near: Distance = 0.2,
-        far: Distance = 12.0,
+        near: Distance | None = None,
+        far: Distance | None = None,
         eval_crop: Annotated[float, Range(more_than=0, at_most=1)] = 1.0,
         **options: Any,
     ) -> None:
@@ -60,4 +62,5 @@ class OpenCVData(PosedImages):
     def read(self, split: str) -> FrameSet:
         manifest = read_manifest(self.root, split)
         crop = 1.0 if split == "train" else self.eval_crop
-        return FrameSet(manifest.frames, manifest.lenses(), "opencv", crop=crop)
+        near, far = (manifest.number(name, default) for name, default in (("near", 0.2), ("far", 12.0)))
+        return FrameSet(manifest.frames, manifest.lenses(), "opencv", near, far, crop)

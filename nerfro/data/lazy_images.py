@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,6 +21,20 @@ from nerfro.errors import NerfroError
 
 # Maximum number of files decoded at the same time, which bounds the memory for decoding.
 _MAX_THREADS = 8
+# `decoded_once` keeps so many bytes, and only images of which at least so many fit.
+_KEPT_BYTES, _MIN_KEPT = 2**29, 128
+_decoded: dict[Hashable, Levels] | None = None
+
+
+@contextlib.contextmanager
+def decoded_once() -> Iterator[None]:
+    """Keep downscaled images in memory, for a program that reads the same photographs several times."""
+    global _decoded
+    _decoded = {}
+    try:
+        yield
+    finally:
+        _decoded = None
 
 
 @dataclass(frozen=True)
@@ -101,7 +116,19 @@ class LazyImages:
         return (self[index] for index in range(len(self)))
 
     def levels(self, index: int) -> Levels:
-        """Decode one image to integer levels of type `dtype`."""
+        """Return one image as integer levels of type `dtype`."""
+        if _decoded is None or not self.recipe:
+            return self._decode(index)
+        file = self.files[index]
+        key = file, file.stat().st_mtime_ns, self.recipe, self.size, self.dtype, self.downscale, self.window
+        if key in _decoded:
+            return _decoded[key]
+        levels = self._decode(index)
+        if levels.nbytes * max(len(_decoded), _MIN_KEPT) <= _KEPT_BYTES:
+            _decoded[key] = levels
+        return levels
+
+    def _decode(self, index: int) -> Levels:
         levels = self.read(self.files[index])
         if levels.shape[:2] != self.size:
             raise NerfroError(f"the size of image {self.files[index]} has changed during the run; start it again")

@@ -36,6 +36,12 @@ class Manifest:
     document: Mapping[str, object]
     frames: list[Frame]
 
+    def number(self, key: str, default: float) -> float:
+        """Return a number of the file, which may lack the key."""
+        value: Any = self.document.get(key)
+        check(f"{self.path}: ", {key: float}, {key: value})
+        return default if value is None else value
+
     def lenses(self, chosen: Sequence[int] | None = None) -> list[Lens]:
         """Read the lenses of all frames, or of the chosen ones, for the size of their images; see `read_lens`."""
         entries: Any = self.document["frames"]

@@ -14,7 +14,6 @@ from nerfro.errors import NerfroError, first_of
 from nerfro.paths import refuse_root
 
 _LOCK, PARTIAL = ".lock", ".partial"  # lock file, and ending of files that are being written
-STAGE = "NERFRO_STAGE"  # environment variable of stages: the folders that nerfro.reconstruct has locked
 _locked: dict[Path, int] = {}  # folders that this process has locked, with the inode of each lock file
 
 
@@ -22,9 +21,8 @@ _locked: dict[Path, int] = {}  # folders that this process has locked, with the 
 def lock_folder(folder: Path, option: str) -> Iterator[None]:
     """Lock a folder for this process, and create the folder if needed.
 
-    A process may lock a folder several times. A stage of nerfro.reconstruct may use the folder that nerfro.reconstruct
-    has locked. Partial files of killed processes are removed. A folder without new files at the end is restored to its
-    earlier state.
+    A process may lock a folder several times. Partial files of killed processes are removed. A folder without new
+    files at the end is restored to its earlier state.
 
     Args:
         folder: folder to lock.
@@ -35,14 +33,11 @@ def lock_folder(folder: Path, option: str) -> Iterator[None]:
     """
     refuse_root(folder, option)
     folder = folder.absolute()
-    if os.path.realpath(folder) in os.environ.get(STAGE, "").split("\n"):
-        yield
-        return
     created = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
         before = {path.name for path in folder.iterdir()}
-        lock = FileLock(folder / _LOCK, is_singleton=True)
+        lock = FileLock(Path(os.path.realpath(folder)) / _LOCK, is_singleton=True)
         lock.acquire(blocking=False)
         _locked[folder] = (folder / _LOCK).stat().st_ino
         if lock.lock_counter == 1:
@@ -65,11 +60,6 @@ def lock_folder(folder: Path, option: str) -> Iterator[None]:
                     for path in created:
                         path.rmdir()
         lock.release()
-
-
-def environment_of_stages() -> dict[str, str]:
-    """Return the environment of the stages of nerfro.reconstruct, which may use the folders of this process."""
-    return {**os.environ, STAGE: "\n".join(map(os.path.realpath, _locked))}
 
 
 def require_lock(path: Path) -> None:

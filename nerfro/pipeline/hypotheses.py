@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
-from nerfro.capture.overrides import is_given, of_groups
+from nerfro.rendering.scene_file import SceneFile
 
 # Number of training photographs that score the hypotheses.
 _NUM_VALIDATION_VIEWS = 5
@@ -22,7 +20,7 @@ class Hypothesis:
 
     Attributes:
         name: name in the table.
-        options: options of `python -m nerfro.train` under this assumption.
+        options: options of `python -m nerfro.train` under this assumption, beside the scene file.
         doubt: reason for a failure of bent rays, for the message about the result; empty if unknown.
         speed: number of training steps in the time of one step with bent rays.
     """
@@ -55,7 +53,7 @@ class Hypothesis:
         ]
 
 
-def hypotheses(found: Mapping[str, Any], medium: Mapping[str, Any]) -> list[Hypothesis]:
+def hypotheses(scene: SceneFile) -> list[Hypothesis]:
     """List the assumptions about the object, straight rays first.
 
     Straight rays show an opaque object, and are the baseline of all other hypotheses. A body has the index that
@@ -63,27 +61,23 @@ def hypotheses(found: Mapping[str, Any], medium: Mapping[str, Any]) -> list[Hypo
     index. A vessel needs the lengths of `preprocess vessel=true`.
 
     Args:
-        found: content of the result file of `preprocess`.
-        medium: configuration of the medium.
+        scene: content of the scene file.
     """
-    options, near = found["options"], found["near"]
-    straight = Hypothesis(
-        "straight rays", ["+experiment=straight", *of_groups(("data", "camera"), options)], speed=_STRAIGHT_SPEED
-    )
+    near = scene.surroundings == "near"
+    straight = Hypothesis("straight rays", ["+experiment=straight"], speed=_STRAIGHT_SPEED)
     known_materials = f"+experiment={'glass_room' if near else 'glass'}"
-    if "wall" in medium:  # the materials of a vessel are known
-        return [straight, Hypothesis("vessel", [known_materials, *options])]
-    if medium.get("bodies") is not None:
-        return [straight, Hypothesis("bodies", [known_materials, *options])]
-    body = [f"+experiment={'glass_room' if near else 'unknown'}", *options]
-    if not found["doubtful"]:
-        bodies = [Hypothesis("solid body", body)]
+    if "wall" in scene.medium:  # the materials of a vessel are known
+        return [straight, Hypothesis("vessel", [known_materials])]
+    if scene.short is None:
+        return [straight, Hypothesis("bodies", [known_materials])]
+    body = f"+experiment={'glass_room' if near else 'unknown'}"
+    if not scene.provenance.doubts:
+        bodies = [Hypothesis("solid body", [body])]
     else:
         doubt = "the photographs do not determine its index"
         bodies = [
-            Hypothesis(f"solid body, {name}", [*body, f"medium.ior={index}", "medium.learn_ior=true"], doubt)
+            Hypothesis(f"solid body, {name}", [body, f"medium.ior={index}", "medium.learn_ior=true"], doubt)
             for name, index in _COMMON_INDICES.items()
         ]
-    if "shell_voxels" not in medium or is_given("medium", options) or not found.get("vessel"):
-        return [straight, *bodies]
-    return [straight, *bodies, Hypothesis("vessel", [known_materials, *found["vessel"]])]
+    vessel = [Hypothesis("vessel", [known_materials, "medium=vessel"])] if scene.vessel else []
+    return [straight, *bodies, *vessel]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Optional
@@ -11,9 +10,9 @@ from typing import Annotated, Any, Optional
 from omegaconf import MISSING, DictConfig
 
 from nerfro.allowed import Count, Natural, Range
-from nerfro.capture.overrides import is_given
-from nerfro.data.transforms import read_json
 from nerfro.errors import NerfroError
+from nerfro.overrides import as_overrides, is_given
+from nerfro.rendering.scene_file import read_scene_file
 
 
 @dataclass
@@ -77,26 +76,18 @@ def have_poses(config: DictConfig, overrides: list[str]) -> bool:
     return posed
 
 
-def common_options(config: DictConfig, overrides: list[str], found: Mapping[str, Any]) -> list[str]:
+def common_options(config: DictConfig, overrides: list[str], scene: Path) -> list[str]:
     """Determine the options of the training that do not depend on the assumptions about the object.
 
     Args:
         config: options of the command.
         overrides: the command line.
-        found: content of the result file of `preprocess`.
+        scene: the scene file.
     """
-    options, extra = [], shlex.split(config.train)
+    options, extra = as_overrides({"scene": scene}), shlex.split(config.train)
     if not is_given("camera.exposure", extra):
         options.append("camera.exposure=true")  # telephones select an exposure for each photograph
-    if not is_given("data.downscale", overrides):
-        options.append(f"data.downscale={max(1.0, max(found['pixels']) / config.pixels):.4g}")
+    sides = read_scene_file(scene).photograph
+    if sides and not is_given("data.downscale", overrides):
+        options.append(f"data.downscale={max(1.0, max(sides) / config.pixels):.4g}")
     return [*options, *extra]
-
-
-def read_result(file: Path, keys: set[str]) -> dict[str, Any]:
-    """Read the result file of a stage, which the user may have edited."""
-    advice = "delete the file to repeat the stage"
-    result = read_json(file, advice)
-    if not isinstance(result, dict) or not keys <= result.keys():
-        raise NerfroError(f"{file} lacks one of {', '.join(sorted(keys))}; {advice}")
-    return result

@@ -3,30 +3,32 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import itertools
+import os
 import shlex
 import signal
-import subprocess
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
+import torch
+
 from nerfro.capture.photographs import PHOTOGRAPH_SUFFIXES, place_photograph
-from nerfro.cli import EXIT_INTERRUPTED
+from nerfro.cli import EXIT_INTERRUPTED, call, in_one_line
 from nerfro.data.frames import list_images
 from nerfro.data.image_files import IMAGE_SUFFIXES
 from nerfro.errors import Interrupted, NerfroError
-from nerfro.files.folder_lock import environment_of_stages
+from nerfro.overrides import without_hints
 from nerfro.progress import track
-from nerfro.trust import command_of_module
 
-_INTERRUPTED = (EXIT_INTERRUPTED, -signal.SIGINT, -signal.SIGTERM)  # exit statuses
+_SEED = 67280421310721  # of torch in a new process
 
 
 @dataclass(frozen=True)
 class Stage:
-    """A command of nerfro with its input and output files.
+    """A command of nerfro with its input and output files, which runs in this process.
 
     Attributes:
         command: name of the command, as in `python -m nerfro.COMMAND`.
@@ -48,7 +50,7 @@ class Stage:
         return self.result.is_file() and not is_older(self.result, self.inputs)
 
     def run(self) -> None:
-        """Run the command unless the stage is done.
+        """Run the command in this process unless the stage is done.
 
         Raises:
             NerfroError: the command failed.
@@ -57,50 +59,51 @@ class Stage:
         if self.is_done:
             print(f"{self.command}: done; {self.result} is kept (delete the file to repeat the stage)", flush=True)
             return
-        module = f"nerfro.{self.command}"
-        print(f"\n{self.command}: {shlex.join(['python', '-m', module, *self.options])}", flush=True)
-        status = run_command([*command_of_module(module), *self.options])
-        if status in _INTERRUPTED:
-            raise Interrupted(f"{self.command} is incomplete; repeat the same command to continue")
-        if status != 0 or not self.result.is_file():
+        print(f"\n{self.command}: {shlex.join(['python', '-m', f'nerfro.{self.command}', *self.options])}", flush=True)
+        incomplete = f"{self.command} is incomplete; repeat the same command to continue"
+        try:
+            # A command depends on no random numbers of earlier stages.
+            with without_hints(), torch.random.fork_rng(devices=[]):
+                torch.manual_seed(_SEED)
+                call(self.command, list(self.options))
+            if not self.result.is_file():
+                raise NerfroError(f"{self.result} was not written")
+        except KeyboardInterrupt:
+            raise Interrupted(incomplete) from None
+        except SystemExit as end:
+            if end.code != EXIT_INTERRUPTED:
+                raise
+            raise Interrupted(incomplete) from None  # training has saved a checkpoint
+        except Exception as error:
+            if os.environ.get("NERFRO_DEBUG"):
+                raise
             raise NerfroError(
-                f"{self.command} failed for the reason in the line above; correct the input, set "
-                f"{self.command}='OPTIONS', or run the printed command with other options; then repeat this command, "
-                "which keeps all completed stages"
-            )
+                f"{self.command} failed: {in_one_line(error)}; correct the input, set {self.command}='OPTIONS', or run "
+                "the printed command with other options; then repeat this command, which keeps all completed stages"
+            ) from error
+        gc.collect()  # models refer to themselves
         print(f"{self.command}: done; look at {self.preview}", flush=True)
+
+
+@contextlib.contextmanager
+def terminated_in_one_line() -> Iterator[None]:
+    """End this program on SIGTERM as on Ctrl-C. A second signal ends the program at once."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        raise KeyboardInterrupt
+
+    previous = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, previous)
 
 
 def is_older(file: Path, others: Iterable[Path]) -> bool:
     """Test whether one of the existing other files was modified after a file."""
     written = file.stat().st_mtime_ns
     return any(other.stat().st_mtime_ns > written for other in others if other.exists())
-
-
-def run_command(command: list[str]) -> int:
-    """Run a command and return the exit status. On SIGTERM or Ctrl-C, wait until the command has saved its work."""
-    process: subprocess.Popen[bytes] | None = None
-    terminates = False
-
-    def forward(number: int, frame: FrameType | None) -> None:
-        nonlocal terminates
-        terminates |= number == signal.SIGTERM  # the terminal sends Ctrl-C to the command as well
-        if terminates and process is not None:
-            process.terminate()
-
-    previous = {number: signal.signal(number, forward) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        process = subprocess.Popen(command, env=environment_of_stages())
-        if terminates:  # the signal arrived before the command had started
-            process.terminate()
-        while process.poll() is None:
-            # Without a limit, the second of two signals in quick succession would be handled after the command.
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                process.wait(timeout=1)
-        return process.returncode
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
 
 
 def move_aside(folder: Path) -> Path:

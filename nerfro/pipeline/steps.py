@@ -11,17 +11,19 @@ from omegaconf import DictConfig
 
 from nerfro.capture.calibrated_data import PLOT, REPORT
 from nerfro.capture.overlaps import SHEET
-from nerfro.capture.overrides import as_overrides, is_given
-from nerfro.capture.preprocess_options import FOUND, MESH
+from nerfro.capture.preprocess_options import MESH
 from nerfro.capture.video import extract_frames
 from nerfro.cli import warn
 from nerfro.data.frames import list_images
 from nerfro.errors import NerfroError
 from nerfro.evaluation.results import FULL, read_metrics_json
+from nerfro.files.reading import read_json
+from nerfro.overrides import as_overrides, is_given
 from nerfro.paths import user_path
 from nerfro.pipeline.hypotheses import Hypothesis, hypotheses
-from nerfro.pipeline.options import common_options, read_result
+from nerfro.pipeline.options import common_options
 from nerfro.pipeline.stages import Stage, is_older, link_photographs, move_aside
+from nerfro.rendering.scene_file import OLD_SCENE, SCENE, read_scene_file
 from nerfro.training.run_folder import CONFIG_FILE
 
 # Smallest gain of bent rays over straight rays in short trainings, in dB. On a simulated empty glass, a gain of 0.25 dB
@@ -55,9 +57,9 @@ def calibrate(config: DictConfig, data: list[str], out: Path) -> list[str]:
     options = [*as_overrides({"images": out / "images", "out": out}), "target=colmap", "overwrite=true"]
     options += [text.removeprefix("data.") for text in data if text.startswith("data.mask_labels=")]
     Stage("calibrate", [*options, *shlex.split(config.calibrate)], out / REPORT, out / PLOT).run()
-    ray_range = read_result(out / REPORT, {"options"})["options"]
-    kept = [text for text in ray_range if not is_given(text.split("=")[0], data)]
-    return [*as_overrides({"data.root": out}), *kept, *data]
+    report = read_json(out / REPORT, "delete the file to repeat the stage")
+    bounds = report.get("options", []) if isinstance(report, dict) else []  # bounds of the rays in earlier releases
+    return [*as_overrides({"data.root": out}), *bounds, *data]
 
 
 def segment(config: DictConfig, options: list[str], root: Path) -> None:
@@ -67,27 +69,28 @@ def segment(config: DictConfig, options: list[str], root: Path) -> None:
         Stage("mask", [*options, *shlex.split(config.mask)], sheet, sheet).run()
 
 
-def preprocess(config: DictConfig, options: list[str], root: Path, folder: Path) -> None:
-    """Reconstruct surface and index in a folder."""
+def preprocess(config: DictConfig, options: list[str], root: Path, folder: Path) -> Path:
+    """Reconstruct surface and index in a folder, and return the scene file."""
     inputs = [*root.glob("transforms*.json"), *(file for place in _MASKS for file in root.glob(place))]
     automatic = [*as_overrides({"out": folder}), "refine=true", "wrong_masks=null", "symmetry=auto", "overwrite=true"]
     if "wall" not in config.medium and "shell_voxels" in config.medium and config.medium.get("bodies") is None:
         automatic.append("vessel=true")
     options = [*options, *automatic, *shlex.split(config.preprocess)]
-    Stage("preprocess", options, folder / FOUND, folder / SHEET, inputs).run()
+    old = (folder / OLD_SCENE).is_file() and not (folder / SCENE).is_file()  # written by an earlier release
+    scene = folder / (OLD_SCENE if old else SCENE)
+    Stage("preprocess", options, scene, folder / SHEET, inputs).run()
+    return folder / SCENE if (folder / SCENE).is_file() else scene
 
 
-def train(config: DictConfig, overrides: list[str], surface: Path, out: Path) -> None:
+def train(config: DictConfig, overrides: list[str], scene: Path, out: Path) -> None:
     """Train with the hypothesis that predicts the validation photographs best."""
-    inputs = [surface / FOUND, surface / MESH]
-    found = read_result(surface / FOUND, {"options", "doubtful", "near", "pixels"})
-    common = common_options(config, overrides, found)
+    inputs = [scene, scene.with_name(MESH)]
+    common, candidates = common_options(config, overrides, scene), hypotheses(read_scene_file(scene))
     if is_given("experiment", common):
-        options = [*found["options"], *found["doubtful"]]
+        options = []
     elif config.trial_steps == 0:
-        options = hypotheses(found, config.medium)[1].options
+        options = candidates[1].options
     else:
-        candidates = hypotheses(found, config.medium)
         trials = [out / "trials" / hypothesis.folder for hypothesis in candidates]
         for hypothesis, trial in zip(candidates, trials, strict=True):
             print(f"\nhypothesis: {hypothesis.name}")
@@ -145,8 +148,8 @@ def report(out: Path) -> None:
     options = as_overrides({"checkpoint": run, "what": "page", "out": page, "overwrite": True})
     try:
         Stage("export", options, page, page, [run / "metrics.json"]).run()
-    except NerfroError:
-        warn("no page was written, for the reason in the line above")
+    except NerfroError as error:
+        warn(f"no page was written: {error}")
         page.unlink(missing_ok=True)  # of an earlier run
     print(f"\nreport: {report}")
     if page.is_file():

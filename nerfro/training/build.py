@@ -18,6 +18,7 @@ from nerfro.options import describe_command
 from nerfro.paths import CONF_DIR
 from nerfro.registry import discover
 from nerfro.rendering import Renderer
+from nerfro.rendering.scene_file import with_scene
 from nerfro.training.background_pretraining import BackgroundPretraining
 from nerfro.training.camera_steps import CameraSteps
 from nerfro.training.config import TrainConfig, build_data, build_model, check_run, settle_trainer
@@ -48,7 +49,7 @@ def build(experiment: str | None = None, overrides: Sequence[str] = ()) -> tuple
     discover()
     ConfigStore.instance().store(name="train_schema", node=TrainConfig, provider="nerfro")
     chosen = [] if experiment is None else [f"+experiment={experiment}"]
-    given = [*chosen, *map(renamed_override, overrides)]
+    given = with_scene([*chosen, *map(renamed_override, overrides)], ["data", "medium"])
     try:
         with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
             config = compose("train", given)

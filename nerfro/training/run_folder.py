@@ -7,10 +7,8 @@ import pickle
 import platform
 import shlex
 import subprocess
-import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +25,7 @@ from nerfro.files.foreign_config import foreign_config, read_foreign_config
 from nerfro.files.reading import reading
 from nerfro.kernels.available import fast_bfloat16
 from nerfro.paths import PACKAGE_DIR, user_path
+from nerfro.provenance import command_line, versions
 from nerfro.rendering import Renderer
 from nerfro.training import backdrop, content
 from nerfro.training.config import build_model, check_trained, training_device
@@ -45,7 +44,6 @@ _REQUIRED_KEYS = {
     "loops": dict,
 }
 _SPARE_BYTES = 64 * 2**20  # images and logs, in addition to checkpoints
-_PACKAGES = ("nerfro", "torch", "lightning", "hydra-core", "torchmetrics", "numpy", "numba", "trimesh")
 
 
 @contextmanager
@@ -125,7 +123,7 @@ def record(folder: Path, config: DictConfig) -> None:
         "threads": torch.get_num_threads(),
         "gpu": torch.cuda.get_device_name() if device == "cuda" else None,
         "fast_bfloat16": fast_bfloat16(device),
-        "versions": {name: _version(name) for name in _PACKAGES},
+        "versions": versions(),
     }
     write_atomically(folder / "run.json", json.dumps(facts, indent=2) + "\n")
     if diff:
@@ -264,13 +262,4 @@ def _command() -> str:
     if in_sweep():
         # In a launcher's worker this process has another main module and other arguments.
         return shlex.join(["python", "-m", "nerfro.train", *HydraConfig.get().overrides.task])
-    spec = getattr(sys.modules["__main__"], "__spec__", None)
-    program = [sys.argv[0]] if spec is None else ["-m", spec.name]
-    return shlex.join([Path(sys.executable).name, *program, *sys.argv[1:]])
-
-
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
+    return command_line()

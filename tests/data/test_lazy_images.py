@@ -1,5 +1,6 @@
 """Images stay in their files until they are asked for, and training pixels keep every bit."""
 
+import os
 from functools import partial
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from PIL import Image
 
 from nerfro.data import pixel_store
 from nerfro.data.image_files import read_rgb
-from nerfro.data.lazy_images import LazyImages
+from nerfro.data.lazy_images import LazyImages, decoded_once
 from nerfro.data.pixel_store import PixelStore
 from nerfro.errors import NerfroError
 
@@ -57,6 +58,26 @@ def test_only_a_few_pictures_are_decoded_ahead(tmp_path: Path) -> None:
     next(levels)
     assert 1 <= len(decoded) <= 10
     levels.close()
+
+
+def test_a_program_decodes_a_picture_once_per_size(tmp_path: Path) -> None:
+    paths, _ = save(tmp_path, 3)
+    decoded: list[Path] = []
+
+    def counting(path: Path) -> np.ndarray:
+        decoded.append(path)
+        return read(path)
+
+    with decoded_once():
+        for downscale in (1, 2, 1, 2):
+            pictures = LazyImages.of(paths, counting, downscale, recipe="drop")
+            shown = np.stack(list(pictures.all_levels()))
+        assert sorted(decoded) == sorted(paths * 2)
+        os.utime(paths[0], (0, 0))
+        assert np.array_equal(np.stack(list(pictures.select([0, 1]).all_levels())), shown[:2])
+        assert decoded[6:] == [paths[0]]
+    LazyImages.of(paths, counting, recipe="drop").levels(2)
+    assert decoded[7:] == [paths[2]]
 
 
 def test_picture_that_changes_its_size_is_told(tmp_path: Path) -> None:

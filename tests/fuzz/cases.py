@@ -33,6 +33,7 @@ from nerfro.files import lat_long
 from nerfro.files.foreign_config import read_foreign_config
 from nerfro.files.reading import load_array
 from nerfro.geometry.mesh import load_mesh
+from nerfro.rendering.scene_file import with_scene
 from nerfro.samplers.traced_file import read_rays
 from nerfro.training.load import scene_of
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
@@ -323,6 +324,15 @@ def _save_ball(file: Path) -> None:
 
 
 OUTLINES = {"a": [1, 2, 30, 40], "b": [[1, 2], [3, 4], [5, 1]]}
+SCENE = {
+    "data": {"type": "blender", "root": ".."},
+    "medium": {"resolution": 32, "box_min": [-1.0, -1.0, -1.0]},
+    "bodies": {"glass": {"mesh": "mesh.ply", "ior": 1.5}, "water": {"mesh": "water.ply", "material": "water"}},
+    "vessel": {"wall": 0.1},
+    "surroundings": "near",
+    "photograph": [64, 48],
+    "provenance": {"command": "x", "versions": {"nerfro": "1"}, "standard_error": [0.1], "doubts": ["y"]},
+}
 CONFIG = {"name": "x", "seed": 1, "data": {"root": "r", "near": 2.0}, "batches": {"size": 8}, "loss": {"a": [1, 2]}}
 # How a file of each kind is written and read.
 FILES: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any]]] = {
@@ -335,6 +345,8 @@ FILES: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any]]] = {
     "array.npy": (lambda file: np.save(file, np.ones((2, 3))), load_array),
     "outlines.json": (lambda file: file.write_text(json.dumps(OUTLINES)), lambda file: read_outlines(str(file))),
     "metrics.json": (_save_metrics, read_metrics_json),
+    "scene.json": (lambda file: file.write_text(json.dumps(SCENE)),
+                   lambda file: with_scene([f"scene={file}"], ["data", "medium"])),
     "config.yaml": (lambda file: file.write_text(OmegaConf.to_yaml(CONFIG)), read_foreign_config),
 }  # fmt: skip
 

@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shlex
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 
-from nerfro.files.folder_lock import STAGE
+_prints_hints = ContextVar("_prints_hints", default=True)
+
+
+@contextmanager
+def without_hints() -> Iterator[None]:
+    """Suppress hints, in a program that runs the next command itself."""
+    token = _prints_hints.set(False)
+    try:
+        yield
+    finally:
+        _prints_hints.reset(token)
 
 
 def print_hint(text: str) -> None:
-    """Print what the user may do next, unless nerfro.reconstruct runs the next stage."""
-    if STAGE not in os.environ:
+    """Print what the user may do next."""
+    if _prints_hints.get():
         print(text)
 
 
@@ -24,6 +35,11 @@ def print_next(label: str, command: str, options: Sequence[str]) -> None:
 def is_given(option: str, overrides: Iterable[str]) -> bool:
     """Test whether overrides set an option."""
     return option in {_name(text) for text in overrides}
+
+
+def is_scene_file(argument: str) -> bool:
+    """Test whether an argument names a scene file; `scene=NAME` selects the settings of a known scene."""
+    return argument.startswith("scene=") and argument.strip("'\"").endswith(".json")
 
 
 def of_groups(groups: tuple[str, ...], overrides: Iterable[str]) -> list[str]:
@@ -41,9 +57,11 @@ def _name(override: str) -> str:
 
 
 def _quoted(value: object) -> str:
+    if isinstance(value, Mapping):
+        return "{" + ",".join(f"{name}:{_quoted(each)}" for name, each in value.items()) + "}"
     if isinstance(value, list):
         return f"[{','.join(map(_quoted, value))}]"
-    text = str(value)
+    text = "null" if value is None else str(value)
     if re.fullmatch(r"[\w./+@%-]+", text, re.ASCII):
         return text
     return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'

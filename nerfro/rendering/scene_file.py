@@ -1,0 +1,243 @@
+"""The scene file `scene.json`: data set, bodies, surroundings and their origin, for the commands that follow."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import re
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal, Optional, cast
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from nerfro.allowed import Count, check_settings
+from nerfro.cli import warn
+from nerfro.errors import NerfroError
+from nerfro.files.atomic import write_atomically
+from nerfro.files.reading import read_json
+from nerfro.media.bodies import BodySettings
+from nerfro.overrides import as_overrides, is_given, is_scene_file
+from nerfro.paths import EMBEDDED_PREFIX, user_path
+from nerfro.provenance import command_line, versions
+from nerfro.registry import plugin_of
+
+SCENE, OLD_SCENE = "scene.json", "preprocess.json"  # names of the scene file in this release and in earlier ones
+_ADVICE = "see docs/reference/file_formats.md, or run nerfro.preprocess again"
+
+
+@dataclass
+class Provenance:
+    """Origin of a scene file.
+
+    Attributes:
+        command: command that wrote the file.
+        versions: versions of packages.
+        standard_error: standard error of the estimated index of each body; empty if the indices were given.
+        doubts: reasons why the photographs do not determine the indices; empty if they do.
+    """
+
+    command: str = ""
+    versions: dict[str, str] = field(default_factory=dict)
+    standard_error: list[float] = field(default_factory=list)
+    doubts: list[str] = field(default_factory=list)
+
+
+@dataclass
+class SceneFile:
+    """Content of `scene.json`; paths in the file are relative to its folder.
+
+    Attributes:
+        data: `type` of the data set (an option of the group `data`), and its settings, such as `root`.
+        medium: `type` of the medium (an option of the group `medium`), and its settings except those of bodies.
+        bodies: bodies by name, the outer one first.
+        vessel: settings of the medium with `medium=vessel`, which replace those above; empty without a fitted vessel.
+        surroundings: distance of the surroundings; None if unknown.
+        photograph: width and height of the photographs in pixels; empty if unknown.
+        provenance: origin of the file.
+    """
+
+    data: dict[str, Any] = field(default_factory=dict)
+    medium: dict[str, Any] = field(default_factory=dict)
+    bodies: dict[str, BodySettings] = field(default_factory=dict)
+    vessel: dict[str, Any] = field(default_factory=dict)
+    surroundings: Annotated[Optional[str], Literal["near", "far"]] = None  # noqa: UP045 - OmegaConf on Python 3.10
+    photograph: list[Count] = field(default_factory=list)
+    provenance: Provenance = field(default_factory=Provenance)
+
+    @property
+    def short(self) -> dict[str, object] | None:
+        """Settings of the medium for bodies that have only a mesh and an index; None for other bodies."""
+        plain = [BodySettings(mesh=body.mesh, ior=body.ior) for body in self.bodies.values()]
+        if plain != list(self.bodies.values()) or any(body.ior is None for body in plain[1:]):
+            return None
+        outer, inner = plain[:1], plain[1:]
+        settings: dict[str, object] = {name: value for body in outer for name, value in _given(body).items()}
+        if inner:
+            settings |= {"inner_meshes": [body.mesh for body in inner], "inner_iors": [body.ior for body in inner]}
+        return settings
+
+    def settings(self, medium: str | None = None) -> dict[str, object]:
+        """Return the settings of the groups `data` and `medium` by their full names.
+
+        Args:
+            medium: another type of the medium.
+        """
+        data, own = dict(self.data), dict(self.medium)
+        kind = own.pop("type", "object")
+        short = self.short
+        own |= {"bodies": {name: _given(body) for name, body in self.bodies.items()}} if short is None else short
+        if medium == "vessel":
+            own |= self.vessel
+        chosen: dict[str, object] = {"data": data.pop("type")}
+        if (medium or kind) != "object":  # `object` is the choice of most experiments; others have their own
+            chosen["medium"] = medium or kind
+        for group, values in (("data", data), ("medium", own)):
+            chosen |= {f"{group}.{name}": value for name, value in values.items()}
+        return chosen
+
+    def save(self, path: Path) -> None:
+        """Write the file, with the command of this process and the versions of packages."""
+        folder = os.path.realpath(path.parent)
+        scene = self._with_paths(lambda place: Path(os.path.relpath(os.path.realpath(user_path(place)), folder)))
+        known = {name: version for name, version in versions().items() if version is not None}
+        origin = replace(self.provenance, command=command_line(), versions=known)
+        document = {name: value for name, value in vars(scene).items() if value not in (None, {}, [])}
+        text = json.dumps(document | {"provenance": origin}, default=_given, indent=1)
+        # Lists of numbers are on one line.
+        write_atomically(path, re.sub(r"\[[^][{}\"]*\]", lambda numbers: re.sub(r"\s+", " ", numbers[0]), text) + "\n")
+
+    def _with_paths(self, convert: Callable[[str], Path]) -> SceneFile:
+        """Return a copy with other places of the data set and of meshes; embedded data stays."""
+
+        def place(given: str) -> str:
+            return given if given.startswith(EMBEDDED_PREFIX) else convert(given).as_posix()
+
+        bodies = {
+            name: replace(body, mesh=None if body.mesh is None else place(body.mesh))
+            for name, body in self.bodies.items()
+        }
+        return replace(self, data=self.data | {"root": place(str(self.data["root"]))}, bodies=bodies)
+
+
+def described(node: DictConfig, type_name: str) -> dict[str, Any]:
+    """Describe a component: its type, and the settings that differ from the defaults of its class."""
+    defaults = {name: default for name, _, default in plugin_of(node).fields()}
+    values = cast(dict[str, Any], OmegaConf.to_container(node, resolve=True))
+    del values["_target_"]
+    return {"type": type_name} | {name: value for name, value in values.items() if value != defaults.get(name)}
+
+
+def take_bodies(medium: dict[str, Any]) -> dict[str, BodySettings]:
+    """Remove the bodies from the settings of a medium, and return them."""
+    mesh, ior, inner, iors = (medium.pop(name, None) for name in ("mesh", "ior", "inner_meshes", "inner_iors"))
+    named = medium.pop("bodies", None)
+    if named is not None:
+        return {name: BodySettings(**({"mesh": mesh} | body)) for name, body in named.items()}
+    bodies = {"object": BodySettings(mesh=mesh, ior=ior)}
+    for number, (mesh, ior) in enumerate(zip(inner or [], iors or [], strict=True), 1):
+        bodies[f"inner_{number}"] = BodySettings(mesh=mesh, ior=ior)
+    return bodies
+
+
+def read_scene_file(path: Path) -> SceneFile:
+    """Read a scene file, or a `preprocess.json` of an earlier release.
+
+    Raises:
+        NerfroError: the file is damaged, or a name or a value is not allowed.
+    """
+    document = read_json(path, "give the scene.json of nerfro.preprocess")
+    if not isinstance(document, dict):
+        raise NerfroError(f"{path} is not a scene file; {_ADVICE}")
+    if "${" in json.dumps(document):
+        raise NerfroError(f"{path} contains an interpolation (${{...}}); write the value instead")
+    if "options" in document:
+        return _of_options(document, path)
+    try:
+        typed = cast(DictConfig, OmegaConf.merge(OmegaConf.structured(SceneFile), document))
+        check_settings(typed, SceneFile)
+        scene = cast(SceneFile, OmegaConf.to_object(typed))
+    except (OmegaConfBaseException, NerfroError) as error:
+        raise NerfroError(f"{path}: {str(error).strip().partition(chr(10))[0]}; {_ADVICE}") from error
+    for group in ("data", "medium", "vessel", "bodies"):
+        for name in getattr(scene, group):
+            if not re.fullmatch(r"[^\W\d_]\w*", name):
+                raise NerfroError(f"{path}: {group} has the key {name!r}; a key has letters, digits and underscores")
+    for name, example in (("type", "blender"), ("root", ".")):
+        if not isinstance(scene.data.get(name), str):
+            raise NerfroError(f"{path} lacks the text data.{name}; write {json.dumps({'data': {name: example}})}")
+    folder = Path(os.path.realpath(path.parent))
+    if folder == Path(os.path.abspath(path.parent)):  # no link
+        folder = path.parent
+    return scene._with_paths(lambda place: Path(os.path.normpath(folder / user_path(place))))
+
+
+def _of_options(document: Mapping[str, Any], path: Path) -> SceneFile:
+    """Read a `preprocess.json`, which holds command-line options; its paths are relative to the current directory."""
+    try:
+        values, doubtful, vessel = (_parsed(document.get(name, [])) for name in ("options", "doubtful", "vessel"))
+        data = {"type": "blender", "root": "embedded:torus"} | _node(values, "data")
+        medium = {"mesh": f"{data['root']}/mesh.ply"} | _node(values | doubtful, "medium")
+        vessel, near = _node(vessel, "medium"), document["near"]
+        vessel.pop("type", None)
+        return SceneFile(
+            data,
+            medium,
+            take_bodies(medium),
+            {name: value for name, value in vessel.items() if (name, value) not in medium.items()},
+            None if near is None else "near" if near else "far",
+            document["pixels"],
+            Provenance(doubts=["nerfro.preprocess has reported the reason"] if doubtful else []),
+        )
+    except (HydraException, KeyError, TypeError, ValueError) as error:
+        raise NerfroError(f"{path} is not a result of nerfro.preprocess; {_ADVICE}") from error
+
+
+def _parsed(options: Sequence[str]) -> dict[str, Any]:
+    """Read command-line overrides."""
+    parsed = OverridesParser.create().parse_overrides(list(options))
+    return {override.get_key_element(): override.value() for override in parsed}
+
+
+def _node(values: Mapping[str, Any], group: str) -> dict[str, Any]:
+    """Return the settings of a group, and its option as `type`."""
+    chosen = {"type": values[group]} if group in values else {}
+    return chosen | {
+        name.removeprefix(f"{group}."): each for name, each in values.items() if name.startswith(f"{group}.")
+    }
+
+
+def with_scene(arguments: Sequence[str], names: Collection[str]) -> list[str]:
+    """Replace `scene=FILE.json` in a command line by the settings in the file; other arguments have precedence.
+
+    Args:
+        arguments: command-line overrides.
+        names: settings of the command; only those of the groups `data` and `medium` are taken from the file.
+
+    Raises:
+        NerfroError: several scene files are given, or the file cannot be used.
+    """
+    files = [text for text in arguments if is_scene_file(text)]
+    if not files:
+        return list(arguments)
+    if len(files) > 1:
+        raise NerfroError(f"{files[0]} and {files[1]} are both given; give one scene file")
+    others = [text for text in arguments if text not in files]
+    path = user_path(files[0].partition("=")[2].strip("'\""))
+    scene = read_scene_file(path)
+    chosen = {text.partition("=")[0]: text.partition("=")[2] for text in others if text.partition("=")[0] in names}
+    settings = scene.settings(chosen.get("medium"))
+    if scene.provenance.doubts and "medium" in names and not is_given("medium.ior", others):
+        warn(f"{path}: the photographs do not determine the index ({scene.provenance.doubts[0]}); set medium.ior=")
+    kept = {name: value for name, value in settings.items() if name.partition(".")[0] in names and name not in chosen}
+    return [*as_overrides(kept), *others]
+
+
+def _given(body: BodySettings | Provenance) -> dict[str, object]:
+    """Return the settings of a body that differ from the defaults, for JSON."""
+    return {name: value for name, value in dataclasses.asdict(body).items() if value not in (None, [], {}, 0, "")}

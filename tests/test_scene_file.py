@@ -1,0 +1,123 @@
+"""The scene file: what it says survives moving its folder, a command line has precedence, and mistakes get one line."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
+
+from nerfro.errors import NerfroError
+from nerfro.media.bodies import BodySettings
+from nerfro.rendering.scene_file import Provenance, SceneFile, read_scene_file, with_scene
+
+NODES = ["data", "medium", "sampler"]
+DATA = {"type": "opencv", "root": ".."}
+
+
+def write(path: Path, **content: Any) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(content))
+    return path
+
+
+def settings(*arguments: str) -> dict[str, Any]:
+    """Settings of a command line with a scene file, as Hydra reads them; the last of several values holds."""
+    parsed = OverridesParser.create().parse_overrides(with_scene(arguments, NODES))
+    return {override.get_key_element(): override.value() for override in parsed}
+
+
+def test_a_scene_survives_moving_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "old capture" / "surface").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path)
+    scene = SceneFile(
+        data={"type": "opencv", "root": "old capture", "near": 0.1},
+        medium={"type": "object", "box_min": [-1.0, -1.0, -2.0]},
+        bodies={"object": BodySettings(mesh="old capture/surface/mesh.ply", ior=1.5)},
+        surroundings="near",
+        photograph=[640, 480],
+        provenance=Provenance(standard_error=[0.002]),
+    )
+    scene.save(Path("old capture/surface/scene.json"))
+    (tmp_path / "old capture").rename("new")
+    moved = read_scene_file(Path("new/surface/scene.json"))
+    assert moved.provenance.versions["nerfro"]
+    moved.provenance = scene.provenance
+    assert json.dumps(moved, default=vars) == json.dumps(scene, default=vars).replace("old capture", "new")
+    link = tmp_path / "elsewhere" / "link"
+    link.parent.mkdir()
+    link.symlink_to(tmp_path / "new" / "surface")
+    assert read_scene_file(link / "scene.json").data["root"] == str((tmp_path / "new").resolve())
+
+
+def test_the_command_line_has_precedence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bodies, vessel = {"object": {"mesh": "mesh.ply", "ior": 1.4}}, {"wall": 0.1, "ior": 1.52}
+    content = {"data": DATA, "bodies": bodies, "vessel": vessel}
+    file = write(tmp_path / "surface" / "scene.json", **content, medium={"resolution": 64})
+    expected = {"data": "opencv", "data.root": str(tmp_path), "medium.resolution": 64,
+                "medium.mesh": str(tmp_path / "surface" / "mesh.ply"), "medium.ior": 1.4}  # fmt: skip
+    assert settings(f"scene={file}") == expected
+    given = {"medium.ior": 1.6, "data": "blender"}
+    assert settings("medium.ior=1.6", f"scene={file}", "data=blender") == expected | given
+    as_vessel = {"medium": "vessel", "medium.wall": 0.1, "medium.ior": 1.52}
+    assert settings(f"scene={file}", "medium=vessel") == expected | as_vessel
+    assert with_scene(["seed=1"], NODES) == ["seed=1"]
+    assert not [text for text in with_scene([f"scene={file}"], ["medium"]) if text.startswith("data")]
+    assert capsys.readouterr().out == ""
+    write(file, **content, provenance={"doubts": ["the minimum is shallow"]})
+    assert settings(f"scene={file}")["medium.ior"] == 1.4
+    assert "do not determine the index (the minimum is shallow); set medium.ior=" in capsys.readouterr().out
+    assert settings(f"scene={file}", "medium.ior=1.6")["medium.ior"] == 1.6
+    assert capsys.readouterr().out == ""
+
+
+def test_bodies_with_materials_keep_their_names(tmp_path: Path) -> None:
+    bodies: dict[str, Any] = {"glass": {"mesh": "a b.ply", "ior": 1.5}, "water": {"mesh": "c.ply", "ior": 1.33}}
+    file = write(tmp_path / "scene.json", data=DATA, bodies=bodies)
+    short = settings(f"scene={file}")
+    assert short["medium.mesh"] == str(tmp_path / "a b.ply")
+    assert short["medium.inner_meshes"] == [str(tmp_path / "c.ply")]
+    assert (short["medium.ior"], short["medium.inner_iors"]) == (1.5, [1.33])
+    bodies["water"] = {"mesh": "c.ply", "material": "water", "learn": ["absorption"]}
+    file = write(tmp_path / "scene.json", data=DATA, bodies=bodies)
+    assert settings(f"scene={file}")["medium.bodies"] == {
+        "glass": {"mesh": str(tmp_path / "a b.ply"), "ior": 1.5},
+        "water": {"mesh": str(tmp_path / "c.ply"), "material": "water", "learn": ["absorption"]},
+    }
+
+
+def test_files_of_earlier_releases_are_read(tmp_path: Path) -> None:
+    options = ["data=opencv", "data.root=capture", "medium.box_min=[-1.0,-1.0,-1.0]", "medium.mesh=o/mesh.ply"]
+    vessel = ["data=opencv", "data.root=capture", "medium=vessel", "medium.wall=0.1", "medium.ior=1.52"]
+    old = {"options": options, "doubtful": ["medium.ior=1.4"], "near": True, "pixels": [64, 48], "vessel": vessel}
+    scene = read_scene_file(write(tmp_path / "preprocess.json", **old))
+    assert scene.data == {"type": "opencv", "root": "capture"}
+    assert scene.medium == {"box_min": [-1.0, -1.0, -1.0]}
+    assert scene.bodies == {"object": BodySettings(mesh="o/mesh.ply", ior=1.4)}
+    assert scene.vessel == {"wall": 0.1, "ior": 1.52}
+    assert (scene.surroundings, scene.photograph, len(scene.provenance.doubts)) == ("near", [64, 48], 1)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ([], "is not a scene file"),
+        ({}, "lacks the text data.type"),
+        ({"data": {"type": "opencv"}}, "lacks the text data.root"),
+        ({"data": DATA, "body": {}}, "Key 'body' not in 'SceneFile'"),
+        ({"data": DATA, "bodies": {"object": {"iro": 1.5}}}, "Key 'iro' not in 'BodySettings'"),
+        ({"data": DATA, "bodies": {"object": {"ior": "x"}}}, "Value 'x' of type 'str' could not be converted to Float"),
+        ({"data": DATA, "surroundings": "close"}, "surroundings='close' is not allowed; choose 'near', 'far'"),
+        ({"data": DATA, "photograph": [0, 4]}, "photograph=[0, 4] is not allowed"),
+        ({"data": DATA | {"far seed=3": 1}}, "data has the key 'far seed=3'"),
+        ({"data": DATA | {"_target_": "os.system"}}, "data has the key '_target_'"),
+        ({"data": DATA | {"near": "${oc.env:HOME}"}}, "contains an interpolation"),
+        ({"options": 3, "near": True, "pixels": []}, "is not a result of nerfro.preprocess"),
+    ],
+)
+def test_mistakes_get_one_line(content: Any, message: str, tmp_path: Path) -> None:
+    (tmp_path / "scene.json").write_text(json.dumps(content))
+    with pytest.raises(NerfroError) as error:
+        with_scene([f"scene={tmp_path}/scene.json"], NODES)
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
