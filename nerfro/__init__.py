@@ -1,4 +1,8 @@
-"""nerfro: novel-view synthesis of refractive objects."""
+"""nerfro: novel-view synthesis of refractive objects.
+
+In docstrings and comments, "the paper" is Pan et al., "Sampling Neural Radiance Fields for Refractive Objects"
+(SIGGRAPH Asia 2022), and "the authors' code" is their implementation.
+"""
 
 from __future__ import annotations
 

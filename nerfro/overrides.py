@@ -22,13 +22,13 @@ def without_hints() -> Iterator[None]:
 
 
 def print_hint(text: str) -> None:
-    """Print what the user may do next."""
+    """Print a hint about the next step, except inside `without_hints`."""
     if _prints_hints.get():
         print(text)
 
 
 def print_next(label: str, command: str, options: Sequence[str]) -> None:
-    """Print the command that follows as a hint."""
+    """Print the next command as a hint."""
     print_hint(f"{label}: {shlex.join(['python', '-m', f'nerfro.{command}', *options])}")
 
 
@@ -43,12 +43,12 @@ def is_scene_file(argument: str) -> bool:
 
 
 def of_groups(groups: tuple[str, ...], overrides: Iterable[str]) -> list[str]:
-    """Select the overrides of some groups, or of options with these names."""
+    """Select the overrides of the given groups or options."""
     return [text for text in overrides if _name(text).split(".")[0] in groups]
 
 
 def as_overrides(settings: Mapping[str, object]) -> list[str]:
-    """Convert settings to overrides, with quotes around text that Hydra would not read as a single text."""
+    """Convert settings to overrides, and quote text with special characters of Hydra's grammar."""
     return [f"{name}={_quoted(value)}" for name, value in settings.items()]
 
 

@@ -119,7 +119,7 @@ _discovered: set[str] = set()
 
 
 def register(kind: str, name: str) -> Callable[[type[Part]], type[Part]]:
-    """Decorator that registers a class as option `name` of a plugin type.
+    """Register a class as option `name` of a plugin type; used as a decorator.
 
     The signature of the constructor becomes the configuration. Parameters annotated with int, float, bool, str, their
     optional, list and dict forms or `Literal` are configuration. The caller of `build` passes all other parameters.

@@ -309,7 +309,7 @@ class Radiance:
 
 @dataclass(frozen=True)
 class Rendering:
-    """One sampling level of rendered rays (paper, Eqn. volrendBd).
+    """One sampling level of rendered rays (paper, Eqn. 5).
 
     Attributes:
         rgb: radiance of each ray in the colour space of the scene, including the background; the sum over all

@@ -134,6 +134,7 @@ def test_comparison_keeps_finished_rows_and_repeats_interrupted_ones(
         (("tracing", "--resolution", 48, "--euler-resolution", 48, "--side", 16, "--rays", 16), 34),
         (("footprints", "--views", 1, "--size", 8, "--resolution", 24, "--texture", 64), 12),
         (("vessel", "--rays", 200, "--resolution", 32), 0),
+        (("peers", "--turns", 1, "--steps", 2, "--paper-steps", 2, "--paper-options", *PAPER, "--options", *SMALL), 6),
         (("installation", "--turns", 1, "--starts", "import nerfro", "--least", 1e4), 6),
         pytest.param(("two_bodies", "--size", 16), 5, marks=pytest.mark.slow),
     ],

@@ -13,7 +13,7 @@ from nerfro.types import Exits
 
 
 class Boundary(nn.Module, ABC):
-    """Background radiance: light that arrives from beyond the volume, C'(d) of the paper's Eqn. volrendBd."""
+    """Background radiance: light that arrives from beyond the volume, C'(d) of the paper's Eqn. 5."""
 
     @abstractmethod
     def forward(self, exits: Exits) -> Float[Tensor, "*batch 3"]:

@@ -105,7 +105,7 @@ def gauss_newton_step(
 def _robust_error(
     error: Float[Tensor, "R 3"], scale: float, view: Int[Tensor, "R"], num_views: int
 ) -> Float[Tensor, "V"]:
-    """Sum the Geman-McClure error of each view, in which each pixel counts at most 1."""
+    """Sum the Geman-McClure error r^2 / (1 + r^2) of the pixels of each view."""
     squares = (error / scale).square().sum(-1)
     return squares.new_zeros(num_views).index_add(0, view, squares / (1 + squares))
 

@@ -46,8 +46,8 @@ class _Plan(NamedTuple):
 # By number of bodies.
 _PLANS = {1: _Plan(31, 12_000, 9, (1 / 30, 1 / 75), 60_000), 2: _Plan(13, 4_000, 5, (1 / 75, 1 / 75), 20_000)}
 _NEAR_PIXELS = 12_000  # near surroundings are rendered for each ray, so fewer pixels are used
-# Maximum number of grids of one radius, which follow the minimum, and usual number of grids, for the progress.
-_MAX_GRIDS, _USUAL_GRIDS = 10, 4
+# Maximum number of grids of one radius, which follow the minimum, and typical number of grids, for the progress.
+_MAX_GRIDS, _TYPICAL_GRIDS = 10, 4
 # The indices of two bodies trade, so their valley is narrow. Grids are elongated along the valley by at most this
 # factor. Finite differences at so many pixels, over this fraction of the range, determine the direction of the valley.
 _MAX_ELONGATION, _SLOPE_PIXELS, _DIFFERENCE = 6.0, 6_000, 1 / 300
@@ -105,7 +105,7 @@ def find_indices(
         plan = plan._replace(coarse_pixels=_NEAR_PIXELS // 4, fine_pixels=_NEAR_PIXELS)
     coarse, offsets = (_grid(steps, num_bodies) for steps in (plan.coarse_steps, plan.fine_steps))
     coarse = 0.5 * (LOWEST + HIGHEST + _RANGE * coarse)
-    work = len(coarse) * plan.coarse_pixels + _USUAL_GRIDS * len(offsets) * plan.fine_pixels
+    work = len(coarse) * plan.coarse_pixels + _TYPICAL_GRIDS * len(offsets) * plan.fine_pixels
     search = _Search(medium, through.some(plan.fine_pixels), surroundings, lambda done: progress(min(1, done / work)))
     coarse_errors = mean_errors(*search.errors(coarse, plan.coarse_pixels, False))
     middle = coarse[coarse_errors.argmin()]

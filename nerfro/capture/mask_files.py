@@ -1,4 +1,4 @@
-"""The mask command: outlines and existing masks come in, masks are written beside their images."""
+"""Input and output of `nerfro.mask`: outlines, existing masks, and new masks beside the images."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def find_frame(name: str, frames: list[Frame]) -> int:
 
 
 def check_start(frames: list[Frame], outlined: Collection[int], kept: Collection[int], hull_only: bool) -> None:
-    """Check that there is a mask or outline to start from, a mask to make, and a unique file for each mask."""
+    """Refuse data without any mask or outline, without a missing mask, or with one file for several masks."""
     if not outlined and not kept:
         raise NerfroError(
             "there is no mask to start from; give the outline of the object in one image, for example "

@@ -31,7 +31,7 @@ from nerfro.boundaries.cube_map import texel_directions
 from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.capture.preprocess_options import FIGURES
 from nerfro.capture.rims import RimFinder
-from nerfro.capture.room_picture import RoomPicture, picture_of
+from nerfro.capture.room_panorama import RoomPanorama, panorama_of
 from nerfro.capture.silhouettes import mesh_silhouettes
 from nerfro.capture.surroundings import Observations, Pixels, Room, Surroundings, robust
 from nerfro.capture.visual_hull import Silhouettes
@@ -271,7 +271,7 @@ class _Descent:
         distance = (cameras.camera_to_world[:, :, 3] - middle).norm(dim=-1)
         self.contour_deviation = _CONTOUR_DEVIATION * float((distance / cameras.fx).mean())
         boundary = surroundings.boundary
-        self.picture = picture_of(boundary, medium, middle) if isinstance(boundary, Room) else boundary
+        self.panorama = panorama_of(boundary, medium, middle) if isinstance(boundary, Room) else boundary
 
     @torch.no_grad()
     def medium(self) -> SdfGrid:
@@ -297,7 +297,7 @@ class _Descent:
         """Make one step of a stage."""
         done = step / stage.steps
         if step % _VALIDATE_EVERY == 0:
-            self.blurred = _blurred(self.picture, stage.blur[0] + (stage.blur[1] - stage.blur[0]) * done)
+            self.blurred = _blurred(self.panorama, stage.blur[0] + (stage.blur[1] - stage.blur[0]) * done)
         self.optimizer.param_groups[0]["lr"] = stage.rate * 0.5 * (1 + math.cos(math.pi * done))
         self.optimizer.zero_grad()
         with torch.enable_grad():
@@ -362,11 +362,11 @@ class _Descent:
 
 
 @torch.no_grad()
-def _blurred(picture: EnvironmentMap | RoomPicture, degrees: float) -> Boundary:
+def _blurred(panorama: EnvironmentMap | RoomPanorama, degrees: float) -> Boundary:
     """Convolve surroundings with a Gaussian of the given standard deviation."""
     if degrees == 0:
-        return picture
-    sky = picture.colours if isinstance(picture, RoomPicture) else picture
+        return panorama
+    sky = panorama.colours if isinstance(panorama, RoomPanorama) else panorama
     generator = torch.Generator().manual_seed(0)
     directions = texel_directions(max(16, round(135 / degrees)))
     total = torch.zeros_like(directions)
@@ -374,7 +374,7 @@ def _blurred(picture: EnvironmentMap | RoomPicture, degrees: float) -> Boundary:
         turned = directions + math.radians(degrees) * torch.randn(3, generator=generator)
         total += sky(Exits(turned / turned.norm(dim=-1, keepdim=True))).clamp(max=1)
     blurred = EnvironmentMap.of_texels(total / _BLUR_SAMPLES)
-    return RoomPicture(picture.middle, blurred, picture.distances) if isinstance(picture, RoomPicture) else blurred
+    return RoomPanorama(panorama.middle, blurred, panorama.distances) if isinstance(panorama, RoomPanorama) else blurred
 
 
 def _project_onto(mesh: TriangleMesh, medium: SdfGrid) -> TriangleMesh:

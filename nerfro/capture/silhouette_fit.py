@@ -33,14 +33,14 @@ class _Prior(NamedTuple):
     bending: float
     first: float  # initial strength
     last: float  # final strength
-    usual: bool  # whether bending is relative to the typical curvature around a vertex, or to zero
+    typical_curvature: bool  # whether bending is relative to the typical curvature around a vertex, or to zero
     edge: float  # curvature (see `_mean_curvature`) above which the weights decrease, because it belongs to an edge
     steady: float  # weight of changes of curvature in the last steps, per squared validation error
 
 
 # Chosen on the scenes `torus` and `ship` with antialiased masks.
-_ROUND = _Prior(area=3e-6, bending=1e-5, first=100, last=0.01, usual=True, edge=np.inf, steady=0)
-_FLAT = _Prior(area=3e-6, bending=5e-9, first=100, last=0.1, usual=False, edge=0.02, steady=4)
+_ROUND = _Prior(area=3e-6, bending=1e-5, first=100, last=0.01, typical_curvature=True, edge=np.inf, steady=0)
+_FLAT = _Prior(area=3e-6, bending=5e-9, first=100, last=0.1, typical_curvature=False, edge=0.02, steady=4)
 # Number of steps with decreasing strength, and of final steps with all views and the selected strength.
 _STEPS, _LAST_STEPS = 22, 6
 # Binary masks: number of final steps with the probit model of pixels, factor of the strength for these steps, and mean
@@ -223,21 +223,23 @@ class _Fit:
         shares = along * np.concatenate([1 - rims.share, rims.share])
         observed = sparse.csr_matrix((shares, (row, column)), (num_rims, len(vertices)))
         curvature, curved, around = _mean_curvature(vertices, normals, self.edges, self.mesh.mean)
-        usual = (
-            _typical_curvature(curved, vertices, normals, _NORMAL_DISTANCE * self.size) if prior.usual else 0 * curved
+        typical = (
+            _typical_curvature(curved, vertices, normals, _NORMAL_DISTANCE * self.size)
+            if prior.typical_curvature
+            else 0 * curved
         )
-        bent = np.abs(curved - usual)
+        bent = np.abs(curved - typical)
         # While the prior is strong, large curvature may belong to the roofs of the visual hull instead of edges.
         edge = prior.edge * max(1.0, strength)
         stiff = 1 / np.hypot(1, 0.5 * (bent + self.mesh.mean @ bent) / edge)
         stiffness, tension = sparse.diags(stiff), self.across.T @ sparse.diags(stiff[self.edges].prod(1)) @ self.across
         stretch = sum(n @ tension @ n for n in map(sparse.diags, normals.T))
         stretched = sum(normals[:, a] * (tension @ vertices[:, a]) for a in range(3))
-        pressure = -self.degree * around / np.sqrt(around.mean()) * usual
+        pressure = -self.degree * around / np.sqrt(around.mean()) * typical
         system = observed.T @ sparse.diags(rims.weight) @ observed + area * stretch
         system += bending * (curvature.T @ stiffness @ curvature)
         right = observed.T @ (rims.weight * rims.misfit) - area * (stretched - pressure)
-        right -= bending * (curvature.T @ (stiffness @ (curved - usual)))
+        right -= bending * (curvature.T @ (stiffness @ (curved - typical)))
         if steady:
             alike = sparse.diags(_along_edges(vertices, normals, self.edges, self.mesh.mean))
             changes = steady * num_rims * self.size**2 * (curvature.T @ self.across.T @ alike @ self.across)

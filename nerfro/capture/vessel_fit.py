@@ -26,7 +26,7 @@ from nerfro.progress import bar
 from nerfro.samplers.snell import Snell
 
 # Lengths of a typical glass, as fractions of its width.
-_ORDINARY = {"wall": 0.02, "foot": 0.06, "fillet": 0.1}
+_TYPICAL = {"wall": 0.02, "foot": 0.06, "fillet": 0.1}
 _MAX_FILLET = 0.4
 _GLASS, _WATER = 1.52, 1.333
 # Levels of a liquid that are compared with an empty glass, as fractions of the height.
@@ -118,20 +118,20 @@ def fit_vessel(
         observations: observations of the object and its surroundings.
         progress: called with the completed fraction.
     """
-    ordinary = {name: fraction * width for name, fraction in _ORDINARY.items()}
-    widest = ordinary | {"fillet": _MAX_FILLET * width}  # distances are exact up to this depth
+    typical = {name: fraction * width for name, fraction in _TYPICAL.items()}
+    widest = typical | {"fillet": _MAX_FILLET * width}  # distances are exact up to this depth
     empty = build(**widest, liquid_ior=1.0)
     filled = build(**widest, liquid_ior=_WATER, level=0.5 * empty.height)
-    work = 1 + len(_LEVELS) + len(_ROUNDS) * (len(ordinary) + 1) * len(_GRID)
+    work = 1 + len(_LEVELS) + len(_ROUNDS) * (len(typical) + 1) * len(_GRID)
     search = _Search(observations, lambda count: progress(min(1.0, count / work)))
     levels: list[dict[str, float]] = [{}, *({"level": level * empty.height} for level in _LEVELS)]
-    errors = [search.errors(filled if level else empty, ordinary | level) for level in levels]
+    errors = [search.errors(filled if level else empty, typical | level) for level in levels]
     best = int(np.argmin([mean_errors(each[None], search.counts)[0, 0] for each in errors]))
     vessel = filled if best and search.differs(errors[0], errors[best]) else empty
-    ordinary |= levels[best] if vessel is filled else {}
-    lengths, standard_errors = dict(ordinary), dict[str, float]()
+    typical |= levels[best] if vessel is filled else {}
+    lengths, standard_errors = dict(typical), dict[str, float]()
     for factor, fraction in _ROUNDS:
-        for name in ordinary:
+        for name in typical:
             is_level = name == "level"
             half_width = fraction * empty.height if is_level else np.log(factor)
             middle = lengths[name] if is_level else np.log(lengths[name])
@@ -142,9 +142,9 @@ def fit_vessel(
             spread = float(_minimum(grid, mean_errors(sums, search.counts, search.samples)).std())
             lengths[name] = float(min(found, empty.height) if is_level else np.exp(found))
             standard_errors[name] = spread if is_level else spread * lengths[name]
-    unknown = [name for name in ordinary if standard_errors[name] > _MAX_STANDARD_ERROR * lengths[name]]
+    unknown = [name for name in typical if standard_errors[name] > _MAX_STANDARD_ERROR * lengths[name]]
     progress(1.0)
-    return VesselFit(lengths | {name: ordinary[name] for name in unknown}, standard_errors, unknown)
+    return VesselFit(lengths | {name: typical[name] for name in unknown}, standard_errors, unknown)
 
 
 def _minimum(grid: Float[np.ndarray, "C"], errors: Float[np.ndarray, "B C"]) -> Float[np.ndarray, "B"]:

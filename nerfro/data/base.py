@@ -90,7 +90,7 @@ class Views:
         return replace(self, cameras=self.cameras.select(chosen), names=names, frames=frames, **images)
 
     def joined(self, other: Views) -> Views | None:
-        """Append other views, without their usable pixels; None unless both have image and mask files of one size."""
+        """Append other views, without masks of usable pixels; None unless all image and mask files have one size."""
         parts = self.images, other.images, self.masks, other.masks
         if not all(isinstance(part, LazyImages) for part in parts) or self.images.shape != other.images.shape:
             return None

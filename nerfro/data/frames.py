@@ -161,7 +161,7 @@ class PosedImages(DataSource):
             )
 
     def _require_own_masks(self, frames: Sequence[Frame]) -> None:
-        """Refuse a mask file that the search finds for several images, of one split or of several."""
+        """Refuse a mask file that belongs to several images of one split or of different splits."""
         for frame in frames:
             image = frame.mask and self._images_of_masks.setdefault(frame.mask, frame.image)
             if image not in (None, frame.image) and frame.mask == find_mask(self.root, frame.image):

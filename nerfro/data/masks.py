@@ -104,7 +104,7 @@ def unused_masks(root: Path, images: Sequence[Path], masks: Sequence[Path | None
 
 
 def require_used(root: Path, images: Sequence[Path], masks: Sequence[Path | None]) -> None:
-    """Refuse a data set with mask files of which none belongs to an image.
+    """Refuse a data set whose mask files belong to no image.
 
     Args:
         root: folder of the data set.

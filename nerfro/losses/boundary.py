@@ -17,7 +17,7 @@ _MIN_TRANSMITTANCE = 0.5
 
 @register("loss", "boundary")
 class BoundaryRegulariser(Loss):
-    """Penalize |T C'(d) - C| where the final transmittance T is above 1/2 (paper, Eqn. lossBD).
+    """Penalize |T C'(d) - C| where the final transmittance T is above 1/2 (paper, Eqn. 8).
 
     The background alone should explain such pixels. Only the density of the finest level learns, because the colour of
     the background is detached; the loss removes fog in front of the surface. Channels are summed, and the sum over

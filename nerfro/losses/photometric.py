@@ -15,7 +15,7 @@ from nerfro.types import Batch, Rendering
 
 @register("loss", "photometric")
 class Photometric(Loss):
-    """Compute the mean squared colour error of all sampling levels (paper, Eqn. lossRGB).
+    """Compute the mean squared colour error of all sampling levels (paper, Eqn. 7).
 
     The mean is over pixels and channels, as in the authors' code; the norm in the paper is three times larger.
 

@@ -16,7 +16,7 @@ from nerfro.types import Batch, Exits, Rendering
 
 @register("loss", "smoothness")
 class Smoothness(Loss):
-    """Penalize squared differences of the background colour between neighbouring directions (paper, Eqn. lossS).
+    """Penalize squared differences of the background colour between neighbouring directions (paper, Eqn. 9).
 
     Args:
         tile_size: side in pixels of a random window of a random training view, whose viewing directions are compared.

@@ -1,4 +1,4 @@
-"""The medium of the paper: a mesh that is voxelized to occupancy fractions and smoothed (section 3.1)."""
+"""The medium of the paper: a mesh that is voxelized to occupancy fractions and smoothed (section 2)."""
 
 from __future__ import annotations
 

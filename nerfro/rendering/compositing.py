@@ -10,9 +10,19 @@ from nerfro.types import Path, Radiance, Rendering, Samples
 
 
 def composite(samples: Samples, radiance: Radiance, boundary_rgb: Float[Tensor, "P 3"], path: Path) -> Rendering:
-    """Render one level: C = sum_i w_i c_i + T_{N+1} C'(d_N) (paper, Eqn. volrendBd), summed over a ray's polylines.
+    """Composite one sampling level: C = sum_i w_i c_i + T_{N+1} C'(d_N) (paper, Eqn. 5).
 
-    In absorbing media, the radiance of samples and of the background is multiplied by the transmittance of the medium.
+    The radiance of a ray is the sum over its polylines. In absorbing media, the radiance of samples and of the
+    background is multiplied by the transmittance of the medium.
+
+    Args:
+        samples: N samples on each of P polylines.
+        radiance: density [P, N] per world unit, and radiance [P, N, 3] of the samples.
+        boundary_rgb: background radiance in the exit direction of each polyline.
+        path: the polylines of R rays.
+
+    Returns:
+        Radiance [R, 3] of the rays, with the weights and the transmittance of the polylines.
     """
     density, rgb = radiance.density.float(), radiance.rgb.float()  # sums over a ray stay in single precision
     weights, transmittance = volume_weights(density, samples.deltas)

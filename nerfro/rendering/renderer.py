@@ -143,7 +143,13 @@ class Renderer(nn.Module, ABC):
     ) -> Float[Tensor, "P 3"]:
         """Evaluate the background radiance in the exit directions of polylines, or in other `directions`.
 
-        Without `teaches_background`, the background learns from all rays.
+        Args:
+            path: P polylines of R rays.
+            teaches_background: rays from which the background learns; None for all.
+            directions: unit directions that replace the exit directions.
+
+        Returns:
+            Background radiance of each polyline, in the colour space of the scene.
         """
         teaches = None if teaches_background is None else path.of_ray(teaches_background)
         return background_radiance(self.scene.boundary, path.exits(directions), teaches)

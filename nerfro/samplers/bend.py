@@ -27,7 +27,7 @@ _MARGIN = 4
 
 
 class Bent(NamedTuple):
-    """Rays where they leave the box around the body, on the CPU.
+    """Exit rays at the box around the body, in CPU memory.
 
     Attributes:
         positions: exit positions in world units, in the precision of the origins.
@@ -79,7 +79,7 @@ def bend(
 def polylines(
     medium: Medium, origins: ArrayLike | Tensor, directions: ArrayLike | Tensor, length: float | None = None
 ) -> list[np.ndarray]:
-    """Trace rays through a medium, and return the vertices of their paths, for example to plot them.
+    """Trace rays through a medium, and return the vertices of the paths, for example for a plot.
 
     Args:
         medium: bodies, traced by Snell's law, or a medium with a continuous index, traced by the ray equation.
@@ -96,7 +96,7 @@ def polylines(
     rays = make_rays(*_checked_rays(origins, directions), medium, 0.0, length)
     path = (Snell() if isinstance(medium, Solid) else Eikonal())(rays, medium)
     vertices = zip(path.positions.numpy() + medium.origin, path.s.numpy(), strict=True)
-    # Rows repeat the last vertex.
+    # All rows have the same length and repeat the last vertex.
     return [positions[np.diff(s, prepend=-1.0) > 0] for positions, s in vertices]
 
 

@@ -86,7 +86,7 @@ class Eikonal(PathSampler):
 
 
 def march_uniform(rays: Rays, medium: Medium, integrator: Integrator, num_steps: int) -> Path:
-    """Trace rays by equal steps ds = (far - near) / (num_steps - 1) (paper, Eqn. eikonal).
+    """Trace rays by equal steps ds = (far - near) / (num_steps - 1) (paper, Eqn. 4).
 
     The arc length of a vertex is the length of the polyline. At near, v = n d.
     """

@@ -1,6 +1,6 @@
 """Single steps of the Eikonal equation in arc length, d/ds (n dx/ds) = grad n.
 
-With v = n dx/ds the equation is x' = v / n, v' = grad n (paper, Eqn. eikonal), and |v| = n along every exact solution.
+With v = n dx/ds the equation is x' = v / n, v' = grad n (paper, Eqn. 4), and |v| = n along every exact solution.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ _MIN_TOTAL_WEIGHT = 1e-5
 def volume_weights(
     density: Float[Tensor, "R N"], deltas: Float[Tensor, "R N"]
 ) -> tuple[Float[Tensor, "R N"], Float[Tensor, "R"]]:
-    """Compute the weights w_i = T_i (1 - exp(-sigma_i delta_i)) and the transmittance T_{N+1} (paper, Eqn. volrend).
+    """Compute the weights w_i = T_i (1 - exp(-sigma_i delta_i)) and the transmittance T_{N+1} (paper, Eqn. 1).
 
     Args:
         density: density per world unit.
@@ -35,7 +35,7 @@ def volume_weights(
 def spread_uniform(path: Path, num_samples: int, draws: Draws | None, stream: str = "samples") -> Float[Tensor, "P N"]:
     """Spread numbers over [0, 1), ascending along each polyline.
 
-    With `draws`, there is one uniform number in each of `num_samples` equal bins (paper, Eqn. stratified). Without, the
+    With `draws`, there is one uniform number in each of `num_samples` equal bins (paper, Eqn. 2). Without, the
     numbers are evenly spaced and include both ends, 0 and 1 - eps, as the authors' code does in evaluation.
     """
     like = path.s
@@ -49,7 +49,7 @@ def spread_uniform(path: Path, num_samples: int, draws: Draws | None, stream: st
 def invert_cdf(
     edges: Float[Tensor, "R E"], weights: Float[Tensor, "R E-1"], u: Float[Tensor, "R N"]
 ) -> Float[Tensor, "R N"]:
-    """Sample a step function by inversion of its cumulative distribution (paper, Eqn. hierarchical).
+    """Sample a step function by inversion of its cumulative distribution (paper, Eqn. 3).
 
     Args:
         edges: bounds of the intervals, ascending.

@@ -1,4 +1,4 @@
-"""Stratified sampling of straight and bent paths (paper, Eqn. stratified)."""
+"""Stratified sampling of straight and bent paths (paper, Eqn. 2)."""
 
 from __future__ import annotations
 
@@ -101,7 +101,15 @@ class Stratified(PointSampler):
 
 
 def point_samples(path: Path, s: Float[Tensor, "R N"]) -> Samples:
-    """Create samples at ascending arc lengths; the interval of each sample ends at the next sample."""
+    """Create samples at given arc lengths.
+
+    Args:
+        path: P polylines.
+        s: arc lengths [P, N] in ascending order along each polyline, world units.
+
+    Returns:
+        Samples with positions and directions on the paths. The interval of each sample ends at the next sample.
+    """
     return Samples.along(path, s, _edges_from_starts(s))
 
 

@@ -68,7 +68,7 @@ def make_rays(
 
 
 def leave_box(path: Path, medium: Medium) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R"]]:
-    """Return positions and arc lengths at which paths leave the box; for rays that miss the box, the first vertex."""
+    """Return positions and arc lengths of the exits from the box, or of the first vertex for rays beside the box."""
     # Short rows repeat the last vertex, so the last event is the last vertex before far.
     last = (path.s < path.far[:, None]).sum(-1).sub(1).clamp(min=0)
     rows = torch.arange(len(last))

@@ -95,7 +95,7 @@ def _settle_ball(content: DictConfig, cameras: Cameras) -> None:
     poses = cameras.camera_to_world.double().cpu().numpy()
     centres, forward = poses[:, :, 3], -poses[:, :, 2]
     if content.box_min is None:
-        middle = looked_at(centres, forward, _depth(cameras))
+        middle = common_target(centres, forward, _depth(cameras))
     else:
         middle = np.mean([list(content.box_min), list(content.box_max)], axis=0)
     distances = np.linalg.norm(centres - middle, axis=1)
@@ -113,15 +113,15 @@ def _settle_ball(content: DictConfig, cameras: Cameras) -> None:
         content.cells = int(np.clip(math.ceil(_CELLS_PER_PIXEL * 4 * radius / pixel), _FEWEST_CELLS, _MOST_CELLS))
 
 
-def looked_at(
+def common_target(
     centres: Float[np.ndarray, "V 3"], forward: Float[np.ndarray, "V 3"], depth: float
 ) -> Float[np.ndarray, "3"]:
     """Return the point nearest to all optical axes (least squares); for nearly parallel axes, a point at `depth`."""
     across = np.eye(3) - forward[:, :, None] * forward[:, None, :]  # projects out the axis
-    usual = centres.mean(0) + depth * forward.mean(0)
+    typical = centres.mean(0) + depth * forward.mean(0)
     values, axes = np.linalg.eigh(across.mean(0))
-    offset = axes.T @ (across @ (centres - usual)[:, :, None])[:, :, 0].mean(0)
-    return usual + axes @ np.where(values > _PARALLEL, offset / np.maximum(values, _PARALLEL), 0.0)
+    offset = axes.T @ (across @ (centres - typical)[:, :, None])[:, :, 0].mean(0)
+    return typical + axes @ np.where(values > _PARALLEL, offset / np.maximum(values, _PARALLEL), 0.0)
 
 
 def _depth(cameras: Cameras) -> float:

@@ -10,7 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 
 
 class Role(Enum):
-    """Role of a setting; settings that `_NAMED` does not contain have the role METHOD."""
+    """Role of a setting; METHOD for every setting outside `_NAMED`."""
 
     METHOD = "what is learned, and how"
     SEED = "which random draws"
@@ -47,9 +47,9 @@ _NAMED = {
     "trainer.enable_model_summary": Role.WATCHING,
 }
 
-# To resume a checkpoint, these settings must be equal; budget, machine and scoring may differ.
+# Settings with these roles must be equal to resume a checkpoint; budget, machine and scoring may differ.
 RESUMING = frozenset({Role.METHOD, Role.SEED, Role.SCENE})
-# Two cells of a sweep have the same result if these settings are equal.
+# Two runs of a sweep have the same result if all settings with these roles are equal.
 RESULT = RESUMING | {Role.BUDGET, Role.SCORING}
 # Runs with equal settings are one row of a table; scenes are columns, and each budget has a table.
 TABLE_ROW = frozenset({Role.METHOD, Role.SCORING})

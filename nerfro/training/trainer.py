@@ -32,7 +32,7 @@ from nerfro.training.log import TrainingLog, keep_rows
 from nerfro.training.run_folder import CONFIG_FILE, LAST_CHECKPOINT, in_sweep
 from nerfro.training.validation import OverfittingWarning
 
-# Arguments of the Trainer that nerfro implements itself.
+# Arguments of the Trainer with an implementation in nerfro.
 _OWN = ("profiler", "fast_dev_run", "overfit_batches", "limit_test_batches")
 _LOST_CONNECTION = re.compile("gloo|NCCL|[Cc]onnection (closed|reset)")  # in errors of torch.distributed
 _PROFILERS = {"simple": SimpleProfiler, "advanced": AdvancedProfiler, "pytorch": PyTorchProfiler}
@@ -90,18 +90,18 @@ def make_trainer(config: DictConfig, folder: Path, throughput: Throughput, extra
 
 
 def _profiler(name: str | None, folder: Path) -> Profiler | None:
-    """Build a profiler of Lightning that writes to the run folder."""
+    """Build a profiler of Lightning with reports in the run folder."""
     return None if name is None else _PROFILERS[name](dirpath=folder / "profile", filename=name)
 
 
 def print_profile(folder: Path) -> None:
-    """Print the reports of a profiler, if there is one."""
+    """Print the reports in the run folder of a profiled training."""
     for report in sorted((folder / "profile").glob("*.txt")):
         print(report.read_text(encoding="utf-8"))
 
 
 def _shared(callback: Callback) -> Callback:
-    """Replace Lightning's timer of `max_time`."""
+    """Replace Lightning's timer of `max_time` by a timer that all processes share."""
     if type(callback) is not Timer:
         return callback
     remaining = callback.time_remaining()
@@ -147,7 +147,7 @@ def fit(
     checkpoint: Path | None,
     throughput: Throughput,
 ) -> None:
-    """Train, from a checkpoint if there is one.
+    """Train from the start, or resume a checkpoint.
 
     Raises:
         NerfroError: the state of the trainer in the checkpoint cannot be restored, or another process has ended.
@@ -176,7 +176,7 @@ def finish_logs(trainer: pl.Trainer, scores: Mapping[str, float | None]) -> None
 
 
 def _quieten_lightning() -> None:
-    """Suppress hints of Lightning about data loaders and hardware, because they do not apply."""
+    """Suppress Lightning's hints about data loaders and hardware, which do not apply here."""
     for package in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(package).setLevel(logging.WARNING)
     for message in (

@@ -44,7 +44,7 @@ class ExportConfig:
 
 @dataclass(frozen=True)
 class Export:
-    """A kind of output file.
+    """A format of exported files.
 
     Attributes:
         suffixes: allowed endings of the file.

@@ -73,7 +73,7 @@ def assemble_page(title: str, static: dict[str, Any], parts: dict[str, Baked], l
 
 
 def static_parts(scene: TrainedScene, views: Views, split: str) -> dict[str, Any]:
-    """Collect everything that is constant during training: cameras, photographs, and the position of the scene."""
+    """Collect the data that is constant during training: cameras, photographs, and the position of the scene."""
     renderer, cameras, contraction = scene.renderer, views.cameras, contraction_radius(scene)
     box = renderer.scene.medium.content_box.float().cpu()
     if not (box[1] > box[0]).all():

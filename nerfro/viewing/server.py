@@ -123,7 +123,7 @@ class PageServer:
 
 
 class _QuietServer(ThreadingHTTPServer):
-    """A server whose clients may disappear or be slow."""
+    """A server that tolerates slow clients and lost connections."""
 
     request_queue_size = 128  # connections that wait; beyond, the system delays clients by a second or more
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from nerfro.boundaries.base import Boundary
 from nerfro.capture import refinement
 from nerfro.capture.refinement import Refined, RefinementSettings, Stage, refine_surface
-from nerfro.capture.room_picture import picture_of
+from nerfro.capture.room_panorama import panorama_of
 from nerfro.capture.silhouettes import mesh_silhouettes
 from nerfro.capture.surroundings import Pixels, Room, Surroundings, divide_pixels, learn_surroundings
 from nerfro.capture.visual_hull import Silhouettes
@@ -110,7 +110,7 @@ class PaintedShell(Room):
 def test_a_backdrop_is_the_room_along_every_line() -> None:
     room = PaintedShell()
     middle = torch.tensor([0.1, -0.2, 0.05])
-    backdrop = picture_of(room, solid([1.5]), middle)
+    backdrop = panorama_of(room, solid([1.5]), middle)
     generator = torch.Generator().manual_seed(0)
     positions = (torch.rand(500, 3, generator=generator) - 0.5).requires_grad_()
     directions = torch.nn.functional.normalize(torch.randn(500, 3, generator=generator), dim=-1).requires_grad_()

@@ -9,7 +9,7 @@ from nerfro.cameras import Cameras
 from nerfro.errors import NerfroError
 from nerfro.media.analytic import Vacuum
 from nerfro.training.config import TrainConfig
-from nerfro.training.content import describe, looked_at, settle_content
+from nerfro.training.content import common_target, describe, settle_content
 
 MIDDLE = np.array([0.4, -2.0, 1.0])
 
@@ -56,7 +56,7 @@ def test_what_is_given_is_kept() -> None:
 def test_axes_that_are_parallel_are_followed_to_a_usual_depth() -> None:
     centres = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])
     forward = np.tile([0.0, 0.0, -1.0], (4, 1))
-    np.testing.assert_allclose(looked_at(centres, forward, 4.0), [0.5, 0.5, -4.0], atol=1e-9)
+    np.testing.assert_allclose(common_target(centres, forward, 4.0), [0.5, 0.5, -4.0], atol=1e-9)
 
 
 def test_a_box_covers_nothing_else_and_needs_no_cameras() -> None:

@@ -24,7 +24,7 @@ _CHUNK = 16384  # rays rendered at once
 _STEPS = 5  # fixed-point iterations of the lookup; few suffice, because the object is small beside its surroundings
 
 
-class RoomPicture(Boundary):
+class RoomPanorama(Boundary):
     """A panorama with depth around a point; the lookup intersects exit rays from other positions with the depth.
 
     The panorama lacks surfaces that are hidden from the point.
@@ -63,7 +63,7 @@ class RoomPicture(Boundary):
 
 
 @torch.no_grad()
-def picture_of(room: Room, medium: SdfGrid, middle: Float[Tensor, "3"]) -> RoomPicture:
+def panorama_of(room: Room, medium: SdfGrid, middle: Float[Tensor, "3"]) -> RoomPanorama:
     """Render a panorama of near surroundings from the surface of an object outwards."""
     radius = float((medium.box[1] - medium.box[0]).norm())
     radiance, distances = [], []
@@ -75,4 +75,4 @@ def picture_of(room: Room, medium: SdfGrid, middle: Float[Tensor, "3"]) -> RoomP
         seen, distance = room.seen(Exits(directions, starts))
         radiance.append(seen)
         distances.append(distance + (starts - middle).norm(dim=-1))
-    return RoomPicture(middle, EnvironmentMap.of_texels(torch.cat(radiance)), torch.cat(distances))
+    return RoomPanorama(middle, EnvironmentMap.of_texels(torch.cat(radiance)), torch.cat(distances))
