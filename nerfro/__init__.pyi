@@ -26,7 +26,7 @@ from .training.build import build
 from .training.data_module import RayDataModule
 from .training.load import load
 from .training.module import TrainingModule
-from .training.optimizer import OptimizerConfig
+from .training.optimizer import GroupConfig, OptimizerConfig
 from .training.ray_batches import RayBatches
 from .viewing.trained_scene import TrainedScene
 
@@ -41,6 +41,7 @@ __all__ = [
     "Distortion",
     "Eikonal",
     "EnvironmentMap",
+    "GroupConfig",
     "HashGridField",
     "Hierarchical",
     "NerfField",

@@ -72,7 +72,13 @@ RENAMED: dict[str, str | None] = {
     "batches.hold_back": "batches.num_validation_views",
     "batches.object": "batches.object_fraction",
     "optimizer.boundary_first": "optimizer.boundary_steps",
-    "optimizer.tint_learning_rate": "optimizer.absorption_learning_rate",
+    "optimizer.tint_learning_rate": "optimizer.groups[bodies.*.material.absorption].learning_rate",
+    "optimizer.absorption_learning_rate": "optimizer.groups[bodies.*.material.absorption].learning_rate",
+    "optimizer.boundary_learning_rate": "optimizer.groups[background.*].learning_rate",
+    "optimizer.boundary_start": "optimizer.groups[background.*].start",
+    "optimizer.exposure_learning_rate": "optimizer.groups[cameras.exposure].learning_rate",
+    "optimizer.medium_learning_rate": "optimizer.groups[bodies.*.material.ior].learning_rate",
+    "optimizer.medium_start": "optimizer.groups[bodies.*.material.ior].start",
     "medium.learn_surface": None,
     "optimizer.surface_learning_rate": None,
     "optimizer.surface_start": None,
@@ -457,7 +463,10 @@ def renamed_override(override: str) -> str:
     new_package = _renamed_key(package if at else key)
     if new_package is None:
         raise NerfroError(_gone(key))
-    return f"{prefix}{group + at if at else ''}{new_package}{equals}{new_value}"
+    renamed = f"{prefix}{group + at if at else ''}{new_package}{equals}{new_value}"
+    # Hydra reads names with dots only inside of a mapping and without quotes, and adds them only with a plus sign.
+    renamed = re.sub(r"(optimizer\.groups)\[(.+)\]\.(\w+)=(.*)", r"\1={\2: {\3: \4}}", renamed)
+    return f"+{renamed}".replace('"', "") if renamed.startswith("optimizer.groups=") else renamed
 
 
 def renamed_config(config: DictConfig, origin: Path) -> DictConfig:

@@ -61,7 +61,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetr
     lpips = find_lpips_networks()
     module, datamodule = build_training(config, source, training)
     renderer = module.renderer
-    require_same_run(folder, checkpoint, config, renderer)
+    require_same_run(folder, checkpoint, config, module.parameter_groups())
     throughput, interruption = Throughput(), StopOnSignal()
     trainer = make_trainer(config, folder, throughput, [interruption, Viewer(config, source, test)])
     batches = datamodule.batches.share(trainer.global_rank, trainer.world_size)

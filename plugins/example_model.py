@@ -30,9 +30,6 @@ class Haze(RefractiveModel):
         self.log_density = nn.Parameter(torch.tensor(density).log())
         self.colour = nn.Parameter(torch.zeros(3))
 
-    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        return super().parameter_groups() | {"haze": [self.log_density, self.colour]}
-
     def render_path(
         self, path: Path, draws: Draws | None = None, teaches_background: Bool[Tensor, "R"] | None = None
     ) -> list[Rendering]:

@@ -12,7 +12,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import OverrideParseException
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from nerfro.cli import RENAMED, _flags_first, _RenamingFiles, errors_in_one_line, in_one_line, renamed_override, warn
 from nerfro.errors import NerfroError
@@ -191,11 +191,24 @@ def test_bodies_are_settings_of_the_medium(tmp_path: Path, capsys: pytest.Captur
     assert not capsys.readouterr().out
 
 
-def test_renamed_settings_exist_and_their_old_names_do_not() -> None:
+def composed(*overrides: str) -> DictConfig:
     discover()
     ConfigStore.instance().store(name="train_schema", node=TrainConfig, provider="nerfro")
     with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
-        config = compose("train", ["+experiment=straight"])
+        return compose("train", list(overrides))
+
+
+def test_groups_of_parameters_are_added_to_those_of_the_experiment() -> None:
+    pattern = "bodies.*.material.ior"
+    for old in ("optimizer.medium_start=7", f'optimizer.groups={{"{pattern}": {{start: 7}}}}'):
+        config = composed("+experiment=unknown", renamed_override(old))
+        assert config.optimizer.groups[pattern] == {"learning_rate": 1e-3, "start": 7}
+    run = foreign_config("optimizer: {medium_start: 7}", CONF_DIR / "config.yaml")
+    assert run == {"optimizer": {"groups": {pattern: {"start": 7}}}}
+
+
+def test_renamed_settings_exist_and_their_old_names_do_not() -> None:
+    config = composed("+experiment=straight")
     for old, new in RENAMED.items():
         group, is_option, option = old.partition("=")
         if is_option:

@@ -85,8 +85,8 @@ def composed(command: str, choices: tuple[str, ...]) -> DictConfig:
 def require_valid(command: str, options: list[str]) -> None:
     """Raise an error unless a command accepts the options. Hydra composes only the choices of groups, to save time."""
     schema, verbatim = entry_points()[command]
-    options = [_full_key(option) for option in options]
-    assert [renamed_override(option) for option in options] == options, "an old name"
+    given, options = [_full_key(option) for option in options], [renamed_override(option) for option in options]
+    assert [option.lstrip("+") for option in options] == [option.lstrip("+") for option in given], "an old name"
     # Of a sweep the first value; no patterns, and no options of Hydra, whose launchers may not be installed.
     options = [re.sub(r"^([^=]+=[^,[{]+),[^]}]*$", r"\1", option) for option in options if "(" not in option]
     options = [_quoted(option, verbatim) for option in options if not option.lstrip("+").startswith("hydra")]

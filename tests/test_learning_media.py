@@ -35,7 +35,7 @@ def test_an_index_that_is_off_is_mended_in_training(train_here: Callable[..., An
     options += ["data.near=0.5", "boundary.resolutions=[4,8,16,32]", "batches.size=384", "evaluation.split=train"]
     options += ["sampler.points.num_samples=4", "sampler.points.num_bins=16", "sampler.points.resolution=16"]
     options += ["field.num_levels=2", "field.log2_table_size=8", "field.width=16", "loss.boundary.start=0"]
-    options += ["optimizer.medium_learning_rate=0.006", "optimizer.medium_start=60", "evaluation.every=0"]
+    options += ["optimizer.groups={bodies.*.ior: {learning_rate: 0.006, start: 60}}", "evaluation.every=0"]
     options += [
         "trainer.accelerator=cpu",
         "trainer.max_time=null",

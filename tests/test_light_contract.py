@@ -23,7 +23,7 @@ from nerfro.samplers.straight import straight_path
 from nerfro.samplers.stratified import Stratified
 from nerfro.testing import NUM_RAYS, example_batch, example_components, example_draws, example_path, example_rays
 from nerfro.training.module import TrainingModule
-from nerfro.training.optimizer import OptimizerConfig
+from nerfro.training.optimizer import GroupConfig, OptimizerConfig
 from nerfro.types import Exits, Path, Radiance
 from tests.closed_forms import grid_points
 
@@ -160,11 +160,12 @@ def test_a_png_sky_is_decoded_and_encoded_again(tmp_path: FilePath) -> None:
 
 def test_all_that_learns_has_a_group_and_a_rate() -> None:
     model = RefractiveModel(example_components())
-    assert set(model.parameter_groups()) == {"fields"}
+    assert all(name.startswith("fields.0.") for name in model.parameters_by_name())
     model.scene.medium.index = torch.nn.Parameter(torch.tensor(1.5))
     model.scene.camera.shift = torch.nn.Parameter(torch.zeros(3))
-    groups = TrainingModule(model, {}, OptimizerConfig()).configure_optimizers().param_groups
-    assert [group["name"] for group in groups] == ["fields", "medium", "camera"]
+    optimizer = OptimizerConfig(groups={"medium.*": GroupConfig(), "cameras.*": GroupConfig()})
+    groups = TrainingModule(model, {}, optimizer).configure_optimizers().param_groups
+    assert [group["name"] for group in groups] == ["common", "medium.*", "cameras.*"]
     assert sum(len(group["params"]) for group in groups) == len(list(model.parameters()))
     assert model.paths_learn
     with torch.no_grad():

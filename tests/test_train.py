@@ -97,7 +97,7 @@ def test_log_holds_every_loss_and_weight_of_every_second_step_and_images(run: Pa
     def logged(name: str) -> list[tuple[int, float]]:
         return [(event.step, event.value) for event in events.Scalars(name)]
 
-    rate = "optimizer/learning_rate/fields"
+    rate = "optimizer/learning_rate/common"
     for name in ("loss/total", "loss/photometric", "train/psnr", "train/rays_per_second", rate):
         assert [step for step, _ in logged(name)] == [0, 1, 3, 5], name
     assert logged("weight/boundary") == [(0, 0), (1, 0), (3, pytest.approx(0.025)), (5, pytest.approx(0.025))]

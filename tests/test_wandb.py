@@ -77,7 +77,7 @@ def test_offline_run_needs_no_account_and_holds_what_tensorboard_and_the_csv_hol
     assert "epoch" not in logged
     assert {
         "loss/total", "loss/photometric", "loss/boundary", "loss/smoothness", "weight/boundary", "train/psnr",
-        "val/psnr", "train/rays_per_second", "train/peak_memory_gib", "optimizer/learning_rate/fields",
+        "val/psnr", "train/rays_per_second", "train/peak_memory_gib", "optimizer/learning_rate/common",
     } <= scalars  # fmt: skip
     with (folder / "csv" / "metrics.csv").open() as stream:
         assert scalars <= set(next(csv.reader(stream)))

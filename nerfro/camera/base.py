@@ -48,14 +48,9 @@ class Camera(nn.Module, ABC):
         """Return the gain of linear radiance of each ray's photograph, or None if exposures are not estimated."""
         return None if self.exposure is None else self.exposure(view)
 
-    def bending_parameters(self) -> list[nn.Parameter]:
-        """Return the parameters that change rays."""
-        brightness = set(self.brightness_parameters())
-        return [parameter for parameter in self.parameters() if parameter not in brightness]
-
-    def brightness_parameters(self) -> list[nn.Parameter]:
-        """Return the parameters that change gains."""
-        return [] if self.exposure is None else list(self.exposure.parameters())
+    def parameters_by_name(self) -> dict[str, nn.Parameter]:
+        """Return the parameters that gradient descent learns by name, see `Scene.parameters_by_name`."""
+        return {f"cameras.{name.removesuffix('.log_gain')}": value for name, value in self.named_parameters()}
 
     def estimated(self, cameras: Cameras) -> Cameras:
         """Return the estimated training cameras, given those of the data set."""
@@ -65,6 +60,6 @@ class Camera(nn.Module, ABC):
         """Apply the similarity transformation between the given and the estimated training cameras to other cameras."""
         return cameras
 
-    def learned(self) -> dict[str, float]:
+    def measurements(self) -> dict[str, float]:
         """Return estimated physical quantities by name, for the log."""
-        return {} if self.exposure is None else {"gain_spread": self.exposure.spread}
+        return {} if self.exposure is None else {"cameras.gain_spread": self.exposure.spread}

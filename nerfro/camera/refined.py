@@ -229,13 +229,15 @@ class RefinedCamera(Camera):
         x, y = cameras.cx + shift[0], cameras.cy + shift[1]
         return replace(cameras, fx=cameras.fx * growth, fy=cameras.fy * growth, cx=x, cy=y)
 
-    def learned(self) -> dict[str, float]:
-        with torch.no_grad():
-            found = {"motion_pixels": float((self.motions.fixed() / self.motions.units).square().sum(-1).mean().sqrt())}
-            if self.lens is not None:
-                growth, (x, y) = self._lens()
-                found |= {"focal_length_factor": float(growth), "principal_x": float(x), "principal_y": float(y)}
-        return super().learned() | found
+    @torch.no_grad()
+    def measurements(self) -> dict[str, float]:
+        motion = (self.motions.fixed() / self.motions.units).square().sum(-1).mean().sqrt()
+        found = super().measurements() | {"cameras.motion_pixels": float(motion)}
+        if self.lens is not None:
+            growth, (x, y) = self._lens()
+            named = {"focal_length_factor": growth, "principal_x": x, "principal_y": y}
+            found |= {f"cameras.{name}": float(value) for name, value in named.items()}
+        return found
 
 
 def rotations(vectors: Float[Tensor, "V 3"]) -> Float[Tensor, "V 3 3"]:

@@ -96,12 +96,12 @@ class Medium(nn.Module, ABC):
         """Return the path with the absorption of all crossed bodies."""
         return path
 
-    def bending_parameters(self) -> list[nn.Parameter]:
-        """Return the learned parameters with an influence on paths."""
-        return list(self.parameters())
+    def parameters_by_name(self) -> dict[str, nn.Parameter]:
+        """Return the learned parameters by name, see `Scene.parameters_by_name`."""
+        return {f"medium.{name}": parameter for name, parameter in self.named_parameters()}
 
-    def learned(self) -> dict[str, float]:
-        """Return learned physical quantities by name in the log."""
+    def measurements(self) -> dict[str, float]:
+        """Return learned physical quantities by name, for the log."""
         return {}
 
     def clearance(self, positions: Vectors) -> Scalars:

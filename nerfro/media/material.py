@@ -191,6 +191,11 @@ class Material(nn.Module):
         else:
             self.register_buffer("_absorption", given if given.any() else None, persistent=False)
 
+    def learned(self) -> dict[str, nn.Parameter]:
+        """Return the parameters of the learned quantities, `ior` and `absorption`."""
+        quantities = {"ior": self.ior, "absorption": self._absorption}
+        return {name: value for name, value in quantities.items() if isinstance(value, nn.Parameter)}
+
     @property
     def absorbs(self) -> bool:
         """Whether the material may absorb light."""

@@ -21,7 +21,7 @@ from nerfro.media.base import Medium, Scalars, Vectors
 from nerfro.media.bodies import Body, read_bodies
 from nerfro.media.distance_grid import DistanceGrid, DistanceGrids
 from nerfro.media.material import materials_of
-from nerfro.media.solid import Solid
+from nerfro.media.solid import Solid, body_names
 from nerfro.media.voxel_grid import BYTES_PER_VERTEX, check_margin, grid_box
 from nerfro.paths import resolve_path
 from nerfro.registry import register
@@ -104,8 +104,8 @@ class SdfGrid(Solid):
             )
         else:
             materials = materials_of([ior, *inner_iors], absorption, learn_absorption, abbe, learn_ior)
-            files = [mesh, *inner_meshes]
-            members = [Body(str(i + 1), file, materials[i]) for i, file in enumerate(files)]
+            names, files = body_names(len(materials)), [mesh, *inner_meshes]
+            members = [Body(*body) for body in zip(names, files, materials, strict=True)]
         require_bytes(len(members) * BYTES_PER_VERTEX * resolution**3, f"medium.resolution={resolution}")
         meshes = [load_mesh(resolve_path(body.mesh), accept_open_mesh) for body in members]
         boxes = [grid_box(box_min, box_max, [body], resolution, AIR) for body in meshes]

@@ -49,7 +49,7 @@ class Solid(Medium):
             others and touch them without a gap, and a body of index 1 is air, as outside. Otherwise a point belongs to
             the last body that contains it.
         materials: material of each body.
-        names: name of each body in the log.
+        names: name of each body.
     """
 
     nested = False
@@ -72,7 +72,7 @@ class Solid(Medium):
         if len(materials) > _MAX_BODIES:
             raise NerfroError(f"the medium has {len(materials)} bodies; at most {_MAX_BODIES} are allowed")
         self.materials = nn.ModuleList(materials)  # type: ignore[assignment]
-        self.names = list(names) or [str(body + 1) for body in range(len(materials))]
+        self.names = list(names) or body_names(len(materials))
         self.register_load_state_dict_pre_hook(_read_old_parameters)
 
     def __repr__(self) -> str:
@@ -124,18 +124,20 @@ class Solid(Medium):
             return path
         return replace(path, absorption=torch.cat([torch.zeros_like(of_bodies[:1]), of_bodies]).to(path.s))
 
-    def bending_parameters(self) -> list[nn.Parameter]:
-        of_absorption = {id(material._absorption) for material in self.materials}
-        return [parameter for parameter in self.parameters() if id(parameter) not in of_absorption]
+    def parameters_by_name(self) -> dict[str, nn.Parameter]:
+        found = super().parameters_by_name()
+        found = {name: found[name] for name in found if not name.startswith("medium.materials.")}
+        for body, material in zip(self.names, self.materials, strict=True):
+            found |= {f"bodies.{body}.material.{name}": parameter for name, parameter in material.learned().items()}
+        return found
 
-    def learned(self) -> dict[str, float]:
+    def measurements(self) -> dict[str, float]:
         found: dict[str, float] = {}
-        for name, material in zip(self.names, self.materials, strict=True):
-            if isinstance(material.ior, nn.Parameter):
-                found[f"ior_{name}"] = float(material.ior.detach())
-            if isinstance(material._absorption, nn.Parameter):
-                values = material.absorption.detach().tolist()
-                found |= {f"absorption_{name}_{colour}": value for colour, value in zip(_COLOURS, values, strict=True)}
+        for body, material in zip(self.names, self.materials, strict=True):
+            for quantity in material.learned():
+                name, value = f"bodies.{body}.material.{quantity}", getattr(material, quantity).tolist()
+                of_colours = zip(_COLOURS, value, strict=True) if quantity == "absorption" else ()
+                found |= {f"{name}.{colour}": each for colour, each in of_colours} or {name: value}
         return found
 
     @abstractmethod
@@ -195,6 +197,11 @@ class Solid(Medium):
         cosine = ((directions * gradients).sum(-1) / torch.where(varies, slope, 1.0)).abs()
         cosine = torch.where(varies, cosine, 1.0)
         return 2 * self.shell / STEPS_PER_SHELL / cosine.clamp(min=MIN_COSINE)
+
+
+def body_names(num_bodies: int) -> list[str]:
+    """Return the names of bodies to which the configuration gives none: `object` for one, numbers for several."""
+    return ["object"] if num_bodies == 1 else [str(body + 1) for body in range(num_bodies)]
 
 
 def _read_old_parameters(module: nn.Module, state: dict[str, Tensor], prefix: str, *_: object) -> None:

@@ -98,6 +98,7 @@ class SdfVessel(SdfGrid):
             learn_absorption,
             _of_bodies(abbe, 1, len(iors), 1.0, "abbe"),
         )
+        self.names = ["wall", *["air"] * (len(iors) - 2), "liquid"]
         self.meshes = []  # rays are refracted at the distance field, not at triangles
         upwards = _direction(up)
         check_margin(surface, box, resolution, 2)

@@ -125,11 +125,10 @@ class Renderer(nn.Module, ABC):
         """
         return progress
 
-    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Return all learned parameters by optimizer group. Models with further parameters add a group."""
-        groups = self.scene.parameter_groups()
-        groups["medium"] += self.path_sampler.parameters()
-        return {name: parameters for name, parameters in groups.items() if parameters}
+    def parameters_by_name(self) -> dict[str, nn.Parameter]:
+        """Return the parameters of the scene and of the model itself by name, see `Scene.parameters_by_name`."""
+        own = {name: value for name, value in self.named_parameters() if not name.startswith("scene.")}
+        return self.scene.parameters_by_name() | own
 
     def forward(self, rays: Rays, draws: Draws | None = None) -> list[Rendering]:
         """Trace rays and render their paths, one rendering for each sampling level."""

@@ -60,23 +60,26 @@ class Scene(nn.Module):
         on_device: torch.Tensor = self._on_device  # type: ignore[assignment]
         return on_device.device
 
+    def parameters_by_name(self) -> dict[str, nn.Parameter]:
+        """Return the parameters that gradient descent learns, by name.
+
+        The settings of the optimizer (`optimizer.groups`) and the log use these names. All values that depend on the
+        parameters are computed when they are needed, so changed parameters take effect at once.
+
+        Returns:
+            `fields.*` and `background.*` (weights by their attributes), `bodies.NAME.material.ior` and
+            `bodies.NAME.material.absorption` (before softplus), `medium.*` (parameters of media without bodies),
+            `cameras.exposure`, and further parameters of cameras.
+        """
+        parts = {"fields": self.fields, "background": self.boundary}
+        found = {f"{part}.{name}": own for part, module in parts.items() for name, own in module.named_parameters()}
+        return found | self.medium.parameters_by_name() | self.camera.parameters_by_name()
+
     def path_parameters(self) -> list[nn.Parameter]:
         """Return the parameters on which paths depend: of the cameras, and of the index and surfaces of the medium."""
-        return [*self.camera.bending_parameters(), *self.medium.bending_parameters()]
-
-    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Return all parameters by the name of their optimizer group."""
-        bending = self.medium.bending_parameters()
-        return {
-            "fields": list(self.fields.parameters()),
-            "boundary": list(self.boundary.parameters()),
-            "medium": bending,
-            "absorption": [own for own in self.medium.parameters() if all(own is not other for other in bending)],
-            "camera": self.camera.bending_parameters(),
-            "exposure": self.camera.brightness_parameters(),
-        }
+        found = self.medium.parameters_by_name() | self.camera.parameters_by_name()
+        return [own for name, own in found.items() if not name.endswith((".material.absorption", "cameras.exposure"))]
 
     def measurements(self) -> dict[str, float]:
-        """Return learned physical quantities, such as refractive indices, by their names in the log."""
-        found = {"medium": self.medium.learned(), "camera": self.camera.learned()}
-        return {f"{component}/{name}": value for component, values in found.items() for name, value in values.items()}
+        """Return learned physical quantities, such as refractive indices, by name, for the log."""
+        return self.medium.measurements() | self.camera.measurements()

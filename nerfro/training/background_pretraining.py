@@ -58,7 +58,7 @@ class BackgroundPretraining(Callback):
         # Gains learn, too, because a background that averages photographs of different exposures would slow them down.
         learning += [parameter for parameter in scene.camera.parameters() if parameter.requires_grad]
         optimizer = trainer.optimizers[0]
-        group = next(group for group in optimizer.param_groups if group["name"] == "boundary")
+        groups = [group for group in optimizer.param_groups if any(own is learning[0] for own in group["params"])]
         first, last = _RATES
         batches: RayBatches = trainer.datamodule.batches  # type: ignore[attr-defined]
         num_pixels = min(_NUM_PIXELS, int(_SHARE * batches.num_pixels))
@@ -71,7 +71,8 @@ class BackgroundPretraining(Callback):
             progress = max(step / self._num_steps, training_progress(trainer) / _TIME_SHARE)
             if len(rays) < _MIN_PIXELS or progress >= 1:
                 break
-            group["lr"] = group["initial_lr"] * first * (last / first) ** progress
+            for group in groups:
+                group["lr"] = group["initial_lr"] * first * (last / first) ** progress
             radiance = scene.boundary(Exits.unbent(rays))
             compared = scene.colour_space.prediction_and_target(radiance, rgb, scene.camera.gains(view))
             loss = torch.nn.functional.mse_loss(*compared)

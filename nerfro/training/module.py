@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
@@ -53,7 +53,8 @@ class TrainingModule(LightningModule):
     def of(cls, renderer: Renderer, config: DictConfig, callbacks: Sequence[Callback] = ()) -> TrainingModule:
         """Train a model with the losses and the optimizer of a run's configuration."""
         configuration = OmegaConf.to_yaml(config, resolve=True)
-        return cls(renderer, build_losses(config.loss), OptimizerConfig(**config.optimizer), callbacks, configuration)
+        optimizer = cast(OptimizerConfig, OmegaConf.to_object(config.optimizer))
+        return cls(renderer, build_losses(config.loss), optimizer, callbacks, configuration)
 
     @classmethod
     def load_from_checkpoint(  # type: ignore[override]
@@ -110,7 +111,7 @@ class TrainingModule(LightningModule):
         self.log("train/psnr", -10 * torch.log10(error))
         self.log("loss/total", total)
         for name, measurement in self.scene.measurements().items():
-            self.log(name, measurement)
+            self.log(f"scene/{name}", measurement)
         return {"loss": total, "squared_error": error}
 
     def log(self, *args: Any, **kwargs: Any) -> None:
@@ -124,16 +125,24 @@ class TrainingModule(LightningModule):
         progress = self.renderer.begin_step(training_progress(self.trainer))
         factor = learning_rate_factor(self.global_step, progress, self.optimizer_config)
         for group in self.trainer.optimizers[0].param_groups:
-            waits = self.global_step < self.optimizer_config.start(group["name"])
+            waits = self.global_step < self.optimizer_config.group(group["name"]).start
             group["lr"] = 0.0 if waits else group["initial_lr"] * factor
         # At the end of the previous step, the update would follow the checkpoint, and a resumed run would miss it.
         if self.global_step > 0:
             self.renderer.point_sampler.after_step(list(self.scene.fields), batch.draws)  # type: ignore[arg-type]
 
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """Return all learned parameters by optimizer group.
+
+        Raises:
+            NerfroError: a pattern of `optimizer.groups` matches no parameter.
+        """
+        return self.optimizer_config.grouped(self.renderer.parameters_by_name())
+
     def configure_optimizers(self) -> torch.optim.Optimizer:
         groups = []
-        for name, parameters in self.renderer.parameter_groups().items():
-            rate = self.optimizer_config.rate(name)
+        for name, parameters in self.parameter_groups().items():
+            rate = self.optimizer_config.group(name).learning_rate or self.optimizer_config.learning_rate
             groups.append({"params": parameters, "lr": rate, "initial_lr": rate, "name": name})
         # Lightning cannot clip the gradients of a fused optimizer under mixed precision.
         fused = self._trainer is None or not self._trainer.gradient_clip_val

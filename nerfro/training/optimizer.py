@@ -1,12 +1,32 @@
-"""Settings of Adam and the learning rate schedule."""
+"""Settings of Adam, groups of parameters by name, and the learning rate schedule."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from typing import Optional
 
+from torch import nn
+
 from nerfro.allowed import Natural, NotNegative, Positive, checked
+from nerfro.errors import NerfroError
+
+# Patterns of groups that a scene without these parameters ignores.
+OPTIONAL_GROUPS = ("background.*", "bodies.*.material.ior", "bodies.*.material.absorption", "cameras.exposure")
+# Name of the group of all parameters that no pattern matches.
+COMMON = "common"
+
+
+@checked("optimizer.groups")
+@dataclass
+class GroupConfig:
+    """Settings of all parameters whose names match a pattern."""
+
+    learning_rate: Optional[Positive] = None  # noqa: UP045 - initial learning rate; None for the common rate
+    start: Natural = 0  # step at which the parameters begin to learn
 
 
 @checked("optimizer")
@@ -16,28 +36,39 @@ class OptimizerConfig:
 
     learning_rate: Positive = 5e-4  # initial learning rate
     final_learning_rate: Positive = 5e-6  # learning rate at the end of the run
-    # Initial learning rate of the background, with the same decay; None for the common rate.
-    boundary_learning_rate: Optional[Positive] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
-    medium_learning_rate: Optional[Positive] = None  # noqa: UP045 - of refractive indices; None for the common rate
-    # Initial learning rate of absorption coefficients; None for the common rate.
-    absorption_learning_rate: Optional[Positive] = None  # noqa: UP045
-    exposure_learning_rate: Optional[Positive] = None  # noqa: UP045 - of exposures; None for the common rate
-    medium_start: Natural = 0  # step at which refractive indices begin to learn, after the scene is roughly known
+    # Learning rate and start of parameters by the pattern of their names (`Scene.parameters_by_name`), in which an
+    # asterisk stands for any text: {bodies.*.material.ior: {learning_rate: 1e-3, start: 100}}. The rates have the same
+    # decay. Of several matching patterns the last one decides.
+    groups: dict[str, GroupConfig] = dataclasses.field(default_factory=dict)
     boundary_steps: Natural = 0  # steps that pretrain the background with rays that miss the content's box
-    # Step at which the background resumes learning, from all rays; earlier, it would learn the colours of the content.
-    boundary_start: Natural = 0
     warmup_steps: Natural = 2500  # length of the warm-up; 0 for none
     warmup_factor: NotNegative = 0.01  # factor of the learning rate at its first step
     adam_epsilon: Positive = 1e-8  # epsilon of Adam
 
-    def rate(self, group: str) -> float:
-        """Return the initial learning rate of a parameter group."""
-        own: float | None = getattr(self, f"{group}_learning_rate", None)
-        return self.learning_rate if own is None else own
+    def group(self, name: str) -> GroupConfig:
+        """Return the settings of a group of `grouped`."""
+        return self.groups.get(name, GroupConfig())
 
-    def start(self, group: str) -> int:
-        """Return the step at which a parameter group begins to learn."""
-        return getattr(self, f"{group}_start", 0)
+    def grouped(self, parameters: Mapping[str, nn.Parameter]) -> dict[str, list[nn.Parameter]]:
+        """Group parameters by the last pattern that matches their names; the others are in the group `COMMON`.
+
+        Args:
+            parameters: parameters by name.
+
+        Raises:
+            NerfroError: a pattern matches no parameter.
+        """
+        for pattern in self.groups:
+            if pattern not in OPTIONAL_GROUPS and not any(fnmatchcase(name, pattern) for name in parameters):
+                raise NerfroError(
+                    f"optimizer.groups: {pattern} matches no learned parameter; choose from {', '.join(parameters)}, "
+                    "with * for any text"
+                )
+        groups: dict[str, list[nn.Parameter]] = {}
+        for name, parameter in parameters.items():
+            matching = (pattern for pattern in reversed(self.groups) if fnmatchcase(name, pattern))
+            groups.setdefault(next(matching, COMMON), []).append(parameter)
+        return groups
 
 
 def learning_rate_factor(step: int, progress: float, config: OptimizerConfig) -> float:

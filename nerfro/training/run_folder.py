@@ -16,7 +16,7 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
-from torch import Tensor
+from torch import Tensor, nn
 
 from nerfro.errors import Interrupted, NerfroError, first_of
 from nerfro.files.atomic import require_room, write_atomically
@@ -182,10 +182,9 @@ def require_finite(weights: Mapping[str, Any], path: Path) -> None:
             raise NerfroError(f"{path} holds infinite numbers or NaN in {name}; train the run again, with another seed")
 
 
-def require_optimizer_fits(checkpoint: Mapping[str, Any], renderer: Renderer, path: Path) -> None:
+def require_optimizer_fits(checkpoint: Mapping[str, Any], groups: Mapping[str, list[nn.Parameter]], path: Path) -> None:
     """Refuse an optimizer state that is not of Adam, or has moments of wrong shape or infinite values."""
-    groups = renderer.parameter_groups().values()
-    shapes = [parameter.shape for parameters in groups for parameter in parameters]
+    shapes = [parameter.shape for parameters in groups.values() for parameter in parameters]
     defaults = torch.optim.Adam([torch.empty(0)]).defaults
     try:
         (optimizer,) = checkpoint["optimizer_states"]
@@ -222,13 +221,22 @@ def restore(checkpoint: dict, config: DictConfig) -> Renderer:
     return renderer.eval()
 
 
-def require_same_run(folder: Path, checkpoint: Path | None, config: DictConfig, renderer: Renderer) -> None:
-    """Refuse to resume from an unsuitable checkpoint, or in the folder of another run."""
+def require_same_run(
+    folder: Path, checkpoint: Path | None, config: DictConfig, groups: Mapping[str, list[nn.Parameter]]
+) -> None:
+    """Refuse to resume from an unsuitable checkpoint, or in the folder of another run.
+
+    Args:
+        folder: folder of the run.
+        checkpoint: checkpoint to resume from, if there is one.
+        config: configuration of the run.
+        groups: parameters by optimizer group.
+    """
     begun = folder / CONFIG_FILE
     if checkpoint is not None:
         content, trained = load_checkpoint(checkpoint)
         require_same_configuration(checkpoint, trained, config)
-        require_optimizer_fits(content, renderer, checkpoint)
+        require_optimizer_fits(content, groups, checkpoint)
     elif config.ckpt_path is not None:
         require_same_configuration(begun, read_foreign_config(begun), config)
 

@@ -7,7 +7,7 @@ from enum import IntEnum
 
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from nerfro.draws import Draws
 from nerfro.errors import NerfroError
@@ -129,10 +129,6 @@ class EikonalFields(Renderer):
             )
         if self._blurred is None or level != self._level:
             self._level, self._blurred = level, self._sharp.blurred(self.blur / 2**level)
-
-    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        # Parameters outside of a stage get no gradient, which Adam skips.
-        return {**super().parameter_groups(), "interior": list(self.interior.parameters())}
 
     def trace(self, rays: Rays, path: Path | None = None) -> Path:
         """Trace rays according to the current stage, because the medium changes during training."""

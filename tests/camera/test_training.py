@@ -36,7 +36,7 @@ SMALL = [
 
 
 # A scene of a few steps has slopes for cameras to go by.
-LEARNED_SKY = ["optimizer.boundary_start=0", "optimizer.boundary_learning_rate=0.1", "optimizer.warmup_steps=0"]
+LEARNED_SKY = ["optimizer.groups={background.*: {learning_rate: 0.1, start: 0}}", "optimizer.warmup_steps=0"]
 
 
 def poses_in(file: Path) -> torch.Tensor:
@@ -85,7 +85,7 @@ def test_the_gains_of_disturbed_exposures_come_back(train_here: Callable[..., An
     images = to_srgb(to_linear(views.images) * logarithm.exp()[:, None, None])
     save(replace(views, images=images), tmp_path / "ball")
     options = ["camera.exposure=true", *SMALL, "trainer.max_steps=150", f"data.root={tmp_path / 'ball'}"]
-    options += ["optimizer.exposure_learning_rate=0.03"]
+    options += ["optimizer.groups={cameras.exposure: {learning_rate: 0.03}}"]
     done = train_here(*options, f"hydra.run.dir={tmp_path / 'run'}")
     assert done.code == 0, done.err
     frames = json.loads((tmp_path / "run" / "cameras.json").read_text("utf-8"))["frames"]

@@ -59,15 +59,15 @@ def test_a_reflection_past_the_ball_is_not_tinted() -> None:
 def test_absorption_learns_without_tracing_again() -> None:
     model = RefractiveModel(replace(example_components(), medium=Ball(learn_absorption=True), path_sampler=Snell()))
     assert not model.paths_learn, "paths may be traced ahead"
-    parameters = model.parameter_groups()["absorption"]
-    assert [tuple(parameter.shape) for parameter in parameters] == [(3,)]
+    absorption = "bodies.object.material.absorption"
+    parameter = model.parameters_by_name()[absorption]
     with torch.no_grad():
         path = model.trace(example_rays())
     renderings = model.render_path(model.trace(example_rays(), path))
-    (gradient,) = torch.autograd.grad(renderings[-1].rgb.sum(), parameters)
+    (gradient,) = torch.autograd.grad(renderings[-1].rgb.sum(), parameter)
     assert (gradient != 0).all()
-    assert set(model.scene.medium.learned()) == {f"absorption_1_{colour}" for colour in ("red", "green", "blue")}
-    assert max(model.scene.medium.learned().values()) == pytest.approx(0.02)
+    names = [f"{absorption}.{colour}" for colour in ("red", "green", "blue")]
+    assert model.scene.measurements() == dict.fromkeys(names, pytest.approx(0.02))
 
 
 def test_absorption_is_given_for_all_bodies_or_for_each() -> None:

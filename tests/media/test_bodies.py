@@ -126,13 +126,13 @@ def test_the_index_of_one_body_and_the_absorption_of_the_other_are_learned_toget
         glass={"mesh": files[0], "ior": 1.45, "learn": ["ior"]},
         tinted={"mesh": files[1], "ior": 1.33, "absorption": [0.2, 0.2, 0.2], "learn": ["absorption"]},
     )
-    assert {name for name, _ in medium.named_parameters()} == {"materials.0.ior", "materials.1._absorption"}
-    assert [parameter.shape for parameter in medium.bending_parameters()] == [()]
+    ior, absorption = "bodies.glass.material.ior", "bodies.tinted.material.absorption"
+    parameters = medium.parameters_by_name()
+    assert list(parameters) == [ior, absorption]
     clear, tinted = (_rays_at(centre, 100) for centre in CENTRES)
     expected = _through(clear, CENTRES[0], 1.5)
     sigma = torch.tensor([0.5, 0.1, 0.3], dtype=torch.float64)
-    rates = {"materials.0.ior": 0.02, "materials.1._absorption": 0.1}
-    groups = [{"params": [values], "lr": rates[name]} for name, values in medium.named_parameters()]
+    groups = [{"params": [parameters[name]], "lr": rate} for name, rate in ((ior, 0.02), (absorption, 0.1))]
     sampler, optimizer = Snell(), torch.optim.Adam(groups)
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.96)
 
@@ -149,9 +149,9 @@ def test_the_index_of_one_body_and_the_absorption_of_the_other_are_learned_toget
         loss.backward()
         optimizer.step()
         schedule.step()
-    learned = medium.learned()
-    assert learned["ior_glass"] == pytest.approx(1.5, abs=2e-3)
-    colours = [learned[f"absorption_tinted_{colour}"] for colour in ("red", "green", "blue")]
+    learned = medium.measurements()
+    assert learned[ior] == pytest.approx(1.5, abs=2e-3)
+    colours = [learned[f"{absorption}.{colour}"] for colour in ("red", "green", "blue")]
     assert colours == pytest.approx(sigma.tolist(), abs=5e-3)
 
 

@@ -18,7 +18,7 @@ from nerfro.samplers.hierarchical import Hierarchical
 from nerfro.samplers.stratified import Stratified
 from nerfro.testing import example_rays
 from nerfro.training.module import TrainingModule
-from nerfro.training.optimizer import OptimizerConfig
+from nerfro.training.optimizer import GroupConfig, OptimizerConfig
 from nerfro.types import Exits
 from tests.closed_forms import Luneburg
 
@@ -85,7 +85,7 @@ def test_chunks_bound_how_many_rays_are_rendered_at_once(parts: Components, monk
 
 def test_optimizer_gives_the_boundary_its_own_rate(parts: Components) -> None:
     model = RefractiveModel(parts)
-    optimizer = OptimizerConfig(learning_rate=1e-3, boundary_learning_rate=1e-2)
+    optimizer = OptimizerConfig(learning_rate=1e-3, groups={"background.*": GroupConfig(learning_rate=1e-2)})
     groups = TrainingModule(model, {}, optimizer).configure_optimizers().param_groups
     rates = {id(p): group["initial_lr"] for group in groups for p in group["params"]}
     assert {rates[id(p)] for p in model.scene.fields.parameters()} == {1e-3}

@@ -130,7 +130,7 @@ def test_absorption_is_that_of_the_path_and_is_learned_from_a_picture(what: str)
 
     assert agreement(picture(given, BRANCHES(rays_of_picture(), given)), expected) > 35
     few = BRANCHES(rays_of_picture(8), given)
-    assert max(learner.learned().values()) < 0.03
+    assert max(learner.measurements().values()) < 0.03
     optimizer = torch.optim.Adam(learner.parameters(), lr=0.15)
     for _ in range(160):
         loss = (to_srgb(picture(learner, few)) - to_srgb(expected)).square().mean()
@@ -138,7 +138,7 @@ def test_absorption_is_that_of_the_path_and_is_learned_from_a_picture(what: str)
         loss.backward()
         optimizer.step()
     torch.testing.assert_close(
-        torch.tensor(list(learner.learned().values())), torch.tensor(COLOURED), rtol=0.05, atol=0
+        torch.tensor(list(learner.measurements().values())), torch.tensor(COLOURED), rtol=0.05, atol=0
     )
 
 

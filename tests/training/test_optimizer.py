@@ -7,12 +7,13 @@ from typing import Any
 from unittest.mock import Mock
 
 import pytest
+import torch
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Timer
 
 from nerfro.errors import NerfroError
 from nerfro.training.module import training_progress
-from nerfro.training.optimizer import OptimizerConfig, learning_rate_factor
+from nerfro.training.optimizer import GroupConfig, OptimizerConfig, learning_rate_factor
 
 PAPER = OptimizerConfig(learning_rate=5e-4, final_learning_rate=5e-6, warmup_steps=2500, warmup_factor=0.01)
 
@@ -73,9 +74,20 @@ def test_progress_is_the_spent_share_of_the_budget(
     assert training_progress(run(step, max_steps, timer)) == pytest.approx(progress)
 
 
-def test_boundary_has_the_fields_rate_unless_given_its_own() -> None:
-    assert OptimizerConfig(learning_rate=3e-4).rate("boundary") == 3e-4
-    assert OptimizerConfig(learning_rate=3e-4, boundary_learning_rate=1e-5).rate("boundary") == 1e-5
+def test_the_last_matching_pattern_decides_and_a_misspelt_one_is_refused() -> None:
+    names = ["fields.0.table", "background.texels", "bodies.glass.material.ior", "bodies.water.material.ior"]
+    parameters = {name: torch.nn.Parameter(torch.tensor(float(i))) for i, name in enumerate(names)}
+
+    def grouped(*patterns: str) -> dict[str, list[str]]:
+        groups = OptimizerConfig(groups={pattern: GroupConfig() for pattern in patterns}).grouped(parameters)
+        return {group: [names[int(parameter)] for parameter in own] for group, own in groups.items()}
+
+    index, water = "bodies.*.material.ior", "bodies.water.*"
+    assert grouped(index, water) == {"common": names[:2], index: [names[2]], water: [names[3]]}
+    assert grouped(water, index) == {"common": names[:2], index: names[2:]}
+    assert grouped("bodies.*.material.absorption") == {"common": names}, "a group of an experiment may be absent"
+    with pytest.raises(NerfroError, match=r"bodies\.glas\.\* matches no .*choose from .*bodies\.glass\.material\.ior"):
+        grouped("bodies.glas.*")
 
 
 @pytest.mark.parametrize("wrong", [{"learning_rate": 0.0}, {"final_learning_rate": -1.0}, {"warmup_steps": -1}])
