@@ -21,9 +21,10 @@ from nerfro.paths import resolve_path, user_path
 from nerfro.pipeline.options import ReconstructConfig, have_poses
 from nerfro.pipeline.stages import terminated_in_one_line
 from nerfro.pipeline.steps import calibrate, preprocess, report, segment, train
+from nerfro.rendering.scene_file import with_scene
 
 
-@entry_point("reconstruct", ReconstructConfig, verbatim=("calibrate", "mask", "preprocess", "train"))
+@entry_point("reconstruct", ReconstructConfig, expand=with_scene, verbatim=("calibrate", "mask", "preprocess", "train"))
 def main(config: DictConfig) -> None:
     """Run all stages that are not done."""
     overrides = list(HydraConfig.get().overrides.task)

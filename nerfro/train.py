@@ -3,7 +3,6 @@
 Examples:
     nerfro train trainer.max_time=2m hydra.run.dir=outputs/first
     nerfro train experiment=glass data.root=data/glass medium.mesh=data/glass/mesh.ply medium.ior=1.5
-    nerfro train experiment=glass scene=data/glass/scene.json
 """
 
 from __future__ import annotations
