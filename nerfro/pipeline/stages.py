@@ -87,7 +87,7 @@ class Stage:
 
 @contextlib.contextmanager
 def terminated_in_one_line() -> Iterator[None]:
-    """End this program on SIGTERM as on Ctrl-C. A second signal ends the program at once."""
+    """End this program on SIGTERM in the same way as on Ctrl-C. A second SIGTERM ends the program immediately."""
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)

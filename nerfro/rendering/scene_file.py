@@ -1,4 +1,4 @@
-"""The scene file `scene.json`: data set, bodies, surroundings and their origin, for the commands that follow."""
+"""The scene file `scene.json`: data set, bodies and surroundings of a capture, with their provenance."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ class Provenance:
     """Origin of a scene file.
 
     Attributes:
-        command: command that wrote the file.
+        command: command line of the writer.
         versions: versions of packages.
         standard_error: standard error of the estimated index of each body; empty if the indices were given.
-        doubts: reasons why the photographs do not determine the indices; empty if they do.
+        doubts: reasons for doubt about the indices; empty for reliable indices.
     """
 
     command: str = ""
@@ -56,7 +56,7 @@ class SceneFile:
         data: `type` of the data set (an option of the group `data`), and its settings, such as `root`.
         medium: `type` of the medium (an option of the group `medium`), and its settings except those of bodies.
         bodies: bodies by name, the outer one first.
-        vessel: settings of the medium with `medium=vessel`, which replace those above; empty without a fitted vessel.
+        vessel: settings of a fitted vessel, which `medium=vessel` selects instead of the index of the bodies.
         surroundings: distance of the surroundings; None if unknown.
         photograph: width and height of the photographs in pixels; empty if unknown.
         provenance: origin of the file.
@@ -72,7 +72,7 @@ class SceneFile:
 
     @property
     def short(self) -> dict[str, object] | None:
-        """Settings of the medium for bodies that have only a mesh and an index; None for other bodies."""
+        """Settings of the medium if every body has only mesh and index; None for other bodies."""
         plain = [BodySettings(mesh=body.mesh, ior=body.ior) for body in self.bodies.values()]
         if plain != list(self.bodies.values()) or any(body.ior is None for body in plain[1:]):
             return None
@@ -113,20 +113,17 @@ class SceneFile:
         write_atomically(path, re.sub(r"\[[^][{}\"]*\]", lambda numbers: re.sub(r"\s+", " ", numbers[0]), text) + "\n")
 
     def _with_paths(self, convert: Callable[[str], Path]) -> SceneFile:
-        """Return a copy with other places of the data set and of meshes; embedded data stays."""
+        """Return a copy with other places of data set and meshes; embedded data stays."""
 
-        def place(given: str) -> str:
-            return given if given.startswith(EMBEDDED_PREFIX) else convert(given).as_posix()
+        def place(given: str | None) -> str | None:
+            return given if given is None or given.startswith(EMBEDDED_PREFIX) else convert(given).as_posix()
 
-        bodies = {
-            name: replace(body, mesh=None if body.mesh is None else place(body.mesh))
-            for name, body in self.bodies.items()
-        }
+        bodies = {name: replace(body, mesh=place(body.mesh)) for name, body in self.bodies.items()}
         return replace(self, data=self.data | {"root": place(str(self.data["root"]))}, bodies=bodies)
 
 
 def described(node: DictConfig, type_name: str) -> dict[str, Any]:
-    """Describe a component: its type, and the settings that differ from the defaults of its class."""
+    """Describe a component by its type and the settings with other values than the defaults of the class."""
     defaults = {name: default for name, _, default in plugin_of(node).fields()}
     values = cast(dict[str, Any], OmegaConf.to_container(node, resolve=True))
     del values["_target_"]
@@ -178,7 +175,7 @@ def read_scene_file(path: Path) -> SceneFile:
 
 
 def _of_options(document: Mapping[str, Any], path: Path) -> SceneFile:
-    """Read a `preprocess.json`, which holds command-line options; its paths are relative to the current directory."""
+    """Read command-line options from a `preprocess.json`; paths are relative to the current directory."""
     try:
         values, doubtful, vessel = (_parsed(document.get(name, [])) for name in ("options", "doubtful", "vessel"))
         data = {"type": "blender", "root": "embedded:torus"} | _node(values, "data")
@@ -191,8 +188,8 @@ def _of_options(document: Mapping[str, Any], path: Path) -> SceneFile:
             take_bodies(medium),
             {name: value for name, value in vessel.items() if (name, value) not in medium.items()},
             None if near is None else "near" if near else "far",
-            document["pixels"],
-            Provenance(doubts=["nerfro.preprocess has reported the reason"] if doubtful else []),
+            photograph=document["pixels"],
+            provenance=Provenance(doubts=["nerfro.preprocess has reported the reason"] if doubtful else []),
         )
     except (HydraException, KeyError, TypeError, ValueError) as error:
         raise NerfroError(f"{path} is not a result of nerfro.preprocess; {_ADVICE}") from error
@@ -217,7 +214,7 @@ def with_scene(arguments: Sequence[str], names: Collection[str]) -> list[str]:
 
     Args:
         arguments: command-line overrides.
-        names: settings of the command; only those of the groups `data` and `medium` are taken from the file.
+        names: names of the settings of the command; other settings in the file have no effect.
 
     Raises:
         NerfroError: several scene files are given, or the file cannot be used.
@@ -239,5 +236,5 @@ def with_scene(arguments: Sequence[str], names: Collection[str]) -> list[str]:
 
 
 def _given(body: BodySettings | Provenance) -> dict[str, object]:
-    """Return the settings of a body that differ from the defaults, for JSON."""
+    """Return the settings with other values than the defaults, for JSON."""
     return {name: value for name, value in dataclasses.asdict(body).items() if value not in (None, [], {}, 0, "")}
