@@ -49,7 +49,7 @@ def main() -> None:
         quantity, ours = measured[name]
         reported = between(low, high, ".0f" if low > 100 else ".1f")
         ratio = between(ours / high, ours / low, ".2f" if ours < 10 * low else ".0f")
-        print(f"| {quantity} | {ours:,.1f} | {program} | {reported} | {ratio} |")
+        print(f"| {quantity} | {ours:,.{0 if ours > 100 else 1}f} | {program} | {reported} | {ratio} |")
 
 
 def between(low: float, high: float, form: str) -> str:
