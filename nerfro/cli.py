@@ -299,7 +299,8 @@ def answer(described: Described, arguments: list[str]) -> None:
     unknown = any(argument.startswith(("--config", "-c", "hydra.searchpath")) for argument in arguments)
     if not unknown:  # other folders of configurations may have other groups
         current = [text for text in arguments if not any(f"{text.lstrip('+~')}.".startswith(old) for old in RENAMED)]
-        current = [text for text in current if not is_scene_file(text)]
+        if {"data", "medium"} & {*described.names[""]}:
+            current = [text for text in current if not is_scene_file(text)]
         described.require_known([_full_key(text) for text in current])
 
 

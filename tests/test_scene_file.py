@@ -62,6 +62,7 @@ def test_the_command_line_has_precedence(tmp_path: Path, capsys: pytest.CaptureF
     as_vessel = {"medium": "vessel", "medium.wall": 0.1, "medium.ior": 1.52}
     assert settings(f"scene={file}", "medium=vessel") == expected | as_vessel
     assert with_scene(["seed=1"], NODES) == ["seed=1"]
+    assert with_scene(["--cfg", "job", "seed=1", f"scene={file}"], ["data"])[:3] == ["--cfg", "job", "data=opencv"]
     assert not [text for text in with_scene([f"scene={file}"], ["medium"]) if text.startswith("data")]
     assert capsys.readouterr().out == ""
     write(file, **content, provenance={"doubts": ["the minimum is shallow"]})

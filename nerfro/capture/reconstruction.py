@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
+import signal
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -304,8 +305,10 @@ def _intrinsics(lens: Lens) -> Intrinsics:
 
 def require_pycolmap() -> Any:
     """Import pycolmap, or raise an error with the command that installs pycolmap."""
+    handler = signal.getsignal(signal.SIGTERM)
     try:
         import pycolmap
     except ImportError as error:
         raise NerfroError(f"target=colmap needs pycolmap ({error}); pip install 'nerfro[capture]'") from error
+    signal.signal(signal.SIGTERM, handler)  # the import replaces the handler by one for crashes
     return pycolmap

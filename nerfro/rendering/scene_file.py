@@ -232,7 +232,9 @@ def with_scene(arguments: Sequence[str], names: Collection[str]) -> list[str]:
     if scene.provenance.doubts and "medium" in names and not is_given("medium.ior", others):
         warn(f"{path}: the photographs do not determine the index ({scene.provenance.doubts[0]}); set medium.ior=")
     kept = {name: value for name, value in settings.items() if name.partition(".")[0] in names and name not in chosen}
-    return [*as_overrides(kept), *others]
+    # After the flags of Hydra, and before all other overrides.
+    start = next((i for i, text in enumerate(others) if "=" in text and not text.startswith("-")), len(others))
+    return [*others[:start], *as_overrides(kept), *others[start:]]
 
 
 def _given(body: BodySettings | Provenance) -> dict[str, object]:

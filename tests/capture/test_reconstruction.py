@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -177,3 +179,9 @@ def test_a_sequence_is_matched_with_its_neighbours_and_ever_fewer_beyond() -> No
     assert len(pairs) == len(set(pairs)) == sum(40 - stride for stride in (*range(1, 11), 16, 32))
     assert {abs(i - j) for i, j in pairs} == {*range(1, 11), 16, 32}
     assert sequential_pairs([2, 0, 1]) == [(2, 0), (0, 1), (2, 1)]
+
+
+def test_pycolmap_leaves_sigterm_alone() -> None:
+    program = "import signal; signal.signal(15, lambda *_: exit(130)); "
+    program += "from nerfro.capture.reconstruction import require_pycolmap; require_pycolmap(); signal.raise_signal(15)"
+    assert subprocess.run([sys.executable, "-c", program], stderr=subprocess.DEVNULL).returncode == 130
