@@ -70,7 +70,7 @@ def _calibrate(config: DictConfig, out: Path) -> None:
     _report(calibration, "points" if board is None else "tags", may_distort, out)
     splits = split_views([image.name for image in images if image.name in calibration.poses], config.test_every)
     reach = ray_range(calibration, seen)
-    written = write_calibrated(out, images, size, calibration, splits, config.target, quads, points, reach)
+    written = write_calibrated(out, images, size, calibration, splits, config.target, (quads, points), reach)
     print(f"wrote {', '.join(written)}")
     options = ["data=opencv", f"data.root={out}"]
     if any(masks):

@@ -192,19 +192,8 @@ def entry_point(
                     sys.argv[1:] = expand(sys.argv[1:], [field.name for field in dataclasses.fields(schema)])
                 if config_name == "train":
                     sys.argv[1:] = map(_added, sys.argv[1:])
-                try:
+                with _run_folder():
                     hydra.main(version_base="1.3", config_path=str(config_dir), config_name=config_name)(job)()
-                except OSError as error:  # raised by Hydra, which creates the run folder
-                    if isinstance(error, (HydraException, BrokenPipeError)):
-                        raise
-                    reason = f"{error.filename or 'the folder'} cannot be used: {error.strerror}"
-                    raise NerfroError(f"{reason}; choose another hydra.run.dir, or hydra.sweep.dir") from error
-                except ValueError as error:
-                    if "null byte" not in str(error):
-                        raise
-                    raise NerfroError(
-                        "the name of a folder contains a null byte; choose another hydra.run.dir"
-                    ) from error
             if failures:
                 raise failures[0]
 
@@ -237,6 +226,22 @@ def call(command: str, arguments: list[str]) -> None:
         _STAGES[command]()
     finally:
         sys.argv, main.__spec__, composed.hydra = program, spec, outer
+
+
+@contextlib.contextmanager
+def _run_folder() -> Iterator[None]:
+    """Convert errors of Hydra, which creates the run folder, to one line."""
+    try:
+        yield
+    except OSError as error:
+        if isinstance(error, (HydraException, BrokenPipeError)):
+            raise
+        reason = f"{error.filename or 'the folder'} cannot be used: {error.strerror}"
+        raise NerfroError(f"{reason}; choose another hydra.run.dir, or hydra.sweep.dir") from error
+    except ValueError as error:
+        if "null byte" not in str(error):
+            raise
+        raise NerfroError("the name of a folder contains a null byte; choose another hydra.run.dir") from error
 
 
 @contextlib.contextmanager

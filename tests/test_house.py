@@ -80,3 +80,71 @@ def test_only_training_imports_lightning() -> None:
 def test_commands_compose_call_and_print(module: str) -> None:
     assert count_code_lines(FILES[module].read_text(encoding="utf-8")) < 90
     assert {other for other in IMPORTS[module] if room(other) == "commands"} == set(), "commands share what lies below"
+
+
+FUNCTIONS = [
+    (module, node)
+    for module, file in FILES.items()
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+    if isinstance(node, ast.FunctionDef)
+]
+MAX_LINES, MAX_ARGUMENTS = 60, 8
+# Objects of other libraries and nodes of configurations, which have no methods of ours.
+FOREIGN = {
+    "bar", "config", "content", "ctx", "hydra_config", "job", "log_gain", "logger", "loss", "node", "numba", "options",
+    "pairing", "parameter", "parent", "parser", "pycolmap", "reader", "sampled", "session", "spec", "sys", "tensor",
+    "trained", "trainer", "hydra", "_RenamingFiles",
+}  # fmt: skip
+
+
+def num_arguments(names: list[str]) -> int:
+    """Number of arguments of a compiled function; three coordinates in a row count as one."""
+    text = " ".join(names)
+    vectors = re.sub(r"\b(\w*)[xi0] \1[yj1] \1[zk2]\b", "vector", text)
+    return len(vectors.split())
+
+
+def test_functions_fit_on_a_screen() -> None:
+    """Without signature and docstring."""
+    lines = {f"{module}.{node.name}": node.end_lineno - node.body[0].end_lineno for module, node in FUNCTIONS}
+    assert {name: count for name, count in lines.items() if count > MAX_LINES} == {}
+
+
+def test_compiled_functions_have_few_arguments() -> None:
+    compiled = [
+        (f"{module}.{node.name}", num_arguments([argument.arg for argument in node.args.args]))
+        for module, node in FUNCTIONS
+        if any(ast.unparse(mark).startswith(("compiled", "inlined")) for mark in node.decorator_list)
+    ]
+    assert len(compiled) > 50
+    assert {name: count for name, count in compiled if count > MAX_ARGUMENTS} == {}
+
+
+def written(tree: ast.AST) -> Iterator[ast.Attribute]:
+    """Attributes that are assigned to."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store):
+            yield node
+
+
+@pytest.mark.parametrize("module", sorted(FILES))
+def test_only_its_class_writes_an_attribute(module: str) -> None:
+    """A class also writes attributes of copies, and of objects that it makes without their constructor."""
+    tree = ast.parse(FILES[module].read_text(encoding="utf-8"))
+    own = {
+        (made.targets[0].id, attribute)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ClassDef)
+        for made in ast.walk(node)
+        if isinstance(made, ast.Assign) and isinstance(made.targets[0], ast.Name)
+        and re.match(r"copy\.copy\(self\)|\w+\.__new__\(\w+\)", ast.unparse(made.value))
+        for attribute in written(node)
+    }  # fmt: skip
+    outside = [
+        ast.unparse(attribute)
+        for attribute in written(tree)
+        if not (isinstance(attribute.value, ast.Name) and attribute.value.id in ("self", "cls"))
+        and (getattr(attribute.value, "id", None), attribute) not in own
+        and not FOREIGN & set(ast.unparse(attribute).split("."))
+    ]
+    assert outside == []

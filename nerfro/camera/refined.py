@@ -180,7 +180,7 @@ class RefinedCamera(Camera):
 
     def move(self, motion: Float[Tensor, "V 6"], lens: Float[Tensor, "L"]) -> None:
         """Add to the parameters of cameras and lens, in pixels."""
-        self.motions.motion += motion
+        self.motions.motion.add_(motion)
         if self.lens is not None:
             self.lens += lens
 

@@ -36,8 +36,7 @@ def write_calibrated(
     calibration: Calibration,
     splits: dict[str, list[str]],
     target: str,
-    quads: list[Float[np.ndarray, "4 3"]],
-    points: Float[np.ndarray, "P 3"],
+    shown: tuple[list[Float[np.ndarray, "4 3"]], Float[np.ndarray, "P 3"]],
     bounds: dict[str, float],
 ) -> list[str]:
     """Write the data set (see docs/guides/data_formats.md), calibration.json and cameras.png.
@@ -49,8 +48,7 @@ def write_calibrated(
         calibration: estimated lens and poses.
         splits: image names by split.
         target: name of the calibration target.
-        quads: corners of the sheets of the board, for the plot.
-        points: scene points, for the plot.
+        shown: corners of the sheets of the board and scene points, for the plot.
         bounds: bounds `near` and `far` of the rays; empty if unknown.
 
     Returns:
@@ -88,7 +86,7 @@ def write_calibrated(
     write_atomically(out / REPORT, json.dumps(report, indent=1) + "\n")
     poses = list(calibration.poses.values())
     matrices, errors = np.stack([pose.camera_to_world for pose in poses]), [pose.error for pose in poses]
-    write_atomically(out / PLOT, _plot_cameras(matrices, np.nan_to_num(errors), quads, points))
+    write_atomically(out / PLOT, _plot_cameras(matrices, np.nan_to_num(errors), *shown))
     return [*written, str(out / REPORT), str(out / PLOT)]
 
 

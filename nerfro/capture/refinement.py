@@ -143,7 +143,7 @@ def refine_surface(
     """
     descent = _Descent(mesh, medium, silhouettes, through, surroundings, learn_index, settings)
     error = descent.validation_error(medium)
-    descent.start, smoothed = descent.smoothed(medium, error)
+    smoothed = descent.smooth_start(error)
     steps, errors, best = [0, 0], [error, smoothed], descent.values()
     done, total = 0, sum(stage.steps for stage in settings.stages)
     for number, stage in enumerate(settings.stages):
@@ -318,6 +318,11 @@ class _Descent:
         square = ((current - given) / self.contour_deviation).square()
         contours = (square / (1 + square)).mean()
         return photometric + _CONTOUR_WEIGHT * contours + _ROUGHNESS_WEIGHT * self.offsets.roughness()
+
+    def smooth_start(self, error: float) -> float:
+        """Smooth the initial surface, whose validation error is given, and return its new error; see `smoothed`."""
+        self.start, error = self.smoothed(self.start, error)
+        return error
 
     @torch.no_grad()
     def smoothed(self, medium: SdfGrid, error: float) -> tuple[SdfGrid, float]:

@@ -257,18 +257,22 @@ class Room(Boundary):
             low, high, radius, finest_resolution=512, log2_table_size=17, direction_bands=1, initial_depth=3.0
         )
         self.sampler = DensityGridSampler(box_min=low, box_max=high, radius=radius, update_fraction=0.25, decay=0.6)
-        self.draws: Draws | None = None  # random numbers of the current training step
 
-    def forward(self, exits: Exits) -> Float[Tensor, "P 3"]:
-        return self.seen(exits)[0]
+    def forward(self, exits: Exits, draws: Draws | None = None) -> Float[Tensor, "P 3"]:
+        return self.seen(exits, draws)[0]
 
-    def seen(self, exits: Exits) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P"]]:
-        """Render radiance and its distance along exit rays. Transmitted light has the colour of the farthest sample."""
+    def seen(self, exits: Exits, draws: Draws | None = None) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P"]]:
+        """Render radiance and its distance along exit rays. Transmitted light has the colour of the farthest sample.
+
+        Args:
+            exits: the rays.
+            draws: random numbers of a training step; None for evenly spaced samples.
+        """
         assert exits.positions is not None
         ones = torch.ones_like(exits.positions[:, 0])
         rays = Rays(exits.positions, exits.directions, exits.radii * ones, 0 * ones, ones)
         path = straight_path(rays)
-        samples = self.sampler(path, None, self.draws)
+        samples = self.sampler(path, None, draws)
         radiance = self.field(samples)
         rendered = composite(samples, radiance, radiance.rgb[:, -1], path)
         return rendered.rgb, rendered.depth
@@ -281,11 +285,11 @@ def _learn(boundary: Boundary, pixels: Pixels, steps: int, batch: int, progress:
     optimizer = torch.optim.Adam(boundary.parameters(), first, eps=1e-15)
     with torch.enable_grad():
         for step in range(steps):
-            if isinstance(boundary, Room):
-                boundary.draws = Draws(0, step, torch.arange(batch))
             optimizer.param_groups[0]["lr"] = first * (last / first) ** (step / steps)
             drawn = pixels[torch.randint(len(pixels), (batch,), generator=generator)]
-            predicted = boundary(Exits.unbent(drawn.rays))
+            exits = Exits.unbent(drawn.rays)
+            draws = (Draws(0, step, torch.arange(batch)),) if isinstance(boundary, Room) else ()
+            predicted = boundary(exits, *draws)
             # A photograph clips radiance at 1, so brighter predictions of clipped pixels are no error.
             seen = torch.where(drawn.radiance >= 1, predicted.clamp(max=1), predicted)
             optimizer.zero_grad()
@@ -294,8 +298,6 @@ def _learn(boundary: Boundary, pixels: Pixels, steps: int, batch: int, progress:
             if isinstance(boundary, Room):
                 boundary.sampler.after_step([boundary.field], Draws(0, step + 1, torch.arange(batch)))
             progress((step + 1) / steps)
-    if isinstance(boundary, Room):
-        boundary.draws = None
     boundary.eval().requires_grad_(False)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Sequence
@@ -142,6 +143,12 @@ class DataSource(ABC):
     root: Path
     mask_labels: Sequence[int] | None = None
     origin: Float[np.ndarray, "3"] = WORLD_ORIGIN
+
+    def with_origin(self, origin: Float[np.ndarray, "3"]) -> DataSource:
+        """Return the same data set with positions relative to another origin, world coordinates."""
+        moved = copy.copy(self)
+        moved.origin = origin
+        return moved
 
     @property
     @abstractmethod

@@ -77,7 +77,7 @@ def _distance_to(
     for first in track("distances", range(0, resolution, PLANES)):
         planes = slice(first, first + PLANES)
         found = distance[planes], height[planes]
-        _narrow_band(triangles, normals, order, starts[first:], origin, spacing, first, reach, *found)
+        _narrow_band((triangles, normals), order, starts[first:], (origin, spacing), first, reach, found)
     # The surface point nearest to a vertex lies within half a voxel diagonal of a vertex in the band.
     half_diagonal = 0.5 * float(np.linalg.norm(spacing))
     far = distance_to_set(distance <= half_diagonal, spacing) - half_diagonal
@@ -137,11 +137,20 @@ def _closest_barycentric(t, x, y, z):
 
 
 @compiled_parallel
-def _narrow_band(triangles, normals, order, starts, origin, spacing, first, reach, distance, height):
+def _narrow_band(surface, order, starts, grid, first, reach, found):
     """Write distance to the nearest triangle and signed height of the smooth surface, where a triangle is in reach.
 
-    The planes of the grid begin with number `first`.
+    Args:
+        surface: triangles, and the normals at their corners.
+        order, starts: numbers of the triangles of one plane of the grid after another, and the first of each plane.
+        grid: lowest corner and spacing of the grid, world units.
+        first: number of the first plane of `found`.
+        reach: largest distance, world units.
+        found: arrays for the distances and the heights.
     """
+    triangles, normals = surface
+    origin, spacing = grid
+    distance, height = found
     resolution = distance.shape[1]
     for i in prange(len(distance)):
         x = origin[0] + (first + i) * spacing[0]

@@ -366,8 +366,15 @@ def distance_out(low, high, x, y, z, dx, dy, dz):
 
 
 @compiled
-def put_vertex(positions, directions, s, count, x, y, z, dx, dy, dz, length):
-    """Append a vertex to a polyline; vertices beyond the capacity are only counted."""
+def put_vertex(row, count, x, y, z, dx, dy, dz, length):
+    """Append a vertex to a polyline; vertices beyond the capacity are only counted.
+
+    Args:
+        row: positions, directions and arc lengths of the polyline.
+        count: number of its vertices.
+        x, y, z, dx, dy, dz, length: position, direction and arc length of the new vertex.
+    """
+    positions, directions, s = row
     if count < s.shape[0]:
         positions[count, 0], positions[count, 1], positions[count, 2] = x, y, z
         directions[count, 0], directions[count, 1], directions[count, 2] = dx, dy, dz
@@ -376,19 +383,9 @@ def put_vertex(positions, directions, s, count, x, y, z, dx, dy, dz, length):
 
 
 @compiled
-def put_end(positions, directions, s, count, low, high, bent, x, y, z, dx, dy, dz, length, far):
-    """Append the last vertex at `far`, or farther if a bent path has not left the box by then."""
-    ahead = far - length
-    if bent:
-        ahead = max(ahead, distance_out(low, high, x, y, z, dx, dy, dz))
-    return put_vertex(
-        positions, directions, s, count, x + ahead * dx, y + ahead * dy, z + ahead * dz, dx, dy, dz, length + ahead
-    )
-
-
-@compiled
-def repeat_last(positions, directions, s, count):
+def repeat_last(row, count):
     """Fill the rest of a polyline with the last vertex."""
+    positions, directions, s = row
     last = min(count, s.shape[0]) - 1
     for i in range(last + 1, s.shape[0]):
         for axis in range(3):

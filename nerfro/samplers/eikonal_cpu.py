@@ -15,7 +15,7 @@ from nerfro.kernels.lookup import (
     block_at,
     blocks_from,
     box_span,
-    put_end,
+    distance_out,
     put_vertex,
     repeat_last,
     solid_clearance,
@@ -62,7 +62,6 @@ def _kick(h, px, py, pz, vx, vy, vz, n, gx, gy, gz):
 def _march_ray_uniformly(voxels, origin, direction, near, far, num_steps, row):
     """Trace one ray by `integrators.euler` and write its vertices; returns whether the index varied along the path."""
     table, low, inverse_spacing = voxels.table, voxels.low, voxels.inverse_spacing
-    positions, directions, lengths = row
     vx, vy, vz = float(direction[0]), float(direction[1]), float(direction[2])
     s = float(near)
     x, y, z = origin[0] + s * vx, origin[1] + s * vy, origin[2] + s * vz
@@ -72,7 +71,7 @@ def _march_ray_uniformly(voxels, origin, direction, near, far, num_steps, row):
     bent = False
     for step in range(num_steps):
         norm = math.sqrt(vx * vx + vy * vy + vz * vz)
-        put_vertex(positions, directions, lengths, step, x, y, z, vx / norm, vy / norm, vz / norm, s)
+        put_vertex(row, step, x, y, z, vx / norm, vy / norm, vz / norm, s)
         bent = bent or gx != 0.0 or gy != 0.0 or gz != 0.0
         if step == num_steps - 1:
             break
@@ -154,12 +153,11 @@ def _march_ray(voxels, solids, origin, direction, near, far, settings, row):
     """Trace one ray and write its vertices; returns their number, whether the index varied, and the excess of steps."""
     low, high = _box_of(voxels, solids)
     step, tolerance, max_steps = settings
-    positions, directions, lengths = row
     skip = REACHED * step
     dx, dy, dz = float(direction[0]), float(direction[1]), float(direction[2])
     s, end = float(near), float(far)
     x, y, z = origin[0] + s * dx, origin[1] + s * dy, origin[2] + s * dz
-    count, refracted, exceeded = put_vertex(positions, directions, lengths, 0, x, y, z, dx, dy, dz, s), False, False
+    count, refracted, exceeded = put_vertex(row, 0, x, y, z, dx, dy, dz, s), False, False
     enter, leave = box_span(low, high, x, y, z, dx, dy, dz)
     if enter < leave and leave > 0.0 and enter < end - s:
         # Position, direction and arc length of the last recorded vertex.
@@ -178,7 +176,7 @@ def _march_ray(voxels, solids, origin, direction, near, far, settings, row):
                     known = True
             if free > skip:
                 if (dx - kdx) ** 2 + (dy - kdy) ** 2 + (dz - kdz) ** 2 > MIN_TURN:
-                    count = put_vertex(positions, directions, lengths, count, x, y, z, dx, dy, dz, s)
+                    count = put_vertex(row, count, x, y, z, dx, dy, dz, s)
                     kx, ky, kz, kdx, kdy, kdz, ks = x, y, z, dx, dy, dz, s
                 x, y, z, s = x + free * dx, y + free * dy, z + free * dz, s + free
                 known = False
@@ -197,16 +195,19 @@ def _march_ray(voxels, solids, origin, direction, near, far, settings, row):
                 ahead = s - ks
                 ex, ey, ez = x - kx - ahead * kdx, y - ky - ahead * kdy, z - kz - ahead * kdz
                 if ex * ex + ey * ey + ez * ez > tolerance * tolerance:
-                    count = put_vertex(positions, directions, lengths, count, x, y, z, dx, dy, dz, s)
+                    count = put_vertex(row, count, x, y, z, dx, dy, dz, s)
                     kx, ky, kz, kdx, kdy, kdz, ks = x, y, z, dx, dy, dz, s
             outside = x < low[0] or x > high[0] or y < low[1] or y > high[1] or z < low[2] or z > high[2]
             if outside:
                 exceeded = False
                 break
         if (dx - kdx) ** 2 + (dy - kdy) ** 2 + (dz - kdz) ** 2 > MIN_TURN:
-            count = put_vertex(positions, directions, lengths, count, x, y, z, dx, dy, dz, s)
-    count = put_end(*row, count, low, high, refracted, x, y, z, dx, dy, dz, s, end)
-    repeat_last(*row, count)
+            count = put_vertex(row, count, x, y, z, dx, dy, dz, s)
+    ahead = end - s
+    if refracted:  # a bent path ends outside of the box
+        ahead = max(ahead, distance_out(low, high, x, y, z, dx, dy, dz))
+    count = put_vertex(row, count, x + ahead * dx, y + ahead * dy, z + ahead * dz, dx, dy, dz, s + ahead)
+    repeat_last(row, count)
     return count, refracted, exceeded
 
 

@@ -213,13 +213,7 @@ def trace_interfaces(rays: Rays, medium: Solid, max_events: int, branching: Bran
     """
     box = medium.box
     front = Wavefront(rays, medium, box, max_events, branching)
-    in_box = ((front.x >= box[0]) & (front.x <= box[1])).all(-1, keepdim=True)
-    front.inside = in_box & (medium.signed_distances(front.x)[0] < 0)
-    front.add_vertices(front.ray)
-    entry = torch.where(front.moving, front.enter.clamp(min=0), 0.0)
-    front.x += entry[:, None] * front.d
-    front.s += entry
-    front.inside = medium.signed_distances(front.x)[0] < 0
+    front.begin(lambda x: medium.signed_distances(x)[0] < 0)
     min_step = MIN_SEARCH_STEP * float((box[1] - box[0]).min())
     while len(rows := front.moving.nonzero()[:, 0]):
         x, d, inside = front.x[rows], front.d[rows], front.inside[rows]

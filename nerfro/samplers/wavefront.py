@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -88,6 +89,20 @@ class Wavefront:
         self.exceeded = torch.zeros_like(self.moving)
         self.inside = self.exceeded[:, None].repeat(1, len(medium.iors))
         self.lines = Polylines(len(rays), self.x)
+
+    def begin(self, inside: Callable[[Tensor], Bool[Tensor, "P K"]]) -> None:
+        """Record the first vertices, and move the rows that meet the box to the box.
+
+        Args:
+            inside: function that returns which bodies contain each point.
+        """
+        in_box = ((self.x >= self.box[0]) & (self.x <= self.box[1])).all(-1, keepdim=True)
+        self.inside = in_box & inside(self.x)
+        self.add_vertices(self.ray)
+        entry = torch.where(self.moving, self.enter.clamp(min=0), 0.0)
+        self.x += entry[:, None] * self.d
+        self.s += entry
+        self.inside = inside(self.x)
 
     def add_vertices(
         self,

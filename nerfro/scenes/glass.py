@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from typing import Any, cast
+from typing import Any
 
 PLUGIN = "transmitting_glass"
 EMBEDDED = "embedded_in_glass"
@@ -26,6 +26,11 @@ def register_materials(variant: str) -> None:
     import drjit as dr
     import mitsuba as mi
 
+    mi.register_bsdf(PLUGIN, _transmitting_glass(mi, dr))
+    mi.register_bsdf(EMBEDDED, _embedded_in_glass(mi, dr))
+
+
+def _transmitting_glass(mi: Any, dr: Any) -> type:
     class TransmittingGlass(mi.BSDF):
         def __init__(self, properties: mi.Properties) -> None:
             super().__init__(properties)
@@ -72,11 +77,15 @@ def register_materials(variant: str) -> None:
         def to_string(self) -> str:
             return f"TransmittingGlass[ior={self.ior}, tint={self.tint}]"
 
+    return TransmittingGlass
+
+
+def _embedded_in_glass(mi: Any, dr: Any) -> type:
     class EmbeddedInGlass(mi.BSDF):
         def __init__(self, properties: mi.Properties) -> None:
             super().__init__(properties)
             self.absorption = mi.Color3f(properties.get("absorption", mi.ScalarColor3f(0.0)))
-            self.nested = cast(Any, properties["nested"])
+            self.nested = properties["nested"]
             self.m_components = [self.nested.flags(index) for index in range(self.nested.component_count())]
             self.m_flags = self.nested.flags()
 
@@ -100,5 +109,4 @@ def register_materials(variant: str) -> None:
         def to_string(self) -> str:
             return f"EmbeddedInGlass[absorption={self.absorption}, {self.nested}]"
 
-    mi.register_bsdf(PLUGIN, TransmittingGlass)
-    mi.register_bsdf(EMBEDDED, EmbeddedInGlass)
+    return EmbeddedInGlass

@@ -90,7 +90,7 @@ class OutlinePage:
             message = f"{len(found.by_hull)} masks are projections of the {found.shape}"
             if request["save"]:
                 message = self.save(self.outlines, found)
-                self._server.ends = True
+                self._server.finish()
         return {"outlines": self.outlines, "masks": masks, "notes": notes, "message": message}
 
     def _photographs(self) -> list[dict[str, Any]]:

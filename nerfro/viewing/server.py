@@ -58,12 +58,10 @@ class PageServer:
 
     def __init__(self, host: str, port: int, answer: Callable[[Any], Any] | None = None) -> None:
         try:
-            self._server = _QuietServer((host, port), _Handler)
+            self._server = _QuietServer((host, port), self)
         except (OSError, OverflowError) as error:
             reason = getattr(error, "strerror", None) or error
             raise NerfroError(f"{host}:{port} is not available ({reason}); give another port, or port 0") from error
-        self._server.daemon_threads = True
-        self._server.page = self  # type: ignore[attr-defined]
         self.url = f"http://{host}:{self._server.server_address[1]}"
         self._lock, self._requests = threading.Lock(), threading.Lock()
         self._to_answer, self.ends, self.ended = answer, False, threading.Event()
@@ -81,6 +79,10 @@ class PageServer:
         """Replace the placeholder by the page."""
         with self._lock:
             self._page = page.encode()
+
+    def finish(self) -> None:
+        """Make the answer to the present request the last one."""
+        self.ends = True
 
     def publish(self, scene: dict[str, Any], arrays: dict[str, str]) -> None:
         """Send changed numbers and arrays to the browsers that show the page."""
@@ -126,6 +128,10 @@ class _QuietServer(ThreadingHTTPServer):
     """A server that tolerates slow clients and lost connections."""
 
     request_queue_size = 128  # connections that wait; beyond, the system delays clients by a second or more
+
+    def __init__(self, address: tuple[str, int], page: PageServer) -> None:
+        super().__init__(address, _Handler)
+        self.page = page
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Print no traceback of a connection that ends early, because the terminal shows the training."""
