@@ -210,7 +210,11 @@ class Material(nn.Module):
 
     def ior_at(self, wavelength: float) -> Float[Tensor, ""]:
         """Return the refractive index at a wavelength in nm, with gradients."""
-        return self.ior if self.dispersion is None else self.ior + (self.ior - 1) * self.dispersion(wavelength)
+        return self.ior + (self.ior - 1) * self.dispersion_at(wavelength)
+
+    def dispersion_at(self, wavelength: float) -> float:
+        """Return (n(w) - n_d) / (n_d - 1) at a wavelength w in nm; 0 without dispersion."""
+        return 0.0 if self.dispersion is None else self.dispersion(wavelength)
 
 
 def materials_of(

@@ -58,14 +58,16 @@ def bake_surface(renderer: Renderer) -> Baked:
     """
     medium: Medium = renderer.scene.medium
     if isinstance(medium, Vacuum):
-        return Baked({"iors": [], "nested": False, "absorption": [], "vertices": [2, 2, 2], "low": [[0, 0, 0]],
-                      "high": [[1, 1, 1]], "steps": [1.0], "clearances": [1.0], "block": BLOCK, "shortest": 1.0,
-                      "events": 0})  # fmt: skip
+        return Baked({"iors": [], "dispersion": [], "nested": False, "absorption": [], "vertices": [2, 2, 2],
+                      "low": [[0, 0, 0]], "high": [[1, 1, 1]], "steps": [1.0], "clearances": [1.0], "block": BLOCK,
+                      "shortest": 1.0, "events": 0})  # fmt: skip
     if not isinstance(medium, Solid):
         raise NerfroError(
             f"an interactive page shows bodies with a surface, and the index of {type(medium).__name__} varies "
             "in space; render a film of this run, or train with medium=sdf_grid"
         )
+    wavelengths = getattr(renderer.path_sampler, "wavelengths", [0.0] * 3)
+    colours = np.reshape(wavelengths, (3, -1))[:, len(wavelengths) // 6].tolist()  # of the middle band of each channel
     solids = _on_same_grid(medium).packed()
     bodies = range(len(solids.low))
     spacing = 1 / solids.inverse_spacing
@@ -80,6 +82,7 @@ def bake_surface(renderer: Renderer) -> Baked:
     return Baked(
         {
             "iors": [float(ior) for ior in medium.indices],
+            "dispersion": [[body.dispersion_at(colour) for colour in colours] for body in medium.materials],
             "nested": medium.nested,
             "absorption": absorption_of(renderer.scene).tolist(),
             "vertices": solids.shape[0].tolist(),

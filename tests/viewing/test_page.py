@@ -74,13 +74,13 @@ def one_ray(scene: TrainedScene, cameras: Cameras | None = None) -> Float[torch.
 
 @pytest.fixture
 def glass_cube(scene: TrainedScene) -> TrainedScene:
-    """The embedded scene's glass, sky and cameras around the ball inside, and a bubble in the glass."""
+    """The embedded scene's glass, sky and cameras around the ball inside, and a bubble in the glass; both disperse."""
     mesh = "embedded:torus/mesh.ply"
     box = torch.tensor([[-1.5] * 3, [1.5] * 3])
     outer = SdfGrid(mesh, resolution=64, box_min=[-1.5] * 3, box_max=[1.5] * 3, cache=False)
     axes = torch.stack(torch.meshgrid(*[torch.linspace(-1.5, 1.5, 64)] * 3, indexing="ij"), -1)
     bubble = torch.linalg.vector_norm(axes - torch.tensor([-0.3, -0.3, 0.2]), dim=-1) - 0.15
-    medium = SdfGrid.from_distances([outer.grids[0].distances, bubble], box, [1.5, 1.05], outer.shell)
+    medium = SdfGrid.from_distances([outer.grids[0].distances, bubble], box, [1.5, 1.05], outer.shell, abbe=[8.0])
     sky = EnvironmentMap([128], str(resolve_path("embedded:torus/sky.png")))
     return TrainedScene(
         with_changed_scene(scene.renderer, medium=medium, boundary=sky), BlenderData("embedded:torus", downscale=2)

@@ -96,7 +96,7 @@ class Tracer {
       allLow: extremes(surface.low, Math.min), allHigh: extremes(surface.high, Math.max), distanceStep: surface.steps,
       clearanceStep: surface.clearances, blockCells: surface.block, shortestStep: surface.shortest,
       bodies: shown, nested: surface.nested, maxEvents: surface.events, startInside: shown ? this.bodiesAt(view.eye) : 0,
-      index: [1, ...settings.iors], absorption: [0, 0, 0, ...settings.absorption.flat()],
+      absorption: [0, 0, 0, ...settings.absorption.flat()],
       reflection: settings.reflection,
       volumeLow: volume.low, volumeHigh: volume.high, logDensity: volume.density, brightest: volume.brightest,
       marchStep: volume.step, ball: volume.radius, skyIsPicture: this.skyIsPicture,
@@ -104,7 +104,15 @@ class Tracer {
     gl.enable(gl.BLEND);
     gl.blendColor(0, 0, 0, weight);
     gl.blendFunc(gl.CONSTANT_ALPHA, gl.ONE_MINUS_CONSTANT_ALPHA);
-    gl.drawArrays(gl.TRIANGLES, 0, 3);
+    // Bodies whose index depends on the wavelength take one pass for each colour.
+    const colours = surface.dispersion.flat().some((change) => change !== 0) ? [0, 1, 2] : [-1];
+    for (const colour of colours) {
+      const indexOf = (ior, body) => ior + (colour < 0 ? 0 : (ior - 1) * surface.dispersion[body][colour]);
+      this.set("trace", { index: [1, ...settings.iors.map(indexOf)] });
+      if (colour >= 0) gl.colorMask(colour === 0, colour === 1, colour === 2, colour === 2);
+      gl.drawArrays(gl.TRIANGLES, 0, 3);
+    }
+    gl.colorMask(true, true, true, true);
     gl.disable(gl.BLEND);
   }
 
