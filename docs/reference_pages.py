@@ -24,6 +24,7 @@ from nerfro.training import lightning_callbacks  # noqa: F401 - registers callba
 from nerfro.training.config import TrainConfig
 
 _CHOOSE = {"loss": "+loss.NAME.weight=0.1", "callbacks": "+callbacks=NAME"}
+_BODY = "bodies={BODY: {surface: {name: NAME}, ior: 1.5}}"
 
 
 def on_files(files: Any, config: Any) -> Any:
@@ -86,7 +87,7 @@ def plugins_page() -> str:
         "`python -m nerfro.plugins` prints the same list, including your own plugins.\n",
     ]
     for kind in KINDS:
-        choose = f"Choose with `{_CHOOSE.get(kind, f'{kind}=NAME')}`."
+        choose = f"Choose with `{_BODY if kind == 'surface' else _CHOOSE.get(kind, f'{kind}=NAME')}`."
         text.append(f"## {kind}\n\n{'Every metric is scored.' if kind == 'metric' else choose}\n")
         for plugin in plugins(kind):
             if ".example_" not in plugin.target:  # templates
@@ -100,7 +101,7 @@ def _plugin(plugin: Plugin) -> str:
         return f"### {plugin.name}\n\n`{plugin.target}`" + (f" with the options {fields}.\n" if fields else ".\n")
     body, _ = google_docstring(inspect.getdoc(plugin.cls) or "")
     prefix = plugin.kind.replace("/", ".") + ("." if plugin.kind not in _CHOOSE else f".{plugin.name}.")
-    rows = plugin_options(plugin, prefix)
+    rows = plugin_options(plugin, "" if plugin.kind == "surface" else prefix)
     return f"### {plugin.name}\n\n{body}\n\n{_table(rows)}"
 
 

@@ -32,8 +32,8 @@ from nerfro.errors import NerfroError
 from nerfro.paths import PLUGINS_DIR
 
 KINDS = (
-    "model", "camera", "medium", "sampler/path", "sampler/points", "field", "boundary", "loss", "data", "callbacks",
-    "metric",
+    "model", "camera", "medium", "surface", "sampler/path", "sampler/points", "field", "boundary", "loss", "data",
+    "callbacks", "metric",
 )  # fmt: skip
 
 SEVERAL = ("loss", "callbacks")  # a run may have several plugins of these types

@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
 import torch
 
 from nerfro.boundaries.base import Boundary
@@ -24,6 +25,7 @@ from nerfro.fields.nerf import NerfField
 from nerfro.losses.base import Loss
 from nerfro.media.base import Medium
 from nerfro.media.shapes import Ball
+from nerfro.media.surface import Grid, Surface
 from nerfro.models.refractive import RefractiveModel
 from nerfro.registry import Plugin, build
 from nerfro.rendering import Components, Renderer, composite
@@ -131,6 +133,17 @@ def _check_medium(medium: Medium) -> None:
     _require(bool((ior > 0).all()) and bool(gradient.isfinite().all()), "n is positive and grad n finite")
     ior, gradient = medium(high + (high - low) * (1 + torch.rand(50, 3)))
     _require(bool((ior == 1).all()) and bool((gradient == 0).all()), "outside the box n = 1 and grad n = 0")
+
+
+def _check_surface(surface: Surface) -> None:
+    _require(getattr(surface, "bounds", None) is not None, "a surface has `bounds` [2, 3], its lower and upper corner")
+    size = np.ptp(surface.bounds, axis=0)
+    distances = surface.distances(Grid(surface.bounds + 0.2 * size * [[-1], [1]], 24))
+    _require(distances.shape == (24, 24, 24), "distances returns one number for each vertex of the grid")
+    outside, inside = distances[[0, -1]], distances < 0
+    _require(bool(inside.any() and (outside > 0).all()), "distances are negative inside and positive outside")
+    slope = np.abs(np.diff(distances, axis=0)).max() * 23 / (1.4 * size[0])
+    _require(bool(slope < 1.01), "distances change by at most one per unit of length")
 
 
 def _check_camera(camera: Camera) -> None:
@@ -261,6 +274,7 @@ def _check_callback(callback: Any) -> None:
 _CONTRACTS: dict[str, tuple[type, Callable[[Any], None]]] = {
     "camera": (Camera, _check_camera),
     "medium": (Medium, _check_medium),
+    "surface": (Surface, _check_surface),
     "sampler/path": (PathSampler, _check_path_sampler),
     "sampler/points": (PointSampler, _check_point_sampler),
     "field": (Field, _check_field),

@@ -11,6 +11,11 @@ discover()
 FIELDS: dict[str, dict[str, object]] = {
     "medium/sdf_grid": {"mesh": "embedded:torus/mesh.ply", "resolution": 32},
     "medium/voxel_grid": {"mesh": "embedded:torus/mesh.ply", "resolution": 32, "smoothing_size": 3},
+    "surface/ball": {"radius": 1.0},
+    "surface/box": {"sides": [1.0, 1.0, 0.2], "rounding": 0.05},
+    "surface/mesh": {"file": "embedded:torus/mesh.ply"},
+    "surface/offset": {"surface": {"name": "ball", "radius": 1.0}, "distance": 0.2},
+    "surface/revolution": {"profile": [[1.0, 0.0], [0.5, 1.0]], "axis": [1.0, 1.0, 0.0]},
     "sampler/path/eikonal": {"num_steps": 128},
     "field/nerf": {"width": 16, "depth": 3, "skip": 2, "view_width": 8},
     "field/mip_nerf": {"width": 16, "depth": 3, "skip": 2, "view_width": 8},

@@ -20,6 +20,7 @@ from nerfro.data.base import DataSource, Views
 from nerfro.data.blender import BlenderData
 from nerfro.errors import NerfroError
 from nerfro.media.base import Medium
+from nerfro.media.surface import Surface
 from nerfro.paths import PLUGINS_DIR
 from nerfro.registry import KINDS, discover, find, plugins, register
 from nerfro.testing import ContractError, check
@@ -155,6 +156,7 @@ def ones(medium: Medium, positions: torch.Tensor) -> tuple[torch.Tensor, torch.T
     [
         ("medium", Medium, {"forward": ones}, r"a medium has a buffer `box` \[2, 3\]"),
         ("medium", Medium, {}, "Broken lacks forward"),
+        ("surface", Surface, {"distances": None}, "a surface has `bounds`"),
         ("data", DataSource, {"load": None, "splits": ["train"]}, "has the attribute `root`"),
     ],
 )
@@ -211,7 +213,7 @@ def test_plugins_of_the_current_directory_are_registered_unless_the_environment_
 
 # Overrides that use each template.
 TEMPLATES = {
-    "example_body": ["medium=rounded_cube", "sampler/path=snell"],
+    "example_surface": ["bodies={ring: {surface: {name: torus}, ior: 1.5}}"],
     "example_boundary": ["boundary=gradient_sky"],
     "example_camera": ["camera=shifted"],
     "example_data": ["data=numpy_views"],

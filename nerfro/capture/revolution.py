@@ -8,7 +8,6 @@ from typing import Literal
 
 import numpy as np
 import torch
-import trimesh
 from jaxtyping import Float
 from skimage.measure import find_contours
 from torch import Tensor
@@ -19,11 +18,11 @@ from torch.nn.functional import normalize
 from nerfro.capture.upright import body_axis
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.geometry.mesh import TriangleMesh
+from nerfro.geometry.revolve import revolve
 
 Symmetry = Literal["axis", "auto"]
 
-# Number of radii along the axis, and of vertices around the axis.
-_KNOTS, _SECTIONS = 72, 160
+_KNOTS = 72  # radii along the axis
 # Quantile of the distances of vertices from the axis that gives the initial radius at a height: vertices on end faces
 # lie nearer to the axis than the outline, and corners of the hull of few views lie farther away.
 _OUTER_QUANTILE, _INNER_QUANTILE = 0.8, 0.1
@@ -86,13 +85,9 @@ class Profile:
     def mesh(self) -> TriangleMesh:
         """Convert the body to a closed mesh with counter-clockwise faces seen from outside."""
         axis, foot, radii = (values.double().numpy() for values in (self.axis, self.foot, self.radii))
-        across = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
-        across /= np.linalg.norm(across)
         heights = np.linspace(0, float(self.height), len(radii))
         outline = np.column_stack([np.pad(radii, 1), np.pad(heights, 1, "edge")])
-        body = trimesh.creation.revolve(outline, sections=_SECTIONS)
-        vertices = body.vertices @ np.stack([across, np.cross(axis, across), axis]) + foot
-        return TriangleMesh(vertices, np.asarray(body.faces))
+        return revolve(outline, foot, axis)
 
 
 def fit_revolution(

@@ -8,12 +8,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Optional
 
+import numpy as np
+from jaxtyping import Float
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from nerfro.allowed import NotNegative, Positive, check
 from nerfro.errors import NerfroError, nearest_of
+from nerfro.geometry.mesh import local_origin, origin_of_file
 from nerfro.media.material import Abbe, Material, find_material
+from nerfro.media.surface import make_surface
+from nerfro.paths import resolve_path
 
 _LEARNED = ("ior", "absorption")
 
@@ -24,6 +29,7 @@ class BodySettings:
 
     Attributes:
         mesh: closed triangle mesh, world units; by default `medium.mesh`.
+        surface: name and settings of another surface (`python -m nerfro.plugins surface`), in place of a mesh.
         ior: refractive index, of the d line if the body disperses light.
         material: material of the catalogue (`python -m nerfro.plugins material`), with its dispersion.
         abbe: Abbe number; without one, the index of a body with `ior` is the same for all colours.
@@ -33,6 +39,7 @@ class BodySettings:
     """
 
     mesh: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
+    surface: Any = None
     ior: Optional[Positive] = None  # noqa: UP045
     material: Optional[str] = None  # noqa: UP045
     abbe: Optional[Positive] = None  # noqa: UP045
@@ -43,10 +50,14 @@ class BodySettings:
 
 @dataclass(frozen=True)
 class Body:
-    """Surface and material of a body."""
+    """A body.
+
+    Attributes:
+        surface: name and settings of the surface, see `media.surface.make_surface`.
+    """
 
     name: str
-    mesh: str
+    surface: Mapping[str, Any]
     material: Material
 
 
@@ -69,17 +80,32 @@ def read_bodies(bodies: Any, mesh: str | None) -> list[Body]:
     if not settings:
         raise NerfroError("bodies={} has no body; write bodies={NAME: {mesh: FILE, ior: 1.5}}")
     ordered = sorted(settings.items(), key=lambda item: item[1].priority)
-    return [Body(name, _mesh(name, given.mesh or mesh), _material(name, given)) for name, given in ordered]
+    return [Body(name, _surface(name, given, mesh), _material(name, given)) for name, given in ordered]
 
 
-def mesh_files(medium: Any) -> list[str]:
-    """Return the mesh file of each body of a medium's configuration, which may have none."""
+def surfaces_of(medium: Any) -> list[Mapping[str, Any]]:
+    """Return the surface of each body of a medium's configuration, which may have none."""
     if not isinstance(medium, Mapping):
         return []
     bodies, mesh = medium.get("bodies"), medium.get("mesh")
     if bodies is not None:
-        return [body.mesh for body in read_bodies(bodies, mesh)]
-    return [] if mesh is None else [str(mesh)]
+        return [body.surface for body in read_bodies(bodies, mesh)]
+    return [] if mesh is None else [mesh_surface(mesh)]
+
+
+def origin_of(medium: Any) -> Float[np.ndarray, "3"]:
+    """Return the origin of the positions in a medium, given its configuration; see `Medium.origin`."""
+    surfaces = surfaces_of(medium)
+    if not surfaces:
+        return np.zeros(3)
+    if surfaces[0].get("name") == "mesh":
+        return origin_of_file(resolve_path(surfaces[0]["file"]))
+    return local_origin(make_surface(surfaces[0]).bounds)
+
+
+def mesh_surface(file: str) -> dict[str, Any]:
+    """Return the settings of a surface that is a mesh."""
+    return {"name": "mesh", "file": str(file)}
 
 
 def _settings(name: str, given: Any) -> BodySettings:
@@ -106,10 +132,15 @@ def _settings(name: str, given: Any) -> BodySettings:
     return settings
 
 
-def _mesh(name: str, mesh: str | None) -> str:
-    if mesh is None:
-        raise NerfroError(f"bodies.{name} needs a mesh; add bodies.{name}.mesh=FILE")
-    return str(mesh)
+def _surface(name: str, given: BodySettings, mesh: str | None) -> Mapping[str, Any]:
+    file = given.mesh or mesh
+    if given.surface is None:
+        if file is None:
+            raise NerfroError(f"bodies.{name} needs a mesh; add bodies.{name}.mesh=FILE")
+        return mesh_surface(file)
+    if given.mesh is not None or not isinstance(given.surface, Mapping):
+        raise NerfroError(f"bodies.{name} needs one of mesh and surface; write surface: {{name: ball, radius: 1}}")
+    return given.surface
 
 
 def _material(name: str, given: BodySettings) -> Material:

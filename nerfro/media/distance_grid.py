@@ -12,10 +12,7 @@ from jaxtyping import Bool, Float, UInt8
 from scipy.ndimage import distance_transform_cdt
 from torch import Tensor, nn
 
-from nerfro.files.cache import cached_arrays, content_hash
 from nerfro.geometry.interpolation import quadratic_spline, spline_coefficients
-from nerfro.geometry.mesh import TriangleMesh
-from nerfro.geometry.signed_distance import signed_distance_grid
 from nerfro.kernels.constants import constant
 from nerfro.kernels.tolerances import MIN_SEARCH_STEP
 from nerfro.media.base import Scalars, Vectors, lazy_buffer
@@ -30,8 +27,6 @@ BLOCK, SURFACE_BLOCK = 4, 3
 # up to 2.19 and whose negative weights to -1.19. It is positive if the largest coefficient is less than 1.84 times the
 # smallest.
 _CONTINUED = 1.8
-# Part of the cache key. Increase it when the same mesh and settings give different distances.
-_VERSION = 3
 
 
 class DistanceGrid(nn.Module):
@@ -55,20 +50,6 @@ class DistanceGrid(nn.Module):
         self.register_buffer("box", box, persistent=False)
         self.register_buffer("coefficients", spline_coefficients(distances), persistent=False)
         self.register_buffer("distances", distances, persistent=False)
-
-    @classmethod
-    def of_mesh(cls, mesh: TriangleMesh, box: Float[np.ndarray, "2 3"], resolution: int, cache: bool) -> DistanceGrid:
-        """Compute the distances to a mesh, or load them from the cache folder.
-
-        Args:
-            mesh: the body.
-            box: corners of the grid in the coordinates of the mesh.
-            resolution: vertices along each side of the grid.
-            cache: whether to use the cache folder.
-        """
-        box = box.astype(np.float32).astype(np.float64)  # far from the origin, rounding would move the surface
-        distances = cached_distance(mesh, box, resolution, BAND, cache)
-        return cls(torch.from_numpy(distances), torch.from_numpy(box).float())
 
     @property
     def spacing(self) -> Float[Tensor, "3"]:
@@ -201,20 +182,3 @@ def _extremes(values: Float[Tensor, "X Y Z"], windows: list[int]) -> tuple[Tenso
         lowest = lowest.unfold(axis, window, SURFACE_BLOCK).amin(-1)
         highest = highest.unfold(axis, window, SURFACE_BLOCK).amax(-1)
     return lowest, highest
-
-
-def cached_distance(
-    mesh: TriangleMesh,
-    box: Float[np.ndarray, "2 3"],
-    resolution: int,
-    band: float,
-    cache: bool,
-    lid: Bool[np.ndarray, "F"] | None = None,
-) -> Float[np.ndarray, "X Y Z"]:
-    """Compute the signed distance to a mesh at the vertices of a grid, or load it from the cache folder."""
-    normals = "none" if mesh.normals is None else mesh.normals
-    settings = box, resolution, band
-    left_out = () if lid is None else (lid,)
-    key = "distance_" + content_hash(_VERSION, mesh.vertices, mesh.faces, normals, *settings, *left_out)
-    arrays = cached_arrays(key, lambda: {"distance": signed_distance_grid(mesh, *settings, *left_out)}, cache)
-    return arrays["distance"]

@@ -1,4 +1,4 @@
-"""Homogeneous bodies made from meshes: signed distances on a grid for each body, with a continuous gradient."""
+"""Homogeneous bodies: signed distances on a grid for each body, with a continuous gradient."""
 
 from __future__ import annotations
 
@@ -13,30 +13,26 @@ from torch import Tensor
 
 from nerfro.allowed import NotNegative, Positive, Resolution
 from nerfro.errors import NerfroError
-from nerfro.geometry.bodies import require_separate
 from nerfro.geometry.intersection import LayeredIntersector, Triangles
-from nerfro.geometry.mesh import TriangleMesh, load_mesh, local_origin
+from nerfro.geometry.mesh import TriangleMesh, local_origin
 from nerfro.kernels.available import require_bytes
 from nerfro.media.base import Medium, Scalars, Vectors
-from nerfro.media.bodies import Body, read_bodies
+from nerfro.media.bodies import Body, mesh_surface, read_bodies
 from nerfro.media.distance_grid import DistanceGrid, DistanceGrids
 from nerfro.media.material import materials_of
 from nerfro.media.solid import Solid, body_names
-from nerfro.media.voxel_grid import BYTES_PER_VERTEX, check_margin, grid_box
-from nerfro.paths import resolve_path
+from nerfro.media.surface import Grid, make_surface
+from nerfro.media.voxel_grid import BYTES_PER_VERTEX, grid_box
 from nerfro.registry import register
 from nerfro.variants import variant
 
 if TYPE_CHECKING:
     from nerfro.kernels.lookup import Solids
 
-# Voxels of air around the object if its box is not given.
-AIR = 4
-
 
 @register("medium", "sdf_grid")
 class SdfGrid(Solid):
-    """Bodies of constant index bounded by meshes: sharp surfaces for `snell`, thin shells for `eikonal`.
+    """Bodies of constant index with closed surfaces, which are sharp for `snell` and thin shells for `eikonal`.
 
     Each body has its own grid in its own box, so bodies may be nested, apart, or overlap. A point belongs to the last
     body that contains it.
@@ -58,15 +54,16 @@ class SdfGrid(Solid):
         learn_absorption: learn the absorption; only for `sampler/path=snell`.
         abbe: Abbe number of each body, or one for all bodies, for dispersion; only for `sampler/path=snell`.
         cache: keep the distances in the cache folder.
-        bodies: bodies by name, with the settings mesh, ior or material, abbe, absorption, priority and learn of each
-            (`media.bodies.BodySettings`); replaces `ior` and the lists of all bodies.
+        bodies: bodies by name, with the settings mesh or surface, ior or material, abbe, absorption, priority and learn
+            of each (`media.bodies.BodySettings`); replaces `ior` and the lists of all bodies.
 
     Attributes:
-        meshes: the meshes of the bodies; empty if the medium was made from distances.
+        meshes: the meshes of the bodies; empty if a body has none.
         grids: signed distances of each body.
     """
 
     grids: DistanceGrids
+    _content_box: Float[Tensor, "2 3"] | None
 
     def __init__(
         self,
@@ -104,31 +101,26 @@ class SdfGrid(Solid):
             )
         else:
             materials = materials_of([ior, *inner_iors], absorption, learn_absorption, abbe, learn_ior)
-            names, files = body_names(len(materials)), [mesh, *inner_meshes]
+            names, files = body_names(len(materials)), map(mesh_surface, [mesh, *inner_meshes])
             members = [Body(*body) for body in zip(names, files, materials, strict=True)]
         require_bytes(len(members) * BYTES_PER_VERTEX * resolution**3, f"medium.resolution={resolution}")
-        meshes = [load_mesh(resolve_path(body.mesh), accept_open_mesh) for body in members]
-        boxes = [grid_box(box_min, box_max, [body], resolution, AIR) for body in meshes]
+        surfaces = [make_surface(body.surface, accept_open_mesh) for body in members]
+        boxes = [grid_box(box_min, box_max, surface.bounds, resolution) for surface in surfaces]
         spacing = min(float((box[1] - box[0]).min()) for box in boxes) / (resolution - 1)
         Medium.__init__(self)
         self._set_materials([body.material for body in members], [body.name for body in members])
         self.shell = shell_voxels * spacing
-        self._set_meshes(meshes, boxes, resolution, cache)
-
-    def _set_meshes(
-        self, meshes: list[TriangleMesh], boxes: list[Float[np.ndarray, "2 3"]], resolution: int, cache: bool
-    ) -> None:
-        for body, box in zip(meshes, boxes, strict=True):
-            check_margin(body, box, resolution, 2)
-        self.origin = local_origin(meshes[0].vertices)
-        self.meshes = [body.relative_to(self.origin) for body in meshes]
-        for body in self.meshes:
-            if body.is_closed:
-                require_separate(body)
-        self._set_grids(
-            DistanceGrid.of_mesh(body, box - self.origin, resolution, cache)
-            for body, box in zip(self.meshes, boxes, strict=True)
-        )
+        self.origin = local_origin(surfaces[0].bounds)
+        meshes = [surface.mesh.relative_to(self.origin) for surface in surfaces if surface.mesh is not None]
+        self.meshes = meshes if len(meshes) == len(surfaces) else []
+        bounds = np.stack([surface.bounds for surface in surfaces], 1) - self.origin
+        self._content_box = torch.from_numpy(np.stack([bounds[0].min(0), bounds[1].max(0)])).float()
+        grids = []
+        for surface, box in zip(surfaces, boxes, strict=True):
+            relative = torch.from_numpy(box - self.origin).float()  # rounded before the distances are computed
+            distances = surface.distances(Grid(relative.double().numpy() + self.origin, resolution, cache=cache))
+            grids.append(DistanceGrid(torch.from_numpy(distances).float(), relative))
+        self._set_grids(grids)
 
     @classmethod
     def from_distances(
@@ -150,7 +142,7 @@ class SdfGrid(Solid):
         """
         medium = cls.__new__(cls)
         Solid.__init__(medium, iors, shell, **glass)
-        medium.meshes = []
+        medium.meshes, medium._content_box = [], None
         boxes = [boxes] * len(iors) if isinstance(boxes, Tensor) else boxes
         medium._set_grids(DistanceGrid(values, box) for values, box in zip(distances, boxes, strict=True))
         return medium
@@ -162,11 +154,8 @@ class SdfGrid(Solid):
 
     @property
     def content_box(self) -> Float[Tensor, "2 3"]:
-        """Bounds of the meshes, world units; the box of the grids if there are no meshes."""
-        if not self.meshes:
-            return self.box
-        low, high = np.stack([mesh.bounds for mesh in self.meshes], 1)
-        return torch.from_numpy(np.stack([low.min(0), high.max(0)])).float()
+        """Bounds of the surfaces, world units; the box of the grids if the medium was made from distances."""
+        return self.box if self._content_box is None else self._content_box
 
     def grown(self, outwards: Float[Tensor, "X Y Z"]) -> SdfGrid:
         """Return the same bodies with the outer surface displaced.
@@ -177,7 +166,7 @@ class SdfGrid(Solid):
             outwards: outward displacement at the vertices of the outer body's grid, world units.
         """
         outer, *inner = self.grids
-        changed = variant(self, meshes=[])
+        changed = variant(self, meshes=[], _content_box=None)
         changed._set_grids([DistanceGrid(outer.distances - outwards, outer.box), *inner])
         return changed
 

@@ -11,15 +11,14 @@ from torch import Tensor
 
 from nerfro.allowed import Coordinate, NotNegative, Positive, Resolution
 from nerfro.errors import NerfroError
-from nerfro.geometry.bodies import require_separate
 from nerfro.geometry.lids import find_lid
-from nerfro.geometry.mesh import load_mesh, local_origin
+from nerfro.geometry.mesh import local_origin
 from nerfro.kernels.available import require_bytes
-from nerfro.media.distance_grid import BAND, DistanceGrid, cached_distance
-from nerfro.media.sdf_grid import AIR, SdfGrid
+from nerfro.media.distance_grid import DistanceGrid
+from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.solid import Solid
-from nerfro.media.voxel_grid import BYTES_PER_VERTEX, check_margin, grid_box
-from nerfro.paths import resolve_path
+from nerfro.media.surface import Grid, MeshSurface, cached_distances, direction
+from nerfro.media.voxel_grid import BYTES_PER_VERTEX, grid_box
 from nerfro.registry import register
 from nerfro.variants import variant
 
@@ -86,8 +85,8 @@ class SdfVessel(SdfGrid):
         fillet: NotNegative = 0.0,
     ) -> None:
         require_bytes(BYTES_PER_VERTEX * resolution**3, f"medium.resolution={resolution}")
-        surface = load_mesh(resolve_path(mesh), accept_open_mesh)
-        box = grid_box(box_min, box_max, [surface], resolution, AIR)
+        surface = MeshSurface(mesh, accept_open_mesh).mesh
+        box = grid_box(box_min, box_max, surface.bounds, resolution)
         spacing = float((box[1] - box[0]).min()) / (resolution - 1)
         iors = [ior, liquid_ior] if level is None else [ior, 1.0, liquid_ior]
         Solid.__init__(
@@ -100,12 +99,9 @@ class SdfVessel(SdfGrid):
         )
         self.names = ["wall", *["air"] * (len(iors) - 2), "liquid"]
         self.meshes = []  # rays are refracted at the distance field, not at triangles
-        upwards = _direction(up)
-        check_margin(surface, box, resolution, 2)
+        upwards = direction("medium.up", up)
         self.origin = local_origin(surface.vertices)
         box, surface = box - self.origin, surface.relative_to(self.origin)
-        if surface.is_closed:
-            require_separate(surface)
         self._content_box = torch.from_numpy(surface.bounds).float()
         low, high = (float(end(surface.vertices @ upwards)) for end in (np.min, np.max))
         self.height = high - low if height is None else height
@@ -115,12 +111,11 @@ class SdfVessel(SdfGrid):
             self.lengths["level"] = level
         self._require_lengths_within()
         # The wall's inner surface and the fillet are made of these distances, and a refinement moves them.
-        band = min(BAND + (2 * wall + fillet) * self.unit / spacing, resolution)
-        settings = surface, box, resolution, band, cache
-        outer = side = torch.from_numpy(cached_distance(*settings))
+        grid = Grid(box, resolution, cache=cache).widened((2 * wall + fillet) * self.unit)
+        outer = side = torch.from_numpy(cached_distances(surface, grid))
         if not closed:
-            side = torch.from_numpy(cached_distance(*settings, find_lid(surface, upwards)))
-        heights = _heights(box, resolution, upwards) - low
+            side = torch.from_numpy(cached_distances(surface, grid, find_lid(surface, upwards)))
+        heights = torch.from_numpy(grid.points @ upwards - low)
         for name, values in (("_outer", outer), ("_side", side), ("_heights", heights.float())):
             self.register_buffer(name, values, persistent=False)
         self._set_distances(torch.from_numpy(box).float())
@@ -130,10 +125,6 @@ class SdfVessel(SdfGrid):
                 f"medium.wall={wall:g} and medium.foot={self.lengths['foot']:g} leave no cavity: no point of the body "
                 f"is deeper than {deepest:.3g}; give smaller ones, in world units, or medium.height= in the same unit"
             )
-
-    @property
-    def content_box(self) -> Float[Tensor, "2 3"]:
-        return self._content_box
 
     @property
     def absorption(self) -> Float[Tensor, "K 3"] | None:
@@ -172,20 +163,6 @@ class SdfVessel(SdfGrid):
                 f"{given} is not allowed: heights are measured from the vessel's lowest point, the foot is below the "
                 f"level, and the vessel is {self.height:.4g} high, in world units or the unit of medium.height="
             )
-
-
-def _direction(up: Sequence[float]) -> Float[np.ndarray, "3"]:
-    length = np.linalg.norm(up)
-    if len(up) != 3 or not length > 0:
-        raise NerfroError(f"medium.up={list(up)} is no direction; give three numbers, not all of them 0")
-    return np.array(up, np.float64) / length
-
-
-def _heights(box: Float[np.ndarray, "2 3"], resolution: int, up: Float[np.ndarray, "3"]) -> Float[Tensor, "X Y Z"]:
-    """Return the heights of the vertices of a grid above the world origin."""
-    axes = (part * np.linspace(low, high, resolution) for low, high, part in zip(*box, up, strict=True))
-    x, y, z = map(torch.from_numpy, axes)
-    return x[:, None, None] + y[:, None] + z
 
 
 def _of_bodies(given: Sequence[float], each: int, num_bodies: int, air: float, name: str) -> list[float]:

@@ -13,21 +13,21 @@ from torch import Tensor
 from nerfro.allowed import Positive, Range, Resolution, corners_of_box
 from nerfro.errors import NerfroError
 from nerfro.files.cache import cached_arrays, content_hash
-from nerfro.geometry.bodies import require_separate
 from nerfro.geometry.interpolation import gradient, smooth, trilinear
-from nerfro.geometry.mesh import TriangleMesh, load_mesh, local_origin, require_inside
+from nerfro.geometry.mesh import local_origin, require_inside
 from nerfro.geometry.occupancy import occupancy_fraction
 from nerfro.geometry.signed_distance import distance_to_set
 from nerfro.kernels.available import require_bytes
 from nerfro.kernels.constants import constant
 from nerfro.media.base import Medium, Scalars, Vectors, lazy_buffer
-from nerfro.paths import resolve_path
+from nerfro.media.surface import MeshSurface
 from nerfro.registry import register
 
 # Part of the cache key. Increase it when the same mesh and settings give different fractions.
 _VERSION = 1
 # Inside tests along each side around a vertex.
 _SUBSAMPLES = 4
+_AIR = 4  # voxels around the object if its box is not given
 BYTES_PER_VERTEX = 64  # peak memory while a grid is built
 
 
@@ -67,13 +67,11 @@ class VoxelGrid(Medium):
         super().__init__()
         require_bytes(BYTES_PER_VERTEX * resolution**3, f"medium.resolution={resolution}")
         box = corners_of_box(box_min, box_max)
-        loaded = load_mesh(resolve_path(mesh), accept_open_mesh)
+        loaded = MeshSurface(mesh, accept_open_mesh).mesh
         # One voxel for the subsamples, one for the central difference, and the radius of the smoothing kernel.
-        check_margin(loaded, box, resolution, 2 + smoothing_size // 2)
+        check_margin(loaded.bounds, box, resolution, 2 + smoothing_size // 2)
         self.origin = local_origin(loaded.vertices)
         box, loaded = box - self.origin, loaded.relative_to(self.origin)
-        if loaded.is_closed:
-            require_separate(loaded)
         key = "occupancy_" + content_hash(_VERSION, loaded.vertices, loaded.faces, box, resolution, _SUBSAMPLES)
         occupancy = cached_arrays(
             key,
@@ -174,38 +172,39 @@ class VoxelGrid(Medium):
 def grid_box(
     box_min: Sequence[float] | None,
     box_max: Sequence[float] | None,
-    meshes: Sequence[TriangleMesh],
+    bounds: Float[np.ndarray, "2 3"],
     resolution: int,
-    air: int,
 ) -> Float[np.ndarray, "2 3"]:
-    """Return the corners of a medium's grid: the given ones, or the bounds of the meshes with a margin of air.
+    """Return the corners of a medium's grid: the given ones, or the bounds of the object with a margin of air.
 
     A flat object gets a box at least half as thick as it is long, because voxels should not be much longer than wide.
 
     Args:
-        box_min, box_max: given corners, world units; both None to use the meshes.
-        meshes: the bodies.
+        box_min, box_max: given corners, world units; both None to use the bounds.
+        bounds: corners of the object, world units.
         resolution: vertices along each side of the grid.
-        air: voxels of air on each side.
 
     Raises:
-        NerfroError: one corner is given without the other, or the corners do not make a box.
+        NerfroError: one corner is given without the other, the corners do not make a box, or the object does not
+            fit into it.
     """
     if box_min is not None and box_max is not None:
-        return corners_of_box(box_min, box_max)
+        box = corners_of_box(box_min, box_max)
+        check_margin(bounds, box, resolution, 2)
+        return box
     if box_min is not None or box_max is not None:
         raise NerfroError(
             "medium.box_min and medium.box_max belong together; give both, or neither for the bounds of the mesh"
         )
-    low, high = np.min([mesh.bounds[0] for mesh in meshes], 0), np.max([mesh.bounds[1] for mesh in meshes], 0)
+    low, high = bounds
     sides = np.maximum(high - low, 0.5 * (high - low).max())
-    share = min(2 * air / (resolution - 1), 0.5)
+    share = min(2 * _AIR / (resolution - 1), 0.5)
     return 0.5 * (low + high) + np.array([[-0.5], [0.5]]) * sides / (1 - share)
 
 
-def check_margin(mesh: TriangleMesh, box: Float[np.ndarray, "2 3"], resolution: int, voxels: int) -> None:
-    """Refuse a mesh that leaves fewer than `voxels` voxels of air on a side of the box."""
-    low, high = mesh.bounds
+def check_margin(bounds: Float[np.ndarray, "2 3"], box: Float[np.ndarray, "2 3"], resolution: int, voxels: int) -> None:
+    """Refuse an object that leaves fewer than `voxels` voxels of air on a side of the box."""
+    low, high = bounds
     margin = voxels * (box[1] - box[0]) / (resolution - 1)
     if (low - margin >= box[0]).all() and (high + margin <= box[1]).all():
         return
@@ -217,7 +216,7 @@ def check_margin(mesh: TriangleMesh, box: Float[np.ndarray, "2 3"], resolution: 
         )
     margin = 0.5 * (high - low).max() * share / (1 - share)
     raise NerfroError(
-        f"the mesh does not fit into the box with {voxels} voxels of air; it needs a box such as "
+        f"the object does not fit into the box with {voxels} voxels of air; it needs a box such as "
         f"medium.box_min={_rounded(low - margin, -1)} medium.box_max={_rounded(high + margin, 1)}"
     )
 

@@ -30,10 +30,9 @@ from nerfro.data.base import DataSource, Views
 from nerfro.data.validation_views import WithValidationViews
 from nerfro.errors import NerfroError
 from nerfro.evaluation.results import Region
-from nerfro.geometry.mesh import origin_of_file
 from nerfro.losses.base import Loss
 from nerfro.media.analytic import Vacuum
-from nerfro.media.bodies import mesh_files
+from nerfro.media.bodies import origin_of
 from nerfro.paths import resolve_path, scene_name
 from nerfro.registry import build, check_node, configure, create, find, require_lightning
 from nerfro.rendering import Components, Renderer
@@ -306,9 +305,7 @@ def build_data(config: DictConfig) -> DataSource:
             f"{root} holds no data yet; run python -m nerfro.synthesize scene={scene} out={root} {small} first"
         )
     source, number = build(config.data), config.batches.num_validation_views
-    meshes = mesh_files(OmegaConf.select(config, "medium"))
-    if meshes:
-        source.origin = origin_of_file(resolve_path(meshes[0]))
+    source = source.with_origin(origin_of(OmegaConf.select(config, "medium")))
     return WithValidationViews(source, number) if number else source
 
 

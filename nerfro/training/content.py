@@ -13,10 +13,11 @@ from omegaconf import DictConfig, OmegaConf
 from nerfro.allowed import Count, NotNegative, Positive
 from nerfro.cameras import Cameras
 from nerfro.errors import NerfroError
-from nerfro.geometry.mesh import load_mesh, local_origin
+from nerfro.geometry.mesh import local_origin
 from nerfro.media.analytic import Vacuum
 from nerfro.media.base import Medium
-from nerfro.media.bodies import mesh_files
+from nerfro.media.bodies import surfaces_of
+from nerfro.media.surface import make_surface
 from nerfro.paths import resolve_path
 from nerfro.registry import build
 
@@ -130,13 +131,13 @@ def _depth(cameras: Cameras) -> float:
 
 
 def _box(config: DictConfig, medium: Medium) -> Float[np.ndarray, "2 3"] | None:
-    """Return the bounds of the object from the medium or its mesh; None without both."""
+    """Return the bounds of the object from the medium or its surfaces; None without both."""
     if not isinstance(medium, Vacuum):
         return medium.content_box.double().numpy().round(6)
-    files = [resolve_path(mesh) for mesh in mesh_files(config.medium)]
-    if files and all(file.is_file() for file in files):
+    surfaces = surfaces_of(config.medium)
+    if surfaces and all(resolve_path(surface.get("file", ".")).exists() for surface in surfaces):
         # Straight rays need no medium, but the baselines get the same bounds as the refractive model.
-        bounds = np.stack([load_mesh(file, accept_open_mesh=True).bounds for file in files])
+        bounds = np.stack([make_surface(surface, accept_open_mesh=True).bounds for surface in surfaces])
         return (np.stack([bounds[:, 0].min(0), bounds[:, 1].max(0)]) - local_origin(bounds[0])).round(6)
     return None
 

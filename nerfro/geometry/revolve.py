@@ -1,0 +1,29 @@
+"""Meshes of bodies of revolution."""
+
+from __future__ import annotations
+
+import numpy as np
+import trimesh
+from jaxtyping import Float
+
+from nerfro.geometry.mesh import TriangleMesh
+
+_SECTIONS = 160  # vertices around the axis
+
+
+def revolve(
+    profile: Float[np.ndarray, "K 2"], foot: Float[np.ndarray, "3"], axis: Float[np.ndarray, "3"]
+) -> TriangleMesh:
+    """Return the closed mesh of a body of revolution.
+
+    Args:
+        profile: radii and heights along the outline, which runs counter-clockwise from axis to axis or is closed.
+        foot: world coordinates of height 0 on the axis.
+        axis: unit direction of the axis.
+    """
+    size = np.ptp(profile, axis=0).max()  # trimesh drops triangles with areas below 1e-8
+    body = trimesh.creation.revolve(profile / size, sections=_SECTIONS)
+    across = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+    across /= np.linalg.norm(across)
+    vertices = size * body.vertices @ np.stack([across, np.cross(axis, across), axis]) + foot
+    return TriangleMesh(vertices, np.asarray(body.faces))
