@@ -163,15 +163,7 @@ def entry_point(
                     except Exception as error:  # raised later, because Hydra prints an additional line for it
                         failures.append(error)
                         return None
-                discover()  # the process may be a launcher's worker
-                try:
-                    return task(config)
-                except Exception as error:  # Hydra's sweepers continue with the other jobs
-                    if os.environ.get("NERFRO_DEBUG"):
-                        raise
-                    line = f"{Path(HydraConfig.get().runtime.output_dir).name}: {in_one_line(error)}"
-                    print(f"nerfro: error: {line}", file=sys.stderr, flush=True)
-                    raise NerfroError(line) from None
+                return _job_of_sweep(task, config)
 
             # Otherwise Hydra prints its own report and exits.
             os.environ["HYDRA_FULL_ERROR"] = "1"
@@ -226,6 +218,18 @@ def call(command: str, arguments: list[str]) -> None:
         _STAGES[command]()
     finally:
         sys.argv, main.__spec__, composed.hydra = program, spec, outer
+
+
+def _job_of_sweep(task: Callable[[DictConfig], float | None], config: DictConfig) -> float | None:
+    discover()  # the process may be a launcher's worker
+    try:
+        return task(config)
+    except Exception as error:  # Hydra's sweepers continue with the other jobs
+        if os.environ.get("NERFRO_DEBUG"):
+            raise
+        line = f"{Path(HydraConfig.get().runtime.output_dir).name}: {in_one_line(error)}"
+        print(f"nerfro: error: {line}", file=sys.stderr, flush=True)
+        raise NerfroError(line) from None
 
 
 @contextlib.contextmanager

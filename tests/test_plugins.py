@@ -213,7 +213,12 @@ def test_plugins_of_the_current_directory_are_registered_unless_the_environment_
 
 # Overrides that use each template.
 TEMPLATES = {
-    "example_surface": ["bodies={ring: {surface: {name: torus}, ior: 1.5}}"],
+    "example_surface": [
+        "medium=object",
+        "sampler/path=snell",
+        "medium.resolution=32",
+        "bodies={ring: {surface: {name: torus}, ior: 1.5}}",
+    ],
     "example_boundary": ["boundary=gradient_sky"],
     "example_camera": ["camera=shifted"],
     "example_data": ["data=numpy_views"],

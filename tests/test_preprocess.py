@@ -16,7 +16,7 @@ from nerfro.data.base import Views
 from nerfro.geometry.mesh import load_mesh
 from nerfro.media.bodies import BodySettings
 from nerfro.rendering.scene_file import read_scene_file
-from tests.ball_photographs import NUM_VIEWS, RADIUS, SIZE, cameras, mesh, save
+from tests.ball_photographs import NUM_VIEWS, RADIUS, SIZE, cameras, mesh, photographs, save
 
 
 @pytest.fixture
@@ -131,6 +131,17 @@ def test_supplied_mesh_is_compared_and_kept(preprocess: Callable[..., str], capt
     assert read_scene_file(capture / "scene.json").bodies["object"].mesh == str(tmp_path / "my ball.ply")
     assert not (capture / "mesh.ply").exists()
     assert json.loads((capture / "overlaps.json").read_text())["mean"] > 0.97
+
+
+def test_the_index_of_a_named_body_without_material_is_searched(preprocess: Callable[..., str], capture: Path) -> None:
+    save(photographs([1.45]), capture)
+    mesh().save(capture / "ball.ply")
+    ball = f"bodies={{ball: {{mesh: {capture / 'ball.ply'}, absorption: [0.1]}}}}"
+    printed = preprocess(f"mesh={capture / 'ball.ply'}", ball, "room=false", "data.near=0.5")
+    assert "index: 1.4" in printed
+    found = read_scene_file(capture / "scene.json").bodies["ball"]
+    assert found.ior == pytest.approx(1.45, rel=0.01)
+    assert found.absorption == [0.1]
 
 
 def test_data_without_masks_is_refused(preprocess: Callable[..., str], tiny_scene: Path) -> None:

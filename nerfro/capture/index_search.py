@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
@@ -98,7 +98,7 @@ def find_indices(
     if num_bodies not in _PLANS:
         raise NerfroError(
             f"the medium has {num_bodies} bodies, and at most two indices are searched for; set medium.ior= and "
-            "medium.inner_iors="
+            "medium.inner_iors=, or ior or material of each of bodies="
         )
     plan = _PLANS[num_bodies]
     if isinstance(surroundings.boundary, Room):
@@ -297,15 +297,12 @@ class FoundMedium:
     Attributes:
         medium: the medium.
         estimate: the indices that were searched; None if they are known.
+        index_settings: settings of the medium for these indices.
     """
 
     medium: Medium
     estimate: Estimate | None = None
-
-    @property
-    def index_settings(self) -> dict[str, object]:
-        """Settings of the medium for the indices that were searched."""
-        return {} if self.estimate is None else index_settings(self.estimate.values)
+    index_settings: dict[str, object] = field(default_factory=dict)
 
     @property
     def provenance(self) -> Provenance:
@@ -334,12 +331,15 @@ def find_medium(
     """
     if not request.searches_index:
         return FoundMedium(build_medium(request, settings | {"mesh": location}))
-    num_bodies = 1 + len(request.config.medium.get("inner_meshes", []))
-    medium = build_medium(request, settings | {"mesh": location} | index_settings([1.5] * num_bodies))
+    config = request.config.medium
+    bodies, inner = config.get("bodies"), config.get("inner_meshes", [])
+    num_bodies = 1 + len(inner) if bodies is None else len(bodies)
+    medium = build_medium(request, settings | {"mesh": location} | index_settings(config, [1.5] * num_bodies))
     if not isinstance(medium, Solid):
         raise NerfroError("the index of this type of medium cannot be searched for; set medium.ior=, or medium=object")
     found = _search_index(observations, medium, request.folder)
-    return FoundMedium(medium.with_indices(torch.from_numpy(found.values)), found)
+    searched = medium.with_indices(torch.from_numpy(found.values))
+    return FoundMedium(searched, found, index_settings(config, found.values))
 
 
 def _search_index(observations: Observations, medium: Solid, folder: Path) -> Estimate:

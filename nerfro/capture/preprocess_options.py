@@ -99,9 +99,11 @@ class Request:
 
     @property
     def searches_index(self) -> bool:
-        """Whether to search the index. The materials of a vessel and of named bodies are known."""
+        """Whether to search the index. The materials of a vessel are known, and those of named bodies if one is."""
         medium = self.config.medium
-        return not (is_given("medium.ior", self.overrides) or "wall" in medium or medium.get("bodies") is not None)
+        if medium.get("bodies") is not None:
+            return not any({"ior", "material"} & set(body) for body in medium.bodies.values())
+        return not (is_given("medium.ior", self.overrides) or "wall" in medium)
 
     @property
     def files(self) -> list[Path]:
@@ -175,9 +177,14 @@ def build_medium(request: Request, settings: dict[str, object]) -> Medium:
     return typing.cast(Medium, build(medium | settings))
 
 
-def index_settings(iors: Iterable[float]) -> dict[str, object]:
-    """Return the settings of the medium for the indices of the bodies."""
-    first, *inner = (round(float(ior), 4) for ior in iors)
+def index_settings(medium: DictConfig, iors: Iterable[float]) -> dict[str, object]:
+    """Return the settings of the medium for the indices of the bodies, which are in the order of their priorities."""
+    first, *inner = values = [round(float(ior), 4) for ior in iors]
+    bodies = medium.get("bodies")
+    if bodies is not None:
+        names = sorted(bodies, key=lambda name: bodies[name].get("priority", 0))
+        found = {name: {"ior": ior} for name, ior in zip(names, values, strict=True)}
+        return {"bodies": OmegaConf.to_container(OmegaConf.merge(bodies, found), resolve=True)}
     return {"ior": first} | ({"inner_iors": inner} if inner else {})
 
 

@@ -118,7 +118,15 @@ class SceneFile:
         def place(given: str | None) -> str | None:
             return given if given is None or given.startswith(EMBEDDED_PREFIX) else convert(given).as_posix()
 
-        bodies = {name: replace(body, mesh=place(body.mesh)) for name, body in self.bodies.items()}
+        def placed(surface: Any) -> Any:
+            if not isinstance(surface, Mapping):
+                return surface
+            return {key: place(value) if key == "file" else placed(value) for key, value in surface.items()}
+
+        bodies = {
+            name: replace(body, mesh=place(body.mesh), surface=placed(body.surface))
+            for name, body in self.bodies.items()
+        }
         return replace(self, data=self.data | {"root": place(str(self.data["root"]))}, bodies=bodies)
 
 
@@ -135,7 +143,9 @@ def take_bodies(medium: dict[str, Any]) -> dict[str, BodySettings]:
     mesh, ior, inner, iors = (medium.pop(name, None) for name in ("mesh", "ior", "inner_meshes", "inner_iors"))
     named = medium.pop("bodies", None)
     if named is not None:
-        return {name: BodySettings(**({"mesh": mesh} | body)) for name, body in named.items()}
+        return {
+            name: BodySettings(**({} if "surface" in body else {"mesh": mesh}) | body) for name, body in named.items()
+        }
     bodies = {"object": BodySettings(mesh=mesh, ior=ior)}
     for number, (mesh, ior) in enumerate(zip(inner or [], iors or [], strict=True), 1):
         bodies[f"inner_{number}"] = BodySettings(mesh=mesh, ior=ior)
