@@ -182,9 +182,9 @@ def index_settings(medium: DictConfig, iors: Iterable[float]) -> dict[str, objec
     first, *inner = values = [round(float(ior), 4) for ior in iors]
     bodies = medium.get("bodies")
     if bodies is not None:
-        names = sorted(bodies, key=lambda name: bodies[name].get("priority", 0))
-        found = {name: {"ior": ior} for name, ior in zip(names, values, strict=True)}
-        return {"bodies": OmegaConf.to_container(OmegaConf.merge(bodies, found), resolve=True)}
+        given = typing.cast(dict[str, dict[str, Any]], OmegaConf.to_container(bodies, resolve=True))
+        ordered = sorted(given.items(), key=lambda item: item[1].get("priority", 0))
+        return {"bodies": {name: body | {"ior": ior} for (name, body), ior in zip(ordered, values, strict=True)}}
     return {"ior": first} | ({"inner_iors": inner} if inner else {})
 
 

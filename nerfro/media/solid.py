@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -112,7 +112,9 @@ class Solid(Medium):
 
     def at_wavelength(self: Self, wavelength: float) -> Self:
         """Return the same bodies with their indices at a wavelength in nm; gradients reach the original indices."""
-        return self._with_materials([{"ior": material.ior_at(wavelength)} for material in self.materials])
+        same: dict[str, object] = {"dispersion": None}
+        changes = [same | {"ior": material.ior_at(wavelength)} for material in self.materials]
+        return self._with_materials(changes)
 
     def _with_materials(self: Self, changes: Sequence[dict[str, object]]) -> Self:
         changed = [variant(material, **change) for material, change in zip(self.materials, changes, strict=True)]
@@ -204,9 +206,11 @@ def body_names(num_bodies: int) -> list[str]:
     return ["object"] if num_bodies == 1 else [str(body + 1) for body in range(num_bodies)]
 
 
-def _read_old_parameters(module: nn.Module, state: dict[str, Tensor], prefix: str, *_: object) -> None:
+def _read_old_parameters(module: Any, state: dict[str, Tensor], prefix: str, *_: object) -> None:
     """Read the parameters of earlier releases, which held the values of all bodies."""
     for old, new in (("iors", "ior"), ("_absorption", "_absorption")):
         values = state.pop(f"{prefix}{old}", None)
         if values is not None:
-            state |= {f"{prefix}materials.{body}.{new}": value for body, value in enumerate(values)}
+            for body, value in enumerate(values):
+                if isinstance(getattr(module.materials[body], new), nn.Parameter):  # the air of a vessel has none
+                    state[f"{prefix}materials.{body}.{new}"] = value

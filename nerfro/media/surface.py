@@ -121,13 +121,6 @@ def cached_distances(
     return arrays["distance"]
 
 
-def vector(name: str, values: Sequence[float]) -> Float[np.ndarray, "3"]:
-    """Return three numbers as an array."""
-    if len(values) != 3:
-        raise NerfroError(f"surface.{name}={list(values)} is not allowed; give three numbers")
-    return np.array(values, np.float64)
-
-
 def direction(name: str, values: Sequence[float]) -> Float[np.ndarray, "3"]:
     """Return the unit vector along a direction."""
     length = np.linalg.norm(values)

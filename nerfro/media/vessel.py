@@ -14,9 +14,10 @@ from nerfro.errors import NerfroError
 from nerfro.geometry.lids import find_lid
 from nerfro.geometry.mesh import local_origin
 from nerfro.kernels.available import require_bytes
+from nerfro.media.base import Medium
 from nerfro.media.distance_grid import DistanceGrid
+from nerfro.media.material import Material, materials_of
 from nerfro.media.sdf_grid import SdfGrid
-from nerfro.media.solid import Solid
 from nerfro.media.surface import Grid, MeshSurface, cached_distances, direction
 from nerfro.media.voxel_grid import BYTES_PER_VERTEX, grid_box
 from nerfro.registry import register
@@ -88,16 +89,13 @@ class SdfVessel(SdfGrid):
         surface = MeshSurface(mesh, accept_open_mesh).mesh
         box = grid_box(box_min, box_max, surface.bounds, resolution)
         spacing = float((box[1] - box[0]).min()) / (resolution - 1)
-        iors = [ior, liquid_ior] if level is None else [ior, 1.0, liquid_ior]
-        Solid.__init__(
-            self,
-            iors,
-            shell_voxels * spacing,
-            _of_bodies(absorption, 3, len(iors), 0.0, "absorption"),
-            learn_absorption,
-            _of_bodies(abbe, 1, len(iors), 1.0, "abbe"),
-        )
-        self.names = ["wall", *["air"] * (len(iors) - 2), "liquid"]
+        glass, liquid = materials_of([ior, liquid_ior], absorption, learn_absorption, abbe, learn_ior=False)
+        Medium.__init__(self)
+        if level is None:
+            self._set_materials([glass, liquid], ["wall", "liquid"])
+        else:
+            self._set_materials([glass, Material(1.0), liquid], ["wall", "air", "liquid"])
+        self.shell = shell_voxels * spacing
         self.meshes = []  # rays are refracted at the distance field, not at triangles
         upwards = direction("medium.up", up)
         self.origin = local_origin(surface.vertices)
@@ -125,12 +123,6 @@ class SdfVessel(SdfGrid):
                 f"medium.wall={wall:g} and medium.foot={self.lengths['foot']:g} leave no cavity: no point of the body "
                 f"is deeper than {deepest:.3g}; give smaller ones, in world units, or medium.height= in the same unit"
             )
-
-    @property
-    def absorption(self) -> Float[Tensor, "K 3"] | None:
-        """Absorption coefficients of each body and colour channel, per world unit; those of air are zero."""
-        values = super().absorption
-        return values if values is None or len(values) == 2 else values * values.new_tensor([[1.0], [0.0], [1.0]])
 
     def grown(self, outwards: Float[Tensor, "X Y Z"]) -> SdfVessel:
         """Return the vessel with a displaced outer surface. The cavity follows, as the wall keeps its thickness."""
@@ -163,13 +155,3 @@ class SdfVessel(SdfGrid):
                 f"{given} is not allowed: heights are measured from the vessel's lowest point, the foot is below the "
                 f"level, and the vessel is {self.height:.4g} high, in world units or the unit of medium.height="
             )
-
-
-def _of_bodies(given: Sequence[float], each: int, num_bodies: int, air: float, name: str) -> list[float]:
-    """Expand the numbers of wall and liquid, or one number for both, to all bodies; an empty list stays empty."""
-    if len(given) not in (0, 1, 2 * each):
-        raise NerfroError(
-            f"medium.{name}={list(given)} has {len(given)} numbers; give {2 * each}, of wall and liquid, or one for all"
-        )
-    both = list(given) * (2 * each) if len(given) == 1 else list(given)
-    return both[:each] + [air] * (each * (num_bodies - 2)) + both[each:] if given else []

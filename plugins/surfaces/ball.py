@@ -8,8 +8,10 @@ import numpy as np
 from jaxtyping import Float
 
 from nerfro.allowed import Coordinate, Positive
-from nerfro.media.surface import Grid, Surface, vector
+from nerfro.media.surface import Grid, Surface
 from nerfro.registry import register
+
+from .vectors import vector
 
 
 @register("surface", "ball")

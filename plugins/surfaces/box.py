@@ -9,8 +9,10 @@ from jaxtyping import Float
 
 from nerfro.allowed import Coordinate, NotNegative, Positive
 from nerfro.errors import NerfroError
-from nerfro.media.surface import Grid, Surface, vector
+from nerfro.media.surface import Grid, Surface
 from nerfro.registry import register
+
+from .vectors import vector
 
 
 @register("surface", "box")

@@ -11,8 +11,10 @@ from nerfro.allowed import Coordinate
 from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import merge_vertices
 from nerfro.geometry.revolve import revolve
-from nerfro.media.surface import MeshSurface, direction, vector
+from nerfro.media.surface import MeshSurface, direction
 from nerfro.registry import register
+
+from .vectors import vector
 
 
 @register("surface", "revolution")

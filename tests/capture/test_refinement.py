@@ -16,6 +16,7 @@ from nerfro.capture.room_panorama import panorama_of
 from nerfro.capture.silhouettes import mesh_silhouettes
 from nerfro.capture.surroundings import Pixels, Room, Surroundings, divide_pixels, learn_surroundings
 from nerfro.capture.visual_hull import Silhouettes
+from nerfro.draws import Draws
 from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import load_mesh
 from nerfro.media.sdf_grid import SdfGrid
@@ -100,7 +101,7 @@ class PaintedShell(Room):
     def __init__(self) -> None:
         Boundary.__init__(self)
 
-    def seen(self, exits: Exits) -> tuple[Tensor, Tensor]:
+    def seen(self, exits: Exits, draws: Draws | None = None) -> tuple[Tensor, Tensor]:
         assert exits.positions is not None
         along = (exits.positions * exits.directions).sum(-1)
         away = (along**2 - exits.positions.square().sum(-1) + self.RADIUS**2).sqrt() - along

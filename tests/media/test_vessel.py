@@ -169,7 +169,7 @@ def test_tint_and_dispersion_are_those_of_wall_and_liquid(tmp_path: Path) -> Non
         ({"up": [0.0, 0.0, 0.0]}, "is no direction; give three numbers"),
         ({"up": [0.0, 1.0]}, "is no direction; give three numbers"),
         ({"wall": -1.0}, "more than 0"),
-        ({"absorption": [1.0, 2.0]}, "give 6, of wall and liquid, or one for all"),
+        ({"absorption": [1.0, 2.0]}, r"give red, green and blue of each body \(6 numbers\), or one for all"),
     ],
 )
 def test_what_no_vessel_has_is_refused_in_one_line(tmp_path: Path, options: dict[str, object], message: str) -> None:

@@ -87,6 +87,10 @@ def test_every_band_is_traced_as_a_ray_of_its_colour(branches: str) -> None:
         alone = single[single.refracted]
         torch.testing.assert_close(mine.exit_directions, alone.exit_directions, atol=1e-9, rtol=0)
         torch.testing.assert_close(mine.throughput[:, band], alone.throughput[:, 0], atol=1e-9, rtol=0)
+        if band == 0:
+            main = sampler.main(rays, medium)
+            assert main.ray.tolist() == list(range(60))
+            torch.testing.assert_close(main.exit_directions, single.first_of_ray(single.exit_directions))
 
 
 def test_bands_bring_their_gradients_to_the_one_index() -> None:
