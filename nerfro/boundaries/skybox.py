@@ -20,7 +20,9 @@ class Skybox(Boundary):
     The radiance is a sigmoid and at most 1, as in the authors' code. Bright lamps are therefore clipped.
 
     Args:
-        width, depth, skip: of the MLP.
+        width: number of units in each hidden layer.
+        depth: number of hidden layers.
+        skip: number of the layer after which the input is concatenated again.
     """
 
     def __init__(self, width: Width = 128, depth: Depth = 4, skip: int = 3) -> None:

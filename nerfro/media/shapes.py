@@ -23,7 +23,7 @@ class Ball(Solid):
     """A ball around the origin.
 
     Args:
-        radius: of the ball, world units.
+        radius: radius of the ball, world units.
         ior: refractive index.
         shell: half width of the smooth interface for `sampler/path=eikonal`, world units.
         absorption: absorption coefficients of red, green and blue, or one number for all, per world unit.

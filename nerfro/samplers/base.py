@@ -29,7 +29,15 @@ class PathSampler(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, rays: Rays, medium: Medium) -> Path:
-        """Trace rays from near to far through the medium; bent paths end outside of it, beyond far if necessary."""
+        """Trace rays from near to far through the medium.
+
+        Args:
+            rays: R rays with unit directions; lengths in world units, relative to `medium.origin`.
+            medium: refractive index.
+
+        Returns:
+            P polylines, at least one for each ray. Bent paths end outside of the medium, beyond far if necessary.
+        """
 
     def main(self, rays: Rays, medium: Medium) -> Path:
         """Trace only the first polyline of each ray, which is enough to find the exit directions."""

@@ -24,7 +24,7 @@ class Hierarchical(PointSampler):
     """Draw coarse stratified samples, and fine samples by inverse transform sampling of the coarse weights.
 
     Fine arc lengths are mapped to the path by the nearest previous vertex, so that fine samples lie on the bent ray
-    (paper, Fig. sampling).
+    (paper, Fig. 3).
 
     Args:
         num_coarse: number of coarse samples, N_c.

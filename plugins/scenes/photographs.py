@@ -88,7 +88,7 @@ def hand_held(
         count: number of photographs.
         seed: of what is not exact: direction, distance and aim (some per cent), and roll (6 degrees).
         target: what the camera looks at, world units.
-        distance: of the camera from the target.
+        distance: distance of the camera from the target, world units.
         elevations: lowest and highest above the target, degrees; equal areas in between get equally many photographs.
         laps: number of times around.
 
