@@ -9,7 +9,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int, Int8
 
 from nerfro.kernels.compilation import compiled
 from nerfro.kernels.tolerances import BEYOND_BOX, SAFE_SHARE
@@ -50,9 +50,10 @@ class Solids(NamedTuple):
     clearance_start: Int[np.ndarray, "K"]
     clearance_shape: Int[np.ndarray, "K 3"]
     inverse_clearance: Float[np.ndarray, "K 3"]
-    # Smaller blocks: lowest and highest derivatives of the spline, number of empty blocks around, and as above.
+    # Smaller blocks: lowest and highest derivatives of the spline, number of empty blocks around (negative inside the
+    # body), and as above.
     slopes: Float[np.ndarray, "B 3 2"]
-    empty: UInt8[np.ndarray, "B"]
+    empty: Int8[np.ndarray, "B"]
     block_start: Int[np.ndarray, "K"]
     block_shape: Int[np.ndarray, "K 3"]
     inverse_block: Float[np.ndarray, "K 3"]
@@ -67,7 +68,7 @@ class Solids(NamedTuple):
 # Arguments of kernels that take a medium of either type.
 NO_VOXELS = Voxels(np.empty((0, 0, 0, 4), np.float32), np.empty((0, 0, 0), np.float32), *np.empty((3, 3)))
 _corners, _lengths, _counts, _numbers = np.empty((0, 3)), np.empty(0), np.empty((0, 3), np.int64), np.empty(0, np.int64)
-_values, _bounds, _bytes = np.empty(0, np.float32), np.empty((0, 3, 2), np.float32), np.empty(0, np.uint8)
+_values, _bounds, _bytes = np.empty(0, np.float32), np.empty((0, 3, 2), np.float32), np.empty(0, np.int8)
 NO_SOLIDS = Solids(
     _corners, _corners, _corners, _lengths, _values, _numbers, _counts, _values, _numbers, _counts, _corners, _bounds,
     _bytes, _numbers, _counts, _corners, _lengths, False, 0.0, *np.empty((2, 3)),

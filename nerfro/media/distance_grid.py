@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int8
 from scipy.ndimage import distance_transform_cdt
 from torch import Tensor, nn
 
@@ -112,17 +112,18 @@ class DistanceGrid(nn.Module):
         return found
 
     @lazy_buffer
-    def empty_blocks(self) -> UInt8[Tensor, "x y z"]:
+    def empty_blocks(self) -> Int8[Tensor, "x y z"]:
         """Lower bound of the Chebyshev distance to the next block of `SURFACE_BLOCK`^3 cells that may hold the surface.
 
-        0 means that the block itself may hold the surface. A block without sign changes of the coefficients does not,
-        because the values of a spline lie between its coefficients. This does not hold at the border of the grid, where
-        splines are extrapolated.
+        Values of blocks inside the body are negative, and 0 means that the block itself may hold the surface. A block
+        without sign changes of the coefficients does not, because the values of a spline lie between its coefficients.
+        This does not hold at the border of the grid, where splines are extrapolated.
         """
         lowest, highest = _extremes(self._coefficients_of_blocks(), [SURFACE_BLOCK + 3] * 3)
         outside = lowest > torch.where(self._border_blocks(), highest / _CONTINUED, 0)
-        empty = outside | ((highest < 0) & ~self._border_blocks())
-        return torch.from_numpy(distance_transform_cdt(empty.numpy(), "chessboard").clip(0, 255).astype(np.uint8))
+        inside = (highest < 0) & ~self._border_blocks()
+        distance = distance_transform_cdt((outside | inside).numpy(), "chessboard").clip(0, 127).astype(np.int8)
+        return torch.where(inside, -torch.from_numpy(distance), torch.from_numpy(distance))
 
     def _coefficients_of_blocks(self) -> Float[Tensor, "X Y Z"]:
         """Return the coefficients of all blocks of `SURFACE_BLOCK`^3 cells and their neighbours, on the CPU."""

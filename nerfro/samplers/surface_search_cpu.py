@@ -142,9 +142,11 @@ def _surface_ahead(solids, body, inside, line, limit):
     while True:
         i, j, k = block_at(counts, bx + t * rx, by + t * ry, bz + t * rz)
         block = block_number(solids.block_start[body], counts, i, j, k)
-        reach = solids.empty[block]
-        # After a step across a block, a surface in this block may be behind an empty block.
-        if reach > 0 and not across:
+        side = int(solids.empty[block])
+        reach = abs(side)
+        # The last step may have crossed a surface: if it crossed a block, or where the distance of a vessel's cavity
+        # jumps above the opening. Otherwise, empty blocks are skipped.
+        if reach > 0 and not across and (side < 0) == inside:
             before, at_point = t, math.nan
             t = max(t, end_of_blocks(i, j, k, reach, bx, by, bz, qx, qy, qz)) + beyond
             if t >= leave:

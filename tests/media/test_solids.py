@@ -121,7 +121,9 @@ def test_no_surface_is_in_blocks_that_are_said_to_be_empty() -> None:
     positions = torch.rand(20000, 3, dtype=torch.float64) * 3 - 1.5
     places = ((positions + 1.5) / block).long().clamp(max=len(empty) - 1)
     signs = medium.grids[0](positions)[0] < 0
-    reach = empty[places.unbind(-1)].long()
+    side = empty[places.unbind(-1)].long()
+    reach = side.abs()
+    assert torch.equal(side[reach > 0] < 0, signs[reach > 0])
     # As far as the blocks around are empty, the body is on the same side of a place as of that block's middle.
     moved = (places + (torch.rand(20000, 3) * 2 - 1) * (reach[:, None] - 1) + torch.rand(20000, 3)) * block - 1.5
     moved = moved.round(decimals=6).clamp(-1.5, 1.5)

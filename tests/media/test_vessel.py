@@ -11,7 +11,7 @@ from nerfro.errors import NerfroError
 from nerfro.geometry.lids import find_lid
 from nerfro.geometry.mesh import load_mesh
 from nerfro.media.vessel import SdfVessel
-from nerfro.samplers.snell import Snell
+from nerfro.samplers.snell import Snell, trace_interfaces
 from nerfro.viewing.surface import surface_of
 from tests.closed_forms import angle, make_rays
 from tests.media.vessels import RADIUS, WALL, exit_directions, spherical_vessel
@@ -103,6 +103,18 @@ def test_light_enters_an_opening_freely_and_meets_water_glass_and_air(tmp_path: 
     torch.testing.assert_close(
         trace.path.positions[0, 1:4, 2], torch.tensor([0.2, -0.6, -0.8]).double(), atol=2e-3, rtol=0
     )
+
+
+def test_slanted_rays_enter_an_opening_as_in_the_reference_implementation(tmp_path: Path) -> None:
+    glass = _glass(tmp_path)
+    random = np.random.default_rng(0)
+    angles, radius = random.uniform(0, 2 * np.pi, 2000), 0.9 * ABOVE * np.sqrt(random.random(2000))
+    places = np.stack([radius * np.cos(angles), radius * np.sin(angles), np.full(2000, 0.5 * HEIGHT)], -1)
+    slope = random.uniform(0.5, 1.5, 2000)
+    directions = np.stack([slope, 0 * slope, -np.ones(2000)], -1) / np.hypot(slope, 1)[:, None]
+    rays = make_rays(torch.from_numpy(places - 2 * directions), torch.from_numpy(directions), 0.0, 9.0)
+    found, expected = Snell().trace(rays, glass).path, trace_interfaces(rays, glass, 16).path
+    assert (angle(found.exit_directions, expected.exit_directions) > 1).float().mean() < 1e-3
 
 
 def test_paths_through_a_glass_have_gradients_by_its_indices(tmp_path: Path) -> None:
