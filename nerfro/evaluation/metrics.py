@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -43,9 +44,11 @@ class ImageMetrics(nn.Module):
         self.prefix = prefix
         self.views: dict[int, ViewScores] = {}
 
-    def reset(self) -> None:
-        """Remove the scores of all views."""
-        self.views.clear()
+    def emptied(self) -> ImageMetrics:
+        """Return the same metrics without the scores of views."""
+        empty = copy.copy(self)
+        empty.views = {}
+        return empty
 
     @torch.no_grad()
     def update(

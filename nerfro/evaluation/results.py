@@ -22,7 +22,8 @@ Score = float | None  # None if not available; the notes contain the reason
 
 Region = Literal["full", "mask", "crop"]  # see nerfro/evaluation/regions.py
 FULL: Region = "full"
-AS_GIVEN = "as given"  # name of the scores under `test`: cameras and exposures of the data set
+# Names of the scores under `test`, with the cameras and exposures of the data set, and of scores with fitted exposures.
+AS_GIVEN, EXPOSED = "as given", "exposed"
 OBJECT_REGIONS: tuple[Region, ...] = ("mask", "crop")  # regions that require a mask of the object
 
 

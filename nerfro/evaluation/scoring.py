@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -24,48 +25,60 @@ from nerfro.rendering import Renderer
 from nerfro.subdivision import Subdivision
 
 
+@dataclass(frozen=True)
+class Images:
+    """Images of an evaluation.
+
+    Attributes:
+        subfolder: name of their folder.
+        right_halves: score only the right half of each view. If the model estimates exposures, the gain of each view
+            is fitted on the left half of the photograph.
+    """
+
+    subfolder: str
+    right_halves: bool = False
+
+
 def score_views(
     renderer: Renderer,
     views: Views,
     metrics: ImageMetrics,
     folder: Path,
     subdivision: Subdivision,
-    subfolder: str = "images",
-    right_halves: bool = False,
-) -> tuple[EvaluationResult, Float[Tensor, "V 3"]]:
-    """Render all views, write these as 8-bit sRGB to `folder/<subfolder>/<prefix>_NNN.png`, and compute the scores.
+    images: Sequence[Images],
+) -> tuple[list[EvaluationResult], Float[Tensor, "V 3"]]:
+    """Render all views, write 8-bit sRGB images to `folder/<subfolder>/<prefix>_NNN.png`, and compute their scores.
 
     The memory holds the rays and images of one view and the samples of `renderer.chunk_size` rays.
 
     Args:
         renderer: trained model.
         views: views to score.
-        metrics: scores of earlier views are removed.
+        metrics: metrics of each of the images; their scores of other views do not count.
         folder: folder of the evaluation.
         subdivision: which pixels get several rays.
-        subfolder: name of the folder of images.
-        right_halves: score only the right half of each view. If the model estimates exposures, the gain of each view
-            is fitted on the left half of the photograph.
+        images: images that are made of each rendering.
 
     Returns:
-        Scores, and the gain of each view and channel, which is 1 if no gains are fitted.
+        Scores of each of the images, and the gain of each view and channel, which is 1 if no gains are fitted.
     """
-    metrics.reset()
     scene, height, width = renderer.scene, views.cameras.height, views.cameras.width
     cameras, left = views.cameras.to(scene.device), slice(width // 2)
-    scored = slice(width // 2, None) if right_halves else slice(None)
-    gains = torch.ones(len(views), 3)
+    scores, gains = [metrics.emptied() for _ in images], torch.ones(len(views), 3)
     for view in track("evaluate", range(len(views))):
         radiance = render_view(renderer, cameras, view, subdivision).radiance.view(height, width, 3).cpu()
         target, mask = views.images[view], None if views.masks is None else views.masks[view]
-        if right_halves and scene.camera.exposure is not None:
-            to_srgb, shown = scene.colour_space.to_srgb, radiance[:, left].flatten(0, 1)
-            gains[view] = fit_gain(to_srgb, shown, target[:, left].flatten(0, 1))
-        rgb = scene.colour_space.to_display(radiance, gains[view])
-        save_png(folder / subfolder / f"{metrics.prefix}_{view:03d}.png", rgb)
-        prediction, target = (image[:, scored].contiguous() for image in (rgb, target))
-        metrics.update(prediction, target, view, None if mask is None else mask[:, scored].contiguous())
-    return metrics.result(), gains
+        for kind, scored in zip(images, scores, strict=True):
+            gain = torch.ones(3)
+            if kind.right_halves and scene.camera.exposure is not None:
+                to_srgb, shown = scene.colour_space.to_srgb, radiance[:, left].flatten(0, 1)
+                gain = gains[view] = fit_gain(to_srgb, shown, target[:, left].flatten(0, 1))
+            rgb = scene.colour_space.to_display(radiance, gain)
+            save_png(folder / kind.subfolder / f"{metrics.prefix}_{view:03d}.png", rgb)
+            part = slice(width // 2, None) if kind.right_halves else slice(None)
+            coverage = None if mask is None else mask[:, part].contiguous()
+            scored.update(rgb[:, part].contiguous(), target[:, part].contiguous(), view, coverage)
+    return [scored.result() for scored in scores], gains
 
 
 def score_folders(

@@ -19,8 +19,8 @@ from nerfro.cameras import Cameras
 from nerfro.data.base import Views
 from nerfro.data.pixel_store import PixelStore
 from nerfro.evaluation.metrics import ImageMetrics
-from nerfro.evaluation.results import EvaluationResult
-from nerfro.evaluation.scoring import score_views
+from nerfro.evaluation.results import AS_GIVEN, EXPOSED, EvaluationResult
+from nerfro.evaluation.scoring import Images, score_views
 from nerfro.rays import Rays
 from nerfro.rendering import Renderer
 from nerfro.subdivision import Subdivision
@@ -55,22 +55,20 @@ def score_split(
     Returns:
         Scores with the given cameras, and the scores of each treatment by name.
     """
-    scene, gains = renderer.scene, torch.ones(len(views), 3)
-    given, _ = score_views(renderer, views, metrics, folder, subdivision)
-    treated: dict[str, EvaluationResult] = {}
+    scene, settings, results = renderer.scene, (metrics, folder, subdivision), dict[str, EvaluationResult]()
+    images = {AS_GIVEN: Images("images")}
     if scene.camera.moves:
+        [results[AS_GIVEN]], _ = score_views(renderer, views, *settings, [*images.values()])
         views = replace(views, cameras=scene.camera.aligned(views.cameras))
-        treated["aligned"], _ = score_views(renderer, views, metrics, folder, subdivision, "images_aligned")
+        images = {"aligned": Images("images_aligned")}
     if scene.camera.exposure is not None:
-        treated["exposed"], gains = score_views(
-            renderer, views, metrics, folder, subdivision, "images_exposed", right_halves=True
-        )
+        images[EXPOSED] = Images("images_exposed", right_halves=True)
+    scores, gains = score_views(renderer, views, *settings, [*images.values()])
+    results |= dict(zip(images, scores, strict=True))
     if refine_steps:
         views = replace(views, cameras=refine_on_left(renderer, views, gains, refine_steps))
-        treated["refined"], _ = score_views(
-            renderer, views, metrics, folder, subdivision, "images_refined", right_halves=True
-        )
-    return given, treated
+        [results["refined"]], _ = score_views(renderer, views, *settings, [Images("images_refined", True)])
+    return results.pop(AS_GIVEN), results
 
 
 @torch.no_grad()

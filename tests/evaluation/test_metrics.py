@@ -186,12 +186,12 @@ def test_views_are_ordered_by_number_and_repeated_ones_count_once() -> None:
     assert result.views[1].scores["psnr"] != result.views[0].scores["psnr"]
 
 
-def test_reset_forgets_all_views() -> None:
+def test_emptied_metrics_have_no_views() -> None:
     metrics = ImageMetrics()
     metrics.update(*pictures())
-    metrics.reset()
     with pytest.raises(NerfroError, match="no view was scored"):
-        metrics.result()
+        metrics.emptied().result()
+    assert len(metrics.result().views) == 1
 
 
 @pytest.mark.usefixtures("unchecked")
