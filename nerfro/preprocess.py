@@ -9,6 +9,7 @@ Examples:
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import cast
 
 import torch
@@ -17,6 +18,7 @@ from omegaconf import DictConfig
 
 import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
 from nerfro.capture.index_search import find_medium
+from nerfro.capture.object_errors import unsupported_bodies
 from nerfro.capture.overlaps import choose_wrong_masks, report_overlaps
 from nerfro.capture.pose_conventions import require_consistent_poses
 from nerfro.capture.preprocess_options import MESH, PreprocessConfig, Request, surface_settings, write_scene
@@ -27,7 +29,7 @@ from nerfro.capture.vessel_fit import find_vessel
 from nerfro.capture.visual_hull import Silhouettes
 from nerfro.cli import entry_point, warn
 from nerfro.data.base import Views
-from nerfro.data.masks import EVIDENCE, masked_views, method_of, with_other_splits
+from nerfro.data.masks import EVIDENCE, REVOLUTION, masked_views, method_of, with_other_splits
 from nerfro.files.atomic import refuse_existing
 from nerfro.files.folder_lock import lock_folder
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
@@ -72,9 +74,14 @@ def _preprocess(config: DictConfig, request: Request) -> None:
             if silhouettes is not None:
                 report_overlaps(outlined, mesh, silhouettes, None, request.folder, list_all=False)
             found = find_medium(request, observations, location, settings)
-    vessel = find_vessel(cast(SdfGrid, found.medium), location, mesh, observations) if config.vessel else {}
+    vessel, unsupported = dict[str, object](), list[str]()
+    if config.vessel:
+        solid = cast(SdfGrid, found.medium)  # see Request.check
+        vessel, fitted = find_vessel(solid, location, mesh, observations)
+        unsupported = unsupported_bodies(observations, solid, found.is_doubtful, fitted)
     estimated = settings | {"mesh": location} | found.index_settings
-    scene = SceneFile(medium=estimated, vessel=vessel, surroundings=observations.distance, provenance=found.provenance)
+    origin = replace(found.provenance, unsupported=unsupported)
+    scene = SceneFile(medium=estimated, vessel=vessel, surroundings=observations.distance, provenance=origin)
     write_scene(request, scene, views.cameras, mesh)
 
 
@@ -88,7 +95,8 @@ def _reconstruct(request: Request, views: Views, mesh: TriangleMesh | None) -> t
     """
     config, folder = request.config, request.folder
     all_silhouettes = read_silhouettes(views, request.box is not None)
-    own = [i for i, frame in enumerate(views.frames) if frame.mask is None or method_of(frame.mask) in EVIDENCE]
+    methods = [None if frame.mask is None else method_of(frame.mask) for frame in views.frames]
+    own = [i for i, method in enumerate(methods) if method in EVIDENCE]
     views, silhouettes = (views.select(own), all_silhouettes.select(own)) if own else (views, all_silhouettes)
     if len(views) < len(all_silhouettes):
         num_projections = len(all_silhouettes) - len(views)
@@ -98,7 +106,7 @@ def _reconstruct(request: Request, views: Views, mesh: TriangleMesh | None) -> t
     surface = mesh
     if surface is None:
         options = config.resolution, wrong_masks, config.keep, config.smoothing, config.symmetry
-        surface = make_mesh(all_silhouettes, request.box, *options, evidence=silhouettes)
+        surface = make_mesh(all_silhouettes, request.box, *options, silhouettes, REVOLUTION in methods)
         surface.save(folder / MESH)
     # The report is written before the medium is built, because the report shows why a medium refuses a surface.
     report_overlaps(views, surface, silhouettes, wrong_masks if mesh is None else None, folder)

@@ -89,7 +89,7 @@ class Pretended:
 
     def __init__(self, out: Path) -> None:
         self.out, self.near = out, False
-        self.doubts, self.medium = list[str](), {"type": "object"}
+        self.doubts, self.unsupported, self.medium = list[str](), list[str](), {"type": "object"}
         self.psnr = {"straight": 20.0, "unknown": 22.0, "glass": 21.0, "glass_room": 21.0}  # by experiment
         self.ran: list[tuple[str, list[str]]] = []
         self.ends: dict[str, BaseException | None] = {}
@@ -126,7 +126,7 @@ class Pretended:
             self.write("surface/scene.json", {
                 "data": {"type": "opencv", "root": ".."}, "medium": self.medium, "bodies": bodies,
                 "vessel": {"wall": 0.01}, "surroundings": distance, "photograph": [512, 384],
-                "provenance": {"doubts": self.doubts},
+                "provenance": {"doubts": self.doubts, "unsupported": self.unsupported},
             })  # fmt: skip
         if name == "train":
             psnr = next(self.psnr[text.split("=")[1]] for text in options if text.startswith("+experiment="))
@@ -228,6 +228,21 @@ def test_training_continues_with_the_hypothesis_that_the_validation_photographs_
     assert f"trainer.max_steps={105 if chosen == 'straight rays' else 70}" in best
     learned = [option for trial in trials for option in trial if option.startswith("medium.ior=")]
     assert learned == ["medium.ior=1.333", "medium.ior=1.52"] * bool(doubts), "an index in doubt is never known"
+
+
+@pytest.mark.parametrize(
+    ("unsupported", "trials", "chosen"),
+    [(["solid body", "vessel"], 0, "straight"), (["solid body"], 2, "glass"), (["vessel"], 2, "unknown")],
+)
+def test_bodies_that_the_pixels_do_not_support_are_not_tried(
+    reconstruct: Reconstruct, pretended: Pretended, photos: Path, unsupported: list[str], trials: int, chosen: str
+) -> None:
+    pretended.unsupported = unsupported
+    done = reconstruct(*given(photos), f"out={pretended.out}")
+    assert done.code == 0, done.err
+    *tried, train = [options for name, options in pretended.ran if name == "train"]
+    assert len(tried) == trials
+    assert f"+experiment={chosen}" in train
 
 
 def test_stages_print_no_next_command(capsys: pytest.CaptureFixture[str]) -> None:
@@ -364,13 +379,14 @@ def test_posed_photographs_of_a_ball_become_a_scene(
     assert scene["surroundings"] == "far"
     assert scene["bodies"] == {"object": {"mesh": "mesh.ply", "ior": round(index["ior"][0], 4)}}
     assert scene["provenance"]["standard_error"] == index["standard_error"]
+    assert scene["provenance"]["unsupported"] == ["vessel"]
     assert (out / "surface" / "refinement.json").is_file()
     assert json.loads((out / "run" / "metrics.json").read_text())["steps"] == 2
     assert (out / "report" / "report.html").is_file()
     assert "training continues with: " in done.out
     assert (out / "page.html").is_file()
-    # Surface, three trials, training, report and page.
-    assert reconstruct(*asked).out.count(" is kept (delete the file to repeat the stage)") == 7
+    # Surface, two trials, training, report and page.
+    assert reconstruct(*asked).out.count(" is kept (delete the file to repeat the stage)") == 6
     assert (torch.initial_seed(), signal.getsignal(signal.SIGTERM)) == before
     command = next(line for line in done.out.splitlines() if line.endswith(f"hydra.run.dir={out}/run"))
     alone = run_here("train", *shlex.split(command)[4:], f"hydra.run.dir={tmp_path / 'alone'}")

@@ -86,6 +86,7 @@ def make_mesh(
     smoothing: float,
     symmetry: Symmetry | None = None,
     evidence: Silhouettes | None = None,
+    is_revolution: bool = False,
 ) -> TriangleMesh:
     """Carve the visual hull and fit a smooth surface.
 
@@ -99,25 +100,34 @@ def make_mesh(
         symmetry: also fit a body of revolution, which is used unless its overlap with the masks is smaller by more
             than 0.005 (`auto`) or 0.01 (`axis`, with a warning).
         evidence: silhouettes that decide between the two surfaces; by default all.
+        is_revolution: whether silhouettes are projections of a body of revolution, so that a free surface is only
+            fitted if the hull has no axis.
     """
     box = _object_box(silhouettes, wrong_masks) if corners is None else corners
     with bar("carving") as progress:
         distances, corner, spacing = carve_grid(silhouettes, box, resolution, wrong_masks, progress)
     num_parts, num_kept = remove_strays(distances, keep)
-    mesh = extract_surface(distances, corner, spacing)
-    if smoothing > 0:
+    mesh, revolution = extract_surface(distances, corner, spacing), None
+    if symmetry is not None and is_revolution:
+        revolution = _revolution(mesh, silhouettes)
+    if revolution is None and smoothing > 0:
         with bar("fitting") as progress:
             mesh = fit_surface(mesh, silhouettes, smoothing, progress)
-    if symmetry is not None:
-        with bar("finding the axis") as progress:
-            revolution = fit_revolution(mesh, silhouettes, progress)
-        mesh = _choose_symmetry(revolution, mesh, evidence or silhouettes, symmetry)
+    if revolution is not None:
+        mesh = revolution
+    elif symmetry is not None:
+        mesh = _choose_symmetry(_revolution(mesh, silhouettes), mesh, evidence or silhouettes, symmetry)
     if num_kept < num_parts:
         print(f"kept the largest {num_kept} of {num_parts} separate components")
     if reaches_border(distances):
         _warn_of_open_hull(silhouettes, box)
     print(f"{len(mesh.faces)} triangles, voxels of {spacing:.4g}")
     return mesh
+
+
+def _revolution(mesh: TriangleMesh, silhouettes: Silhouettes) -> TriangleMesh | None:
+    with bar("finding the axis") as progress:
+        return fit_revolution(mesh, silhouettes, progress)
 
 
 def _choose_symmetry(

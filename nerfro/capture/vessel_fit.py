@@ -7,15 +7,16 @@ reflections, the foot and the liquid.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from nerfro.capture.index_search import bootstrap_weights, mean_errors
-from nerfro.capture.surroundings import Observations, half_weight, robust
+from nerfro.capture.index_search import mean_errors
+from nerfro.capture.object_errors import COMMON_INDICES, ObjectErrors
+from nerfro.capture.surroundings import Observations
 from nerfro.capture.upright import find_up
 from nerfro.cli import warn
 from nerfro.errors import NerfroError
@@ -23,19 +24,16 @@ from nerfro.geometry.mesh import TriangleMesh
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.vessel import SdfVessel
 from nerfro.progress import bar
-from nerfro.samplers.snell import Snell
 
 # Lengths of a typical glass, as fractions of its width.
 _TYPICAL = {"wall": 0.02, "foot": 0.06, "fillet": 0.1}
 _MAX_FILLET = 0.4
-_GLASS, _WATER = 1.52, 1.333
+_GLASS, _WATER = COMMON_INDICES["glass"], COMMON_INDICES["water"]
 # Levels of a liquid that are compared with an empty glass, as fractions of the height.
 _LEVELS = (0.3, 0.5, 0.7, 0.9)
 # Half width of the grid of candidates of each round: a factor for lengths, and a fraction of the height for the level.
 _ROUNDS = ((2.0, 0.1), (1.5, 0.06), (1.5, 0.03))
 _GRID = np.linspace(-1, 1, 5)
-_NUM_PIXELS = 6000
-_LEAST_WEIGHT = 0.02
 # A vessel contains a liquid if the liquid decreases the error by this number of standard errors.
 _SIGNIFICANT = 2.0
 # Largest standard error of a known length, relative to the length; the last grid limits the error to about 0.4.
@@ -58,8 +56,10 @@ class VesselFit:
     unknown: list[str]
 
 
-def find_vessel(medium: SdfGrid, location: str, mesh: TriangleMesh, observations: Observations) -> dict[str, object]:
-    """Fit a vessel to the photographs, print its lengths, and return the settings of the medium.
+def find_vessel(
+    medium: SdfGrid, location: str, mesh: TriangleMesh, observations: Observations
+) -> tuple[dict[str, object], SdfVessel | None]:
+    """Fit a vessel to the photographs, print its lengths, and return the settings of the medium, and the medium.
 
     Args:
         medium: solid body with the outer surface.
@@ -68,7 +68,7 @@ def find_vessel(medium: SdfGrid, location: str, mesh: TriangleMesh, observations
         observations: observations of the object and its surroundings.
 
     Returns:
-        Settings of the vessel except its mesh; empty if the surface leaves no cavity.
+        Settings of the vessel except its mesh, and the vessel; none if the surface leaves no cavity.
     """
     found_up = find_up(observations.views.cameras, mesh)
     up = [0.0, 0.0, 1.0] if found_up is None else [round(float(x), 4) for x in found_up[0]]
@@ -92,7 +92,7 @@ def find_vessel(medium: SdfGrid, location: str, mesh: TriangleMesh, observations
             fit = fit_vessel(build, float(np.ptp(across, axis=0).max()), observations, progress)
     except NerfroError as error:
         warn(f"no vessel is fitted: {error}")
-        return {}
+        return {}, None
     values = [
         f"{name} {value:.3g}" + ("" if name in fit.unknown else f" +- {fit.standard_errors[name]:.2g}")
         for name, value in fit.lengths.items()
@@ -101,7 +101,8 @@ def find_vessel(medium: SdfGrid, location: str, mesh: TriangleMesh, observations
     if fit.unknown:
         warn(f"the photographs do not determine {' and '.join(fit.unknown)}, which keep typical values")
     lengths = {name: float(f"{length:.4g}") for name, length in fit.lengths.items()}
-    return {"up": up, "ior": _GLASS, "liquid_ior": _WATER if "level" in fit.lengths else 1.0} | lengths
+    liquid_ior = _WATER if "level" in fit.lengths else 1.0
+    return {"up": up, "ior": _GLASS, "liquid_ior": liquid_ior} | lengths, build(liquid_ior=liquid_ior, **lengths)
 
 
 def fit_vessel(
@@ -123,11 +124,11 @@ def fit_vessel(
     empty = build(**widest, liquid_ior=1.0)
     filled = build(**widest, liquid_ior=_WATER, level=0.5 * empty.height)
     work = 1 + len(_LEVELS) + len(_ROUNDS) * (len(typical) + 1) * len(_GRID)
-    search = _Search(observations, lambda count: progress(min(1.0, count / work)))
+    search = ObjectErrors(observations, lambda count: progress(min(1.0, count / work)))
     levels: list[dict[str, float]] = [{}, *({"level": level * empty.height} for level in _LEVELS)]
-    errors = [search.errors(filled if level else empty, typical | level) for level in levels]
-    best = int(np.argmin([mean_errors(each[None], search.counts)[0, 0] for each in errors]))
-    vessel = filled if best and search.differs(errors[0], errors[best]) else empty
+    errors = [search.of((filled if level else empty).with_lengths(typical | level)) for level in levels]
+    best = int(np.argmin([search.mean(each) for each in errors]))
+    vessel = filled if best and search.decreases(errors[0], errors[best], _SIGNIFICANT) else empty
     typical |= levels[best] if vessel is filled else {}
     lengths, standard_errors = dict(typical), dict[str, float]()
     for factor, fraction in _ROUNDS:
@@ -137,7 +138,7 @@ def fit_vessel(
             middle = lengths[name] if is_level else np.log(lengths[name])
             grid = middle + half_width * _GRID
             values = grid.clip(max=empty.height) if is_level else np.exp(grid)
-            sums = np.stack([search.errors(vessel, lengths | {name: value}) for value in values.tolist()])
+            sums = np.stack([search.of(vessel.with_lengths(lengths | {name: value})) for value in values.tolist()])
             found = _minimum(grid, mean_errors(sums, search.counts))[0]
             spread = float(_minimum(grid, mean_errors(sums, search.counts, search.samples)).std())
             lengths[name] = float(min(found, empty.height) if is_level else np.exp(found))
@@ -158,30 +159,3 @@ def _minimum(grid: Float[np.ndarray, "C"], errors: Float[np.ndarray, "B C"]) -> 
     offset = 0.5 * (before - after) / np.where(curvature > 0, curvature, 1)
     offset = np.where(curvature > 0, offset.clip(-1, 1), np.sign(before - after))
     return grid[lowest] + offset * (grid[1] - grid[0])
-
-
-class _Search:
-    """Errors of vessels at pixels of the object; `progress` is called with the number of vessels."""
-
-    def __init__(self, observations: Observations, progress: Callable[[int], None]) -> None:
-        self._surroundings = observations.surroundings
-        self._pixels = observations.through.some(_NUM_PIXELS)
-        self._half_weight = half_weight(self._surroundings)
-        self._sampler = Snell(branches="all", least_weight=_LEAST_WEIGHT)
-        self._progress, self._num_errors = progress, 0
-        self.samples = bootstrap_weights(len(self._pixels.cameras))
-        self.counts = np.bincount(self._pixels.view, minlength=len(self._pixels.cameras)).astype(np.float64)
-
-    def errors(self, vessel: SdfVessel, lengths: Mapping[str, float]) -> Float[np.ndarray, "V"]:
-        """Sum the robust errors over the pixels of each view."""
-        path = self._sampler(self._pixels.rays, vessel.with_lengths(lengths))
-        radiance = path.per_ray(self._surroundings.boundary(path.exits())).clamp(max=1)
-        error = robust(radiance - self._pixels.radiance, self._half_weight).double()
-        self._num_errors += 1
-        self._progress(self._num_errors)
-        return np.bincount(self._pixels.view, error, len(self.counts))
-
-    def differs(self, before: Float[np.ndarray, "V"], after: Float[np.ndarray, "V"]) -> bool:
-        """Test whether the error decreases significantly, by resampling of the views."""
-        gains = mean_errors((before - after)[None], self.counts, self.samples)
-        return bool(gains.mean() > _SIGNIFICANT * gains.std())

@@ -26,7 +26,7 @@ _SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 
 # Key of the text in the PNG file of a derived mask: the method and a checksum of the pixels. The method is the shape
 # whose projection the mask is, POLYGON for an outline, or TRACKED for Segment Anything 2.
-METHOD, POLYGON, TRACKED = "nerfro", "polygon", "sam2"
+METHOD, POLYGON, TRACKED, REVOLUTION = "nerfro", "polygon", "sam2", "body of revolution"
 EVIDENCE = (None, POLYGON, TRACKED)  # methods whose masks show the object in the photograph
 
 _ignore_masks: ContextVar[bool] = ContextVar("ignore_masks", default=False)

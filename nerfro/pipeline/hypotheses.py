@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from nerfro.capture.object_errors import COMMON_INDICES, SOLID, STRAIGHT, VESSEL
 from nerfro.rendering.scene_file import SceneFile
 
 # Number of training photographs that score the hypotheses.
 _NUM_VALIDATION_VIEWS = 5
 # Steps of straight rays in the time of one step of bent rays, on the real glass (docs/lab/glass_of_water.md).
 _STRAIGHT_SPEED = 1.5
-# Indices of water and of soda-lime glass, for photographs that do not determine the index.
-_COMMON_INDICES = {"water": 1.333, "glass": 1.52}
 
 
 @dataclass(frozen=True)
@@ -64,20 +63,20 @@ def hypotheses(scene: SceneFile) -> list[Hypothesis]:
         scene: content of the scene file.
     """
     near = scene.surroundings == "near"
-    straight = Hypothesis("straight rays", ["+experiment=straight"], speed=_STRAIGHT_SPEED)
+    straight = Hypothesis(STRAIGHT, ["+experiment=straight"], speed=_STRAIGHT_SPEED)
     known_materials = f"+experiment={'glass_room' if near else 'glass'}"
     if "wall" in scene.medium:  # the materials of a vessel are known
-        return [straight, Hypothesis("vessel", [known_materials])]
+        return [straight, Hypothesis(VESSEL, [known_materials])]
     if scene.short is None:
         return [straight, Hypothesis("bodies", [known_materials])]
     body = f"+experiment={'glass_room' if near else 'unknown'}"
     if not scene.provenance.doubts:
-        bodies = [Hypothesis("solid body", [body])]
+        bodies = [Hypothesis(SOLID, [body])]
     else:
         doubt = "the photographs do not determine its index"
         bodies = [
-            Hypothesis(f"solid body, {name}", [body, f"medium.ior={index}", "medium.learn_ior=true"], doubt)
-            for name, index in _COMMON_INDICES.items()
+            Hypothesis(f"{SOLID}, {name}", [body, f"medium.ior={index}", "medium.learn_ior=true"], doubt)
+            for name, index in COMMON_INDICES.items()
         ]
-    vessel = [Hypothesis("vessel", [known_materials, "medium=vessel"])] if scene.vessel else []
+    vessel = [Hypothesis(VESSEL, [known_materials, "medium=vessel"])] if scene.vessel else []
     return [straight, *bodies, *vessel]

@@ -16,7 +16,7 @@ from nerfro.capture.video import extract_frames
 from nerfro.cli import warn
 from nerfro.data.frames import list_images
 from nerfro.errors import NerfroError
-from nerfro.evaluation.results import FULL, read_metrics_json
+from nerfro.evaluation.results import EXPOSED, FULL, read_metrics_json
 from nerfro.files.reading import read_json
 from nerfro.overrides import as_overrides, is_given
 from nerfro.paths import user_path
@@ -29,6 +29,7 @@ from nerfro.training.run_folder import CONFIG_FILE
 # Smallest gain of bent rays over straight rays in short trainings, in dB. On a simulated empty glass, a gain of 0.25 dB
 # after 40 seconds became a loss of 0.13 dB after three minutes (docs/lab/hypotheses.md).
 _MIN_GAIN = 0.5
+_NEVERTHELESS = "to use bent rays nevertheless, add train=+experiment=NAME"
 _FEWEST = 3  # photographs
 _MASKS = ("masks/*", "masks/*/*", "mask_*", "*/mask_*")  # where loaders search for masks
 
@@ -85,14 +86,17 @@ def preprocess(config: DictConfig, options: list[str], root: Path, folder: Path)
 def train(config: DictConfig, overrides: list[str], scene: Path, out: Path) -> None:
     """Train with the hypothesis that predicts the validation photographs best."""
     inputs = [scene, scene.with_name(MESH)]
-    common, candidates = common_options(config, overrides, scene), hypotheses(read_scene_file(scene))
+    content = read_scene_file(scene)
+    common, candidates = common_options(config, overrides, scene), hypotheses(content)
     if is_given("experiment", common):
         options = []
     elif config.trial_steps == 0:
         options = candidates[1].options
     else:
-        trials = [out / "trials" / hypothesis.folder for hypothesis in candidates]
-        for hypothesis, trial in zip(candidates, trials, strict=True):
+        unsupported = content.provenance.unsupported
+        candidates = [hypothesis for hypothesis in candidates if hypothesis.name not in unsupported]
+        trials = [out / "trials" / hypothesis.folder for hypothesis in candidates] if len(candidates) > 1 else []
+        for hypothesis, trial in zip(candidates, trials, strict=False):
             print(f"\nhypothesis: {hypothesis.name}")
             _run_training([*hypothesis.options, *common, *hypothesis.trial_options(config.trial_steps)], inputs, trial)
         options = _best_hypothesis(candidates, trials).options
@@ -107,13 +111,20 @@ def _best_hypothesis(tried: Sequence[Hypothesis], runs: Sequence[Path]) -> Hypot
 
     Args:
         tried: the hypotheses, straight rays first.
-        runs: run folder of the trial of each hypothesis.
+        runs: run folder of the trial of each hypothesis; empty if there are only straight rays.
     """
+    if not runs:
+        print(f"\ntraining continues with: {tried[0].name}")
+        print(f"no body explains the pixels of the object better; {_NEVERTHELESS}")
+        return tried[0]
     scores = []
     print("\nPSNR of short trainings on validation photographs, in dB:")
     print(f"  {'hypothesis':<20}{'image':>9}{'object':>9}")
     for hypothesis, run in zip(tried, runs, strict=True):
-        result = read_metrics_json(run / "metrics.json").result
+        metrics = read_metrics_json(run / "metrics.json")
+        # The exposures of validation photographs are unknown. Their right halves may lack the object.
+        result = metrics.treatments.get(EXPOSED, metrics.result)
+        result = metrics.result if result.mean("psnr", "mask") is None else result
         image, inside = result.mean("psnr", FULL) or 0.0, result.mean("psnr", "mask")
         scores.append(image if inside is None else 0.5 * (image + inside))
         print(f"  {hypothesis.name:<20}{image:>9.2f}{'n/a' if inside is None else f'{inside:.2f}':>9}")
@@ -123,7 +134,7 @@ def _best_hypothesis(tried: Sequence[Hypothesis], runs: Sequence[Path]) -> Hypot
     if best is tried[0]:
         doubts = [hypothesis.doubt for hypothesis in tried if hypothesis.doubt]
         reason = doubts[0] if doubts else "the surface or the index is not accurate enough, or the object is opaque"
-        print(f"bent rays are not clearly better: {reason}; to use bent rays nevertheless, add train=+experiment=NAME")
+        print(f"bent rays are not clearly better: {reason}; {_NEVERTHELESS}")
     return best
 
 

@@ -40,12 +40,14 @@ class Provenance:
         versions: versions of packages.
         standard_error: standard error of the estimated index of each body; empty if the indices were given.
         doubts: reasons for doubt about the indices; empty for reliable indices.
+        unsupported: names of bodies that do not explain the pixels of the object better than straight rays.
     """
 
     command: str = ""
     versions: dict[str, str] = field(default_factory=dict)
     standard_error: list[float] = field(default_factory=list)
     doubts: list[str] = field(default_factory=list)
+    unsupported: list[str] = field(default_factory=list)
 
 
 @dataclass

@@ -6,6 +6,7 @@ import torch
 import trimesh
 
 from nerfro.cameras import Cameras
+from nerfro.capture import surface
 from nerfro.capture.revolution import fit_revolution
 from nerfro.capture.silhouettes import mesh_silhouettes
 from nerfro.capture.surface import make_mesh
@@ -90,16 +91,19 @@ def test_a_box_is_no_body_of_revolution(capsys: pytest.CaptureFixture[str]) -> N
         assert sides == pytest.approx([0.3, 0.9, 1.2], abs=0.15)
 
 
-def test_what_came_off_a_wheel_is_known_by_its_masks() -> None:
+def test_what_came_off_a_wheel_is_known_by_its_masks(monkeypatch: pytest.MonkeyPatch) -> None:
     cameras = _cameras()
     masks = _masks(_glass(), cameras)
     masks[:3, 105:] = 0  # something stands before the foot
     silhouettes = Silhouettes.of(cameras, masks)
 
-    def unevenness(symmetry: str | None) -> float:
+    def unevenness(symmetry: str | None, smoothing: float = 0.0, is_revolution: bool = False) -> float:
         """Of the radii of the part that is a cone."""
-        points = make_mesh(silhouettes, None, 32, 3, None, 0.0, symmetry).vertices @ TURN - SHIFT  # type: ignore[arg-type]
+        options = 32, 3, None, smoothing, symmetry, None, is_revolution
+        points = make_mesh(silhouettes, None, *options).vertices @ TURN - SHIFT  # type: ignore[arg-type]
         cone = points[np.abs(points[:, 2] - 0.7) < 0.3]
         return float((np.linalg.norm(cone[:, :2], axis=1) - np.interp(cone[:, 2], [0.3, 1.2], [0.22, 0.45])).std())
 
     assert unevenness("auto") < 0.5 * unevenness(None)
+    monkeypatch.setattr(surface, "fit_surface", None)  # is not called for projections of a body of revolution
+    assert unevenness("auto", 1.0, True) == unevenness("auto")

@@ -1,4 +1,4 @@
-"""The lengths of a glass from its pixels under a sky in closed form."""
+"""The lengths of a glass, and the support for bodies, from pixels under a sky in closed form."""
 
 from pathlib import Path
 from typing import Any
@@ -9,10 +9,13 @@ import trimesh
 from torch import Tensor
 
 from nerfro.boundaries.base import Boundary
+from nerfro.capture.object_errors import unsupported_bodies
 from nerfro.capture.surroundings import Observations, Pixels, Surroundings
 from nerfro.capture.vessel_fit import fit_vessel
 from nerfro.data.base import Views
-from nerfro.geometry.mesh import TriangleMesh
+from nerfro.geometry.mesh import load_mesh
+from nerfro.media.sdf_grid import SdfGrid
+from nerfro.media.solid import Solid
 from nerfro.media.vessel import SdfVessel
 from nerfro.samplers.snell import Snell
 from nerfro.subdivision import pixel_rays
@@ -29,32 +32,56 @@ class Sky(Boundary):
         return sky(exits.directions)
 
 
+BOX: dict[str, Any] = {"box_min": [-0.7] * 3, "box_max": [0.7] * 3, "resolution": 64, "cache": False}
+
+
+@pytest.fixture
+def cylinder(tmp_path: Path) -> Path:
+    trimesh.creation.cylinder(RADIUS, HEIGHT, sections=96).export(tmp_path / "glass.ply")
+    return tmp_path / "glass.ply"
+
+
+def observed(cylinder: Path, glass: Solid) -> Observations:
+    """Observe a body through pixels of its silhouette, with all reflections."""
+    taken, random = cameras(), torch.Generator().manual_seed(0)
+    index = torch.randint(NUM_VIEWS * SIZE * SIZE, (8 * NUM_PIXELS,), generator=random)
+    silhouette = Snell()(pixel_rays(taken, index), SdfGrid(str(cylinder), **BOX)).refracted
+    index = index[silhouette][:NUM_PIXELS].sort().values
+    path = Snell(branches="all", least_weight=0.02)(pixel_rays(taken, index), glass)
+    seen = Pixels(taken, index, path.per_ray(sky(path.exits().directions)).float())
+    views = Views(taken, torch.zeros(NUM_VIEWS, SIZE, SIZE, 3), None, [""] * NUM_VIEWS)
+    observations = Observations(views, load_mesh(cylinder), False)
+    known = Surroundings(Sky(), None, 0.0, seen.radiance)  # type: ignore[arg-type]
+    observations.__dict__.update(through=seen, surroundings=known)
+    return observations
+
+
 @pytest.mark.parametrize(
     "lengths",
     [{"wall": 0.025, "foot": 0.1, "fillet": 0.12}, {"wall": 0.025, "foot": 0.1, "fillet": 0.12, "level": 0.64}],
     ids=["empty", "partly filled"],
 )
-def test_lengths_of_a_glass_are_found_from_ordinary_values(tmp_path: Path, lengths: dict[str, float]) -> None:
-    body = trimesh.creation.cylinder(RADIUS, HEIGHT, sections=96)
-    body.export(tmp_path / "glass.ply")
-
+def test_lengths_of_a_glass_are_found_from_ordinary_values(cylinder: Path, lengths: dict[str, float]) -> None:
     def build(**options: Any) -> SdfVessel:
-        box = {"box_min": [-0.7] * 3, "box_max": [0.7] * 3}
-        return SdfVessel(str(tmp_path / "glass.ply"), ior=1.52, resolution=64, cache=False, **box, **options)
+        return SdfVessel(str(cylinder), ior=1.52, **BOX, **options)
 
     glass = build(**lengths, liquid_ior=1.333 if "level" in lengths else 1.0)
-    taken, random = cameras(), torch.Generator().manual_seed(0)
-    index = torch.randint(NUM_VIEWS * SIZE * SIZE, (8 * NUM_PIXELS,), generator=random)
-    index = index[Snell()(pixel_rays(taken, index), glass).refracted][:NUM_PIXELS].sort().values
-    path = Snell(branches="all", least_weight=0.02)(pixel_rays(taken, index), glass)
-    seen = Pixels(taken, index, path.per_ray(sky(path.exits().directions)).float())
-    views = Views(taken, torch.zeros(NUM_VIEWS, SIZE, SIZE, 3), None, [""] * NUM_VIEWS)
-    observations = Observations(views, TriangleMesh(body.vertices, body.faces), False)
-    known = Surroundings(Sky(), None, 0.0, seen.radiance)  # type: ignore[arg-type]
-    observations.__dict__.update(through=seen, surroundings=known)
-    found = fit_vessel(build, 2 * RADIUS, observations)
+    found = fit_vessel(build, 2 * RADIUS, observed(cylinder, glass))
     assert found.lengths.keys() == lengths.keys()
     assert not found.unknown
     for name, length in lengths.items():
         assert found.lengths[name] == pytest.approx(length, rel=TOLERANCES[name])
         assert 0 < found.standard_errors[name] < 0.1 * length
+
+
+@pytest.mark.parametrize(("ior", "supported"), [(1.0, []), (1.333, ["solid body, water"]), (None, ["vessel"])])
+def test_pixels_support_the_body_that_refracted_their_rays(
+    cylinder: Path, ior: float | None, supported: list[str]
+) -> None:
+    solid, vessel = SdfGrid(str(cylinder), ior=ior or 1.5, **BOX), SdfVessel(str(cylinder), wall=0.05, level=0.6, **BOX)
+    observations = observed(cylinder, solid if ior else vessel)
+    found = {"solid body, water", "solid body, glass", "vessel"}.difference(
+        unsupported_bodies(observations, solid, True, vessel)
+    )
+    assert found == set(supported)
+    assert unsupported_bodies(observations, solid, False, None) == ([] if ior == 1.333 else ["solid body"])
