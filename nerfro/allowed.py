@@ -121,11 +121,7 @@ def check_settings(config: DictConfig, schema: type, prefix: str = "") -> None:
     settings = {name: config[name] for name in hints if not OmegaConf.is_missing(config, name)}
     check(prefix, hints, settings)
     for name, value in settings.items():
-        hint = hints[name]
-        if get_origin(hint) is dict and dataclasses.is_dataclass(get_args(hint)[1]):
-            for key in value:
-                check_settings(value[key], get_args(hint)[1], f"{prefix}{name}.{key}.")
-        elif dataclasses.is_dataclass(hints[name]):
+        if dataclasses.is_dataclass(hints[name]):
             check_settings(value, hints[name], f"{prefix}{name}.")
 
 

@@ -71,7 +71,11 @@ RENAMED: dict[str, str | None] = {
     "loss.nearby": "loss.near_camera",
     "batches.hold_back": "batches.num_validation_views",
     "batches.object": "batches.object_fraction",
-    "optimizer.boundary_first": "optimizer.boundary_steps",
+    "camera.start": "phase.cameras.start",
+    "camera.every": "phase.cameras.every",
+    "camera.num_pixels": "phase.cameras.num_pixels",
+    "optimizer.boundary_first": "phase.background.steps",
+    "optimizer.boundary_steps": "phase.background.steps",
     "optimizer.tint_learning_rate": "optimizer.groups[bodies.*.material.absorption].learning_rate",
     "optimizer.absorption_learning_rate": "optimizer.groups[bodies.*.material.absorption].learning_rate",
     "optimizer.boundary_learning_rate": "optimizer.groups[background.*].learning_rate",
@@ -454,8 +458,9 @@ def _unselected(key: str) -> str | None:
     plugin = next((plugin for plugin in plugins() if (plugin.kind, plugin.name) == (kind, name)), None)
     if plugin is None or kind not in SEVERAL or (option and option not in plugin.setting_names):
         return None
-    if kind == "loss":
-        return f"the experiment does not set {key}; write +loss.{name}.{option or 'weight'}=..., with a plus sign"
+    if kind != "callbacks":
+        setting = option or {"loss": "weight"}.get(kind, "SETTING")
+        return f"the experiment does not set {key}; write +{kind}.{name}.{setting}=..., with a plus sign"
     return f"callbacks.{name} is not selected; add +callbacks={name}"
 
 

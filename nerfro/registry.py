@@ -32,15 +32,16 @@ from nerfro.errors import NerfroError
 from nerfro.paths import PLUGINS_DIR
 
 KINDS = (
-    "model", "camera", "medium", "surface", "sampler/path", "sampler/points", "field", "boundary", "loss", "data",
-    "callbacks", "metric",
+    "model", "camera", "medium", "surface", "sampler/path", "sampler/points", "field", "boundary", "loss", "phase",
+    "data", "callbacks", "metric",
 )  # fmt: skip
 
-SEVERAL = ("loss", "callbacks")  # a run may have several plugins of these types
+SEVERAL = ("loss", "phase", "callbacks")  # a run may have several plugins of these types
 
 # Modules and packages with built-in plugins; `discover` imports all of them.
 _BUILT_IN = (
     "camera", "media", "samplers", "fields", "boundaries", "losses", "models", "data", "evaluation.image_metrics",
+    "training.phases",
 )  # fmt: skip
 _LOCAL_PACKAGE = "nerfro_plugins"
 # Former and present places of classes; configurations of earlier releases name the former ones.

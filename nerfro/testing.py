@@ -33,6 +33,7 @@ from nerfro.samplers.base import PathSampler, PointSampler
 from nerfro.samplers.snell import Snell
 from nerfro.samplers.straight import Straight
 from nerfro.samplers.stratified import Stratified, point_samples
+from nerfro.training.phases.base import Phase
 from nerfro.types import Batch, Exits, Path, Radiance, Rays, Rendering, Samples
 
 NUM_RAYS = 24
@@ -266,6 +267,11 @@ def _check_metric(metric: ImageMetric) -> None:
     _require(math.isclose(masked, float(different), abs_tol=0.05), "a mask of all pixels does not change the score")
 
 
+def _check_phase(phase: Phase) -> None:
+    counts = [phase.steps_before(step) for step in range(1000)]
+    _require(counts == sorted(counts), "the number of steps before a training step does not decrease")
+
+
 def _check_callback(callback: Any) -> None:
     # Importing Lightning takes seconds, and no other plugin needs Lightning.
     _require(hasattr(callback, "on_train_batch_end"), "a callback derives from lightning.pytorch.Callback")
@@ -282,6 +288,7 @@ _CONTRACTS: dict[str, tuple[type, Callable[[Any], None]]] = {
     "loss": (Loss, _check_loss),
     "model": (Renderer, _check_model),
     "data": (DataSource, _check_data),
+    "phase": (Phase, _check_phase),
     "callbacks": (object, _check_callback),
     "metric": (ImageMetric, _check_metric),
 }

@@ -28,7 +28,7 @@ PAPER = ("medium.resolution=48", "sampler.points.num_coarse=4", "sampler.points.
 SMALL = (
     "medium.resolution=24", "sampler.points.num_samples=4", "sampler.points.num_bins=8", "sampler.points.resolution=8",
     "field.num_levels=2", "field.log2_table_size=8", "boundary.resolutions=[4]", "batches.size=16",
-    "optimizer.boundary_steps=0",
+    "phase.background.steps=0",
 )  # fmt: skip
 
 Run = Callable[..., list[str]]

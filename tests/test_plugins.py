@@ -227,6 +227,7 @@ TEMPLATES = {
     "example_medium": ["medium=gradient_rod", "sampler/path=eikonal", "sampler.path.num_steps=64"],
     "example_model": ["model=haze"],
     "example_path_sampler": ["sampler/path=mirror_floor"],
+    "example_phase": ["+phase.extra_steps.every=1"],
     "example_sampler": ["sampler/points=logarithmic", "sampler.points.num_samples=8"],
     "opt_in/example_callback": ["+callbacks=gradient_norm", "callbacks.gradient_norm.every=1"],
     "opt_in/example_export": [],

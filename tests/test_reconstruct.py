@@ -366,7 +366,7 @@ def test_posed_photographs_of_a_ball_become_a_scene(
              "trainer.accelerator=cpu", "trainer.max_steps=2", "trainer.max_time=null", "batches.size=64",
              "boundary.resolutions=[4,8]", "field.num_levels=2", "field.log2_table_size=8",
              "sampler.points.num_samples=4", "sampler.points.resolution=16",
-             "optimizer.boundary_steps=100"]  # fmt: skip
+             "phase.background.steps=100"]  # fmt: skip
     asked = ["data=blender", f"data.root={data}", "data.near=0.5", f"out={out}", "medium.resolution=32",
              "medium.cache=false", "preprocess=resolution=24", f"train={' '.join(train)}", "trial_steps=2"]  # fmt: skip
     before = torch.initial_seed(), signal.getsignal(signal.SIGTERM)

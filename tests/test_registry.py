@@ -17,7 +17,7 @@ from nerfro.cli import entry_point
 from nerfro.errors import NerfroError
 from nerfro.paths import CONF_DIR
 from nerfro.registry import KINDS, build, configure, discover, find, plugins, register
-from nerfro.training.config import TrainConfig, build_losses, check_run
+from nerfro.training.config import TrainConfig, build_each, check_run
 
 discover()
 
@@ -195,7 +195,7 @@ def test_unknown_field_of_a_lightning_object_is_refused() -> None:
 )
 def test_wrong_losses_are_refused(losses: dict[str, object], message: str) -> None:
     with pytest.raises(NerfroError, match=message):
-        build_losses(OmegaConf.create(losses))
+        build_each("loss", OmegaConf.create(losses))
 
 
 # Refusals in an experiment file.

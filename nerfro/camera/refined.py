@@ -9,7 +9,6 @@ from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from nerfro.allowed import Count, Natural
 from nerfro.camera.base import Camera
 from nerfro.camera.exposure import PerView
 from nerfro.camera.pixel_units import even_weights, object_distances, pixel_motions, without_world, world_motions
@@ -91,15 +90,11 @@ class _Motions(PerView):
 class RefinedCamera(Camera):
     """Refine the pose of each training camera, and optionally the common lens, during training.
 
-    Before training, cameras are rotated until photographs of a distant sky agree (`panorama`), and moved until the
-    surface projects into its silhouettes (`capture.outlines`), if the data contain these. Between training steps, each
-    camera takes Gauss-Newton steps (`gauss_newton`). The motion that a similarity transformation of the world would
-    cause is removed to first order, so that the world and the surface keep their place.
+    The phase `cameras` of the training moves them (`training.phases.cameras`). The motion that a similarity
+    transformation of the world would cause is removed to first order, so that the world and the surface keep their
+    place.
 
     Args:
-        start: training step of the first Gauss-Newton step. Earlier, the scene is too inaccurate.
-        every: number of training steps between two Gauss-Newton steps.
-        num_pixels: number of pixels of each photograph in a Gauss-Newton step.
         lens: whether to refine the focal length and the principal point, which all views share.
         exposure: whether to estimate a gain for each training view and colour channel.
         fix_gauge: whether to remove the motion of the world. Disable this for cameras of a scene that is fixed.
@@ -110,15 +105,11 @@ class RefinedCamera(Camera):
 
     def __init__(
         self,
-        start: Natural = 50,
-        every: Count = 50,
-        num_pixels: Count = 300,
         lens: bool = False,
         exposure: bool = False,
         fix_gauge: bool = True,
     ) -> None:
         super().__init__(exposure)
-        self.start, self.every, self.num_pixels = start, every, num_pixels
         self.motions = _Motions(fix_gauge)
         self.register_buffer("lens", torch.zeros(3) if lens else None)  # focal length and principal point in pixels
 

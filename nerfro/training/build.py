@@ -19,14 +19,13 @@ from nerfro.paths import CONF_DIR
 from nerfro.registry import discover
 from nerfro.rendering import Renderer
 from nerfro.rendering.scene_file import with_scene
-from nerfro.training.background_pretraining import BackgroundPretraining
-from nerfro.training.camera_steps import CameraSteps
-from nerfro.training.config import TrainConfig, build_data, build_model, check_run, settle_trainer
+from nerfro.training.config import TrainConfig, build_data, build_each, build_model, check_run, settle_trainer
 from nerfro.training.data_module import RayDataModule, traced
 from nerfro.training.memory import require_memory
 from nerfro.training.module import TrainingModule
 from nerfro.training.ray_batches import RayBatches
 from nerfro.training.reach import require_reach
+from nerfro.training.schedule import Schedule
 
 
 def build(experiment: str | None = None, overrides: Sequence[str] = ()) -> tuple[TrainingModule, RayDataModule]:
@@ -89,9 +88,7 @@ def build_training(config: DictConfig, source: DataSource, training: Views) -> t
     data = RayDataModule(
         traced(batches, renderer, config), validation, config.evaluation.every, config.trainer.overfit_batches
     )
-    # Cameras move by background and outlines before the background is learned.
-    callbacks = [CameraSteps(training), BackgroundPretraining(config.optimizer.boundary_steps)]
-    return TrainingModule.of(renderer, config, callbacks), data
+    return TrainingModule.of(renderer, config, [Schedule(build_each("phase", config.phase), training)]), data
 
 
 def check_first_batch(renderer: Renderer, batches: RayBatches, device: torch.device) -> str:

@@ -19,8 +19,6 @@ from nerfro.progress import progress_bar
 from nerfro.training.module import training_progress
 from nerfro.types import Batch
 
-_PHASES = {"background": "BackgroundPretraining", "cameras": "CameraSteps"}  # callbacks that take steps of their own
-
 
 def steps_by_phase(callbacks: Mapping[str, Any], num_steps: int) -> dict[str, int]:
     """Return the number of steps in each phase of a training that took steps.
@@ -29,7 +27,7 @@ def steps_by_phase(callbacks: Mapping[str, Any], num_steps: int) -> dict[str, in
         callbacks: states of the callbacks by name, as in a checkpoint.
         num_steps: number of training steps.
     """
-    taken = {phase: callbacks.get(name, {}).get("num_done", 0) for phase, name in _PHASES.items()}
+    taken = {phase: begun["num_done"] for phase, begun in callbacks.get("Schedule", {}).items()}
     return {phase: count for phase, count in taken.items() if count} | {"scene": num_steps}
 
 

@@ -30,7 +30,6 @@ from nerfro.data.base import DataSource, Views
 from nerfro.data.validation_views import WithValidationViews
 from nerfro.errors import NerfroError
 from nerfro.evaluation.results import Region
-from nerfro.losses.base import Loss
 from nerfro.media.analytic import Vacuum
 from nerfro.media.bodies import origin_of
 from nerfro.paths import resolve_path, scene_name
@@ -181,6 +180,8 @@ class TrainConfig:
     model: Any = MISSING
     # Settings of each training loss, by the registered name of the loss.
     loss: dict[str, Any] = dataclasses.field(default_factory=dict)
+    # Settings of each phase, by the registered name of the phase.
+    phase: dict[str, Any] = dataclasses.field(default_factory=dict)
     content: ContentConfig = dataclasses.field(default_factory=ContentConfig)
     authors: AuthorsConfig = dataclasses.field(default_factory=AuthorsConfig)
     optimizer: OptimizerConfig = dataclasses.field(default_factory=OptimizerConfig)
@@ -245,7 +246,9 @@ def check_run(config: DictConfig) -> None:
         )
     for name, node in config.callbacks.items():
         configure(find("callbacks", str(name)), node or {})
-    build_losses(config.loss, known=False)
+    for kind in ("loss", "phase"):
+        build_each(kind, config[kind], known=False)
+    OmegaConf.to_object(config.optimizer)  # checks groups of parameters
     for node in (config.data, config.camera, config.sampler.points, config.field, config.boundary, config.model):
         check_node(node)
     if check_node(config.sampler.path).needs_medium:  # type: ignore[attr-defined]
@@ -280,7 +283,9 @@ def settle_trainer(config: DictConfig) -> None:
         return
     steps = 10 if config.debug else int(fast)
     config.trainer.max_steps, config.trainer.limit_test_batches = steps, 1
-    config.optimizer.boundary_steps = min(config.optimizer.boundary_steps, steps)
+    for phase in config.phase.values():
+        if "steps" in phase:
+            phase["steps"] = min(phase["steps"], steps)
     config.evaluation.every, config.evaluation.refine_steps = steps, 0
     config.evaluation.subdivision.side = 1
 
@@ -309,30 +314,29 @@ def build_data(config: DictConfig) -> DataSource:
     return WithValidationViews(source, number) if number else source
 
 
-def build_losses(nodes: DictConfig, known: bool = True) -> dict[str, Loss]:
-    """Build the training losses from the nodes `loss.<registered name>`.
+def build_each(kind: str, nodes: DictConfig, known: bool = True) -> dict[str, Any]:
+    """Build the plugins of a type of which a run may have several, from the nodes `TYPE.<registered name>`.
 
     Args:
-        nodes: configuration nodes of all losses.
+        kind: plugin type.
+        nodes: configuration nodes of all plugins.
         known: whether interpolations in the nodes can be resolved; otherwise such settings keep their defaults.
 
     Raises:
-        NerfroError: there is no loss, or a node does not fit its loss.
+        NerfroError: there is no loss, or a node does not fit its plugin.
     """
-    if not nodes:
+    if kind == "loss" and not nodes:
         raise NerfroError("there is no loss to train with; add one, such as +loss.photometric.weight=1")
-    losses = {}
+    built = {}
     for name in map(str, nodes):
         node = {} if nodes[name] is None else nodes[name]
         if not isinstance(node, Mapping):
-            raise NerfroError(
-                f"loss.{name}={node} is not a set of settings; write loss.{name}.weight={node} for its weight"
-            )
-        plugin = find("loss", name)
+            setting = "weight" if kind == "loss" else "SETTING"
+            raise NerfroError(f"{kind}.{name}={node} is not a set of settings; write {kind}.{name}.{setting}={node}")
         if not known:
             node = {field: node[field] for field in node if not OmegaConf.is_interpolation(node, field)}
-        losses[name] = create(plugin, node)
-    return losses
+        built[name] = create(find(kind, name), node)
+    return built
 
 
 def build_model(config: DictConfig, training: Views | None = None) -> Renderer:

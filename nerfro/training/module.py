@@ -17,7 +17,7 @@ from nerfro.losses.base import Loss
 from nerfro.paths import user_path
 from nerfro.registry import discover
 from nerfro.rendering import Renderer, Scene
-from nerfro.training.config import build_losses
+from nerfro.training.config import build_each
 from nerfro.training.optimizer import OptimizerConfig, learning_rate_factor
 from nerfro.training.run_folder import load_checkpoint, restore
 from nerfro.types import Batch
@@ -54,7 +54,7 @@ class TrainingModule(LightningModule):
         """Train a model with the losses and the optimizer of a run's configuration."""
         configuration = OmegaConf.to_yaml(config, resolve=True)
         optimizer = cast(OptimizerConfig, OmegaConf.to_object(config.optimizer))
-        return cls(renderer, build_losses(config.loss), optimizer, callbacks, configuration)
+        return cls(renderer, build_each("loss", config.loss), optimizer, callbacks, configuration)
 
     @classmethod
     def load_from_checkpoint(  # type: ignore[override]

@@ -40,7 +40,6 @@ class OptimizerConfig:
     # asterisk stands for any text: {bodies.*.material.ior: {learning_rate: 1e-3, start: 100}}. The rates have the same
     # decay. Of several matching patterns the last one decides.
     groups: dict[str, GroupConfig] = dataclasses.field(default_factory=dict)
-    boundary_steps: Natural = 0  # steps that pretrain the background with rays that miss the content's box
     warmup_steps: Natural = 2500  # length of the warm-up; 0 for none
     warmup_factor: NotNegative = 0.01  # factor of the learning rate at its first step
     adam_epsilon: Positive = 1e-8  # epsilon of Adam

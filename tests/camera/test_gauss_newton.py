@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from unittest.mock import Mock
 
 import pytest
 import torch
@@ -10,13 +9,12 @@ from torch import Tensor
 
 from benchmarks.cameras import disturbed
 from nerfro.camera.gauss_newton import Step, gauss_newton_step, informative_pixels
+from nerfro.camera.least_squares import PriorInformation
 from nerfro.camera.refined import RefinedCamera
 from nerfro.camera.similarity import motion_between
-from nerfro.data.base import Views
 from nerfro.light import to_srgb
 from nerfro.rays import Rays
 from nerfro.samplers.snell import Snell
-from nerfro.training.camera_steps import CameraSteps
 from tests.ball_photographs import NUM_VIEWS, SIZE, cameras, sky, solid
 from tests.pretended_gpu import GPU, PretendedGpu
 
@@ -102,14 +100,11 @@ def test_a_resumed_step_on_a_gpu_uses_what_the_checkpoint_holds_on_the_cpu() -> 
     camera = RefinedCamera(fix_gauge=False)
     camera.begin(TRUE)
     size = camera.numbers().numel()
-    steps = CameraSteps(Mock(spec=Views))
-    prior = {"numbers": torch.zeros(size), "information": 1e12 * torch.eye(size).double()}
-    steps.load_state_dict({"aligned": True, "priors": {"panorama": prior}})
+    prior = PriorInformation(torch.zeros(size), 1e12 * torch.eye(size).double())
     with PretendedGpu():
         camera, given = camera.to(GPU), TRUE.to(GPU)
         pixels, pictures = looked_at(0, 20).to(GPU), 1 - PHOTOGRAPHS.to(GPU)
         sky_alone = lambda rays, view: to_srgb(sky(rays.directions))  # noqa: E731
         step = Step(difference_pixels=0.5, scale=10.0, max_pixels=0.25, keep_improvements=False)
-        priors = list(steps._priors.values())
-        gauss_newton_step(camera, given, pixels, lambda chosen: pictures[chosen], sky_alone, step, priors)
+        gauss_newton_step(camera, given, pixels, lambda chosen: pictures[chosen], sky_alone, step, [prior])
         assert float(camera.motions.motion.abs().max()) < 1e-4

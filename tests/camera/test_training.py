@@ -50,7 +50,7 @@ def test_disturbed_poses_come_back(train_here: Callable[..., Any], tmp_path: Pat
     true = views.cameras
     moved = disturbed(true, math.radians(0.5), 0.01, 0)
     save(replace(views, cameras=replace(true, camera_to_world=moved.float())), tmp_path / "ball")
-    options = ["camera=refined", "camera.every=50", *SMALL, "trainer.max_steps=300", f"data.root={tmp_path / 'ball'}"]
+    options = ["camera=refined", *SMALL, "trainer.max_steps=300", f"data.root={tmp_path / 'ball'}"]
     done = train_here(*options, f"hydra.run.dir={tmp_path / 'run'}")
     assert done.code == 0, done.err
     found = poses_in(tmp_path / "run" / "cameras.json")
@@ -100,8 +100,8 @@ def test_the_gains_of_disturbed_exposures_come_back(train_here: Callable[..., An
 def test_each_treatment_of_test_views_is_told_by_its_name(
     train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path: Path
 ) -> None:
-    options = ["camera=refined", "camera.lens=true", "camera.exposure=true", "camera.start=0", *tiny_default_run]
-    options += [*LEARNED_SKY, "camera.every=1", "trainer.max_steps=3", "evaluation.refine_steps=2"]
+    options = ["camera=refined", "camera.lens=true", "camera.exposure=true", "phase.cameras.start=0", *tiny_default_run]
+    options += [*LEARNED_SKY, "phase.cameras.every=1", "trainer.max_steps=3", "evaluation.refine_steps=2"]
     done = train_here(*options, f"hydra.run.dir={tmp_path / 'run'}")
     assert done.code == 0, done.err
     document = json.loads((tmp_path / "run" / "metrics.json").read_text("utf-8"))
@@ -132,7 +132,7 @@ def test_each_treatment_of_test_views_is_told_by_its_name(
 def test_a_run_whose_cameras_learn_goes_on_as_if_it_had_not_stopped(
     train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path: Path
 ) -> None:
-    options = ["camera=refined", "camera.lens=true", "camera.exposure=true", "camera.start=2", "camera.every=2"]
+    options = ["camera=refined", "camera.lens=true", "camera.exposure=true", "phase.cameras={start: 2, every: 2}"]
     options += [*tiny_default_run, "optimizer.final_learning_rate=1e-2"]
     states = []
     for name, parts in (("whole", [[6]]), ("parted", [[2], [6]])):
@@ -154,7 +154,7 @@ def test_cameras_wait_for_the_scene(
     for steps, moves in ((2, False), (3, True)):
         folder = tmp_path / f"run{steps}"
         done = train_here(
-            "camera=refined", "camera.start=2", *tiny_default_run, *LEARNED_SKY, f"trainer.max_steps={steps}",
+            "camera=refined", "phase.cameras.start=2", *tiny_default_run, *LEARNED_SKY, f"trainer.max_steps={steps}",
             f"hydra.run.dir={folder}",
         )  # fmt: skip
         assert done.code == 0, done.err
@@ -179,12 +179,12 @@ def test_cameras_move_by_sky_and_masks_before_training_and_their_priors_are_kept
         done = train_here(*options, f"hydra.run.dir={folder}")
         assert done.code == 0, done.err
         cameras.append(load(folder, "cpu").renderer.scene.camera)
-        kept.append(load_checkpoint(folder / "checkpoints" / "last.ckpt")[0]["callbacks"]["CameraSteps"])
+        kept.append(load_checkpoint(folder / "checkpoints" / "last.ckpt")[0]["callbacks"]["Schedule"])
     without, with_masks = cameras
     assert bool((without.motions.motion[:, :3] != 0).all())
     assert not bool(without.motions.motion[:, 3:].any())
     assert bool((with_masks.motions.motion != 0).all())
-    kept = [state["priors"] for state in kept]
+    kept = [state["cameras"]["state"] for state in kept]
     assert list(kept[0]) == ["panorama"]
     assert list(kept[1]) == ["panorama", "outlines"]
     for told, camera in ((kept[0]["panorama"], without), (kept[1]["outlines"], with_masks)):

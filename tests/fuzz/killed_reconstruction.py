@@ -21,7 +21,7 @@ from tests.ball_photographs import mesh, photographs, save, soft_masks
 TRAIN = (
     "evaluation.split=train evaluation.every=0 evaluation.subdivision.side=1 logger=none trainer.accelerator=cpu "
     "trainer.max_steps=30 trainer.max_time=null batches.size=64 boundary.resolutions=[4,8] field.num_levels=2 "
-    "field.log2_table_size=8 sampler.points.num_samples=4 sampler.points.resolution=16 optimizer.boundary_steps=50"
+    "field.log2_table_size=8 sampler.points.num_samples=4 sampler.points.resolution=16 phase.background.steps=50"
 )
 OPTIONS = ["data=blender", "data.near=0.5", "medium.resolution=32", "preprocess=resolution=24", "trial_steps=5"]
 

@@ -23,9 +23,9 @@ LONG = "NERFRO_LONG_CAMPAIGN" in os.environ
 NUM_KILLS = 25 if LONG else 2  # of each phase of training, and of evaluation
 # Settings that make a phase of training the longest.
 PHASES = {
-    "training": ["optimizer.boundary_steps=0"],
-    "background": ["optimizer.boundary_steps=1500"],
-    "cameras": ["camera=refined", "camera.start=2", "camera.every=3", "optimizer.boundary_steps=100"],
+    "training": ["phase.background.steps=0"],
+    "background": ["phase.background.steps=1500"],
+    "cameras": ["camera=refined", "phase.cameras.start=2", "phase.cameras.every=3", "phase.background.steps=100"],
 }
 
 

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from nerfro.data.blender import BlenderData
 from nerfro.evaluation.results import read_metrics_json
-from nerfro.training import background_pretraining
 from nerfro.training.callbacks import steps_by_phase
+from nerfro.training.phases import background
 from nerfro.training.ray_batches import RayBatches
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
 
@@ -28,7 +28,7 @@ def weights(
     train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Callable[..., dict[str, Tensor]]:
     """Weights after a run whose rates are too small to move anything after its first steps."""
-    monkeypatch.setattr(background_pretraining, "_SHARE", 1.0)
+    monkeypatch.setattr(background, "_SHARE", 1.0)
     still = ["trainer.max_steps=1", "evaluation.every=0", "optimizer.warmup_factor=0", "optimizer.warmup_steps=1000"]
 
     def run(name: str, *overrides: str) -> dict[str, Tensor]:
@@ -40,7 +40,7 @@ def weights(
 
 
 def test_the_boundary_alone_has_learned_before_the_first_step(weights: Callable[..., dict[str, Tensor]]) -> None:
-    without, learned = weights("without", "optimizer.boundary_steps=0"), weights("with", "optimizer.boundary_steps=20")
+    without, learned = weights("without", "phase.background.steps=0"), weights("with", "phase.background.steps=20")
     changed = {name for name, value in learned.items() if not torch.equal(value, without[name])}
     assert changed == {"renderer.scene.boundary.texels"}
 
@@ -50,7 +50,7 @@ def test_pretraining_leaves_time_for_the_scene(
 ) -> None:
     seconds = itertools.count()
     monkeypatch.setattr(timer, "time", SimpleNamespace(monotonic=lambda: float(next(seconds))))
-    weights("run", "optimizer.boundary_steps=100000", "trainer.max_time=300s")
+    weights("run", "phase.background.steps=100000", "trainer.max_time=300s")
     checkpoint = load_checkpoint(tmp_path / "run" / LAST_CHECKPOINT)[0]
     phases = steps_by_phase(checkpoint["callbacks"], checkpoint["global_step"])
     # The clock advances by at least a second in each step, and pretraining takes a fifth of the limit.
@@ -78,7 +78,7 @@ def test_rays_that_miss_a_box_have_their_own_colours(tiny_scene: Path) -> None:
 def test_a_signal_ends_these_steps_and_a_resumed_run_takes_the_others(
     weights: Callable[..., dict[str, Tensor]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    options, drawn, missing = ("optimizer.boundary_steps=20", "trainer.max_steps=2"), [], RayBatches.missing
+    options, drawn, missing = ("phase.background.steps=20", "trainer.max_steps=2"), [], RayBatches.missing
 
     def signalled(self: RayBatches, *given: Any) -> Any:
         drawn.append(given[2])

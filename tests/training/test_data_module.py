@@ -164,7 +164,7 @@ def test_there_is_one_copy_of_the_training_pixels(
     """They move to the training device once, and steps of the cameras and of the background use them there."""
     moves, move = [], PixelStore.to
     monkeypatch.setattr(PixelStore, "to", lambda self, device: moves.append(device) or move(self, device))
-    steps = ["trainer.max_steps=4", "camera=refined", "camera.start=1", "camera.every=1", "optimizer.boundary_steps=2"]
+    steps = ["trainer.max_steps=4", "camera=refined", "phase={cameras: {start: 1, every: 1}, background: {steps: 2}}"]
     finished = train_here(*tiny_default_run, *steps, "evaluation.every=0", f"hydra.run.dir={tmp_path / 'run'}")
     assert finished.code == 0, finished.err
     assert len(moves) == 1

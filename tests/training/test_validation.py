@@ -50,7 +50,7 @@ def noise(tiny_scene: Path, tmp_path: Path) -> Path:
 def learn(train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path: Path) -> Callable[..., Any]:
     """Trains along straight rays through a fine grid, long enough to know few photographs by heart."""
     box = ["content.box_min=[-1.6,-1.6,-1.6]", "content.box_max=[1.6,1.6,1.6]"]
-    quick = ["batches.size=256", "optimizer.learning_rate=3e-2", "optimizer.boundary_steps=0", "evaluation.every=50"]
+    quick = ["batches.size=256", "optimizer.learning_rate=3e-2", "phase.background.steps=0", "evaluation.every=50"]
     parts = [
         "sampler/path=straight",
         "field.log2_table_size=14",

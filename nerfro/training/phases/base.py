@@ -1,0 +1,83 @@
+"""The base class of phases."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from nerfro.data.base import Views
+from nerfro.rendering import Renderer
+from nerfro.training.ray_batches import RayBatches
+
+
+@dataclass(frozen=True)
+class Run:
+    """Model, data and optimizer of a training.
+
+    Attributes:
+        renderer: the model.
+        batches: pixels of the training views.
+        views: training views.
+        optimizer: optimizer of the training, with moments that all phases share.
+        spent: spent fraction of `trainer.max_time` or `trainer.max_steps`.
+    """
+
+    renderer: Renderer
+    batches: RayBatches
+    views: Views
+    optimizer: torch.optim.Optimizer
+    spent: float
+
+    def parameters(self, patterns: Sequence[str]) -> list[nn.Parameter]:
+        """Return the learned parameters whose names match a pattern, see `Scene.parameters_by_name`."""
+        named = self.renderer.parameters_by_name().items()
+        return [own for name, own in named if own.requires_grad and any(fnmatchcase(name, each) for each in patterns)]
+
+    def descend(self, loss: Float[Tensor, ""], parameters: Sequence[nn.Parameter]) -> None:
+        """Take a step of the optimizer with some parameters."""
+        # backward() would wait for gradients of other processes.
+        gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
+        for parameter, gradient in zip(parameters, gradients, strict=True):
+            parameter.grad = gradient
+        self.optimizer.step()
+        self.optimizer.zero_grad()
+
+
+class Phase(ABC):
+    """A part of a training with own steps, before the first training step or between training steps.
+
+    Phases begin in the order of the configuration. The parameters of the constructor are the settings
+    `phase.NAME.SETTING`. The schedule counts the steps, and a resumed run continues with the next one.
+    """
+
+    def begin(self, run: Run) -> dict[str, Any]:
+        """Prepare before the first training step.
+
+        Returns:
+            State for `step`: tensors, numbers, texts, lists and dictionaries. Checkpoints contain the state.
+        """
+        return {}
+
+    @abstractmethod
+    def steps_before(self, training_step: int) -> int:
+        """Return the number of steps of this phase that precede a training step."""
+
+    @abstractmethod
+    def step(self, run: Run, number: int, state: dict[str, Any]) -> bool:
+        """Take a step.
+
+        Args:
+            run: model, data and optimizer; the step changes the model.
+            number: number of the step, from 0 on; random numbers depend on this number.
+            state: result of `begin`.
+
+        Returns:
+            Whether a step was taken; otherwise the phase ends.
+        """

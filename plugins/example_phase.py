@@ -1,0 +1,41 @@
+"""Template: a phase of your own in one file. Use it with `+phase.extra_steps.every=10`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+from nerfro.allowed import Count
+from nerfro.registry import register
+from nerfro.training.phases.base import Phase, Run
+
+_OTHER_PIXELS = 10**6  # numbers of batches that training steps do not use
+
+
+@register("phase", "extra_steps")
+class ExtraSteps(Phase):
+    """Learn some parameters faster: they take additional steps on batches of their own.
+
+    Args:
+        every: number of training steps between two of these steps.
+        learn: patterns of the names of the learned parameters.
+    """
+
+    def __init__(self, every: Count = 10, learn: list[str] = ["background.*"]) -> None:  # noqa: B006
+        self.every, self.learn = every, learn
+
+    def steps_before(self, training_step: int) -> int:
+        return training_step // self.every
+
+    def step(self, run: Run, number: int, state: dict[str, Any]) -> bool:
+        parameters, renderer = run.parameters(self.learn), run.renderer
+        if not parameters:
+            return False
+        with torch.no_grad():
+            batch = run.batches.batch(_OTHER_PIXELS + number)
+        path = renderer.trace(renderer.scene.camera(batch.rays, batch.ray_view), batch.path)
+        radiance = batch.per_pixel(renderer.render_path(path, batch.draws)[-1].rgb)
+        error = renderer.scene.colour_space.to_srgb(radiance) - batch.rgb
+        run.descend(error.square().mean(), parameters)
+        return True

@@ -1,0 +1,63 @@
+"""Phases take their steps before and between training steps, and continue after an interruption."""
+
+import copy
+from typing import Any
+from unittest.mock import Mock
+
+import pytest
+from lightning.pytorch import LightningModule, Trainer
+from torch.optim import Adam
+
+from nerfro.data.base import Views
+from nerfro.rendering import Renderer
+from nerfro.training.callbacks import steps_by_phase
+from nerfro.training.phases.base import Phase, Run
+from nerfro.training.ray_batches import RayBatches
+from nerfro.training.schedule import Schedule
+
+
+class Counted(Phase):
+    """Records its steps. It takes three before the first training step and one before every second one after it."""
+
+    def __init__(self, record: list[tuple[str, int, int]], name: str, end: int) -> None:
+        self.record, self.name, self.end = record, name, end
+
+    def begin(self, run: Run) -> dict[str, Any]:
+        self.record.append((self.name, -1, -1))
+        return {"begun": len(self.record)}
+
+    def steps_before(self, training_step: int) -> int:
+        return 3 + training_step // 2
+
+    def step(self, run: Run, number: int, state: dict[str, Any]) -> bool:
+        self.record.append((self.name, number, state["begun"]))
+        return number < self.end
+
+
+@pytest.mark.parametrize("stop", [0, 2, 3])
+def test_steps_of_phases_are_those_of_an_undisturbed_run(stop: int) -> None:
+    def steps(schedule: Schedule, first: int, last: int) -> dict[str, Any]:
+        module = Mock(spec=LightningModule, renderer=Mock(spec=Renderer))
+        data = Mock(batches=Mock(spec=RayBatches))
+        trainer = Mock(
+            spec=Trainer, callbacks=[], datamodule=data, lightning_module=module, optimizers=[Mock(spec=Adam)]
+        )
+        trainer.configure_mock(global_step=first, max_steps=100)
+        schedule.on_train_start(trainer, module)
+        for trainer.global_step in range(first, last):
+            schedule.on_train_batch_start(trainer, module, None, 0)
+        return copy.deepcopy(schedule.state_dict())
+
+    def schedule(record: list[tuple[str, int, int]]) -> Schedule:
+        return Schedule({name: Counted(record, name, end) for name, end in (("a", 9), ("b", 1))}, Mock(spec=Views))
+
+    whole: list[tuple[str, int, int]] = []
+    state = steps(schedule(whole), 0, 7)
+    before = [("a", -1, -1), ("a", 0, 1), ("a", 1, 1), ("a", 2, 1), ("b", -1, -1), ("b", 0, 5), ("b", 1, 5)]
+    assert whole == [*before, ("a", 3, 1), ("a", 4, 1), ("a", 5, 1)]
+    assert steps_by_phase({"Schedule": state}, 7) == {"a": 6, "b": 1, "scene": 7}
+    parted: list[tuple[str, int, int]] = []
+    resumed = schedule(parted)
+    resumed.load_state_dict(steps(schedule(parted), 0, stop))
+    assert steps(resumed, stop, 7) == state
+    assert parted == whole
