@@ -6,9 +6,10 @@ import ast
 import runpy
 import sys
 
-from nerfro.cli import errors_in_one_line, print_version
+from nerfro.cli import print_version
 from nerfro.completion import completions, shell_code
 from nerfro.errors import NerfroError
+from nerfro.failures import errors_in_one_line
 from nerfro.paths import PACKAGE_DIR
 
 

@@ -19,9 +19,9 @@ from nerfro.capture.calibrated_data import FILES, ray_range, relative, split_vie
 from nerfro.capture.calibration import Calibration, calibrate
 from nerfro.capture.photographs import list_photographs, luminance, outside
 from nerfro.capture.reconstruction import SfmSettings, find_model, import_model
-from nerfro.cli import entry_point, warn
+from nerfro.cli import entry_point
 from nerfro.data.masks import find_mask, require_used
-from nerfro.errors import NerfroError
+from nerfro.errors import NerfroError, warn
 from nerfro.files.atomic import refuse_existing
 from nerfro.files.folder_lock import lock_folder
 from nerfro.overrides import print_next

@@ -15,8 +15,8 @@ from datetime import datetime
 from pathlib import Path
 
 import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
-from nerfro.cli import errors_in_one_line
 from nerfro.evaluation.results import read_metrics_json
+from nerfro.failures import errors_in_one_line
 from nerfro.trust import command_of_module
 from nerfro.viewing.server import open_page
 

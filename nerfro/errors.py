@@ -1,11 +1,13 @@
-"""Exceptions with messages for users, and lists of names in messages."""
+"""Exceptions with messages for users, warnings, and lists of names in messages."""
 
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Sequence
 
 _SHOWN = 3
+_LONGEST_LINE = 1000  # characters of an error; the middle of longer ones is left out
 
 
 class NerfroError(Exception):
@@ -30,3 +32,14 @@ def nearest_of(name: str, names: Sequence[str]) -> str:
     names = sorted(other for other in names if other != "_target_")
     near = difflib.get_close_matches(name, names, n=1)
     return f"did you mean {near[0]}?" if near else f"known: {', '.join(names) or 'none'}"
+
+
+def one_line(text: str) -> str:
+    """Escape control characters, which names of files may contain, and shorten a line with long values of a file."""
+    line = re.sub(r"[\x00-\x1f\x7f]", lambda character: repr(character[0])[1:-1], text)
+    return line if len(line) <= _LONGEST_LINE else f"{line[: _LONGEST_LINE // 2]} ... {line[-_LONGEST_LINE // 4 :]}"
+
+
+def warn(message: str) -> None:
+    """Print a warning about an allowed but suspicious input or result."""
+    print(f"nerfro: warning: {one_line(message)}")

@@ -12,7 +12,7 @@ import sys
 
 import nerfro.startup
 import nerfro.training.lightning_callbacks  # noqa: F401 - registers callbacks
-from nerfro.cli import errors_in_one_line
+from nerfro.failures import errors_in_one_line
 from nerfro.media.material import MATERIALS
 from nerfro.options import plugin_options
 from nerfro.registry import Plugin, discover, find, plugins

@@ -27,9 +27,10 @@ from nerfro.capture.surface import make_mesh, read_silhouettes
 from nerfro.capture.surroundings import Observations
 from nerfro.capture.vessel_fit import find_vessel
 from nerfro.capture.visual_hull import Silhouettes
-from nerfro.cli import entry_point, warn
+from nerfro.cli import entry_point
 from nerfro.data.base import Views
 from nerfro.data.masks import EVIDENCE, REVOLUTION, masked_views, method_of, with_other_splits
+from nerfro.errors import warn
 from nerfro.files.atomic import refuse_existing
 from nerfro.files.folder_lock import lock_folder
 from nerfro.geometry.mesh import TriangleMesh, load_mesh

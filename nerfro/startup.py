@@ -10,7 +10,8 @@ from __future__ import annotations
 import sys
 from types import TracebackType
 
-from nerfro.cli import answer, errors_in_one_line, print_version, program
+from nerfro.cli import answer, print_version, program
+from nerfro.failures import errors_in_one_line
 from nerfro.options import Described, recall, usage
 
 _WITHOUT_CONFIGURATION = ("demo", "plugins")  # commands

@@ -14,13 +14,14 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
-from nerfro.cli import EXIT_INTERRUPTED, entry_point
+from nerfro.cli import entry_point
 from nerfro.distributed import leave
 from nerfro.evaluation.lpips import find_lpips_networks
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.results import RunMetrics, optimized
 from nerfro.evaluation.tables import report
 from nerfro.evaluation.treatments import score_split
+from nerfro.failures import EXIT_INTERRUPTED
 from nerfro.fields.mlp import compile_networks
 from nerfro.rendering.scene_file import with_scene
 from nerfro.subdivision import Subdivision

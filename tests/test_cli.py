@@ -14,9 +14,12 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 
-from nerfro.cli import RENAMED, _flags_first, _RenamingFiles, errors_in_one_line, in_one_line, renamed_override, warn
-from nerfro.errors import NerfroError
+from nerfro.cli import _flags_first
+from nerfro.composition import RenamingFiles
+from nerfro.errors import NerfroError, warn
+from nerfro.failures import errors_in_one_line, in_one_line
 from nerfro.files.foreign_config import foreign_config
+from nerfro.old_names import RENAMED, renamed_override
 from nerfro.paths import CONF_DIR, resolve_path, user_path
 from nerfro.registry import discover, plugins
 from nerfro.training.config import TrainConfig
@@ -25,7 +28,7 @@ from nerfro.trust import GuardedConfigLoader
 
 @pytest.mark.parametrize("num_lines", [1, 10_000])  # less and more than a pipe's buffer
 def test_a_reader_that_has_seen_enough_is_no_error(num_lines: int) -> None:
-    program = f"import nerfro.cli\nwith nerfro.cli.errors_in_one_line():\n    print('line\\n' * {num_lines})"
+    program = f"import nerfro.failures\nwith nerfro.failures.errors_in_one_line():\n    print('line\\n' * {num_lines})"
     reader, writer = os.pipe()
     os.close(reader)
     done = subprocess.run(
@@ -111,7 +114,7 @@ def test_a_file_that_is_no_yaml_is_named_with_the_line(tmp_path: Path) -> None:
         assert f'"{path}", line' in line
     path.write_bytes(b"name: \xe9")
     with pytest.raises(NerfroError, match=r"mine\.yaml is not a text in UTF-8"):
-        _RenamingFiles("mine", f"file://{tmp_path}").load_config("mine")
+        RenamingFiles("mine", f"file://{tmp_path}").load_config("mine")
 
 
 @pytest.mark.parametrize("location", ["~nobody_of_that_name/run", "a\0b"])
@@ -152,7 +155,7 @@ OLD_NAMES = {
 def test_old_names_in_overrides_are_replaced_with_a_warning(
     old: str, new: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("nerfro.cli.RENAMED", OLD_NAMES)
+    monkeypatch.setattr("nerfro.old_names.RENAMED", OLD_NAMES)
     assert renamed_override(old) == new
     printed = capsys.readouterr().out
     assert ("since this release" in printed) == (old != new)
@@ -163,12 +166,12 @@ def test_old_names_in_overrides_are_replaced_with_a_warning(
 def test_old_names_in_files_of_users_and_in_old_runs_are_replaced_with_a_warning(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("nerfro.cli.RENAMED", OLD_NAMES)
+    monkeypatch.setattr("nerfro.old_names.RENAMED", OLD_NAMES)
     (tmp_path / "experiment").mkdir()
     (tmp_path / "experiment" / "mine.yaml").write_text(
         "# @package _global_\ndefaults:\n  - mirror\n  - /loss@loss.near: near\n  - _self_\nbatches: {hidden: 7}\n"
     )
-    files = _RenamingFiles("main", str(tmp_path))
+    files = RenamingFiles("main", str(tmp_path))
     config = files.load_config("experiment/mine").config
     assert config == {"defaults": ["glass", {"/loss@loss.distortion": "distortion"}, "_self_"], "batches": {"size": 7}}
     (tmp_path / "experiment" / "mine.yaml").write_text("# @package _global_\nmedium: {old_depth: 7}\n")
@@ -186,7 +189,7 @@ def test_bodies_are_settings_of_the_medium(tmp_path: Path, capsys: pytest.Captur
     assert renamed_override("+bodies.a.ior=1.5") == "+medium.bodies.a.ior=1.5"
     (tmp_path / "experiment").mkdir()
     (tmp_path / "experiment" / "mine.yaml").write_text("# @package _global_\nbodies: {a: {ior: 1.5}}\n")
-    config = _RenamingFiles("main", str(tmp_path)).load_config("experiment/mine").config
+    config = RenamingFiles("main", str(tmp_path)).load_config("experiment/mine").config
     assert config == {"medium": {"bodies": {"a": {"ior": 1.5}}}}
     assert not capsys.readouterr().out
 

@@ -20,8 +20,7 @@ from jaxtyping import Bool, Float, Num
 
 from nerfro.capture.preprocess_options import INDEX, Request, build_medium, index_settings
 from nerfro.capture.surroundings import Observations, Pixels, Room, Surroundings, half_weight, robust
-from nerfro.cli import warn
-from nerfro.errors import NerfroError
+from nerfro.errors import NerfroError, warn
 from nerfro.files.atomic import write_atomically
 from nerfro.media.base import Medium
 from nerfro.media.solid import Solid

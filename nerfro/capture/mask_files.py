@@ -22,11 +22,10 @@ from nerfro.capture.opencv import opencv
 from nerfro.capture.outline_hull import AGREES, FEWEST_VIEWS
 from nerfro.capture.reconstruction import numeric_order
 from nerfro.capture.tracking import load_tracker, track_object
-from nerfro.cli import warn
 from nerfro.data.base import DataSource, Frame
 from nerfro.data.image_files import read_mask, read_size, to_unit
 from nerfro.data.masks import METHOD, POLYGON, TRACKED, checksum, method_of, without_masks
-from nerfro.errors import NerfroError, first_of
+from nerfro.errors import NerfroError, first_of, warn
 from nerfro.files.drawing import sheet
 from nerfro.files.images import save_image
 from nerfro.files.reading import read_json

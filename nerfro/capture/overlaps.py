@@ -13,9 +13,8 @@ from torch import Tensor
 from nerfro.capture.pose_conventions import GOOD_OVERLAP, better_wrong_masks, overlap
 from nerfro.capture.silhouettes import mesh_silhouettes, pixel_stride
 from nerfro.capture.visual_hull import Silhouettes
-from nerfro.cli import warn
 from nerfro.data.base import Views
-from nerfro.errors import first_of
+from nerfro.errors import first_of, warn
 from nerfro.files.atomic import write_atomically
 from nerfro.files.drawing import sheet
 from nerfro.files.images import save_image

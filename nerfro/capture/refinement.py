@@ -35,8 +35,7 @@ from nerfro.capture.room_panorama import RoomPanorama, panorama_of
 from nerfro.capture.silhouettes import mesh_silhouettes
 from nerfro.capture.surroundings import Observations, Pixels, Room, Surroundings, robust
 from nerfro.capture.visual_hull import Silhouettes
-from nerfro.cli import warn
-from nerfro.errors import NerfroError
+from nerfro.errors import NerfroError, warn
 from nerfro.files.atomic import write_atomically
 from nerfro.geometry.interpolation import bspline_basis, smooth
 from nerfro.geometry.mesh import TriangleMesh

@@ -11,9 +11,8 @@ from nerfro.capture.revolution import Symmetry, fit_revolution
 from nerfro.capture.silhouette_fit import fit_surface
 from nerfro.capture.silhouettes import frame_pixels
 from nerfro.capture.visual_hull import Silhouettes, carve_grid, extract_surface, find_box, reaches_border, remove_strays
-from nerfro.cli import warn
 from nerfro.data.base import Views
-from nerfro.errors import NerfroError, first_of
+from nerfro.errors import NerfroError, first_of, warn
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.progress import bar
 

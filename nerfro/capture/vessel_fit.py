@@ -18,8 +18,7 @@ from nerfro.capture.index_search import mean_errors
 from nerfro.capture.object_errors import COMMON_INDICES, ObjectErrors
 from nerfro.capture.surroundings import Observations
 from nerfro.capture.upright import find_up
-from nerfro.cli import warn
-from nerfro.errors import NerfroError
+from nerfro.errors import NerfroError, warn
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.vessel import SdfVessel

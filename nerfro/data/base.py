@@ -15,9 +15,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerfro.cameras import Cameras
-from nerfro.cli import warn
 from nerfro.data.lazy_images import LazyImages
-from nerfro.errors import NerfroError, first_of
+from nerfro.errors import NerfroError, first_of, warn
 from nerfro.progress import track
 from nerfro.types import WORLD_ORIGIN
 

@@ -14,8 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.allowed import Range, check
-from nerfro.cli import warn
-from nerfro.errors import NerfroError, first_of
+from nerfro.errors import NerfroError, first_of, warn
 from nerfro.files.reading import is_number, parse_matrix
 from nerfro.lens import coefficients, distort, opencv_coefficients, undistort
 

@@ -9,9 +9,9 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from nerfro.cli import renamed_config
 from nerfro.errors import NerfroError
 from nerfro.files.reading import read_text
+from nerfro.old_names import renamed_config
 from nerfro.trust import require_bounded_yaml
 
 

@@ -17,6 +17,7 @@ from typing import Any, TypeVar, cast
 
 import numba
 
+from nerfro.errors import warn
 from nerfro.kernels.threads import num_threads, parallel_threads
 from nerfro.paths import cache_dir
 
@@ -84,8 +85,6 @@ def _compile(function: Function, parallel: bool, allocates: bool = True) -> Func
 
 @functools.cache
 def _warn_of_compiling(folder: Path, variable: str, reason: str) -> None:
-    from nerfro.cli import warn  # imports Hydra, which a library call does not need
-
     warn(
         f"machine code cannot be kept in {folder} ({reason}), so every process compiles its kernels, which takes up to "
         f"a minute; set {variable} to a folder that can be written"

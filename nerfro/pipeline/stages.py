@@ -16,10 +16,11 @@ from types import FrameType
 import torch
 
 from nerfro.capture.photographs import PHOTOGRAPH_SUFFIXES, place_photograph
-from nerfro.cli import EXIT_INTERRUPTED, call, in_one_line
+from nerfro.cli import call
 from nerfro.data.frames import list_images
 from nerfro.data.image_files import IMAGE_SUFFIXES
 from nerfro.errors import Interrupted, NerfroError
+from nerfro.failures import EXIT_INTERRUPTED, in_one_line
 from nerfro.overrides import without_hints
 from nerfro.progress import track
 

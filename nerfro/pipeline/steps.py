@@ -13,9 +13,8 @@ from nerfro.capture.calibrated_data import PLOT, REPORT
 from nerfro.capture.overlaps import SHEET
 from nerfro.capture.preprocess_options import MESH
 from nerfro.capture.video import extract_frames
-from nerfro.cli import warn
 from nerfro.data.frames import list_images
-from nerfro.errors import NerfroError
+from nerfro.errors import NerfroError, warn
 from nerfro.evaluation.results import EXPOSED, FULL, read_metrics_json
 from nerfro.files.reading import read_json
 from nerfro.overrides import as_overrides, is_given

@@ -17,8 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from nerfro.allowed import Count, check_settings
-from nerfro.cli import warn
-from nerfro.errors import NerfroError
+from nerfro.errors import NerfroError, warn
 from nerfro.files.atomic import write_atomically
 from nerfro.files.reading import read_json
 from nerfro.media.bodies import BodySettings

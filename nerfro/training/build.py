@@ -11,9 +11,11 @@ from hydra.errors import HydraException
 from lightning.pytorch import seed_everything
 from omegaconf import DictConfig
 
-from nerfro.cli import check_configuration, in_one_line, renamed_override, warn
+from nerfro.cli import check_configuration
 from nerfro.data.base import DataSource, Views
-from nerfro.errors import NerfroError
+from nerfro.errors import NerfroError, warn
+from nerfro.failures import in_one_line
+from nerfro.old_names import renamed_override
 from nerfro.options import describe_command
 from nerfro.paths import CONF_DIR
 from nerfro.registry import discover

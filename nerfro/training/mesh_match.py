@@ -13,9 +13,8 @@ from torch import Tensor
 
 from nerfro.cameras import Cameras
 from nerfro.capture.silhouettes import PixelBlocks
-from nerfro.cli import warn
 from nerfro.data.base import Views
-from nerfro.errors import NerfroError
+from nerfro.errors import NerfroError, warn
 from nerfro.geometry.intersection import MeshIntersector
 from nerfro.geometry.lines import nearest_point
 from nerfro.geometry.mesh import TriangleMesh

@@ -15,12 +15,11 @@ from torch import Tensor
 
 from nerfro.allowed import Count, Natural, Range, checked
 from nerfro.cameras import Cameras, Window, central_window
-from nerfro.cli import warn
 from nerfro.data.base import Views
 from nerfro.data.pixel_store import PixelStore
 from nerfro.distributed import share_of
 from nerfro.draws import Draws
-from nerfro.errors import NerfroError
+from nerfro.errors import NerfroError, warn
 from nerfro.geometry.interpolation import misses
 from nerfro.rays import Rays
 from nerfro.subdivision import PixelRays, Subdivision, Trace, TraceExits, contrast, pixel_rays, subdivide

@@ -5,8 +5,7 @@ from __future__ import annotations
 import torch
 
 from nerfro.boundaries.constant import ConstantBoundary
-from nerfro.cli import warn
-from nerfro.errors import NerfroError
+from nerfro.errors import NerfroError, warn
 from nerfro.fields.base import Field
 from nerfro.rays import Rays
 from nerfro.rendering import Renderer

@@ -14,10 +14,10 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from nerfro.cli import in_one_line
 from nerfro.data.image_files import IMAGE_SUFFIXES
 from nerfro.errors import NerfroError
 from nerfro.evaluation.results import RunMetrics, read_metrics_json
+from nerfro.failures import in_one_line
 from nerfro.files.atomic import write_atomically
 from nerfro.files.folder_lock import lock_folder
 from nerfro.files.reading import read_json

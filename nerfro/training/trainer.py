@@ -19,8 +19,7 @@ from lightning.pytorch.strategies import DDPStrategy
 from omegaconf import DictConfig
 
 import nerfro.training.lightning_callbacks  # noqa: F401 - registers callbacks
-from nerfro.cli import warn
-from nerfro.errors import NerfroError
+from nerfro.errors import NerfroError, warn
 from nerfro.kernels.allocator import keep_freed_memory
 from nerfro.kernels.available import fast_bfloat16
 from nerfro.registry import build, create, find

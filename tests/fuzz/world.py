@@ -26,8 +26,8 @@ from unittest import mock
 
 import numpy as np
 
-from nerfro.cli import in_one_line
 from nerfro.errors import NerfroError
+from nerfro.failures import in_one_line
 from nerfro.files import cache
 
 SECONDS = 60
