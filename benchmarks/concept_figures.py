@@ -25,9 +25,9 @@ from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.light import to_srgb
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.paths import ASSETS_DIR
-from nerfro.samplers.density_grid import DensityGridSampler
-from nerfro.samplers.snell import Snell
-from nerfro.samplers.stratified import Stratified
+from nerfro.samplers.paths.snell import Snell
+from nerfro.samplers.points.density_grid import DensityGridSampler
+from nerfro.samplers.points.stratified import Stratified
 from nerfro.types import Path as RayPath
 
 MESH = ASSETS_DIR / "torus" / "mesh.ply"

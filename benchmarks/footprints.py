@@ -32,10 +32,10 @@ from nerfro.light import to_srgb
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.rays import Rays
 from nerfro.rendering import Renderer
-from nerfro.samplers.snell import Snell
-from nerfro.scenes.scene import lat_long_texture
-from nerfro.scenes.synthesis import find_scene
+from nerfro.samplers.paths.snell import Snell
 from nerfro.subdivision import Subdivision, contrast, divergence, neighbour_rays, part_rays, pixel_rays
+from nerfro.synthetic.scene import lat_long_texture
+from nerfro.synthetic.synthesis import find_scene
 from nerfro.types import Exits
 from tests.closed_forms import RoundedBox
 

@@ -28,15 +28,15 @@ from PIL import Image
 from scipy.interpolate import PchipInterpolator
 from skimage.measure import approximate_polygon, find_contours
 
-from nerfro.capture.opencv import opencv
 from nerfro.evaluation.results import FULL, read_metrics_json
 from nerfro.light import to_srgb
+from nerfro.opencv import opencv
 from nerfro.progress import track
-from nerfro.scenes.dataset import PlannedImage, write_image
-from nerfro.scenes.path_tracer import PathTracer, Pinhole, panel_shape, triangle_shape
-from nerfro.scenes.scene import Panel, Scene
-from nerfro.scenes.surface import Surface
-from nerfro.scenes.synthesis import find_scene
+from nerfro.synthetic.dataset import PlannedImage, write_image
+from nerfro.synthetic.path_tracer import PathTracer, Pinhole, panel_shape, triangle_shape
+from nerfro.synthetic.scene import Panel, Scene
+from nerfro.synthetic.surface import Surface
+from nerfro.synthetic.synthesis import find_scene
 from nerfro.viewing.film import write_film
 
 dolphin = find_scene("dolphin_capture")

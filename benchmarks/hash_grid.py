@@ -26,8 +26,8 @@ from nerfro.fields.hash_grid import HashGridField
 from nerfro.fields.spherical_harmonics import spherical_harmonics
 from nerfro.kernels.allocator import keep_freed_memory
 from nerfro.media.analytic import Vacuum
-from nerfro.samplers.density_grid import DensityGridSampler
-from nerfro.samplers.straight import Straight
+from nerfro.samplers.paths.straight import Straight
+from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.types import Exits, Rays, Samples
 
 Task = Callable[[], object]

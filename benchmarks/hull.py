@@ -12,13 +12,13 @@ import trimesh
 from capture import read_cameras, similarity, volume_overlap
 from jaxtyping import Float
 
-from nerfro.capture.silhouettes import pixel_stride
 from nerfro.data.base import Views
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.paths import resolve_path
 from nerfro.registry import discover, find
-from nerfro.samplers.snell import Snell
+from nerfro.samplers.paths.snell import Snell
+from nerfro.silhouettes.silhouettes import pixel_stride
 
 _MARGIN_SHARE = 0.15
 _MAX_PIXELS = 160

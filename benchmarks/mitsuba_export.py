@@ -18,7 +18,7 @@ import torch
 import nerfro
 from nerfro.evaluation.image_metrics import psnr
 from nerfro.light import to_srgb
-from nerfro.scenes.path_tracer import load_mitsuba
+from nerfro.synthetic.path_tracer import load_mitsuba
 
 
 def main() -> None:

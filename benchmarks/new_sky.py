@@ -21,10 +21,10 @@ import nerfro
 from nerfro.files import lat_long
 from nerfro.files.images import save_png
 from nerfro.light import to_srgb
-from nerfro.scenes.dataset import CAMERA_ANGLE_X
-from nerfro.scenes.path_tracer import PathTracer, Pinhole
-from nerfro.scenes.scene import lat_long_texture
-from nerfro.scenes.synthesis import build_scene
+from nerfro.synthetic.dataset import CAMERA_ANGLE_X
+from nerfro.synthetic.path_tracer import PathTracer, Pinhole
+from nerfro.synthetic.scene import lat_long_texture
+from nerfro.synthetic.synthesis import build_scene
 
 # Opacity of things inside up to which a pixel shows sky alone.
 _CLEAR = 0.01

@@ -22,8 +22,8 @@ from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball
 from nerfro.media.voxel_grid import VoxelGrid
 from nerfro.paths import ASSETS_DIR
-from nerfro.samplers.eikonal import Eikonal
-from nerfro.samplers.snell import Snell
+from nerfro.samplers.paths.eikonal import Eikonal
+from nerfro.samplers.paths.snell import Snell
 from nerfro.subdivision import part_rays
 from nerfro.types import Path as RayPath
 from nerfro.types import Rays

@@ -24,8 +24,8 @@ from nerfro.cameras import Cameras
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball
 from nerfro.media.voxel_grid import VoxelGrid
-from nerfro.samplers.eikonal import Eikonal
-from nerfro.samplers.snell import Snell
+from nerfro.samplers.paths.eikonal import Eikonal
+from nerfro.samplers.paths.snell import Snell
 from nerfro.types import Rays
 from tests.closed_forms import RoundedBox
 

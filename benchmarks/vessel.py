@@ -20,7 +20,7 @@ from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.solid import Solid
 from nerfro.media.vessel import SdfVessel
 from nerfro.rays import Rays
-from nerfro.samplers.snell import Snell
+from nerfro.samplers.paths.snell import Snell
 
 # A drinking glass in millimetres, and the world unit.
 HEIGHT, RADIUS_BELOW, RADIUS_ABOVE, WALL, FOOT, LEVEL = 120.0, 30.0, 38.0, 2.5, 10.0, 80.0

@@ -16,12 +16,12 @@ from .media.shapes import Ball
 from .models.refractive import RefractiveModel
 from .rays import Rays
 from .rendering.renderer import Components
-from .samplers.bend import bend, polylines
-from .samplers.eikonal import Eikonal
-from .samplers.hierarchical import Hierarchical
-from .samplers.snell import Snell
-from .samplers.straight import Straight
-from .samplers.stratified import Stratified
+from .samplers.paths.bend import bend, polylines
+from .samplers.paths.eikonal import Eikonal
+from .samplers.paths.snell import Snell
+from .samplers.paths.straight import Straight
+from .samplers.points.hierarchical import Hierarchical
+from .samplers.points.stratified import Stratified
 from .training.build import build
 from .training.data_module import RayDataModule
 from .training.load import load

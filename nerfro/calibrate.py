@@ -13,12 +13,6 @@ import numpy as np
 from omegaconf import DictConfig
 
 import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
-from nerfro.capture.boards import TagBoard, print_sheets
-from nerfro.capture.calibrate_options import CalibrateConfig, check_options, make_board
-from nerfro.capture.calibrated_data import FILES, ray_range, relative, split_views, write_calibrated
-from nerfro.capture.calibration import Calibration, calibrate
-from nerfro.capture.photographs import list_photographs, luminance, outside
-from nerfro.capture.reconstruction import SfmSettings, find_model, import_model
 from nerfro.cli import entry_point
 from nerfro.data.masks import find_mask, require_used
 from nerfro.errors import NerfroError, warn
@@ -26,6 +20,12 @@ from nerfro.files.atomic import refuse_existing
 from nerfro.files.folder_lock import lock_folder
 from nerfro.overrides import print_next
 from nerfro.paths import user_path
+from nerfro.poses.boards import TagBoard, print_sheets
+from nerfro.poses.calibrate_options import CalibrateConfig, check_options, make_board
+from nerfro.poses.calibrated_data import FILES, ray_range, relative, split_views, write_calibrated
+from nerfro.poses.calibration import Calibration, calibrate
+from nerfro.poses.photographs import list_photographs, luminance, outside
+from nerfro.poses.reconstruction import SfmSettings, find_model, import_model
 from nerfro.progress import track
 
 # Limits above which a warning is printed: reprojection error in pixels, and relative deviation of the focal length.

@@ -14,14 +14,14 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
-from nerfro.capture.mask_files import MaskConfig, MaskTask, read_outlines
-from nerfro.capture.masking import Segmentation
 from nerfro.cli import entry_point
 from nerfro.data.base import DataSource
 from nerfro.data.frames import require_root
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
 from nerfro.files.folder_lock import lock_folder
+from nerfro.masks.mask_files import MaskConfig, MaskTask, read_outlines
+from nerfro.masks.masking import Segmentation
 from nerfro.overrides import is_given, of_groups, print_next
 from nerfro.paths import EMBEDDED_PREFIX
 from nerfro.progress import progress_bar

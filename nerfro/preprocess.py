@@ -19,14 +19,10 @@ from omegaconf import DictConfig
 import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
 from nerfro.capture.index_search import find_medium
 from nerfro.capture.object_errors import unsupported_bodies
-from nerfro.capture.overlaps import choose_wrong_masks, report_overlaps
-from nerfro.capture.pose_conventions import require_consistent_poses
 from nerfro.capture.preprocess_options import MESH, PreprocessConfig, Request, surface_settings, write_scene
 from nerfro.capture.refinement import refine
-from nerfro.capture.surface import make_mesh, read_silhouettes
 from nerfro.capture.surroundings import Observations
 from nerfro.capture.vessel_fit import find_vessel
-from nerfro.capture.visual_hull import Silhouettes
 from nerfro.cli import entry_point
 from nerfro.data.base import Views
 from nerfro.data.masks import EVIDENCE, REVOLUTION, masked_views, method_of, with_other_splits
@@ -38,6 +34,10 @@ from nerfro.media.sdf_grid import SdfGrid
 from nerfro.paths import resolve_path
 from nerfro.registry import build
 from nerfro.rendering.scene_file import SceneFile, with_scene
+from nerfro.silhouettes.overlaps import choose_wrong_masks, report_overlaps
+from nerfro.silhouettes.pose_conventions import require_consistent_poses
+from nerfro.silhouettes.surface import make_mesh, read_silhouettes
+from nerfro.silhouettes.visual_hull import Silhouettes
 
 
 @entry_point("preprocess", PreprocessConfig, expand=with_scene)

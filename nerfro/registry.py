@@ -40,19 +40,34 @@ SEVERAL = ("loss", "phase", "callbacks")  # a run may have several plugins of th
 
 # Modules and packages with built-in plugins; `discover` imports all of them.
 _BUILT_IN = (
-    "camera", "media", "samplers", "fields", "boundaries", "losses", "models", "data", "evaluation.image_metrics",
+    "camera", "media", "samplers.paths", "samplers.points", "fields", "boundaries", "losses", "models", "data",
+    "evaluation.image_metrics",
     "training.phases",
 )  # fmt: skip
 _LOCAL_PACKAGE = "nerfro_plugins"
 # Former and present places of classes; configurations of earlier releases name the former ones.
-MOVED_CLASSES = {
-    f"nerfro.data.{module}.{name}": f"{_LOCAL_PACKAGE}.data_formats.{module}.{name}"
-    for module, name in (("idr", "IdrData"), ("llff", "LlffData"), ("refref", "RefRefData"))
-} | {
-    "nerfro.data.opencv.OpenCVData": "nerfro.data.blender.OpenCVData",
-    "nerfro.fields.mip_nerf.MipNerfField": f"{_LOCAL_PACKAGE}.mip_nerf.MipNerfField",
-    "nerfro.models.mip_nerf.MipNerfModel": f"{_LOCAL_PACKAGE}.mip_nerf.MipNerfModel",
-}
+MOVED_CLASSES = (
+    {
+        f"nerfro.data.{module}.{name}": f"{_LOCAL_PACKAGE}.data_formats.{module}.{name}"
+        for module, name in (("idr", "IdrData"), ("llff", "LlffData"), ("refref", "RefRefData"))
+    }
+    | {
+        f"nerfro.samplers.{module}.{name}": f"nerfro.samplers.{group}.{module}.{name}"
+        for group, module, name in (
+            ("paths", "eikonal", "Eikonal"),
+            ("paths", "snell", "Snell"),
+            ("paths", "straight", "Straight"),
+            ("points", "density_grid", "DensityGridSampler"),
+            ("points", "hierarchical", "Hierarchical"),
+            ("points", "stratified", "Stratified"),
+        )
+    }
+    | {
+        "nerfro.data.opencv.OpenCVData": "nerfro.data.blender.OpenCVData",
+        "nerfro.fields.mip_nerf.MipNerfField": f"{_LOCAL_PACKAGE}.mip_nerf.MipNerfField",
+        "nerfro.models.mip_nerf.MipNerfModel": f"{_LOCAL_PACKAGE}.mip_nerf.MipNerfModel",
+    }
+)
 ENTRY_POINTS = "nerfro.plugins"
 
 # Objects of Lightning that a configuration may name as Hydra's `_target_`, beside registered classes.

@@ -30,9 +30,9 @@ from nerfro.models.refractive import RefractiveModel
 from nerfro.registry import Plugin, build
 from nerfro.rendering import Components, Renderer, composite
 from nerfro.samplers.base import PathSampler, PointSampler
-from nerfro.samplers.snell import Snell
-from nerfro.samplers.straight import Straight
-from nerfro.samplers.stratified import Stratified, point_samples
+from nerfro.samplers.paths.snell import Snell
+from nerfro.samplers.paths.straight import Straight
+from nerfro.samplers.points.stratified import Stratified, point_samples
 from nerfro.training.phases.base import Phase
 from nerfro.types import Batch, Exits, Path, Radiance, Rays, Rendering, Samples
 

@@ -20,8 +20,8 @@ from nerfro.files.cache import save_arrays
 from nerfro.paths import user_path
 from nerfro.registry import build
 from nerfro.rendering.scene_file import with_scene
-from nerfro.samplers.snell import Snell
-from nerfro.samplers.traced_file import TraceConfig, leave_box, make_rays, read_rays
+from nerfro.samplers.paths.snell import Snell
+from nerfro.samplers.paths.traced_file import TraceConfig, leave_box, make_rays, read_rays
 
 _PLOTTED_RAYS = 24
 

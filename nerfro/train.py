@@ -64,11 +64,10 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetr
     require_same_run(folder, checkpoint, config, module.parameter_groups())
     throughput, interruption = Throughput(), StopOnSignal()
     trainer = make_trainer(config, folder, throughput, [interruption, Viewer(config, source, test)])
-    batches = datamodule.batches.share(trainer.global_rank, trainer.world_size)
     device = trainer.strategy.root_device
     require_match(renderer.scene.medium, training)
-    memory = check_first_batch(renderer, batches, device)
-    del batches  # the data module moves the pixels to the training device
+    # The share is not kept, because the data module moves the pixels to the training device.
+    memory = check_first_batch(renderer, datamodule.batches.share(trainer.global_rank, trainer.world_size), device)
     if trainer.is_global_zero:
         begin(folder, config, renderer)
         print(memory, flush=True)

@@ -11,7 +11,7 @@ from nerfro.allowed import Count
 from nerfro.draws import Draws
 from nerfro.registry import register
 from nerfro.samplers.base import PointSampler
-from nerfro.samplers.stratified import point_samples
+from nerfro.samplers.points.stratified import point_samples
 from nerfro.types import Path, Rendering, Samples
 
 _GROWTH = 4.0  # ratio of the last spacing to the first

@@ -20,8 +20,8 @@ import trimesh
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from nerfro.scenes import llvm
-from nerfro.scenes.path_tracer import load_mitsuba
+from nerfro.synthetic import llvm
+from nerfro.synthetic.path_tracer import load_mitsuba
 
 # Before any test imports Mitsuba, which loads the library at once.
 llvm.select_llvm()
@@ -326,3 +326,21 @@ def trained_run(tiny_default_run: list[str], tmp_path_factory: pytest.TempPathFa
     folder = tmp_path_factory.mktemp("trained") / "run"
     logged = ["logger=tensorboard", "trainer.log_every_n_steps=1"]
     return train_in(folder, *tiny_default_run, *logged, "trainer.max_steps=2", "evaluation.every=0")
+
+
+@pytest.fixture
+def command(run_here: Callable) -> Callable[..., str]:
+    """Run `nerfro.<name>` with overrides; returns what it printed, or its one line of error."""
+
+    def run(name: str, *overrides: str) -> str:
+        code, printed, errors = run_here(name, *overrides)
+        if code == 0:
+            return printed
+        assert code == 1
+        # Progress bars start with a carriage return.
+        message = [line for line in errors.split("\n") if line and not line.startswith("\r")]
+        assert len(message) == 1
+        assert message[0].startswith("nerfro: error: ")
+        return f"{message[0]}\n"
+
+    return run

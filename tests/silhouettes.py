@@ -7,10 +7,10 @@ from matplotlib.path import Path as Polygon
 from scipy.spatial import ConvexHull
 
 from nerfro.cameras import Cameras
-from nerfro.capture.silhouettes import mesh_silhouettes
-from nerfro.capture.visual_hull import Silhouettes, carve_mesh, find_box
 from nerfro.data.base import Views
 from nerfro.geometry.mesh import TriangleMesh
+from nerfro.silhouettes.silhouettes import mesh_silhouettes
+from nerfro.silhouettes.visual_hull import Silhouettes, carve_mesh, find_box
 
 
 def cameras_around(count: int, size: int, distance: float = 4.0, focal: float = 1.4, spread: float = 1.0) -> Cameras:

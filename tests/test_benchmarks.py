@@ -16,7 +16,7 @@ import torch
 from lightning.pytorch.callbacks import timer
 
 import nerfro.train
-from nerfro.capture.video import extract_frames
+from nerfro.poses.video import extract_frames
 from nerfro.viewing import server
 from tests import ball_photographs
 from tests.viewing.test_exports import write

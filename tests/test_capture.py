@@ -21,9 +21,9 @@ from nerfro.data.blender import OpenCVData
 from nerfro.geometry.mesh import load_mesh
 from nerfro.paths import CONF_DIR
 from nerfro.registry import discover
-from nerfro.scenes import path_tracer
-from nerfro.scenes.scene import Scene
-from nerfro.scenes.synthesis import SynthesizeConfig, synthesize
+from nerfro.synthetic import path_tracer
+from nerfro.synthetic.scene import Scene
+from nerfro.synthetic.synthesis import SynthesizeConfig, synthesize
 from tests.silhouettes import overlaps_of_convex_body
 
 discover()

@@ -18,15 +18,15 @@ from tests.test_experiments import SMALL, composed, shrunk
 STEP = 100_000
 
 # Loops end when the last ray has ended, and triangles are met on the CPU.
-TRACING = ("samplers/snell.py", "samplers/eikonal.py", "samplers/polylines.py", "media/sdf_grid.py")
-TRACING += ("geometry/intersection.py", "samplers/wavefront.py")
+TRACING = ("samplers/paths/snell.py", "samplers/paths/eikonal.py", "samplers/paths/polylines.py", "media/sdf_grid.py")
+TRACING += ("geometry/intersection.py", "samplers/paths/wavefront.py")
 
 ADAPTIVE = ["sampler.path.integrator=adaptive", "sampler.path.max_steps=60", "sampler.points.draw=arc_length"]
 
 # A constant is copied to the device once. Fields are asked for samples in the object alone, whose number must be known.
 ONCE = "kernels/constants.py: constant (tensor)"
 # Triangles are met on the CPU, and the rays travel there and back.
-TO_CPU = {"rays.py: <genexpr> (to)", "samplers/replay.py: <genexpr> (to)"}
+TO_CPU = {"rays.py: <genexpr> (to)", "samplers/paths/replay.py: <genexpr> (to)"}
 SELECTED = "fields/selection.py: evaluate_selected (nonzero)"
 
 

@@ -23,9 +23,9 @@ from nerfro.media.base import Medium
 from nerfro.media.shapes import Ball
 from nerfro.registry import discover, find
 from nerfro.rendering import Components, Renderer
-from nerfro.samplers.eikonal import Eikonal
-from nerfro.samplers.straight import straight_path
-from nerfro.samplers.stratified import Stratified
+from nerfro.samplers.paths.eikonal import Eikonal
+from nerfro.samplers.paths.straight import straight_path
+from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import example_rays
 from nerfro.training.config import build_model
 from nerfro.training.module import TrainingModule

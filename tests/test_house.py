@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 
 from nerfro.paths import PACKAGE_DIR
-from tests.size import count_code_lines
+from tests.size import count_by_component, count_code_lines
 
 # From above to below: a package imports what follows it, and itself.
 ORDER = (
-    "commands", "testing", "pipeline", "report", "training", "viewing", "evaluation", "scenes", "capture", "models",
-    "losses", "rendering", "boundaries", "camera", "samplers", "fields", "media", "data", "geometry", "kernels",
-    "files", "core",
+    "commands", "testing", "pipeline", "report", "training", "viewing", "evaluation", "synthetic", "capture", "models",
+    "losses", "rendering", "masks", "poses", "silhouettes", "boundaries", "camera", "samplers", "fields", "media",
+    "data", "geometry", "kernels", "files", "core",
 )  # fmt: skip
 FILES = {
     ".".join(("nerfro", *file.relative_to(PACKAGE_DIR).with_suffix("").parts)).removesuffix(".__init__"): file
@@ -80,6 +80,11 @@ def test_only_training_imports_lightning() -> None:
 def test_commands_compose_call_and_print(module: str) -> None:
     assert count_code_lines(FILES[module].read_text(encoding="utf-8")) < 90
     assert {other for other in IMPORTS[module] if room(other) == "commands"} == set(), "commands share what lies below"
+
+
+def test_no_package_is_large() -> None:
+    sizes = count_by_component(PACKAGE_DIR)
+    assert {name: lines for name, lines in sizes.items() if lines > 3000 and name != "(top level)"} == {}
 
 
 FUNCTIONS = [

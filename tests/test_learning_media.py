@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from nerfro.registry import discover, find
-from nerfro.samplers.eikonal import Eikonal
+from nerfro.samplers.paths.eikonal import Eikonal
 from nerfro.training.run_folder import load_checkpoint
 from tests.ball_photographs import photographs, save
 from tests.closed_forms import make_rays

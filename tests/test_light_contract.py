@@ -16,11 +16,11 @@ from nerfro.losses.photometric import Photometric
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.models.refractive import RefractiveModel
 from nerfro.rendering import composite
-from nerfro.samplers.density_grid import DensityGridSampler
-from nerfro.samplers.hierarchical import Hierarchical
-from nerfro.samplers.snell import Snell, trace_interfaces
-from nerfro.samplers.straight import straight_path
-from nerfro.samplers.stratified import Stratified
+from nerfro.samplers.paths.snell import Snell, trace_interfaces
+from nerfro.samplers.paths.straight import straight_path
+from nerfro.samplers.points.density_grid import DensityGridSampler
+from nerfro.samplers.points.hierarchical import Hierarchical
+from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import NUM_RAYS, example_batch, example_components, example_draws, example_path, example_rays
 from nerfro.training.module import TrainingModule
 from nerfro.training.optimizer import GroupConfig, OptimizerConfig

@@ -22,8 +22,8 @@ from nerfro.media.voxel_grid import VoxelGrid
 from nerfro.models.refractive import RefractiveModel
 from nerfro.registry import create, discover, find
 from nerfro.rendering import Components
-from nerfro.samplers.eikonal import Eikonal
-from nerfro.samplers.hierarchical import Hierarchical
+from nerfro.samplers.paths.eikonal import Eikonal
+from nerfro.samplers.points.hierarchical import Hierarchical
 from nerfro.testing import example_batch
 from nerfro.types import Batch, Rays, Rendering
 

@@ -11,11 +11,11 @@ import pytest
 import torch
 from PIL import Image
 
-from nerfro.capture.silhouettes import mesh_silhouettes
 from nerfro.data.base import Views
 from nerfro.geometry.mesh import load_mesh
 from nerfro.media.bodies import BodySettings
 from nerfro.rendering.scene_file import read_scene_file
+from nerfro.silhouettes.silhouettes import mesh_silhouettes
 from tests.ball_photographs import NUM_VIEWS, RADIUS, SIZE, cameras, mesh, photographs, save
 
 

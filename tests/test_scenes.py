@@ -7,9 +7,9 @@ import pytest
 
 from nerfro.light import to_srgb
 from nerfro.registry import discover
-from nerfro.scenes import SCENES
-from nerfro.scenes.scene import lat_long_texture
-from nerfro.scenes.synthesis import find_scene
+from nerfro.synthetic import SCENES
+from nerfro.synthetic.scene import lat_long_texture
+from nerfro.synthetic.synthesis import find_scene
 
 discover()
 distance = import_module("nerfro_plugins.scenes.distance")

@@ -13,9 +13,9 @@ from nerfro.data.base import Views
 from nerfro.media.analytic import Vacuum
 from nerfro.media.shapes import Ball
 from nerfro.models.refractive import RefractiveModel
-from nerfro.samplers.hierarchical import Hierarchical
-from nerfro.samplers.snell import Snell
-from nerfro.samplers.straight import Straight
+from nerfro.samplers.paths.snell import Snell
+from nerfro.samplers.paths.straight import Straight
+from nerfro.samplers.points.hierarchical import Hierarchical
 from nerfro.subdivision import Subdivision, contrast, divergence, neighbour_rays, part_rays, pixel_rays
 from nerfro.testing import example_components
 from nerfro.training.ray_batches import RayBatches

@@ -14,7 +14,7 @@ from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import load_mesh
 from nerfro.light import to_srgb
 from nerfro.paths import ASSETS_DIR, CONF_DIR
-from nerfro.scenes.synthesis import SynthesizeConfig, synthesize
+from nerfro.synthetic.synthesis import SynthesizeConfig, synthesize
 from nerfro.types import Exits
 from tests.silhouettes import overlaps_of_convex_body
 

@@ -26,7 +26,7 @@ from nerfro.media.base import Medium
 from nerfro.media.solid import Solid
 from nerfro.progress import bar
 from nerfro.rendering.scene_file import Provenance
-from nerfro.samplers.snell import Snell
+from nerfro.samplers.paths.snell import Snell
 
 LOWEST, HIGHEST = 1.0, 2.5  # range of the search
 _RANGE = HIGHEST - LOWEST

@@ -12,7 +12,7 @@ from nerfro.capture.index_search import bootstrap_weights, mean_errors
 from nerfro.capture.surroundings import Observations, half_weight, robust
 from nerfro.media.base import Medium
 from nerfro.media.solid import Solid
-from nerfro.samplers.snell import Snell
+from nerfro.samplers.paths.snell import Snell
 
 # Indices of water and of soda-lime glass, for photographs that do not determine the index.
 COMMON_INDICES = {"water": 1.333, "glass": 1.52}

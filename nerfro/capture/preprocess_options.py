@@ -15,9 +15,6 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 
 from nerfro.allowed import Count, Natural, NotNegative, Range, corners_of_box
 from nerfro.cameras import Cameras
-from nerfro.capture.overlaps import REPORT, SHEET
-from nerfro.capture.revolution import Symmetry
-from nerfro.capture.upright import find_up
 from nerfro.data.frames import require_root
 from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import TriangleMesh
@@ -26,6 +23,9 @@ from nerfro.overrides import as_overrides, is_given, print_hint, print_next
 from nerfro.paths import EMBEDDED_PREFIX, resolve_path, user_path
 from nerfro.registry import build
 from nerfro.rendering.scene_file import SCENE, SceneFile, described, take_bodies
+from nerfro.silhouettes.overlaps import REPORT, SHEET
+from nerfro.silhouettes.revolution import Symmetry
+from nerfro.silhouettes.upright import find_up
 
 MESH = "mesh.ply"
 INDEX, FIGURES = "index.json", "refinement.json"

@@ -30,18 +30,18 @@ from nerfro.boundaries.base import Boundary
 from nerfro.boundaries.cube_map import texel_directions
 from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.capture.preprocess_options import FIGURES
-from nerfro.capture.rims import RimFinder
 from nerfro.capture.room_panorama import RoomPanorama, panorama_of
-from nerfro.capture.silhouettes import mesh_silhouettes
 from nerfro.capture.surroundings import Observations, Pixels, Room, Surroundings, robust
-from nerfro.capture.visual_hull import Silhouettes
 from nerfro.errors import NerfroError, warn
 from nerfro.files.atomic import write_atomically
 from nerfro.geometry.interpolation import bspline_basis, smooth
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.progress import bar
-from nerfro.samplers.snell import Snell
+from nerfro.samplers.paths.snell import Snell
+from nerfro.silhouettes.rims import RimFinder
+from nerfro.silhouettes.silhouettes import mesh_silhouettes
+from nerfro.silhouettes.visual_hull import Silhouettes
 from nerfro.types import Exits, Path
 
 _MAX_VALIDATION_PIXELS = 20_000

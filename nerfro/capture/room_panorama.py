@@ -16,7 +16,7 @@ from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.capture.surroundings import Room
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.rays import Rays
-from nerfro.samplers.snell import Snell
+from nerfro.samplers.paths.snell import Snell
 from nerfro.types import Exits
 
 _SIDE = 192  # texels per side of a cube face, half a degree each

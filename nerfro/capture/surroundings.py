@@ -17,7 +17,6 @@ from nerfro.boundaries.base import Boundary
 from nerfro.boundaries.cube_map import project
 from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.cameras import Cameras
-from nerfro.capture.silhouettes import PixelBlocks, mesh_silhouettes
 from nerfro.data.base import Views
 from nerfro.draws import Draws
 from nerfro.errors import NerfroError
@@ -27,8 +26,9 @@ from nerfro.light import to_linear
 from nerfro.progress import bar
 from nerfro.rays import Rays
 from nerfro.rendering import composite
-from nerfro.samplers.density_grid import DensityGridSampler
-from nerfro.samplers.straight import straight_path
+from nerfro.samplers.paths.straight import straight_path
+from nerfro.samplers.points.density_grid import DensityGridSampler
+from nerfro.silhouettes.silhouettes import VALIDATION_EVERY, PixelBlocks, mesh_silhouettes
 from nerfro.subdivision import pixel_rays
 from nerfro.types import Exits
 
@@ -38,8 +38,6 @@ _MAX_PIXELS = 200
 _SKY_STEPS, _SKY_PIXELS = 300, 16384
 _NEAR_STEPS, _NEAR_PIXELS = 400, 2048
 _RATES = (0.03, 0.0015)
-# Every so many-th view is a validation view.
-VALIDATION_EVERY = 8
 # Surroundings are near if a sky leaves more than this fraction of the variance of validation views unexplained.
 _MAX_SKY_RESIDUAL = 0.25
 # Lower bound of the variance of linear radiance.

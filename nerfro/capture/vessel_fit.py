@@ -17,12 +17,12 @@ from jaxtyping import Float
 from nerfro.capture.index_search import mean_errors
 from nerfro.capture.object_errors import COMMON_INDICES, ObjectErrors
 from nerfro.capture.surroundings import Observations
-from nerfro.capture.upright import find_up
 from nerfro.errors import NerfroError, warn
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.vessel import SdfVessel
 from nerfro.progress import bar
+from nerfro.silhouettes.upright import find_up
 
 # Lengths of a typical glass, as fractions of its width.
 _TYPICAL = {"wall": 0.02, "foot": 0.06, "fillet": 0.1}

@@ -15,13 +15,13 @@ from types import FrameType
 
 import torch
 
-from nerfro.capture.photographs import PHOTOGRAPH_SUFFIXES, place_photograph
 from nerfro.cli import call
 from nerfro.data.frames import list_images
 from nerfro.data.image_files import IMAGE_SUFFIXES
 from nerfro.errors import Interrupted, NerfroError
 from nerfro.failures import EXIT_INTERRUPTED, in_one_line
 from nerfro.overrides import without_hints
+from nerfro.poses.photographs import PHOTOGRAPH_SUFFIXES, place_photograph
 from nerfro.progress import track
 
 _SEED = 67280421310721  # of torch in a new process

@@ -9,10 +9,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from nerfro.capture.calibrated_data import PLOT, REPORT
-from nerfro.capture.overlaps import SHEET
 from nerfro.capture.preprocess_options import MESH
-from nerfro.capture.video import extract_frames
 from nerfro.data.frames import list_images
 from nerfro.errors import NerfroError, warn
 from nerfro.evaluation.results import EXPOSED, FULL, read_metrics_json
@@ -22,7 +19,10 @@ from nerfro.paths import user_path
 from nerfro.pipeline.hypotheses import Hypothesis, hypotheses
 from nerfro.pipeline.options import common_options
 from nerfro.pipeline.stages import Stage, is_older, link_photographs, move_aside
+from nerfro.poses.calibrated_data import PLOT, REPORT
+from nerfro.poses.video import extract_frames
 from nerfro.rendering.scene_file import OLD_SCENE, SCENE, read_scene_file
+from nerfro.silhouettes.overlaps import SHEET
 from nerfro.training.run_folder import CONFIG_FILE
 
 # Smallest gain of bent rays over straight rays in short trainings, in dB. On a simulated empty glass, a gain of 0.25 dB

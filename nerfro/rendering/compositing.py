@@ -5,7 +5,7 @@ from __future__ import annotations
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.samplers.stepfun import volume_weights
+from nerfro.samplers.points.stepfun import volume_weights
 from nerfro.types import Path, Radiance, Rendering, Samples
 
 

@@ -24,7 +24,7 @@ from nerfro.rays import Rays
 from nerfro.rendering.colour_space import ColourSpace
 from nerfro.rendering.scene import Scene
 from nerfro.samplers.base import PathSampler, PointSampler
-from nerfro.samplers.surface_normals import first_normals
+from nerfro.samplers.paths.surface_normals import first_normals
 from nerfro.types import Exits, Path, Rendering
 
 

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from nerfro.draws import Draws
 from nerfro.fields.base import Field
 from nerfro.media.base import Medium
-from nerfro.samplers.branching import ONE_PATH
+from nerfro.samplers.paths.branching import ONE_PATH
 from nerfro.types import Path, Rays, Rendering, Samples
 
 

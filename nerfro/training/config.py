@@ -35,8 +35,8 @@ from nerfro.media.bodies import origin_of
 from nerfro.paths import resolve_path, scene_name
 from nerfro.registry import build, check_node, configure, create, find, require_lightning
 from nerfro.rendering import Components, Renderer
-from nerfro.scenes import SCENES
 from nerfro.subdivision import Subdivision
+from nerfro.synthetic import SCENES
 from nerfro.training.backdrop import settle_backdrop
 from nerfro.training.content import ContentConfig, settle_content
 from nerfro.training.optimizer import OptimizerConfig

@@ -12,7 +12,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerfro.cameras import Cameras
-from nerfro.capture.silhouettes import PixelBlocks
 from nerfro.data.base import Views
 from nerfro.errors import NerfroError, warn
 from nerfro.geometry.intersection import MeshIntersector
@@ -21,6 +20,7 @@ from nerfro.geometry.mesh import TriangleMesh
 from nerfro.geometry.orientation import area_vectors
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
+from nerfro.silhouettes.silhouettes import PixelBlocks
 
 _NUM_VIEWS, _MAX_PIXELS = 8, 32
 # Intersection over union of silhouettes and masks: below the first number the mesh is refused, below the second one a

@@ -51,7 +51,7 @@ class Baked:
 
 
 def bake_surface(renderer: Renderer) -> Baked:
-    """Convert the refractive bodies to the grid of splines that `samplers/snell_cpu.py` traces.
+    """Convert the refractive bodies to the grid of splines that `samplers/paths/snell_cpu.py` traces.
 
     Raises:
         NerfroError: the medium has no surface.

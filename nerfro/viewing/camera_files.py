@@ -16,13 +16,13 @@ from jaxtyping import Float
 from nerfro.camera.base import Camera
 from nerfro.camera.similarity import motion_between
 from nerfro.cameras import Cameras
-from nerfro.capture.calibrated_data import relative
 from nerfro.data.base import Views
 from nerfro.data.frames import check_pose
 from nerfro.data.lenses import Lens, check_lenses, read_lens
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
 from nerfro.files.reading import is_number, parse_matrix, read_json
+from nerfro.poses.calibrated_data import relative
 from nerfro.types import WORLD_ORIGIN
 from nerfro.viewing.camera_paths import CaptureGeometry
 

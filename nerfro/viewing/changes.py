@@ -13,7 +13,7 @@ from nerfro.light import to_srgb
 from nerfro.media.analytic import Vacuum
 from nerfro.media.solid import Solid
 from nerfro.rendering import ColourSpace, Renderer, Scene
-from nerfro.samplers.straight import Straight
+from nerfro.samplers.paths.straight import Straight
 from nerfro.types import Radiance, Samples
 from nerfro.variants import variant
 

@@ -12,13 +12,13 @@ from jaxtyping import Bool, UInt8
 from PIL import Image
 from skimage.measure import approximate_polygon, find_contours
 
-from nerfro.capture.mask_files import read_outlines
-from nerfro.capture.masking import Segmentation
 from nerfro.data.base import Frame
 from nerfro.data.image_files import read_size
 from nerfro.errors import NerfroError
 from nerfro.files.images import data_uri
 from nerfro.files.templates import fill_template
+from nerfro.masks.mask_files import read_outlines
+from nerfro.masks.masking import Segmentation
 from nerfro.paths import ASSETS_DIR
 from nerfro.viewing.server import PageServer, open_page
 

@@ -11,9 +11,9 @@ from nerfro.geometry.interpolation import intersect_box
 from nerfro.media.base import Medium
 from nerfro.registry import register
 from nerfro.samplers.base import PathSampler
-from nerfro.samplers.eikonal import march_uniform
-from nerfro.samplers.integrators import Index, RayState
-from nerfro.samplers.straight import straight_path
+from nerfro.samplers.paths.eikonal import march_uniform
+from nerfro.samplers.paths.integrators import Index, RayState
+from nerfro.samplers.paths.straight import straight_path
 from nerfro.types import Path, Rays
 
 

@@ -15,7 +15,7 @@ from nerfro.fields.base import Field
 from nerfro.fields.selection import inside_box
 from nerfro.registry import register
 from nerfro.rendering import Components, Renderer, composite
-from nerfro.samplers.straight import straight_path
+from nerfro.samplers.paths.straight import straight_path
 from nerfro.types import Path, Radiance, Rays, Rendering, Samples
 
 from .background import Background

@@ -20,7 +20,7 @@ from nerfro.errors import NerfroError
 from nerfro.files.atomic import refuse_existing, write_atomically
 from nerfro.files.deep_images import write_radiance
 from nerfro.media.solid import Solid
-from nerfro.scenes.path_tracer import envmap_texture
+from nerfro.synthetic.path_tracer import envmap_texture
 from nerfro.viewing.changes import absorption_of
 from nerfro.viewing.exports import Export
 from nerfro.viewing.page import page_split

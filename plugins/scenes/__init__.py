@@ -1,6 +1,6 @@
 """Synthetic scenes for benchmarks: `python -m nerfro.synthesize scene=ship`; see docs/guides/synthetic_scenes.md."""
 
-from nerfro.scenes import SCENES
+from nerfro.synthetic import SCENES
 
 for name in ("torus", "ship", "deerglobe", "starlamp", "dolphin_capture"):
     SCENES[name] = f"{__name__}.{name}"

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from nerfro.light import to_linear
-from nerfro.scenes.scene import Scene
-from nerfro.scenes.surface import sphere
+from nerfro.synthetic.scene import Scene
+from nerfro.synthetic.surface import sphere
 
 from .distance import ball, capsule, ellipsoid, join, mirrored, painted, smooth_union
 from .patterns import chosen, fractal_noise, hashed, mix, smoothstep

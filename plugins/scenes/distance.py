@@ -12,8 +12,8 @@ from dataclasses import replace
 import numpy as np
 from skimage.measure import marching_cubes
 
-from nerfro.scenes.scene import Vector
-from nerfro.scenes.surface import Surface
+from nerfro.synthetic.scene import Vector
+from nerfro.synthetic.surface import Surface
 
 Distance = Callable[[np.ndarray], np.ndarray]
 Colour = Callable[[np.ndarray], np.ndarray]

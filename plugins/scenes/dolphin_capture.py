@@ -10,8 +10,8 @@ import itertools
 
 import numpy as np
 
-from nerfro.capture.boards import TagBoard, twelve_faces
-from nerfro.scenes.scene import Panel, Scene, Vector
+from nerfro.poses.boards import TagBoard, twelve_faces
+from nerfro.synthetic.scene import Panel, Scene, Vector
 
 from . import distance, starlamp
 from .distance import Colour, ball, capsule, ellipsoid, join, mirrored, moved, painted, smooth_union

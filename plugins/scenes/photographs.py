@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from nerfro.light import to_srgb
-from nerfro.scenes.dataset import DataSet, PlannedImage, write_image, write_json
-from nerfro.scenes.path_tracer import Pinhole
-from nerfro.scenes.scene import Scene, Vector
-from nerfro.scenes.viewpoints import look_at_origin
+from nerfro.synthetic.dataset import DataSet, PlannedImage, write_image, write_json
+from nerfro.synthetic.path_tracer import Pinhole
+from nerfro.synthetic.scene import Scene, Vector
+from nerfro.synthetic.viewpoints import look_at_origin
 
 from .baking import bake
 

@@ -7,8 +7,8 @@ import functools
 import numpy as np
 
 from nerfro.light import to_linear
-from nerfro.scenes.scene import Scene
-from nerfro.scenes.surface import rounded_box
+from nerfro.synthetic.scene import Scene
+from nerfro.synthetic.surface import rounded_box
 
 from .distance import ball, block, capsule, join, painted
 from .patterns import chosen, fractal_noise, hashed, mix, smoothstep

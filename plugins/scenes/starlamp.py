@@ -7,7 +7,7 @@ import functools
 import numpy as np
 
 from nerfro.light import to_linear
-from nerfro.scenes.scene import Scene
+from nerfro.synthetic.scene import Scene
 
 from . import distance
 from .patterns import chosen, fractal_noise, hashed, mix, smoothstep

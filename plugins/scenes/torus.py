@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from nerfro.light import to_linear
-from nerfro.scenes.scene import Scene
-from nerfro.scenes.surface import rounded_box, torus_angles
+from nerfro.synthetic.scene import Scene
+from nerfro.synthetic.surface import rounded_box, torus_angles
 
 from .patterns import chosen, hashed, mix, smoothstep
 from .skies import clouds, elevation, skyline

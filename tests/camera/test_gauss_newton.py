@@ -14,7 +14,7 @@ from nerfro.camera.refined import RefinedCamera
 from nerfro.camera.similarity import motion_between
 from nerfro.light import to_srgb
 from nerfro.rays import Rays
-from nerfro.samplers.snell import Snell
+from nerfro.samplers.paths.snell import Snell
 from tests.ball_photographs import NUM_VIEWS, SIZE, cameras, sky, solid
 from tests.pretended_gpu import GPU, PretendedGpu
 

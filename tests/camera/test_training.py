@@ -13,7 +13,6 @@ import torch
 
 from benchmarks.cameras import disturbed
 from nerfro.camera.similarity import motion_between
-from nerfro.capture.silhouettes import mesh_silhouettes
 from nerfro.data.blender import BlenderData
 from nerfro.data.nerfstudio import NerfstudioData
 from nerfro.evaluation.results import read_metrics_json
@@ -21,6 +20,7 @@ from nerfro.evaluation.treatments import refine_on_left
 from nerfro.files.images import save_png
 from nerfro.geometry.mesh import load_mesh
 from nerfro.light import to_linear, to_srgb
+from nerfro.silhouettes.silhouettes import mesh_silhouettes
 from nerfro.training.load import load
 from nerfro.training.run_folder import load_checkpoint
 from tests.ball_photographs import photographs, save

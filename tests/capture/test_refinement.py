@@ -13,14 +13,14 @@ from nerfro.boundaries.base import Boundary
 from nerfro.capture import refinement
 from nerfro.capture.refinement import Refined, RefinementSettings, Stage, refine_surface
 from nerfro.capture.room_panorama import panorama_of
-from nerfro.capture.silhouettes import mesh_silhouettes
 from nerfro.capture.surroundings import Pixels, Room, Surroundings, divide_pixels, learn_surroundings
-from nerfro.capture.visual_hull import Silhouettes
 from nerfro.draws import Draws
 from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import load_mesh
 from nerfro.media.sdf_grid import SdfGrid
-from nerfro.samplers.snell import Snell
+from nerfro.samplers.paths.snell import Snell
+from nerfro.silhouettes.silhouettes import mesh_silhouettes
+from nerfro.silhouettes.visual_hull import Silhouettes
 from nerfro.types import Exits
 from tests.ball_photographs import BOX, RADIUS, cameras, mesh, photographs_of, save, sky, solid
 from tests.closed_forms import grid_points

@@ -17,7 +17,7 @@ from nerfro.geometry.mesh import load_mesh
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.solid import Solid
 from nerfro.media.vessel import SdfVessel
-from nerfro.samplers.snell import Snell
+from nerfro.samplers.paths.snell import Snell
 from nerfro.subdivision import pixel_rays
 from nerfro.types import Exits
 from tests.ball_photographs import NUM_VIEWS, SIZE, cameras, sky

@@ -7,7 +7,7 @@ import torch
 from nerfro.evaluation.render_view import render_view
 from nerfro.media.shapes import Ball
 from nerfro.models.refractive import RefractiveModel
-from nerfro.samplers.snell import Snell
+from nerfro.samplers.paths.snell import Snell
 from nerfro.subdivision import Subdivision
 from nerfro.testing import example_batch, example_components
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from nerfro.registry import discover
-from nerfro.samplers.straight import straight_path
-from nerfro.samplers.stratified import cone_samples
+from nerfro.samplers.paths.straight import straight_path
+from nerfro.samplers.points.stratified import cone_samples
 from nerfro.testing import example_path
 from nerfro.types import Rays, Samples
 

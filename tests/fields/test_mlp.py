@@ -19,7 +19,7 @@ from nerfro.fields.mlp import (
 from nerfro.fields.nerf import NerfField
 from nerfro.light import to_srgb
 from nerfro.registry import discover
-from nerfro.samplers.stratified import Stratified
+from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import example_path, example_samples
 
 discover()

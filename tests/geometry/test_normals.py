@@ -11,7 +11,7 @@ from nerfro.geometry.mesh import TriangleMesh, load_mesh, merge_vertices
 from nerfro.geometry.normals import corner_normals
 from nerfro.geometry.orientation import area_vectors
 from nerfro.media.sdf_grid import SdfGrid
-from nerfro.samplers.bend import bend
+from nerfro.samplers.paths.bend import bend
 
 
 def _mesh(shape: trimesh.Trimesh) -> TriangleMesh:

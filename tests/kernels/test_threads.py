@@ -9,7 +9,7 @@ import pytest
 IMPORTS_ONLY = """
 import numba
 before = {name: value for name, value in vars(numba.config).items() if name.isupper()}
-import nerfro.boundaries.cube_map_cpu, nerfro.geometry.occupancy, nerfro.samplers.snell_cpu
+import nerfro.boundaries.cube_map_cpu, nerfro.geometry.occupancy, nerfro.samplers.paths.snell_cpu
 after = {name: value for name, value in vars(numba.config).items() if name.isupper()}
 print({name: after[name] for name in after if before.get(name) != after[name]})
 try:
@@ -21,7 +21,7 @@ except ValueError:
 TWO_THREADS = """
 import threading, numba, torch
 from nerfro.media.sdf_grid import SdfGrid
-from nerfro.samplers.snell import Snell
+from nerfro.samplers.paths.snell import Snell
 from nerfro.types import Rays
 
 torch.set_num_threads(2)

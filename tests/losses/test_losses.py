@@ -21,9 +21,9 @@ from nerfro.losses.total_variation import TotalVariation, direction_pairs
 from nerfro.models.refractive import RefractiveModel
 from nerfro.registry import create, find
 from nerfro.rendering import ColourSpace, Components, Renderer, Scene
-from nerfro.samplers.eikonal import Eikonal
-from nerfro.samplers.hierarchical import Hierarchical
-from nerfro.samplers.stratified import point_samples
+from nerfro.samplers.paths.eikonal import Eikonal
+from nerfro.samplers.points.hierarchical import Hierarchical
+from nerfro.samplers.points.stratified import point_samples
 from nerfro.testing import NUM_RAYS, example_batch, example_components, example_draws, example_path, example_rendering
 from nerfro.types import Batch, Rendering
 from tests.closed_forms import Luneburg

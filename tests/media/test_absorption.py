@@ -9,9 +9,9 @@ from nerfro.errors import NerfroError
 from nerfro.media.shapes import Ball
 from nerfro.models.refractive import RefractiveModel
 from nerfro.rendering import composite
-from nerfro.samplers.eikonal import Eikonal
-from nerfro.samplers.snell import Snell
-from nerfro.samplers.stratified import point_samples
+from nerfro.samplers.paths.eikonal import Eikonal
+from nerfro.samplers.paths.snell import Snell
+from nerfro.samplers.points.stratified import point_samples
 from nerfro.testing import example_components, example_rays
 from nerfro.types import Path, Radiance
 from tests.closed_forms import beam

@@ -14,8 +14,8 @@ from torch import Tensor
 from nerfro.errors import NerfroError
 from nerfro.media.material import MATERIALS
 from nerfro.media.sdf_grid import SdfGrid
-from nerfro.samplers.eikonal import Eikonal
-from nerfro.samplers.snell import Snell, trace_interfaces
+from nerfro.samplers.paths.eikonal import Eikonal
+from nerfro.samplers.paths.snell import Snell, trace_interfaces
 from nerfro.types import Path as RayPath
 from nerfro.types import Rays
 from tests.closed_forms import angle, make_rays

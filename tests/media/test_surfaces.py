@@ -17,7 +17,7 @@ from nerfro.errors import NerfroError
 from nerfro.media.bodies import origin_of
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.registry import discover
-from nerfro.samplers.snell import Snell
+from nerfro.samplers.paths.snell import Snell
 from tests.closed_forms import angle, make_rays
 
 FAR = [0.5, 0.0, -1e6]

@@ -11,7 +11,7 @@ from nerfro.errors import NerfroError
 from nerfro.geometry.lids import find_lid
 from nerfro.geometry.mesh import load_mesh
 from nerfro.media.vessel import SdfVessel
-from nerfro.samplers.snell import Snell, trace_interfaces
+from nerfro.samplers.paths.snell import Snell, trace_interfaces
 from nerfro.viewing.surface import surface_of
 from tests.closed_forms import angle, make_rays
 from tests.media.vessels import RADIUS, WALL, exit_directions, spherical_vessel

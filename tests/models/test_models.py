@@ -13,9 +13,9 @@ from nerfro.fields.nerf import NerfField
 from nerfro.models.refractive import RefractiveModel
 from nerfro.registry import discover
 from nerfro.rendering import Components
-from nerfro.samplers.eikonal import Eikonal
-from nerfro.samplers.hierarchical import Hierarchical
-from nerfro.samplers.stratified import Stratified
+from nerfro.samplers.paths.eikonal import Eikonal
+from nerfro.samplers.points.hierarchical import Hierarchical
+from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import example_rays
 from nerfro.training.module import TrainingModule
 from nerfro.training.optimizer import GroupConfig, OptimizerConfig

@@ -10,8 +10,8 @@ from nerfro.draws import Draws
 from nerfro.fields.hash_grid import HashGridField
 from nerfro.media.shapes import Ball
 from nerfro.rendering import composite
-from nerfro.samplers.density_grid import DensityGridSampler
-from nerfro.samplers.snell import Snell
+from nerfro.samplers.paths.snell import Snell
+from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.types import Path
 
 WALL = 3.0  # half side of the room

@@ -12,10 +12,10 @@ from nerfro.errors import NerfroError
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball
 from nerfro.media.solid import Solid
-from nerfro.samplers import compiled
-from nerfro.samplers.replay import smallest_cosine
-from nerfro.samplers.snell import Snell, trace_interfaces
-from nerfro.samplers.snell_law import reflectance
+from nerfro.samplers.paths import compiled
+from nerfro.samplers.paths.replay import smallest_cosine
+from nerfro.samplers.paths.snell import Snell, trace_interfaces
+from nerfro.samplers.paths.snell_law import reflectance
 from nerfro.types import Path, Rays
 from tests.closed_forms import RoundedBox, Slab, beam, grid_points, make_rays, random_rays
 from tests.samplers.nested import NestedBalls, nested_mesh

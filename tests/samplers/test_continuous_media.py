@@ -14,8 +14,8 @@ from scipy.integrate import quad, simpson
 from torch import Tensor
 
 from nerfro.media.base import Medium
-from nerfro.samplers.eikonal import march_uniform
-from nerfro.samplers.integrators import Integrator, euler, leapfrog
+from nerfro.samplers.paths.eikonal import march_uniform
+from nerfro.samplers.paths.integrators import Integrator, euler, leapfrog
 from nerfro.types import Path, Rays
 from tests.closed_forms import (
     FIBRE_ALPHA,

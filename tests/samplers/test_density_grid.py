@@ -7,7 +7,7 @@ import torch
 
 from nerfro.fields.base import Field
 from nerfro.geometry.contraction import contracted_length, contraction_scale
-from nerfro.samplers.density_grid import DensityGridSampler
+from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.testing import example_draws, example_path
 from nerfro.types import Path, Radiance, Samples
 

@@ -12,8 +12,8 @@ from nerfro.errors import NerfroError
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball
 from nerfro.media.solid import Solid
-from nerfro.samplers.eikonal import Eikonal
-from nerfro.samplers.snell import Snell
+from nerfro.samplers.paths.eikonal import Eikonal
+from nerfro.samplers.paths.snell import Snell
 from tests.closed_forms import RoundedBox, angle, beam, make_rays, random_rays
 from tests.samplers.test_snell import _prism
 

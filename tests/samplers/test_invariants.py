@@ -11,12 +11,12 @@ from nerfro.media.shapes import Ball
 from nerfro.media.voxel_grid import VoxelGrid
 from nerfro.rendering import composite
 from nerfro.samplers.base import PathSampler, PointSampler
-from nerfro.samplers.eikonal import Eikonal
-from nerfro.samplers.hierarchical import Hierarchical
-from nerfro.samplers.integrators import RayState, kick_drift_kick, leapfrog
-from nerfro.samplers.snell import Snell
-from nerfro.samplers.straight import Straight
-from nerfro.samplers.stratified import Stratified
+from nerfro.samplers.paths.eikonal import Eikonal
+from nerfro.samplers.paths.integrators import RayState, kick_drift_kick, leapfrog
+from nerfro.samplers.paths.snell import Snell
+from nerfro.samplers.paths.straight import Straight
+from nerfro.samplers.points.hierarchical import Hierarchical
+from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import example_path, example_rays
 from nerfro.types import Path, Radiance, Rendering
 from tests.closed_forms import (

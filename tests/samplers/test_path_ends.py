@@ -12,8 +12,8 @@ from nerfro.geometry.interpolation import intersect_box
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.samplers.base import PathSampler
-from nerfro.samplers.eikonal import Eikonal
-from nerfro.samplers.snell import Snell
+from nerfro.samplers.paths.eikonal import Eikonal
+from nerfro.samplers.paths.snell import Snell
 from nerfro.types import Path
 from tests.closed_forms import RoundedBox, random_rays
 

@@ -16,10 +16,10 @@ from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball
 from nerfro.media.voxel_grid import VoxelGrid
 from nerfro.samplers.base import PathSampler
-from nerfro.samplers.eikonal import Eikonal, march_adaptive
-from nerfro.samplers.replay import smallest_cosine
-from nerfro.samplers.snell import Snell, trace_interfaces
-from nerfro.samplers.straight import Straight
+from nerfro.samplers.paths.eikonal import Eikonal, march_adaptive
+from nerfro.samplers.paths.replay import smallest_cosine
+from nerfro.samplers.paths.snell import Snell, trace_interfaces
+from nerfro.samplers.paths.straight import Straight
 from nerfro.types import Path, Rays
 from tests.closed_forms import RoundedBox, beam, grid_points, make_rays, random_rays
 from tests.samplers.nested import NestedBalls, nested_mesh

@@ -13,8 +13,8 @@ from benchmarks.rounded_cube import trace_rounded_cube
 from nerfro.errors import NerfroError
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball
-from nerfro.samplers.snell import Snell, trace_interfaces
-from nerfro.samplers.snell_law import refract
+from nerfro.samplers.paths.snell import Snell, trace_interfaces
+from nerfro.samplers.paths.snell_law import refract
 from nerfro.types import Rays
 from tests.closed_forms import Luneburg, RoundedBox, Slab, angle, beam, grid_points, make_rays, random_rays
 

@@ -3,7 +3,7 @@
 import torch
 
 from nerfro.media.shapes import Ball
-from nerfro.samplers.straight import Straight
+from nerfro.samplers.paths.straight import Straight
 from nerfro.types import Rays
 
 

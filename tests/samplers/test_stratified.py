@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from nerfro.errors import NerfroError
-from nerfro.samplers.eikonal import Eikonal
-from nerfro.samplers.straight import straight_path
-from nerfro.samplers.stratified import LAST_DELTA, Stratified
+from nerfro.samplers.paths.eikonal import Eikonal
+from nerfro.samplers.paths.straight import straight_path
+from nerfro.samplers.points.stratified import LAST_DELTA, Stratified
 from nerfro.testing import example_draws, example_rays
 from nerfro.types import Path
 from tests.closed_forms import Luneburg

@@ -16,8 +16,8 @@ from nerfro.data.blender import BlenderData
 from nerfro.data.pixel_store import PixelStore
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.rendering import Renderer, Scene
-from nerfro.samplers.eikonal import Eikonal
-from nerfro.samplers.snell import Snell
+from nerfro.samplers.paths.eikonal import Eikonal
+from nerfro.samplers.paths.snell import Snell
 from nerfro.training.data_module import Prefetcher, RayDataModule, can_prefetch, multiplies_large_matrices
 from nerfro.training.module import TrainingModule
 from nerfro.training.ray_batches import RayBatches

@@ -15,8 +15,8 @@ from nerfro.kernels.available import available_bytes, require_bytes
 from nerfro.media.analytic import Vacuum
 from nerfro.models.refractive import RefractiveModel
 from nerfro.rendering import Components, Renderer
-from nerfro.samplers.straight import Straight
-from nerfro.samplers.stratified import Stratified
+from nerfro.samplers.paths.straight import Straight
+from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import example_rays
 from nerfro.training import memory
 from nerfro.training.memory import require_memory

@@ -10,7 +10,7 @@ from nerfro.cameras import Cameras
 from nerfro.data.base import Views
 from nerfro.errors import NerfroError
 from nerfro.media.shapes import Ball
-from nerfro.samplers.snell import Snell
+from nerfro.samplers.paths.snell import Snell
 from nerfro.subdivision import Subdivision
 from nerfro.training.ray_batches import RayBatches
 

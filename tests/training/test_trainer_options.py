@@ -235,7 +235,7 @@ def test_errors_of_a_plugin_name_its_file_and_line(
 
 @pytest.mark.usefixtures("restored_registry")
 def test_options_of_a_base_class_are_inherited() -> None:
-    from nerfro.samplers.stratified import Stratified
+    from nerfro.samplers.points.stratified import Stratified
 
     @register("sampler/points", "sparse")
     class Sparse(Stratified):

@@ -20,7 +20,7 @@ from nerfro.data.blender import BlenderData
 from nerfro.light import to_srgb
 from nerfro.media.shapes import Ball
 from nerfro.rendering import ColourSpace, Renderer, Scene
-from nerfro.samplers.snell import Snell
+from nerfro.samplers.paths.snell import Snell
 from nerfro.subdivision import Subdivision
 from nerfro.training.data_module import NO_IMAGE, RayDataModule, RotatingView, validation_interval
 from nerfro.training.module import TrainingModule

@@ -15,9 +15,9 @@ from nerfro.files import lat_long
 from nerfro.media.shapes import Ball
 from nerfro.models.refractive import RefractiveModel
 from nerfro.rendering import Components
-from nerfro.samplers.snell import Snell
-from nerfro.samplers.stratified import Stratified
-from nerfro.scenes.viewpoints import look_at_origin
+from nerfro.samplers.paths.snell import Snell
+from nerfro.samplers.points.stratified import Stratified
+from nerfro.synthetic.viewpoints import look_at_origin
 from nerfro.types import Radiance, Samples
 from nerfro.viewing.server import PageServer
 from nerfro.viewing.trained_scene import TrainedScene

@@ -24,8 +24,8 @@ from nerfro.files.deep_images import write_radiance
 from nerfro.light import to_linear
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.paths import resolve_path
-from nerfro.samplers.density_grid import DensityGridSampler
-from nerfro.samplers.snell import Snell
+from nerfro.samplers.paths.snell import Snell
+from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.subdivision import Subdivision
 from nerfro.testing import example_draws
 from nerfro.types import Radiance, Samples

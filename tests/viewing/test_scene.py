@@ -7,7 +7,7 @@ import torch
 
 from nerfro.errors import NerfroError
 from nerfro.files import lat_long
-from nerfro.samplers.snell import Snell
+from nerfro.samplers.paths.snell import Snell
 from nerfro.subdivision import Subdivision
 from nerfro.variants import variant
 from nerfro.viewing.changes import with_changed_scene

@@ -13,10 +13,10 @@ from nerfro.camera.gauss_newton import Step, gauss_newton_step, informative_pixe
 from nerfro.camera.least_squares import PriorInformation
 from nerfro.camera.panorama import align
 from nerfro.camera.refined import RefinedCamera
-from nerfro.capture.outlines import align_to_masks
 from nerfro.geometry.interpolation import misses
 from nerfro.rays import Rays
 from nerfro.registry import register
+from nerfro.silhouettes.outlines import align_to_masks
 from nerfro.subdivision import pixel_rays
 from nerfro.training.phases.background import occupied_box
 from nerfro.training.phases.base import Phase, Run

@@ -1,0 +1,81 @@
+"""Options of `python -m nerfro.calibrate`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Literal, Optional
+
+from omegaconf import DictConfig
+
+from nerfro.allowed import Count, Natural, Positive, Range
+from nerfro.data.frames import Every
+from nerfro.errors import NerfroError
+from nerfro.poses.boards import TagBoard, tag_grid, twelve_faces
+
+Squares = Annotated[int, Range(at_least=1, at_most=100)]  # along a side of a board
+
+
+@dataclass
+class CalibrateConfig:
+    """Options of `python -m nerfro.calibrate`.
+
+    Attributes:
+        images: folder of the photographs, all with one lens and size; the folder may also contain masks (`mask_*`).
+        out: output folder for transforms_{train,val,test}.json, calibration.json and cameras.png.
+        target: `apriltag` for a board of AprilTags in the scene, or `colmap` for structure from motion.
+        board: layout of the tags: `twelve_faces` (the paper's board, of tagStandard41h12) or `grid`, one sheet of
+            tag36h11.
+        columns, rows: number of tags of a grid; by default 5 and 7.
+        size: side of a tag between its detected corners (in a grid: up to the outer borders), in the unit of the poses;
+            metres for printing.
+        write_board: write the board for printing, board.pdf and board_*.png, to `out`. Without `images` the command
+            ends there.
+        reconstruction: folder of a COLMAP model; by default `images`/../sparse/0 or /sparse, else a new model.
+        pairs: image pairs that COLMAP matches: `sequential` (each image with the ten next ones, and with fewer distant
+            ones) or `all`; by default sequential if the file names are numbered.
+        threads: number of threads of COLMAP; by default one per core.
+        lens: distortion coefficients to estimate beside focal lengths and principal point: `pinhole` none, as in the
+            paper; `radial` k1 and k2; `opencv` k1, k2, p1 and p2.
+        mask_labels: labels of the object in the masks, as `data.mask_labels`; by default all but the background.
+        test_every: every such image by name is a test image, and as many are validation images.
+        overwrite: allow replacing existing files.
+    """
+
+    images: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
+    out: Optional[str] = None  # noqa: UP045
+    target: Annotated[str, Literal["apriltag", "colmap"]] = "apriltag"
+    board: Annotated[str, Literal["twelve_faces", "grid"]] = "twelve_faces"
+    columns: Optional[Squares] = None  # noqa: UP045
+    rows: Optional[Squares] = None  # noqa: UP045
+    size: Positive = 0.05
+    write_board: bool = False
+    reconstruction: Optional[str] = None  # noqa: UP045
+    pairs: Annotated[Optional[str], Literal["sequential", "all"]] = None  # noqa: UP045
+    threads: Optional[Count] = None  # noqa: UP045
+    lens: Annotated[str, Literal["pinhole", "radial", "opencv"]] = "pinhole"
+    mask_labels: Optional[list[Natural]] = None  # noqa: UP045
+    test_every: Every = 8
+    overwrite: bool = False
+
+
+def check_options(config: DictConfig) -> None:
+    """Check the options.
+
+    Raises:
+        NerfroError: an option is missing.
+    """
+    if config.out is None:
+        raise NerfroError("out= is missing; set out= to the folder for the data set")
+    if config.images is None and not (config.write_board and config.target != "colmap"):
+        raise NerfroError(
+            "images= is missing; set images= to the folder of the photographs, or write_board=true to print a board"
+        )
+
+
+def make_board(config: DictConfig) -> TagBoard:
+    """Build the board that the options describe."""
+    if config.board == "grid":
+        return tag_grid(config.rows or 7, config.columns or 5, config.size)
+    if config.columns or config.rows:
+        raise NerfroError("board=twelve_faces always has 3x3 tags on each face; set board=grid for columns= and rows=")
+    return twelve_faces(config.size)

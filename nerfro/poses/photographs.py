@@ -1,0 +1,90 @@
+"""Photographs as input of the calibration: size check, luminance, and removal of points seen through the object."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import ImageOps
+
+from nerfro.data.frames import list_images
+from nerfro.data.image_files import IMAGE_SUFFIXES, read_mask, read_rgb, read_size, to_unit
+from nerfro.errors import NerfroError
+from nerfro.files.atomic import atomic_file
+from nerfro.files.reading import open_image, orientation_of
+from nerfro.light import to_linear
+from nerfro.poses.boards import Sighting
+from nerfro.progress import track
+
+HEIF_SUFFIXES = (".heic", ".heif")
+PHOTOGRAPH_SUFFIXES = (*IMAGE_SUFFIXES, *HEIF_SUFFIXES)
+_QUALITY = 95  # of converted photographs
+_LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # of linear sRGB (ITU-R BT.709)
+
+
+def place_photograph(file: Path, folder: Path) -> None:
+    """Link a photograph into a folder; one in HEIC format or with an EXIF orientation is converted to an upright JPEG.
+
+    Existing files are kept.
+    """
+    if file.suffix.lower() in HEIF_SUFFIXES:
+        try:
+            import pillow_heif
+        except ImportError as error:
+            raise NerfroError(f"{file} needs pillow-heif; pip install 'nerfro[capture]', or give JPEG files") from error
+        pillow_heif.register_heif_opener()
+    place, converted = folder / file.name, folder / f"{file.stem}.jpg"
+    if place.exists() or converted.exists():
+        return
+    with open_image(file, upright=False) as (image, _):
+        if file.suffix.lower() in HEIF_SUFFIXES or orientation_of(image) in range(2, 9):
+            upright = ImageOps.exif_transpose(image).convert("RGB")
+            with atomic_file(converted) as output:
+                upright.save(output, "JPEG", quality=_QUALITY, exif=upright.getexif())
+            return
+    place.symlink_to(file.resolve())
+
+
+def list_photographs(folder: Path) -> tuple[list[Path], tuple[int, int]]:
+    """List the photographs of a folder by name, with their common width and height in pixels."""
+    images = list_images(folder)
+    repeated = [stem for stem, count in Counter(image.stem for image in images).items() if count > 1]
+    if repeated:
+        raise NerfroError(f"{folder} contains several images named {repeated[0]}; keep one of each name")
+    shapes = {image: read_size(image)[:2] for image in images}
+    ((size, _),) = Counter(shapes.values()).most_common(1)
+    odd = [image for image in images if shapes[image] != size]
+    if odd:
+        way_out = "rotate or remove this image"
+        if shapes[odd[0]] == size[::-1]:
+            way_out = "the photographs are portrait and landscape, so remove those of one kind, or rotate their pixels"
+        raise NerfroError(
+            f"image {odd[0]} has {shapes[odd[0]][0]}x{shapes[odd[0]][1]} pixels, but {len(images) - len(odd)} of "
+            f"{len(images)} images have {size[0]}x{size[1]}; all images must have one lens and size: {way_out}"
+        )
+    for image in track("reading", images):
+        read_rgb(image, "drop")  # raises an error for a damaged file before the long work starts
+    return images, size
+
+
+def luminance(image: Path) -> UInt8[np.ndarray, "H W"]:
+    """Compute the linear luminance of an image, scaled so that the brightest thousandth of the pixels is white.
+
+    Pixels on an edge average linear light. In sRGB values, edges of bright regions would be detected too far outside:
+    by 0.2 to 0.3 pixels for tags.
+    """
+    light = to_linear(to_unit(read_rgb(image, "drop"))) @ _LUMINANCE
+    white = max(float(np.quantile(light, 0.999)), 1 / 255)
+    return np.uint8(np.rint(255 * np.minimum(light / white, 1.0)))
+
+
+def outside(sighting: Sighting, mask: Path | None, labels: Sequence[int] | None = None) -> Sighting:
+    """Remove features that are seen through the object or overlap the mask of the object."""
+    if mask is None or len(sighting.points) == 0:
+        return sighting
+    inside = to_unit(read_mask(mask, labels)) > 0.5
+    columns, rows = np.clip(sighting.pixels.astype(int), 0, np.array(inside.shape[::-1]) - 1).T
+    return sighting.only(~np.isin(sighting.features, sighting.features[inside[rows, columns]]))

@@ -1,0 +1,1 @@
+"""How rays become paths: straight, refracted, or integrated through a continuous index."""

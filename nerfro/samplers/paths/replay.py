@@ -1,0 +1,189 @@
+"""Differentiable replay of traced paths.
+
+A traced path records its surfaces, and whether the ray was refracted or reflected at each. Given the record, every
+vertex is a smooth function of the ray, the indices and the surfaces, and the replay computes the first derivatives.
+Moving silhouettes, and events that appear or disappear, have no derivatives here; a mask loss is sensitive to both.
+
+Derivatives grow without bound near grazing incidence and near the critical angle; `smallest_cosine` finds such paths.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn import functional
+
+from nerfro.geometry.intersection import Triangles
+from nerfro.media.base import Medium
+from nerfro.media.solid import Solid
+from nerfro.samplers.paths.branching import ONE_PATH, Branching
+from nerfro.samplers.paths.polylines import distance_to_end
+from nerfro.samplers.paths.snell_law import reflectance, refract, turning_normals
+from nerfro.types import Path, Rays
+
+# Lower bound of the cosine between ray and normal in a division, so that gradients stay finite.
+_MIN_COSINE = 1e-6
+
+# Intersects rays with the recorded surfaces. Arguments: rows and column of the vertices, positions and directions of
+# the previous vertices, and traced distances. Results, with gradients: distances and unit normals.
+Meet = Callable[[Tensor, int, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
+# Rows and columns of vertices; their positions, directions and arc lengths.
+Vertices = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
+
+
+class _ValueOf(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, value: Tensor, replayed: Tensor) -> Tensor:
+        ctx.like = replayed.dtype, replayed.device
+        return value.clone()
+
+    @staticmethod
+    def backward(ctx, gradient: Tensor) -> tuple[None, Tensor]:  # type: ignore[override]
+        dtype, device = ctx.like
+        return None, gradient.to(device, dtype)
+
+
+def with_gradient(value: Float[Tensor, "..."], replayed: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
+    """Give a traced value the gradient of its replay; the value does not change by rounding errors of the replay."""
+    return _ValueOf.apply(value, replayed)
+
+
+def smallest_cosine(path: Path, medium: Medium) -> Float[Tensor, "P"]:
+    """Compute the least |N . d| of each path just before and just after events at sharp surfaces; 1 without events.
+
+    First derivatives of a path are reliable if the cosine is above 0.15. Below, the ray grazes a surface or is near the
+    critical angle, and the derivatives grow without bound.
+    """
+    with torch.no_grad():
+        n = indices_of(medium, path.s)[path.body.long()]
+        before, after = path.directions[:, :-1], path.directions[:, 1:]
+        normals = turning_normals(before, after, n[:, :-1], n[:, 1:])
+        cosines = torch.minimum((normals * before).sum(-1).abs(), (normals * after).sum(-1).abs())
+        return torch.where(path.surface[:, 1:] >= 0, cosines, 1.0).amin(-1)
+
+
+def indices_of(medium: Medium, like: Tensor) -> Float[Tensor, "M"]:
+    """Return the refractive index of air and of each body, with gradients."""
+    bodies = [medium.iors] if isinstance(medium, Solid) else []
+    return torch.cat([like.new_ones(1), *(iors.to(like) for iors in bodies)])
+
+
+def start_of(path: Path, rays: Rays) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"], Float[Tensor, "P"]]:
+    """Return position, direction and arc length of the first vertices, with gradients with respect to the rays."""
+    origins, d, s = (path.of_ray(values) for values in (rays.origins, rays.directions, rays.near))
+    return origins + s[:, None] * d, d, s
+
+
+def replay(path: Path, rays: Rays, medium: Medium, meet: Meet, branching: Branching = ONE_PATH) -> Path:
+    """Replay paths of refractions and reflections, with gradients with respect to rays, indices and surfaces.
+
+    Each event is an intersection with the recorded surface, and refraction or reflection as in the trace. Derivatives
+    are taken at the traced vertices, and all values are equal to the traced values.
+    """
+    x, d, s = start_of(path, rays)
+    num_paths, num_vertices = path.s.shape
+    rows, column = torch.arange(num_paths, device=s.device), torch.zeros_like(path.ray)
+    vertices: list[Vertices] = [(rows, column, x, d, s)]
+    indices = indices_of(medium, path.s)
+    weight = torch.ones_like(s)
+    for i in range(1, num_vertices - 1):
+        rows = (path.surface[:, i] >= 0).nonzero().squeeze(1)
+        if not len(rows):
+            break
+        old_x, old_d, old_s = (with_gradient(values[rows, i - 1], replayed[rows]) for values, replayed in (
+            (path.positions, x), (path.directions, d), (path.s, s)))  # fmt: skip
+        before, after, across = (numbers[rows].long() for numbers in (
+            path.body[:, i - 1], path.body[:, i], path.across[:, i]))  # fmt: skip
+        reflected = before == after
+        length, normal = meet(rows, i, old_x, old_d, path.s[rows, i] - path.s[rows, i - 1])
+        turned, _ = refract(old_d, normal, indices[before], indices[across], reflected)
+        if i <= branching.num_events:
+            share = reflectance(old_d, normal, indices[before], indices[across])
+            splits, _ = branching.decide(weight[rows].detach(), share.detach(), torch.full_like(rows, i - 1))
+            factor = torch.where(splits, torch.where(reflected, share, 1 - share), 1.0)
+            weight = weight.index_copy(0, rows, weight[rows] * factor)
+        vertex = old_x + length[:, None] * old_d, turned, old_s + length
+        vertices.append((rows, torch.full_like(rows, i), *vertex))
+        x, d, s = (old.index_copy(0, rows, new) for old, new in zip((x, d, s), vertex, strict=True))
+    replayed = assembled(path, rays, medium, vertices, (x, d, s))
+    if not branching.num_events:
+        return replayed
+    relative = (weight / weight.detach())[:, None]
+    return replace(replayed, throughput=with_gradient(path.throughput, path.throughput * relative))
+
+
+def assembled(
+    path: Path, rays: Rays, medium: Medium, vertices: list[Vertices], last: tuple[Tensor, Tensor, Tensor]
+) -> Path:
+    """Give a traced path the gradients of replayed vertices.
+
+    Args:
+        path: traced path.
+        rays: traced rays.
+        medium: medium, whose box determines the end of bent paths.
+        vertices: replayed vertices; other vertices between the ends have no gradients.
+        last: position, direction and arc length of each row after the last event.
+    """
+    x, d, s = last
+    ahead = distance_to_end(path.of_ray(rays.far).to(s), medium.box, path.refracted, x, d, s)
+    end = torch.cat([x + ahead[:, None] * d, d, (s + ahead)[:, None]], -1)
+    rows, columns = (torch.cat([vertex[i] for vertex in vertices]) for i in range(2))
+    values = torch.cat([torch.cat([*vertex[2:4], vertex[4][:, None]], -1) for vertex in vertices])
+    replayed = torch.where(is_interior(path)[..., None], torch.zeros_like(end)[:, None], end[:, None])
+    replayed = replayed.index_put((rows, columns), values)
+    return replace(
+        path,
+        positions=with_gradient(path.positions, replayed[..., :3]),
+        directions=with_gradient(path.directions, replayed[..., 3:6]),
+        s=with_gradient(path.s, replayed[..., 6]),
+    )
+
+
+def is_interior(path: Path) -> Bool[Tensor, "P S"]:
+    """Return which vertices are neither the first vertex nor at the end, which short rows repeat."""
+    return (path.s < path.s[:, -1:]) & (torch.arange(path.s.shape[1], device=path.s.device) > 0)
+
+
+def meet_solid(medium: Solid, surface: Int[Tensor, "P S"]) -> Meet:
+    """Intersect rays with zero levels of signed distances: t <- t - phi(x + t d) / (grad phi . d), divisor detached.
+
+    Args:
+        medium: traced bodies.
+        surface: recorded surface of each vertex.
+    """
+
+    def meet(rows: Tensor, column: int, x: Tensor, d: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
+        body = surface[rows, column].long()
+        phi, gradients = medium.signed_distances(x + length[:, None] * d)
+        slope = (_of_body(gradients, body) * d).sum(-1).detach()
+        slope = torch.copysign(slope.abs().clamp(min=_MIN_COSINE), slope)
+        length = with_gradient(length, length - phi.gather(-1, body[:, None])[:, 0] / slope)
+        _, gradients = medium.signed_distances(x + length[:, None] * d)
+        return length, functional.normalize(_of_body(gradients, body), dim=-1)
+
+    return meet
+
+
+def _of_body(gradients: Float[Tensor, "R K 3"], body: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
+    return gradients.gather(1, body[:, None, None].expand(-1, 1, 3))[:, 0]
+
+
+def meet_triangles(triangles: Triangles, triangle: Int[Tensor, "P S"]) -> Meet:
+    """Intersect rays with triangles of meshes, on the CPU and in double precision.
+
+    Args:
+        triangles: traced triangles.
+        triangle: recorded triangle of each vertex.
+    """
+
+    def meet(rows: Tensor, column: int, x: Tensor, d: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
+        like, face = length, triangle[rows, column].long().cpu()
+        x, d = x.cpu().double(), d.cpu().double()
+        length = triangles.distance(x, d, face)
+        return length.to(like), triangles.normal(x + length[:, None] * d, face).to(like)
+
+    return meet

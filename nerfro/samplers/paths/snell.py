@@ -1,0 +1,280 @@
+"""Paths of rays that are refracted and reflected at sharp surfaces."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Annotated, Literal
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+from torch.nn.functional import one_hot
+
+from nerfro.allowed import Positive, Range, Share
+from nerfro.errors import NerfroError
+from nerfro.geometry.interpolation import intersect_box
+from nerfro.kernels.tolerances import MIN_SEARCH_STEP
+from nerfro.media.analytic import Vacuum
+from nerfro.media.base import Medium
+from nerfro.media.sdf_grid import SdfGrid
+from nerfro.media.solid import Solid
+from nerfro.registry import register
+from nerfro.samplers.base import PathSampler
+from nerfro.samplers.paths.branching import ONE_PATH, Branching
+from nerfro.samplers.paths.compiled import snell_on_grid
+from nerfro.samplers.paths.polylines import SnellTrace
+from nerfro.samplers.paths.replay import meet_solid, meet_triangles, replay, smallest_cosine
+from nerfro.samplers.paths.straight import straight_path
+from nerfro.samplers.paths.wavefront import Wavefront
+from nerfro.types import Path, Rays
+
+_ROOT_ITERATIONS = 60
+# The search for the next triangle begins at this share of the box's diagonal from the last one, beyond the rounding
+# errors of Embree's single precision.
+_SEARCH_OFFSET = 1e-6
+# Training uses no derivatives of paths whose `smallest_cosine` is below this value.
+_STEADY = 0.15
+
+
+@register("sampler/path", "snell")
+class Snell(PathSampler):
+    """Trace rays with exact refraction (Snell's law) and reflection (total or Fresnel) at the surfaces of solids.
+
+    Args:
+        interface: `sdf` is the zero level of the signed distance, with smooth normals and tolerance of noisy hulls;
+            `mesh` is the triangles, with sharp edges, and vertex normals where the mesh is smooth.
+        max_events: largest number of refractions and reflections of a ray.
+        branches: `none` transmits all light that is not totally reflected, as the paper does; `first` adds the
+            reflection at the first surface of a ray; `all` adds every reflection.
+        least_weight: share of the light of a ray below which a branch is not followed; the other part takes its weight.
+        wavelengths: wavelengths in nm at which rays are traced if the medium disperses: equally many for red, green and
+            blue, in this order.
+    """
+
+    def __init__(
+        self,
+        interface: Literal["sdf", "mesh"] = "sdf",
+        max_events: Annotated[int, Range(at_least=1, at_most=1000)] = 16,
+        branches: Literal["none", "first", "all"] = "none",
+        least_weight: Share = 0.02,
+        wavelengths: Sequence[Positive] = (610.0, 550.0, 465.0),
+    ) -> None:
+        super().__init__()
+        if len(wavelengths) == 0 or len(wavelengths) % 3:
+            raise NerfroError(
+                f"sampler.path.wavelengths={list(wavelengths)} is not allowed; give as many for red, green, blue"
+            )
+        self.wavelengths = list(wavelengths)
+        self.interface, self.max_events = interface, max_events
+        self.branching = Branching({"none": 0, "first": 1, "all": max_events}[branches], least_weight)
+
+    @torch.no_grad()
+    def forward(self, rays: Rays, medium: Medium) -> Path:
+        """Trace rays from near to far; bent paths end outside the medium's box, beyond far if necessary."""
+        return self.trace(rays, medium).path
+
+    @torch.no_grad()
+    def main(self, rays: Rays, medium: Medium) -> Path:
+        if isinstance(medium, Solid) and medium.disperses:
+            medium = self._at_wavelengths(medium)[0]
+        return self.trace(rays, medium, replace(self.branching, main_only=True)).path
+
+    def refine(self, path: Path, rays: Rays, medium: Medium) -> Path:
+        """Return the path with gradients with respect to rays, indices and distance grids; see `samplers.replay`.
+
+        Gradients are unbounded at grazing and critical angles; omit paths whose `smallest_cosine` is below 0.15.
+        """
+        if isinstance(medium, Solid) and medium.disperses:
+            return _refined_in_bands(path, rays, self._at_wavelengths(medium), self._refine)
+        return self._refine(path, rays, medium)
+
+    def _refine(self, path: Path, rays: Rays, medium: Medium) -> Path:
+        if self.interface == "mesh" and isinstance(medium, SdfGrid):
+            meet = meet_triangles(medium.triangles, path.triangle)
+        elif isinstance(medium, Solid):
+            meet = meet_solid(medium, path.surface)
+        else:
+            return straight_path(rays[path.ray])
+        return replay(path, rays, medium, meet, self.branching)
+
+    def _at_wavelengths(self, medium: Solid) -> list[Solid]:
+        """Return the medium at each wavelength."""
+        if self.interface == "mesh" and isinstance(medium, SdfGrid):
+            medium.intersector  # noqa: B018 (created once, before the variants share it)
+        return [medium.at_wavelength(wavelength) for wavelength in self.wavelengths]
+
+    def steady(self, path: Path, medium: Medium) -> Bool[Tensor, "P"]:
+        return smallest_cosine(path, medium) > _STEADY
+
+    def releases_gil(self, medium: Medium) -> bool:
+        return self.interface == "sdf" and isinstance(medium, SdfGrid)
+
+    @torch.no_grad()
+    def trace(self, rays: Rays, medium: Medium, branching: Branching | None = None) -> SnellTrace:
+        """Trace rays and count events; `branching` replaces the rule of the sampler."""
+        if isinstance(medium, Vacuum):
+            none = torch.zeros(len(rays), dtype=torch.long, device=rays.near.device)
+            return SnellTrace(straight_path(rays), none, none.bool())
+        if not isinstance(medium, Solid):
+            raise NerfroError("sampler/path=snell needs a medium with a surface; take medium=sdf_grid, or path=eikonal")
+        if medium.disperses:
+            return _traced_in_bands(rays, self._at_wavelengths(medium), self._trace)
+        return self._trace(rays, medium, branching)
+
+    def _trace(self, rays: Rays, medium: Solid, branching: Branching | None = None) -> SnellTrace:
+        branching = branching or self.branching
+        if self.interface == "mesh":
+            if not isinstance(medium, SdfGrid) or not medium.meshes:
+                raise NerfroError("sampler.path.interface=mesh needs a medium made of a mesh; take medium=sdf_grid")
+            return _trace_triangles(rays, medium, self.max_events, branching)
+        if isinstance(medium, SdfGrid) and rays.origins.device.type == "cpu":
+            return snell_on_grid(rays, medium, self.max_events, branching)
+        return trace_interfaces(rays, medium, self.max_events, branching)
+
+
+def _traced_in_bands(rays: Rays, media: Sequence[Solid], trace: Callable[[Rays, Solid], SnellTrace]) -> SnellTrace:
+    """Trace rays at each wavelength; rays that miss the object have one polyline with light of all colours.
+
+    Args:
+        rays: camera rays.
+        media: bodies with the indices at each wavelength: the bands of red, then of green, then of blue.
+        trace: function that traces rays at one wavelength.
+    """
+    first = trace(rays, media[0])
+    bent = first.path.refracted
+    rows = first.path.ray[bent].unique_consecutive()
+    traces = [first, *(trace(rays[rows], medium) for medium in media[1:])]
+    path = Path.joined([trace.path for trace in traces])
+    of_rays = [first.path.ray, *(rows[trace.path.ray] for trace in traces[1:])]
+    band = torch.cat([torch.full_like(ray, number) for number, ray in enumerate(of_rays)])
+    num_bands = len(media) // 3
+    # Straight polylines have all colours.
+    colours = one_hot(torch.div(band, num_bands, rounding_mode="floor"), 3).to(path.s) / num_bands
+    colours = torch.where(path.refracted[:, None], colours, 1.0)
+    ray = torch.cat(of_rays)
+    order = ray.argsort(stable=True)
+    path = replace(path, throughput=path.throughput * colours, band=band, splits=True)
+    path = replace(path[order], ray=ray[order])
+    num_events, exceeded = (
+        torch.cat([getattr(traced, name) for traced in traces])[order] for name in ("num_events", "exceeded")
+    )
+    return SnellTrace(path, num_events, exceeded)
+
+
+def _refined_in_bands(
+    path: Path, rays: Rays, media: Sequence[Solid], refine: Callable[[Path, Rays, Solid], Path]
+) -> Path:
+    """Refine the polylines of each band in the medium at its wavelength; see `_traced_in_bands` for the arguments."""
+    rows = [(path.band == band).nonzero()[:, 0] for band in range(len(media))]
+    refined = [refine(path[some], rays[path.ray[some]], medium) for some, medium in zip(rows, media, strict=True)]
+    return replace(Path.joined(refined)[torch.cat(rows).argsort()], ray=path.ray)
+
+
+def _trace_triangles(rays: Rays, medium: SdfGrid, max_events: int, branching: Branching) -> SnellTrace:
+    """Trace rays from triangle to triangle of meshes, on the CPU and in double precision.
+
+    The number of crossings of its surface determines whether a ray is inside a body; the orientation of triangles does
+    not matter. Signed distances determine which rays begin inside.
+    """
+    triangles, scene = medium.triangles, medium.intersector
+    box = medium.box.double().cpu()
+    offset = _SEARCH_OFFSET * float(torch.linalg.vector_norm(box[1] - box[0]))
+    front = Wavefront(rays.to("cpu").to(torch.float64), medium, box, max_events, branching, offset, scene.num_layers)
+    within = (front.moving & (front.enter < 0)).nonzero()[:, 0]
+    if len(within):
+        front.inside[within] = (medium.signed_distances(front.x[within].to(medium.box))[0] < 0).cpu()
+    front.add_vertices(front.ray)
+    while len(rows := front.moving.nonzero()[:, 0]):
+        faces = scene.first_hits(front.x[rows] + front.start[rows, None] * front.d[rows], front.d[rows])
+        hit = (faces >= 0).any(1)
+        front.moving[rows] = hit
+        rows, faces = rows[hit], faces[hit]
+        # A straight line meets a plane once, so finding a triangle of the last vertex again is a rounding error.
+        again = ((faces[:, :, None] == front.triangles[rows][:, None]) & (faces >= 0)[:, :, None]).any((1, 2))
+        front.start[rows[again]] += offset
+        rows, faces = rows[~again], faces[~again]
+        lengths = triangles.distance(front.x[rows, None], front.d[rows, None], faces).clamp(min=0)
+        lengths, order = torch.where(faces >= 0, lengths, torch.inf).sort(1)
+        faces, length = faces.gather(1, order), lengths[:, 0]
+        # All triangles at one distance count, because the ray continues behind them.
+        faces = torch.where(lengths <= length[:, None] + offset, faces, -1)
+        body = torch.where(faces >= 0, triangles.body[faces], -1)
+        normal = triangles.normal(front.x[rows] + length[:, None] * front.d[rows], faces[:, 0])
+        front.meet(rows, length, length, body, normal, faces)
+    return front.finish(rays)
+
+
+def trace_interfaces(rays: Rays, medium: Solid, max_events: int, branching: Branching = ONE_PATH) -> SnellTrace:
+    """Trace rays from surface to surface of any solid; the reference implementation of the compiled kernel.
+
+    Sphere tracing finds the surfaces, because a step of the signed distance cannot miss one. A change of sign ends the
+    search, and bisection shrinks the bracket around the surface.
+    """
+    box = medium.box
+    front = Wavefront(rays, medium, box, max_events, branching)
+    front.begin(lambda x: medium.signed_distances(x)[0] < 0)
+    min_step = MIN_SEARCH_STEP * float((box[1] - box[0]).min())
+    while len(rows := front.moving.nonzero()[:, 0]):
+        x, d, inside = front.x[rows], front.d[rows], front.inside[rows]
+        before, after, crossed = _search(medium, x, d, inside, intersect_box(box, x, d)[1], min_step)
+        front.moving[rows] = crossed
+        rows, x, d, inside, before, after = (values[crossed] for values in (rows, x, d, inside, before, after))
+        before, after, body = _first_crossing(medium, x, d, inside, before, after)
+        after, bodies = _closed_gaps(medium, x, d, inside, after, body, min_step)
+        _, normals = medium.signed_distances(x + after[:, None] * d)
+        normal = normals.gather(1, body[:, None, None].expand(-1, 1, 3))[:, 0]
+        normal = normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
+        front.meet(rows, before, after, bodies, normal)
+    return front.finish(rays)
+
+
+def _search(
+    medium: Solid, x: Tensor, d: Tensor, inside: Tensor, limit: Tensor, min_step: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Trace spheres up to `limit`; returns start and end of the last step, and whether it crosses a surface."""
+    before, after = torch.zeros_like(limit), torch.zeros_like(limit)
+    crossed = torch.zeros_like(limit, dtype=torch.bool)
+    going = torch.arange(len(limit), device=limit.device)
+    while len(going):
+        phi, _ = medium.signed_distances(x[going] + after[going, None] * d[going])
+        crossed[going] = ((phi < 0) != inside[going]).any(-1)
+        more = ~crossed[going] & (after[going] < limit[going])
+        going, phi = going[more], phi[more]
+        before[going] = after[going]
+        step = phi.abs().amin(-1).clamp(min=min_step)
+        after[going] = torch.minimum(after[going] + step, limit[going])
+    return before, after, crossed
+
+
+def _first_crossing(
+    medium: Solid, x: Tensor, d: Tensor, inside: Tensor, before: Tensor, after: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Bisect each bracket around the first change of sign; returns the bracket and the body whose sign changes."""
+    for _ in range(_ROOT_ITERATIONS):
+        middle = 0.5 * (before + after)
+        phi, _ = medium.signed_distances(x + middle[:, None] * d)
+        changed = ((phi < 0) != inside).any(-1)
+        after = torch.where(changed, middle, after)
+        before = torch.where(changed, before, middle)
+    phi, _ = medium.signed_distances(x + after[:, None] * d)
+    changed = (phi < 0) != inside
+    return before, after, changed.long().argmax(-1)
+
+
+def _closed_gaps(
+    medium: Solid, x: Tensor, d: Tensor, inside: Tensor, after: Tensor, body: Tensor, min_step: float
+) -> tuple[Tensor, Tensor]:
+    """Close gaps of air between two bodies that are thinner than the shortest step of the search.
+
+    Returns:
+        Distance behind all surfaces that are met, and the bodies with these surfaces [A, L], -1 for none.
+    """
+    if inside.shape[1] == 1:
+        return after, body[:, None]
+    flipped = inside ^ one_hot(body, inside.shape[1]).bool()
+    leaves = (medium.innermost(inside) > 0) & (medium.innermost(flipped) == 0)
+    phi, _ = medium.signed_distances(x + (after + min_step)[:, None] * d)
+    behind = leaves[:, None] & ((phi < 0) != flipped)
+    others = torch.where(behind, torch.arange(inside.shape[1], device=x.device), -1)
+    return torch.where(behind.any(1), after + min_step, after), torch.cat([body[:, None], others], 1)

@@ -1,0 +1,41 @@
+"""Surface normals for images and exports, from the change of direction at the first surface of each path."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+
+from nerfro.media.base import Medium
+from nerfro.media.solid import Solid
+from nerfro.samplers.paths.replay import indices_of
+from nerfro.samplers.paths.snell_law import turning_normals
+from nerfro.types import Path
+
+
+def first_normals(path: Path, medium: Medium) -> Float[Tensor, "R 3"]:
+    """Compute unit normals, towards the camera, at the first event of each ray; zero for rays without events.
+
+    If the index varies continuously, the normals of its level surfaces at the first bend of each path are returned.
+    """
+    normals = path.directions.new_zeros(len(path.s), 3)
+    rows = path.refracted.nonzero()[:, 0]  # only few rays of an image
+    normals[rows] = _bent_normals(path[rows], medium).to(normals)
+    return path.first_of_ray(normals)
+
+
+def _bent_normals(path: Path, medium: Medium) -> Float[Tensor, "P 3"]:
+    """Compute the normals of polylines that meet the medium."""
+    rows = torch.arange(len(path.s), device=path.s.device)
+    before, after = path.directions[:, :-1], path.directions[:, 1:]
+    events = (path.surface[:, 1:] >= 0) | (before != after).any(-1)
+    first = events.byte().argmax(-1)
+    arriving = before[rows, first]
+    if isinstance(medium, Solid):
+        n_before, n_after = (indices_of(medium, path.s)[path.body[rows, first + i].long()] for i in range(2))
+        normals = turning_normals(arriving, after[rows, first], n_before.detach(), n_after.detach())
+    else:
+        _, normals = medium(path.positions[rows, first + 1])
+    towards = -(normals * arriving).sum(-1, keepdim=True).sign()
+    return torch.where(events.any(-1, keepdim=True), functional.normalize(normals * towards, dim=-1), 0.0)

@@ -1,0 +1,202 @@
+"""Rays that are traced together from surface to surface, and split where light is partly reflected."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from nerfro.geometry.interpolation import intersect_box
+from nerfro.media.solid import Solid
+from nerfro.samplers.paths.branching import Branching
+from nerfro.samplers.paths.polylines import Crossed, Polylines, SnellTrace
+from nerfro.samplers.paths.replay import indices_of
+from nerfro.samplers.paths.snell_law import reflectance, refract
+from nerfro.types import Rays
+
+# Attributes of `Wavefront` with one row for each polyline.
+_COLUMNS = ("x", "d", "s", "inside", "triangles", "start", "moving", "ray", "weight", "num_events", "exceeded")
+
+
+class _Crossing(NamedTuple):
+    """Crossings of A rows: arguments of `Wavefront.meet`, and the media on both sides."""
+
+    before: Float[Tensor, "A"]
+    after: Float[Tensor, "A"]
+    body: Int[Tensor, "A L"]
+    normal: Float[Tensor, "A 3"]
+    triangles: Int[Tensor, "A L"]
+    flipped: Bool[Tensor, "A K"]  # whether the far side is inside each surface
+    across: Int[Tensor, "A"]  # body on the far side, numbered from 1; 0 for air
+    n_before: Float[Tensor, "A"]
+    n_after: Float[Tensor, "A"]
+    visible: Bool[Tensor, "A"]  # whether the index changes
+
+    def select(self, index: Tensor) -> _Crossing:
+        return _Crossing(*(values[index] for values in self))
+
+
+class Wavefront:
+    """Rays on their way through bodies with sharp surfaces, one row for each polyline.
+
+    Tracers find the next surface of each row. The wavefront applies Snell's law, follows branches, and records
+    vertices.
+
+    Args:
+        rays: rays, in the precision and on the device of the computation.
+        medium: bodies.
+        box: box of the medium, as precise as the rays and on their device.
+        max_events: largest number of refractions and reflections of a polyline.
+        branching: which parts of light that is partly reflected are followed.
+        offset: distance from a surface at which the search for the next one begins, world units.
+        num_layers: largest number of triangles that a row meets at one distance, L.
+
+    Attributes:
+        x, d: position in world units and unit direction of each row [P, 3].
+        s: arc length from the camera [P].
+        inside: whether each row is inside the surface of each body [P, K]; the tracers set the first values.
+        triangles: triangles that each row lies on [P, L]; -1 for none.
+        start: distance from `x` at which the search for the next surface begins.
+        moving: whether each row may meet another surface.
+        ray, weight: ray of each row, and its share of the light of this ray.
+        num_events, exceeded: events of each row, and whether it met the limit.
+        enter: arc length from near at which each ray enters the box.
+    """
+
+    def __init__(
+        self,
+        rays: Rays,
+        medium: Solid,
+        box: Float[Tensor, "2 3"],
+        max_events: int,
+        branching: Branching,
+        offset: float = 0.0,
+        num_layers: int = 1,
+    ) -> None:
+        self.medium, self.box, self.max_events, self.branching, self.offset = medium, box, max_events, branching, offset
+        self.indices, self.far = indices_of(medium, box), rays.far
+        self.x, self.d = rays.origins + rays.near[:, None] * rays.directions, rays.directions.clone()
+        self.s = rays.near.clone()
+        self.enter, leave = intersect_box(box, self.x, self.d)
+        self.moving = (self.enter < leave) & (leave > 0) & (self.enter < rays.far - self.s)
+        self.ray = torch.arange(len(rays), device=self.s.device)
+        self.triangles = torch.full_like(self.ray[:, None].expand(-1, num_layers), -1)
+        self.num_events = torch.zeros_like(self.ray)
+        self.start, self.weight = torch.zeros_like(self.s), torch.ones_like(self.s)
+        self.exceeded = torch.zeros_like(self.moving)
+        self.inside = self.exceeded[:, None].repeat(1, len(medium.iors))
+        self.lines = Polylines(len(rays), self.x)
+
+    def begin(self, inside: Callable[[Tensor], Bool[Tensor, "P K"]]) -> None:
+        """Record the first vertices, and move the rows that meet the box to the box.
+
+        Args:
+            inside: function that returns which bodies contain each point.
+        """
+        in_box = ((self.x >= self.box[0]) & (self.x <= self.box[1])).all(-1, keepdim=True)
+        self.inside = in_box & inside(self.x)
+        self.add_vertices(self.ray)
+        entry = torch.where(self.moving, self.enter.clamp(min=0), 0.0)
+        self.x += entry[:, None] * self.d
+        self.s += entry
+        self.inside = inside(self.x)
+
+    def add_vertices(
+        self,
+        rows: Int[Tensor, "A"],
+        surface: Int[Tensor, "A"] | int = -1,
+        across: Int[Tensor, "A"] | int = 0,
+        triangle: Int[Tensor, "A"] | int = -1,
+    ) -> None:
+        """Record the present positions of rows as vertices; see `Path` for the numbers."""
+        body = self.medium.innermost(self.inside[rows])
+        self.lines.append(rows, self.x[rows], self.d[rows], self.s[rows], Crossed(body, surface, across, triangle))
+
+    def meet(
+        self,
+        rows: Int[Tensor, "A"],
+        before: Float[Tensor, "A"],
+        after: Float[Tensor, "A"],
+        body: Int[Tensor, "A L"],
+        normal: Float[Tensor, "A 3"],
+        triangles: Int[Tensor, "A L"] | None = None,
+    ) -> None:
+        """Refract and reflect rows at the next surface.
+
+        Args:
+            rows: rows that meet a surface.
+            before, after: distances to points just before and just behind the surface, from which reflected and
+                transmitted light continues.
+            body: bodies whose surfaces are met at this distance, from 0; -1 for none. The first is recorded.
+            normal: unit normal of either orientation.
+            triangles: triangles that are met, as in `body`; by default none.
+        """
+        triangles = torch.full_like(self.triangles[rows], -1) if triangles is None else triangles
+        inside = self.inside[rows]
+        # Number of crossed surfaces of each body; the first column takes the entries without a surface.
+        num_crossed = rows.new_zeros(len(rows), inside.shape[1] + 1)
+        num_crossed.scatter_add_(1, body + 1, torch.ones_like(body))
+        flipped = inside ^ (num_crossed[:, 1:] % 2 == 1)
+        across = self.medium.innermost(flipped)
+        n_before, n_after = self.indices[self.medium.innermost(inside)], self.indices[across]
+        visible = n_before != n_after
+        exceeds = visible & (self.num_events[rows] >= self.max_events)
+        self.exceeded[rows], self.moving[rows] = exceeds, ~exceeds
+        met = _Crossing(before, after, body, normal, triangles, flipped, across, n_before, n_after, visible)
+        rows, met = rows[~exceeds], met.select(~exceeds)
+        turned, reflected = refract(self.d[rows], met.normal, met.n_before, met.n_after)
+        reflected &= met.visible
+        if self.branching.num_events:
+            share = reflectance(self.d[rows], met.normal, met.n_before, met.n_after)
+            rows, place, reflected = self._split(rows, torch.where(met.visible, share, 0.0), reflected)
+            met = met.select(place)
+            turned, _ = refract(self.d[rows], met.normal, met.n_before, met.n_after, reflected)
+        length = torch.where(reflected, met.before, met.after)
+        self.inside[rows] = torch.where(reflected[:, None], self.inside[rows], met.flipped)
+        self.x[rows] += length[:, None] * self.d[rows]
+        self.s[rows] += length
+        self.d[rows] = torch.where(met.visible[:, None], turned, self.d[rows])
+        self.triangles[rows], self.start[rows] = met.triangles, self.offset
+        self.num_events[rows] += met.visible
+        bent = met.select(met.visible)
+        self.add_vertices(rows[met.visible], bent.body[:, 0], bent.across, bent.triangles[:, 0])
+
+    def _split(
+        self, rows: Int[Tensor, "A"], share: Float[Tensor, "A"], reflected: Bool[Tensor, "A"]
+    ) -> tuple[Int[Tensor, "B"], Int[Tensor, "B"], Bool[Tensor, "B"]]:
+        """Duplicate rows whose light splits; the reflected part becomes the next row.
+
+        Args:
+            rows: rows that meet a surface.
+            share: reflectance, 0 where there is nothing to see.
+            reflected: whether each row is totally reflected.
+
+        Returns:
+            The rows and the duplicates, the place of each in the former `rows`, and whether it is reflected.
+        """
+        splits, whole = self.branching.decide(self.weight[rows], share, self.num_events[rows])
+        followed = splits & (not self.branching.main_only)
+        copies = torch.ones_like(self.ray)
+        copies[rows] += followed
+        source = torch.arange(len(copies), device=rows.device).repeat_interleave(copies)
+        place = torch.arange(len(rows), device=rows.device).repeat_interleave(1 + followed.long())
+        second = torch.zeros_like(place, dtype=torch.bool)
+        second[1:] = place[1:] == place[:-1]
+        for name in _COLUMNS:
+            setattr(self, name, getattr(self, name)[source])
+        self.lines.take(source)
+        rows = (copies.cumsum(0) - copies)[rows[place]] + second
+        share = share[place]
+        self.weight[rows] *= torch.where(splits[place], torch.where(second, share, 1 - share), 1.0)
+        return rows, place, (reflected | whole)[place] | second
+
+    def finish(self, rays: Rays) -> SnellTrace:
+        """Append the last vertices, and return the trace in the precision and on the device of the rays."""
+        refracted, device = self.num_events > 0, rays.origins.device
+        self.lines.append_ends(self.far[self.ray], self.box, refracted, self.x, self.d, self.s)
+        split = (self.ray, self.weight) if self.branching.num_events else (None, None)
+        path = self.lines.path(rays, refracted, *split)
+        return SnellTrace(path, self.num_events.to(device), self.exceeded.to(device))

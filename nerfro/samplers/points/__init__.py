@@ -1,0 +1,1 @@
+"""Where paths are sampled."""

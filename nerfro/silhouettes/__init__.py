@@ -1,0 +1,1 @@
+"""From masks to surfaces: outlines, visual hull, smooth fits and bodies of revolution."""

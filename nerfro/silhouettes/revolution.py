@@ -1,0 +1,272 @@
+"""Fit of a body of revolution to the outlines of the masks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from skimage.measure import find_contours
+from torch import Tensor
+from torch.func import jacfwd
+from torch.nn import functional
+from torch.nn.functional import normalize
+
+from nerfro.geometry.mesh import TriangleMesh
+from nerfro.geometry.revolve import revolve
+from nerfro.silhouettes.upright import body_axis
+from nerfro.silhouettes.visual_hull import Silhouettes
+
+Symmetry = Literal["axis", "auto"]
+
+_KNOTS = 72  # radii along the axis
+# Quantile of the distances of vertices from the axis that gives the initial radius at a height: vertices on end faces
+# lie nearer to the axis than the outline, and corners of the hull of few views lie farther away.
+_OUTER_QUANTILE, _INNER_QUANTILE = 0.8, 0.1
+_END = 4  # knots at each end whose initial radii are extrapolated, because the visual hull is inaccurate there
+# Samples per mask: points on the outline, and pixels inside and outside at distances in this range, in pixels.
+_OUTLINE_POINTS, _SIDE_POINTS, _NEAR, _FAR = 100, 40, 3.0, 40.0
+# Iterations, and the distance in pixels at which the weight of an observation is one half, first and last.
+_ITERATIONS, _HALF_WEIGHT = 24, (8.0, 1.0)
+# Weight of bending relative to pixels; longest step and smallest radius, as fractions of the height.
+_BENDING, _MAX_STEP, _MIN_RADIUS = 2.0, 0.03, 1e-3
+_EDGE = 0.5  # radius of the rounded edges, in pixels
+# Weight of the height relative to the observations: no camera sees a low roof on the top or a cone below the foot.
+_FLAT = 0.003
+_END_BENDING = 10.0  # factor of bending at the ends, where the masks show only thin slices
+# Bending at which its weight is one quarter, as a fraction of the height: objects have few, sharp corners.
+_CORNER = 0.002
+# A cone below the foot is cut if its slope exceeds this fraction of the slope that no camera sees as an outline, and if
+# the slope decreases by at least this factor at the edge of the foot.
+_HIDDEN_SLOPE, _EDGE_RATIO = 0.5, 0.6
+# Number of samples along a ray, of samples in each refinement, and width in pixels of the ignored frame.
+_PLACES, _CLOSER, _FRAME = 48, 12, 2
+
+
+@dataclass(frozen=True)
+class Profile:
+    """A body of revolution with flat ends.
+
+    Attributes:
+        foot: intersection of the axis with the lower end, world units.
+        axis: unit direction of the axis.
+        height: distance between the ends.
+        radii: radii at evenly spaced heights.
+        edge: radius by which the edges of the ends are rounded.
+    """
+
+    foot: Float[Tensor, "3"]
+    axis: Float[Tensor, "3"]
+    height: Float[Tensor, ""]
+    radii: Float[Tensor, "K"]
+    edge: float = 0.0
+
+    def in_plane(self, points: Float[Tensor, "*P 3"]) -> tuple[Float[Tensor, "*P"], Float[Tensor, "*P"]]:
+        """Return the distance of points from the axis, and their height above the foot."""
+        offset = points - self.foot
+        along = offset @ self.axis
+        return (offset - along[..., None] * self.axis).square().sum(-1).clamp(min=1e-20).sqrt(), along
+
+    def distance(self, points: Float[Tensor, "*P 3"]) -> Float[Tensor, "*P"]:
+        """Compute an approximate signed distance, negative inside, with an exact zero level."""
+        radius, along = self.in_plane(points)
+        step = self.height / (len(self.radii) - 1)
+        place = (along / step).clamp(0, len(self.radii) - 1.001)
+        low = place.floor().long()
+        first, second = self.radii[low], self.radii[low + 1]
+        slope = ((second - first) / step).detach()
+        side = (radius - torch.lerp(first, second, place - low)) / (1 + slope.square()).sqrt()
+        # At rounded edges, the minimum along a ray depends on both adjacent surfaces, which gives useful gradients.
+        return self.edge * torch.logsumexp(torch.stack([side, -along, along - self.height]) / self.edge, 0)
+
+    def mesh(self) -> TriangleMesh:
+        """Convert the body to a closed mesh with counter-clockwise faces seen from outside."""
+        axis, foot, radii = (values.double().numpy() for values in (self.axis, self.foot, self.radii))
+        heights = np.linspace(0, float(self.height), len(radii))
+        outline = np.column_stack([np.pad(radii, 1), np.pad(heights, 1, "edge")])
+        return revolve(outline, foot, axis)
+
+
+def fit_revolution(
+    mesh: TriangleMesh,
+    silhouettes: Silhouettes,
+    progress: Callable[[float], None] = lambda share: None,
+    axis: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]] | None = None,
+) -> TriangleMesh | None:
+    """Fit a body of revolution to the outlines of the masks.
+
+    The minimum distance to the body along a ray through the outline of a mask is zero. Rays on either side of the
+    outline intersect the body or miss it. Axis, ends and radii minimize a robust sum of the squared distances in
+    pixels, so that outlines of foreground objects have little influence.
+
+    Args:
+        mesh: initial surface.
+        silhouettes: silhouettes of the object.
+        progress: called with the completed fraction.
+        axis: a point on the initial axis and the unit direction of the axis; None takes the axis around which the
+            initial surface is most circular. With a given axis, the initial radii are those of the largest body of
+            revolution inside the initial surface, because the visual hull of few views is much wider than the object.
+
+    Returns:
+        The fitted body; None if the initial surface has no axis.
+    """
+    start = _initial_profile(mesh) if axis is None else _profile_around(mesh, *axis, _INNER_QUANTILE)[1]
+    if start is None:
+        return None
+    origins, directions, width, side = _rays(silhouettes)
+    middle, size = start.foot + 0.5 * start.height * start.axis, start.height
+    if ((origins - middle) @ start.axis).mean() < 0:  # the axis points towards the cameras
+        start = Profile(start.foot + size * start.axis, -start.axis, size, start.radii.flip(0))
+    least_sine = float((normalize(origins - middle, dim=-1) @ start.axis).min())
+    across = torch.linalg.svd(start.axis[None])[2][1:]
+    pixels = float(size / (width * (origins - middle).norm(dim=-1)).median())  # in the height
+
+    # Parameters in units of the height: two translations and two rotations of the axis, both ends, and the radii.
+    def body(numbers: Tensor) -> Profile:
+        axis = normalize(start.axis + numbers[2:4] @ across, dim=0)
+        foot = middle + size * (numbers[:2] @ across + numbers[4] * axis)
+        height, radii = size * (numbers[5] - numbers[4]), size * numbers[6:].clamp(min=_MIN_RADIUS)
+        return Profile(foot, axis, height, radii, _EDGE * float(size) / pixels)
+
+    def misfits(numbers: Tensor) -> Tensor:
+        apart = body(numbers).distance(origins + place[:, None] * directions) / (width * place)
+        return torch.where(side * apart > 0, 0.0, apart)
+
+    numbers = torch.cat([torch.zeros(4), torch.tensor([-0.5, 0.5]), start.radii / size])
+    bends = functional.pad(torch.eye(_KNOTS).diff(n=2, dim=0), (6, 0))
+    bends[:_END] *= _END_BENDING
+    bends[-_END:] *= _END_BENDING
+    for iteration in range(_ITERATIONS):
+        done = min(1.0, iteration / (_ITERATIONS - 6))
+        half_weight = _HALF_WEIGHT[0] * (_HALF_WEIGHT[1] / _HALF_WEIGHT[0]) ** done
+        place = _nearest_place(body(numbers), origins, directions)
+        misfit, slopes = misfits(numbers).double(), jacfwd(misfits)(numbers).double()
+        weight = 1 / (1 + (misfit / half_weight).square()).square()
+        smooth = 1 / (1 + (bends @ numbers / _CORNER).square()).square()  # corners have little weight
+        smooth[-_END:] = 1  # the upper end would flare
+        stiff = (_BENDING * pixels) ** 2 * len(misfit) / _KNOTS * (bends.T @ (smooth[:, None] * bends)).double()
+        system = slopes.T @ (weight[:, None] * slopes) + stiff
+        right = slopes.T @ (weight * misfit) + stiff @ numbers.double()
+        right[4:6] += _FLAT * len(misfit) * pixels * torch.tensor([-1.0, 1.0])
+        damping = 1e-3 * system.diagonal().mean() * torch.eye(len(numbers)).double()
+        step = torch.linalg.solve(system + damping, right)
+        numbers = numbers - (step * (_MAX_STEP / step.abs().max()).clamp(max=1)).float()
+        progress((iteration + 1) / _ITERATIONS)
+    return _without_hidden_cone(body(numbers), least_sine).mesh()
+
+
+def _without_hidden_cone(body: Profile, least_sine: float) -> Profile:
+    """Cut the part below a sharp edge of the foot that hardly a camera sees as an outline, such as a flat cone.
+
+    Args:
+        body: fitted body.
+        least_sine: sine of the smallest angle between the lines of sight and the plane of the foot.
+    """
+    if least_sine <= 0:
+        return body
+    step = body.height / (len(body.radii) - 1)
+    slopes = body.radii.diff()[: len(body.radii) // 3] / step
+    hidden = slopes[:-1] > _HIDDEN_SLOPE * (1 / least_sine**2 - 1) ** 0.5
+    edges = (hidden & (slopes[1:] < _EDGE_RATIO * slopes[:-1])).nonzero()
+    first = int(edges.max()) + 1 if len(edges) else 0
+    foot, height = body.foot + first * step * body.axis, body.height - first * step
+    return Profile(foot, body.axis, height, body.radii[first:], body.edge)
+
+
+def _initial_profile(mesh: TriangleMesh) -> Profile | None:
+    """Choose the axis near a principal axis around which the mesh is most circular; None without an axis."""
+    vertices = mesh.vertices
+    found: list[tuple[float, Profile]] = []
+    for near in np.linalg.eigh(np.cov(vertices.T))[1].T:
+        axis = body_axis(mesh, near)
+        if axis is None:
+            continue
+        middle = mesh.bounds.mean(0)
+        for _ in range(2):  # centre the mesh perpendicular to the axis
+            across = vertices - middle - ((vertices - middle) @ axis)[:, None] * axis
+            middle = middle + across.mean(0)
+        found.append(_profile_around(mesh, middle, axis, _OUTER_QUANTILE))
+    return min(found, key=lambda each: each[0])[1] if found else None
+
+
+def _profile_around(
+    mesh: TriangleMesh, middle: Float[np.ndarray, "3"], axis: Float[np.ndarray, "3"], quantile: float
+) -> tuple[float, Profile]:
+    """Measure the radii of a mesh around an axis.
+
+    Args:
+        mesh: surface.
+        middle: point on the axis.
+        axis: unit direction.
+        quantile: quantile of the distances of vertices from the axis at each height.
+
+    Returns:
+        Mean deviation from a body of revolution, relative to the mean radius, and the body.
+    """
+    offset = mesh.vertices - middle
+    along = offset @ axis
+    radius, low, high = np.linalg.norm(offset - along[:, None] * axis, axis=1), along.min(), along.max()
+    number = ((along - low) / (high - low) * (_KNOTS - 1)).round().astype(np.int64)
+    radii = np.array(
+        [np.quantile(radius[number == k], quantile) if (number == k).any() else np.nan for k in range(_KNOTS)]
+    )
+    known = np.isfinite(radii)
+    radii = np.interp(np.arange(_KNOTS), np.flatnonzero(known), radii[known])
+    radii[:_END], radii[-_END:] = radii[_END], radii[-_END - 1]
+    spread = np.abs(radius - radii[number])[(number > _END) & (number < _KNOTS - _END)].mean() / radii.mean()
+    foot, direction, outline = (torch.from_numpy(part).float() for part in (middle + low * axis, axis, radii))
+    return float(spread), Profile(foot, direction, torch.tensor(float(high - low)), outline)
+
+
+def _rays(
+    silhouettes: Silhouettes,
+) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"], Float[Tensor, "P"], Float[Tensor, "P"]]:
+    """Sample rays on the outlines of the masks and on both sides.
+
+    Returns:
+        Origins, unit directions, the width of a pixel at unit distance, and the side: 0 on the outline, 1 outside, -1
+        inside.
+    """
+    cameras, random = silhouettes.cameras, np.random.default_rng(0)
+    views, places, sides = [], [], []
+    for view, distance in enumerate(silhouettes.distances.numpy()):
+        outside = np.argwhere((distance < -_NEAR) & (distance > -_FAR)).astype(np.float32)
+        inside = np.argwhere(distance > _NEAR).astype(np.float32)
+        for side, points, count in (
+            (0.0, _outline_points(distance), _OUTLINE_POINTS),
+            (1.0, outside, _SIDE_POINTS),
+            (-1.0, inside, _SIDE_POINTS),
+        ):
+            chosen = points[random.permutation(len(points))[:count]]
+            views.append(torch.full((len(chosen),), view))
+            places.append(torch.from_numpy(chosen))
+            sides.append(torch.full((len(chosen),), side))
+    of_view, place = torch.cat(views), torch.cat(places)
+    # Integers are pixel centres here.
+    rays = cameras.rays(of_view, place[:, 0], place[:, 1])
+    width = 1 / (0.5 * (cameras.fx + cameras.fy))[of_view]
+    return rays.origins.float(), rays.directions.float(), width, torch.cat(sides)
+
+
+def _outline_points(distances: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "P 2"]:
+    """Find points (row, column) of the outline on the lines between adjacent pixel centres, away from the frame."""
+    points = np.concatenate([np.empty((0, 2)), *find_contours(distances, 0)]).astype(np.float32)
+    last = np.array(distances.shape) - 1 - _FRAME
+    return points[((points >= _FRAME) & (points <= last)).all(1)]
+
+
+@torch.no_grad()
+def _nearest_place(body: Profile, origins: Tensor, directions: Tensor) -> Float[Tensor, "P"]:
+    """Find the arc length along each ray at which the distance to the body is smallest."""
+    middle = body.foot + 0.5 * body.height * body.axis
+    reach = torch.sqrt((0.5 * body.height) ** 2 + body.radii.max() ** 2)
+    place = ((middle - origins) * directions).sum(-1)
+    for count in (_PLACES, _CLOSER, _CLOSER):
+        candidates = place[:, None] + reach * torch.linspace(-1, 1, count)
+        distances = body.distance(origins[:, None] + candidates[..., None] * directions[:, None])
+        place = candidates.gather(1, distances.argmin(1, keepdim=True))[:, 0]
+        reach = reach * 2 / (count - 1)
+    return place

@@ -1,0 +1,144 @@
+"""Contour points of a surface as seen from the cameras, and their distances to the outlines of the masks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from scipy.ndimage import binary_erosion, distance_transform_edt
+from torch import Tensor
+
+from nerfro.cameras import Cameras
+from nerfro.errors import NerfroError
+from nerfro.geometry.mesh import TriangleMesh
+from nerfro.silhouettes.moving_mesh import MovingMesh, Surface, unit
+from nerfro.silhouettes.visual_hull import Silhouettes
+
+# By view: the index of the outline pixel nearest to each pixel.
+Outlines: TypeAlias = "dict[int, Int[np.ndarray, 'H W']]"
+
+# Accuracy of the outline of a binary mask, in pixels. The median misfit relative to this accuracy scales the two limits
+# below, so that a surface far from the masks keeps its observations.
+_MASK_ACCURACY = 0.35
+# Largest misfit in pixels, beyond which a contour belongs to a fold of the surface in front of itself; misfit in pixels
+# at which the weight of an observation is one half; and smallest scale of that misfit, reached with antialiased masks.
+_MAX_MISFIT, _HALF_WEIGHT, _MIN_SCALE = 3.0, 0.7, 0.3
+
+
+class Rims(NamedTuple):
+    """Contour points on edges (first, second) of a mesh, at the fraction `share` of the way from first to second.
+
+    The surface meets the outline of the mask if it moves by `misfit` along `normal`.
+    """
+
+    first: Int[np.ndarray, "K"]
+    second: Int[np.ndarray, "K"]
+    share: Float[np.ndarray, "K"]
+    points: Float[np.ndarray, "K 3"]  # positions of the contour points
+    normal: Float[np.ndarray, "K 3"]  # unit, outwards, perpendicular to the line of sight
+    misfit: Float[np.ndarray, "K"]  # outward distance to the outline of the mask, world units
+    weight: Float[np.ndarray, "K"]  # robust weight of the misfit
+    width: Float[np.ndarray, "K"]  # width of a pixel at the point, world units
+    view: Int[np.ndarray, "K"]
+
+
+class RimFinder:
+    """Finder of the contour points of a fixed surface for changing cameras.
+
+    Args:
+        mesh: surface.
+        silhouettes: silhouettes of the masks.
+    """
+
+    def __init__(self, mesh: TriangleMesh, silhouettes: Silhouettes) -> None:
+        self._surface = MovingMesh(mesh.faces).surface(mesh.vertices)
+        self._silhouettes, self._outlines = silhouettes, outlines_of(silhouettes)
+
+    def find(self, cameras: Cameras | None = None) -> Rims:
+        """Find the contour points, by default for the cameras of the silhouettes."""
+        silhouettes = self._silhouettes if cameras is None else replace(self._silhouettes, cameras=cameras)
+        return find_rims(self._surface, silhouettes, self._outlines)
+
+
+def outlines_of(silhouettes: Silhouettes) -> Outlines:
+    """Compute the nearest outline pixels of all views."""
+    return {view: _nearest_outline_pixel(mask) for view, mask in enumerate((silhouettes.masks > 0.5).numpy())}
+
+
+def find_rims(surface: Surface, silhouettes: Silhouettes, outlines: Outlines) -> Rims:
+    """Find the outermost contour point near each pixel of the outlines of the masks.
+
+    On a smooth surface, the contour crosses edges of the mesh along which the vertex normals turn away from the camera.
+    On a sharp edge, the contour follows the edge if the camera sees only one of its sides.
+
+    Raises:
+        NerfroError: no view sees the surface.
+    """
+    cameras, vertices = silhouettes.cameras, surface.vertices
+    ends = vertices[surface.edges]
+    spacing = float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).mean())
+    parts = []
+    for view, outline in outlines.items():
+        eye = cameras.camera_to_world[view, :, 3].double().numpy()
+        first, second, share, normal = _turning(surface, eye)
+        points = vertices[first] + share[:, None] * (vertices[second] - vertices[first])
+        places = torch.from_numpy(points).float()
+        inside, width = (values.double().numpy() for values in silhouettes.depth_inside(view, places))
+        known = np.flatnonzero(np.isfinite(inside))
+        if not len(known):
+            continue
+        # Pixels narrower than the edges of the mesh are grouped, or some would only contain contours of folds.
+        pixels = max(1, int(np.ceil(spacing / width[known].mean())))
+        cell = _look_up(outline, cameras.select([view]), places[known], pixels)
+        order = np.lexsort((inside[known], cell))
+        outermost = known[order[np.diff(cell[order], prepend=-1) != 0]]
+        of_view = np.full(len(outermost), view)
+        of_points = (first, second, share, points, normal, inside, width)
+        parts.append((*(values[outermost] for values in of_points), of_view))
+    if not parts:
+        raise NerfroError("no view sees the surface; check that surface, poses and masks belong together")
+    *edges, misfit, width, views = (np.concatenate(values) for values in zip(*parts, strict=True))
+    spread = float(np.median(np.abs(misfit))) / _MASK_ACCURACY
+    near = np.abs(misfit) < _MAX_MISFIT * max(1.0, spread)
+    weight = 1 / (1 + (misfit / (_HALF_WEIGHT * max(_MIN_SCALE, spread))) ** 2)
+    return Rims(*(each[near] for each in (*edges, misfit * width, weight, width, views)))
+
+
+def _turning(surface: Surface, eye: Float[np.ndarray, "3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Find the contour of a surface seen from a point: ends of edges, fractions along the edges, and normals."""
+    vertices, edges, normals, creases, beside = surface
+    facing = (normals * (vertices - eye)).sum(1)[edges]
+    smooth = np.flatnonzero((facing[:, 0] > 0) != (facing[:, 1] > 0))
+    shares = facing[smooth, 0] / (facing[smooth, 0] - facing[smooth, 1])
+    away = (beside * (vertices[creases[:, 0]] - eye)[:, None]).sum(-1) > 0
+    sharp = creases[away[:, 0] != away[:, 1]]
+
+    (first, second), share = np.r_[edges[smooth], sharp].T, np.r_[shares, np.full(len(sharp), 0.5)]
+    along = vertices[second] - vertices[first]
+    look = unit(vertices[first] + share[:, None] * along - eye)
+    normal = (1 - share[:, None]) * normals[first] + share[:, None] * normals[second]
+    # Only the motion of a sharp edge perpendicular to itself is visible, whatever the normals of the adjacent sides.
+    across = np.cross(look, along)
+    across *= np.sign((across * normal).sum(1, keepdims=True))
+    normal -= (normal * look).sum(1, keepdims=True) * look
+    normal[len(smooth) :] = across[len(smooth) :]
+    return first, second, share, unit(normal)
+
+
+def _look_up(outline: Int[np.ndarray, "H W"], camera: Cameras, points: Tensor, pixels: int) -> Int[np.ndarray, "P"]:
+    """Return the index of the block of pixels x pixels that contains the outline pixel nearest to each point."""
+    place = camera.project(points)[0][0].numpy()
+    row = place[:, 1].astype(np.int64).clip(0, camera.height - 1)
+    column = place[:, 0].astype(np.int64).clip(0, camera.width - 1)
+    nearest = outline[row, column]
+    return nearest // camera.width // pixels * camera.width + nearest % camera.width // pixels
+
+
+def _nearest_outline_pixel(inside: np.ndarray) -> Int[np.ndarray, "H W"]:
+    """Return the index of the outline pixel of a mask nearest to each pixel."""
+    outline = inside & ~binary_erosion(inside, border_value=1)
+    rows, columns = distance_transform_edt(~outline, return_distances=False, return_indices=True)
+    return rows.astype(np.int64) * inside.shape[1] + columns

@@ -1,0 +1,127 @@
+"""Outlines of masks with subpixel accuracy, silhouettes of meshes, and downscaling of images."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Shaped
+from scipy.ndimage import distance_transform_edt, gaussian_filter
+from scipy.special import ndtri
+from torch import Tensor
+
+from nerfro.cameras import Cameras, Window
+from nerfro.geometry.intersection import MeshIntersector
+from nerfro.geometry.mesh import TriangleMesh
+
+# Fits exclude every so many-th view, for validation.
+VALIDATION_EVERY = 8
+# Standard deviation, in pixels, of the blur that interpolates between the steps of a binary mask. The error on straight
+# lines is then 0.15 pixels, and corners are preserved.
+_BLUR = 1.0
+# A blur shrinks an outline of radius r by its variance / 2r. The box filter of a pixel adds a variance of 1/12.
+_BLUR_BIAS = 0.5 * (_BLUR**2 + 1 / 12)
+# A mask is antialiased if this fraction of the pixels on the outline has partial coverage. Curvature is only estimated
+# for such masks, because the curvature of a binary mask is dominated by noise.
+_MIN_PARTIAL = 0.2
+# Largest distance, in blur widths, at which the blurred mask determines the distance to the outline.
+_REACH = 1.5
+# Smallest magnitude of a distance, in pixels, so that its sign agrees with the mask.
+_MIN_DISTANCE = 1e-3
+# Margin, in pixels, around the projected vertices of a mesh, because lens distortion bends edges between them.
+_MESH_MARGIN = 8
+
+
+def outline_distance(mask: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
+    """Compute the signed distance of each pixel centre to the outline of a mask.
+
+    Near a straight outline, a blurred mask equals Phi(distance / blur) with the normal distribution function Phi.
+    The inverse of Phi gives the distance with subpixel accuracy, for binary and antialiased masks. The blur shrinks
+    curved outlines; the result is corrected for this bias if the mask is antialiased. The frame of the image is not
+    an outline.
+
+    Args:
+        mask: fraction of each pixel that the object covers.
+
+    Returns:
+        Distances in pixels, positive inside.
+    """
+    inside = mask > 0.5
+    if inside.all() or not inside.any():
+        return np.where(inside, np.inf, -np.inf)
+    counted = np.where(inside, distance_transform_edt(inside) - 0.5, 0.5 - distance_transform_edt(~inside))
+    blurred = gaussian_filter(np.asarray(mask, np.float64), _BLUR, mode="nearest")
+    refined = _BLUR * ndtri(blurred.clip(1e-6, 1 - 1e-6))
+    if is_antialiased(mask, counted):
+        refined -= _BLUR_BIAS * _level_curvature(refined).clip(-1, 1)
+    distance = np.where((np.abs(refined) < _REACH * _BLUR) & (np.abs(counted) < 2 * _REACH), refined, counted)
+    return np.where(inside, distance.clip(min=_MIN_DISTANCE), distance.clip(max=-_MIN_DISTANCE)).astype(np.float32)
+
+
+def is_antialiased(masks: Float[np.ndarray, "*V H W"], distances: Float[np.ndarray, "*V H W"]) -> bool:
+    """Test whether masks give the coverage of pixels on the outline, or only inside and outside.
+
+    Args:
+        masks: coverage of the pixels.
+        distances: distances of the pixel centres to the outlines, in pixels.
+    """
+    partial = ((masks > 0.02) & (masks < 0.98))[np.abs(distances) < 1]
+    return bool(partial.any() and partial.mean() > _MIN_PARTIAL)
+
+
+def _level_curvature(values: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
+    """Compute the curvature of the level lines in 1 / pixels, negative around maxima."""
+    down, right = np.gradient(values)
+    (down_down, down_right), (_, right_right) = np.gradient(down), np.gradient(right)
+    across = right_right * down**2 - 2 * down * right * down_right + down_down * right**2
+    return across / np.hypot(down, right).clip(0.3) ** 3
+
+
+def frame_pixels(masks: Float[Tensor, "V H W"]) -> Bool[Tensor, "V P"]:
+    """Test which pixels along the frame of each mask show the object, which may then continue outside the image."""
+    inside = masks > 0.5
+    return torch.cat([inside[:, [0, -1]].flatten(1), inside[:, :, [0, -1]].flatten(1)], 1)
+
+
+def pixel_stride(cameras: Cameras, max_pixels: int) -> int:
+    """Return the subsampling stride for which an image has at most `max_pixels` per side."""
+    return -(-max(cameras.width, cameras.height) // max_pixels)
+
+
+class PixelBlocks:
+    """Downscaling of images by averaging square blocks; incomplete blocks at the right and bottom are cropped.
+
+    Args:
+        cameras: cameras of the images.
+        max_pixels: maximum length of the longer side after downscaling.
+    """
+
+    def __init__(self, cameras: Cameras, max_pixels: int) -> None:
+        self._stride = pixel_stride(cameras, max_pixels)
+        self.height, self.width = cameras.height // self._stride, cameras.width // self._stride
+        self._window = Window(0, 0, self.height * self._stride, self.width * self._stride)
+
+    def cameras(self, cameras: Cameras) -> Cameras:
+        """Return the cameras of the downscaled images."""
+        return cameras.crop(self._window).resized(self.width, self.height)
+
+    def mean(self, image: Shaped[Tensor, "H W *C"]) -> Float[Tensor, "h w *C"]:
+        """Average an image over each block."""
+        blocks = self._window.cut(image.float()[None])[0].unflatten(1, (self.width, self._stride))
+        return blocks.unflatten(0, (self.height, self._stride)).mean((1, 3))
+
+
+def mesh_silhouettes(mesh: TriangleMesh, cameras: Cameras, stride: int) -> Bool[Tensor, "V h w"]:
+    """Test whether the rays through the centres of every stride-th pixel intersect a mesh."""
+    intersector, vertices = MeshIntersector(mesh.triangles), torch.from_numpy(mesh.vertices).float()
+    row, column = torch.meshgrid(
+        torch.arange(0, cameras.height, stride), torch.arange(0, cameras.width, stride), indexing="ij"
+    )
+    seen = torch.zeros(len(cameras), *row.shape, dtype=torch.bool)
+    for view in range(len(cameras)):
+        pixels, depth = cameras.select([view]).project(vertices)
+        (left, top), (right, bottom) = pixels[0].amin(0) - _MESH_MARGIN, pixels[0].amax(0) + _MESH_MARGIN
+        near = (row >= top) & (row <= bottom) & (column >= left) & (column <= right)
+        near |= depth.amin() <= 0  # pixels of points behind the camera are invalid
+        rays = cameras.rays(torch.full((int(near.sum()),), view), row[near], column[near])
+        seen[view, near] = intersector.first_hits(rays.origins, rays.directions) >= 0
+    return seen

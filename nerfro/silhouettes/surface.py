@@ -1,0 +1,191 @@
+"""From silhouettes to a surface: carving of the visual hull, and fit of a smooth surface."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from nerfro.data.base import Views
+from nerfro.errors import NerfroError, first_of, warn
+from nerfro.geometry.mesh import TriangleMesh
+from nerfro.progress import bar
+from nerfro.silhouettes.pose_conventions import overlap
+from nerfro.silhouettes.revolution import Symmetry, fit_revolution
+from nerfro.silhouettes.silhouette_fit import fit_surface
+from nerfro.silhouettes.silhouettes import frame_pixels
+from nerfro.silhouettes.visual_hull import (
+    Silhouettes,
+    carve_grid,
+    extract_surface,
+    find_box,
+    reaches_border,
+    remove_strays,
+)
+
+_FEWEST_VIEWS, _FEW_VIEWS = 3, 12
+_COARSE_VOXELS = 64
+# Factors by which the initial box is enlarged if it cuts the hull: wrong masks shift the estimated centre.
+_BOX_FACTORS = (1.0, 1.3, 1.7)
+# Margin of the object's box, in coarse voxels.
+_MARGIN_VOXELS = 2
+# A body of revolution is preferred although its overlap may be smaller by this amount, because a free surface is rough
+# and follows errors of the masks; the overlap is computed at the given number of pixels per side.
+_MAX_OVERLAP_LOSS, _MAX_PIXELS = {"axis": 0.01, "auto": 0.005}, 256
+# Cameras within this angle, in degrees, see the object from one side.
+_ONE_SIDE = 75.0
+
+
+def read_silhouettes(views: Views, has_box: bool) -> Silhouettes:
+    """Check the masks of views and compute their outlines.
+
+    Args:
+        views: views with masks.
+        has_box: whether the user gives a box, which bounds the hull where masks are cut by the frame.
+
+    Raises:
+        NerfroError: masks are missing, empty, full, inverted, too few, or all cut by the frame.
+    """
+    if views.masks is None:
+        raise NerfroError(
+            "the data set has no masks, and the visual hull needs masks; docs/guides/masks.md explains where to put "
+            "masks and how to make them"
+        )
+    masks = torch.stack(list(views.masks))
+    coverage = (masks > 0.5).flatten(1).float().mean(1)
+    for wrong, state in ((coverage == 0, "empty"), (coverage == 1, "full")):
+        if wrong.any():
+            raise NerfroError(
+                f"{_names(views, wrong)}: the mask is {state}; draw the object white and everything else black, "
+                "choose its labels with data.mask_labels, or remove the view"
+            )
+    inverted = (frame_pixels(masks).float().mean(1) > 0.9) & (coverage < 1)
+    if inverted.float().mean() > 0.5:
+        raise NerfroError(
+            f"{int(inverted.sum())} of {len(views)} masks are inverted: white along the frame of the image, and black "
+            "inside; save masks with the object white and everything else black"
+        )
+    if len(views) < _FEWEST_VIEWS:
+        raise NerfroError(
+            f"{len(views)} views do not determine a shape; give masks of at least {_FEWEST_VIEWS} views, better of 30 "
+            "from all sides"
+        )
+    if len(views) < _FEW_VIEWS:
+        warn(f"{len(views)} views give a coarse visual hull; 30 views from all sides are better")
+    silhouettes = Silhouettes.of(views.cameras, masks)
+    if silhouettes.cut.all() and not has_box:
+        raise NerfroError(
+            f"the frame cuts the object in all {len(views)} views, so no outline is complete; photograph the object "
+            "from farther away, or give box_min= and box_max= to bound the hull"
+        )
+    if silhouettes.cut.any():
+        warn(f"{_names(views, silhouettes.cut)}: the frame cuts the object; the surface outside the frame is unknown")
+    return silhouettes
+
+
+def make_mesh(
+    silhouettes: Silhouettes,
+    corners: Float[np.ndarray, "2 3"] | None,
+    resolution: int,
+    wrong_masks: int,
+    keep: int | None,
+    smoothing: float,
+    symmetry: Symmetry | None = None,
+    evidence: Silhouettes | None = None,
+    is_revolution: bool = False,
+) -> TriangleMesh:
+    """Carve the visual hull and fit a smooth surface.
+
+    Args:
+        silhouettes: silhouettes of the object.
+        corners: box of the hull; None estimates the box.
+        resolution: number of voxels along the longest side.
+        wrong_masks: number of views that may be wrong about any point.
+        keep: number of components to keep; None keeps all but small ones.
+        smoothing: factor of the estimated smoothing strength; 0 returns the hull itself.
+        symmetry: also fit a body of revolution, which is used unless its overlap with the masks is smaller by more
+            than 0.005 (`auto`) or 0.01 (`axis`, with a warning).
+        evidence: silhouettes that decide between the two surfaces; by default all.
+        is_revolution: whether silhouettes are projections of a body of revolution, so that a free surface is only
+            fitted if the hull has no axis.
+    """
+    box = _object_box(silhouettes, wrong_masks) if corners is None else corners
+    with bar("carving") as progress:
+        distances, corner, spacing = carve_grid(silhouettes, box, resolution, wrong_masks, progress)
+    num_parts, num_kept = remove_strays(distances, keep)
+    mesh, revolution = extract_surface(distances, corner, spacing), None
+    if symmetry is not None and is_revolution:
+        revolution = _revolution(mesh, silhouettes)
+    if revolution is None and smoothing > 0:
+        with bar("fitting") as progress:
+            mesh = fit_surface(mesh, silhouettes, smoothing, progress)
+    if revolution is not None:
+        mesh = revolution
+    elif symmetry is not None:
+        mesh = _choose_symmetry(_revolution(mesh, silhouettes), mesh, evidence or silhouettes, symmetry)
+    if num_kept < num_parts:
+        print(f"kept the largest {num_kept} of {num_parts} separate components")
+    if reaches_border(distances):
+        _warn_of_open_hull(silhouettes, box)
+    print(f"{len(mesh.faces)} triangles, voxels of {spacing:.4g}")
+    return mesh
+
+
+def _revolution(mesh: TriangleMesh, silhouettes: Silhouettes) -> TriangleMesh | None:
+    with bar("finding the axis") as progress:
+        return fit_revolution(mesh, silhouettes, progress)
+
+
+def _choose_symmetry(
+    revolution: TriangleMesh | None, free: TriangleMesh, silhouettes: Silhouettes, symmetry: Symmetry
+) -> TriangleMesh:
+    """Choose the body of revolution or the free surface by the overlap of their silhouettes with the masks.
+
+    The medians are compared, because a foreground object may be cut out of some masks.
+    """
+    if revolution is None:
+        if symmetry == "axis":
+            raise NerfroError("symmetry=axis is not possible, because the visual hull has no axis; remove the option")
+        return free
+    symmetric, unconstrained = (
+        float(np.median(overlap(mesh, silhouettes, _MAX_PIXELS))) for mesh in (revolution, free)
+    )
+    result = f"median overlap with the masks: {symmetric:.4f} as a body of revolution, {unconstrained:.4f} otherwise"
+    if symmetry == "axis" and symmetric < unconstrained - _MAX_OVERLAP_LOSS[symmetry]:
+        warn(f"{result}; the object is no body of revolution, and symmetry=axis is ignored")
+        return free
+    print(result)
+    return revolution if symmetric >= unconstrained - _MAX_OVERLAP_LOSS[symmetry] else free
+
+
+def _object_box(silhouettes: Silhouettes, wrong_masks: int) -> Float[np.ndarray, "2 3"]:
+    """Estimate the bounding box of the object, with a margin, from a coarse visual hull.
+
+    A box that cuts the hull is enlarged; if no enlargement contains the hull, the initial box is used.
+    """
+    initial = find_box(silhouettes, wrong_masks)
+    for factor in (*_BOX_FACTORS, 1.0):
+        box = initial.mean(0) + factor * (initial - initial.mean(0))
+        distances, corner, spacing = carve_grid(silhouettes, box, _COARSE_VOXELS, wrong_masks)
+        remove_strays(distances)
+        if not reaches_border(distances):
+            break
+    inside = np.argwhere(distances < 0)
+    low, high = inside.min(0) - _MARGIN_VOXELS, inside.max(0) + _MARGIN_VOXELS
+    return np.stack([corner + spacing * low, corner + spacing * high]).clip(*box)
+
+
+def _warn_of_open_hull(silhouettes: Silhouettes, box: Float[np.ndarray, "2 3"]) -> None:
+    towards = silhouettes.cameras.camera_to_world[:, :, 3] - torch.from_numpy(box.mean(0)).float()
+    towards = torch.nn.functional.normalize(towards, dim=-1)
+    spread = float(torch.rad2deg(torch.arccos((towards @ towards.T).clamp(-1, 1))).max())
+    if spread < _ONE_SIDE:
+        reason = f"all cameras look from within {spread:.0f} degrees, so silhouettes do not bound the object in depth"
+    else:
+        reason = "the masks that would bound the hull are cut by their frames, or the box is too small"
+    corners = np.round(box, 3).tolist()
+    warn(f"the box {corners} cuts the visual hull: {reason}; set the box with box_min= and box_max=")
+
+
+def _names(views: Views, chosen: torch.Tensor) -> str:
+    return first_of([name for name, wanted in zip(views.names, chosen.tolist(), strict=True) if wanted])

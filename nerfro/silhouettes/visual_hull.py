@@ -1,0 +1,230 @@
+"""Shape from silhouettes: the visual hull, the largest body that is consistent with all masks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from scipy.ndimage import binary_fill_holes, label
+from skimage.measure import marching_cubes
+from torch import Tensor
+
+from nerfro.cameras import Cameras
+from nerfro.errors import NerfroError
+from nerfro.geometry.lines import nearest_point
+from nerfro.geometry.mesh import TriangleMesh, merge_vertices
+from nerfro.silhouettes.silhouettes import frame_pixels, outline_distance
+
+# Number of refinements. Each halves the voxels and evaluates only voxels near the surface of the coarser level.
+_LEVELS = 2
+# Width of the neighbourhood in voxels of the coarser level, more than a voxel's diagonal.
+_BAND = 2.0
+# Components below this fraction of the volume of the largest component are removed.
+_MIN_VOLUME = 0.02
+_MIN_VIEWS = 2
+_CHUNK = 1 << 18
+
+
+@dataclass(frozen=True)
+class Silhouettes:
+    """Silhouettes of the object in several views.
+
+    Attributes:
+        cameras: cameras of the views.
+        masks: fraction of each pixel that the object covers.
+        distances: signed distances of the pixel centres to the outlines, in pixels, positive inside.
+        cut: views in which the frame cuts the object, so that nothing is known outside the frame.
+    """
+
+    cameras: Cameras
+    masks: Float[Tensor, "V H W"]
+    distances: Float[Tensor, "V H W"]
+    cut: Bool[Tensor, "V"]
+
+    @classmethod
+    def of(cls, cameras: Cameras, masks: Float[Tensor, "V H W"]) -> Silhouettes:
+        """Compute the outlines of masks."""
+        distances = np.stack([outline_distance(mask.numpy()) for mask in masks])
+        return cls(cameras, masks, torch.from_numpy(distances.astype(np.float32)), frame_pixels(masks).any(1))
+
+    def __len__(self) -> int:
+        return len(self.masks)
+
+    def select(self, views: list[int]) -> Silhouettes:
+        """Select views, in the given order."""
+        return Silhouettes(self.cameras.select(views), self.masks[views], self.distances[views], self.cut[views])
+
+    def depth_inside(self, view: int, points: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "P"], Float[Tensor, "P"]]:
+        """Compute the distances of points to the outline of one view.
+
+        Returns:
+            Signed distance in pixels, positive inside; infinite where the view gives no information, which means
+            behind the camera and outside a frame that cuts the object. Width of a pixel at the point, in world units.
+        """
+        cameras = self.cameras.select([view])
+        pixels, depth = (values[0] for values in cameras.project(points))
+        size = torch.tensor([cameras.width, cameras.height])
+        outside = torch.linalg.vector_norm(pixels - pixels.clamp(torch.zeros(2), size), dim=-1)
+        grid = (2 * pixels / size - 1).nan_to_num(0.0)[None, None]
+        distance = F.grid_sample(
+            self.distances[view][None, None], grid, align_corners=False, padding_mode="border"
+        ).flatten()
+        visible = depth > 1e-6 * depth.abs().max().clamp(min=1e-12)
+        unknown = ~visible | ((outside > 0) & self.cut[view])
+        distance = torch.where(outside > 0, distance.clamp(max=0) - outside, distance)
+        width = depth / (0.5 * (cameras.fx + cameras.fy))
+        return torch.where(unknown, torch.inf, distance), width
+
+    def carve(self, points: Float[Tensor, "P 3"], wrong_masks: int = 0) -> Float[Tensor, "P"]:
+        """Compute an approximate signed distance to the visual hull with an exact zero level.
+
+        The value is the maximum over the views of the distance to the cone of the silhouette, or the
+        (wrong_masks + 1)-th largest value if so many views may be wrong about any point. Points that fewer than two
+        views see are outside.
+
+        Returns:
+            Distances in world units, negative inside.
+        """
+        largest = torch.full((wrong_masks + 1, len(points)), -torch.inf)
+        num_seen = torch.zeros(len(points), dtype=torch.int32)
+        for view in range(len(self)):
+            inside, width = self.depth_inside(view, points)
+            known = inside < torch.inf
+            num_seen += known
+            value = torch.where(known, -inside * width, -torch.inf)
+            for rank in range(wrong_masks + 1):
+                largest[rank], value = torch.maximum(largest[rank], value), torch.minimum(largest[rank], value)
+        far = torch.where(largest[-1].isfinite(), largest[-1].abs(), 1.0)
+        return torch.where(num_seen < _MIN_VIEWS, far, largest[-1])
+
+
+def centre_lines(silhouettes: Silhouettes) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "V 3"]]:
+    """Return origins and unit directions of the rays through the centroids of the masks, none of which may be empty."""
+    cameras, inside = silhouettes.cameras, silhouettes.masks > 0.5
+    rows, columns = torch.arange(cameras.height) + 0.5, torch.arange(cameras.width) + 0.5
+    count = inside.sum((1, 2))
+    row, column = (inside.sum(2) * rows).sum(1) / count, (inside.sum(1) * columns).sum(1) / count
+    rays = cameras.rays(torch.arange(len(cameras)), row - 0.5, column - 0.5)
+    return rays.origins.double().numpy(), rays.directions.double().numpy()
+
+
+def find_box(silhouettes: Silhouettes, wrong_masks: int = 0) -> Float[np.ndarray, "2 3"]:
+    """Estimate a cube that contains the object.
+
+    The centre is the point nearest to the rays through the centroids of the masks. The side follows from the widest
+    mask, after the `wrong_masks` widest ones are ignored. No mask may be empty.
+    """
+    cameras, inside = silhouettes.cameras, silhouettes.masks > 0.5
+    centre = nearest_point(*centre_lines(silhouettes))
+    pixels, depth = cameras.project(torch.from_numpy(centre[None]).float())
+    radii = []
+    for view in range(len(cameras)):
+        height, width = inside[view].any(1).nonzero(), inside[view].any(0).nonzero()
+        corners = torch.tensor([[width.min(), height.min()], [width.max() + 1, height.max() + 1]])
+        reach = (corners - pixels[view, 0]).abs().amax()
+        radii.append(float(reach * depth[view, 0].abs() / (0.5 * (cameras.fx[view] + cameras.fy[view]))))
+    half_side = 1.1 * sorted(radii)[-1 - min(wrong_masks, len(radii) - 1)]
+    return np.stack([centre - half_side, centre + half_side])
+
+
+def carve_grid(
+    silhouettes: Silhouettes,
+    box: Float[np.ndarray, "2 3"],
+    resolution: int,
+    wrong_masks: int = 0,
+    progress: Callable[[float], None] = lambda share: None,
+) -> tuple[Float[np.ndarray, "X Y Z"], Float[np.ndarray, "3"], float]:
+    """Evaluate the visual hull on a grid, coarse to fine near the surface.
+
+    Args:
+        silhouettes: silhouettes of the object.
+        box: corners of the grid; the upper corner moves outwards to an integer number of voxels.
+        resolution: number of voxels along the longest side.
+        wrong_masks: number of views that may be wrong about any point.
+        progress: called with the completed fraction.
+
+    Returns:
+        Signed distances at the corners of the voxels (see `Silhouettes.carve`), the lower corner, and the voxel size.
+    """
+    extent = np.asarray(box[1] - box[0], np.float64)
+    factor = 2**_LEVELS
+    spacing = float(extent.max()) / (resolution // factor * factor)
+    cells = np.ceil(np.round(extent / (factor * spacing), 6)).astype(int).clip(1)
+    values = torch.empty(0)
+    for level in range(_LEVELS + 1):
+        step = spacing * 2 ** (_LEVELS - level)
+        axes = [torch.from_numpy(box[0][a] + step * np.arange(cells[a] * 2**level + 1)) for a in range(3)]
+        points = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).float()
+        if level == 0:
+            values, near = torch.empty(points.shape[:3]), torch.ones(points.shape[:3], dtype=torch.bool)
+        else:
+            values = F.interpolate(values[None, None], points.shape[:3], mode="trilinear", align_corners=True)[0, 0]
+            near = values.abs() < _BAND * 2 * step
+        wanted = points[near]
+        carved = torch.empty(len(wanted))
+        for start in range(0, len(wanted), _CHUNK):
+            carved[start : start + _CHUNK] = silhouettes.carve(wanted[start : start + _CHUNK], wrong_masks)
+            progress((level + min(start + _CHUNK, len(wanted)) / len(wanted)) / (_LEVELS + 1))
+        values[near] = carved
+    return values.numpy(), np.asarray(box[0], np.float64), spacing
+
+
+def carve_mesh(
+    silhouettes: Silhouettes, box: Float[np.ndarray, "2 3"], resolution: int, wrong_masks: int = 0
+) -> TriangleMesh | None:
+    """Carve the visual hull without small components (see `carve_grid`); None if the hull is empty."""
+    distances, corner, spacing = carve_grid(silhouettes, box, resolution, wrong_masks)
+    remove_strays(distances)
+    return extract_surface(distances, corner, spacing) if (distances < 0).any() else None
+
+
+def remove_strays(distances: Float[np.ndarray, "X Y Z"], keep: int | None = None) -> tuple[int, int]:
+    """Remove small components and fill enclosed voids, in place.
+
+    Silhouettes cannot show voids, and the cones of few views also intersect in empty places.
+
+    Args:
+        distances: signed distances, negative inside.
+        keep: number of largest components to keep; by default all with 2 % of the volume of the largest one.
+
+    Returns:
+        Number of components before and after the removal.
+    """
+    inside = distances < 0
+    voids = binary_fill_holes(inside) & ~inside
+    distances[voids] = -np.abs(distances[voids]) - 1e-6
+    parts, num_parts = label(distances < 0)
+    if num_parts == 0:
+        return 0, 0
+    sizes = np.bincount(parts.ravel())[1:]
+    order = np.argsort(-sizes, kind="stable")
+    num_kept = int((sizes >= _MIN_VOLUME * sizes.max()).sum()) if keep is None else min(keep, num_parts)
+    strays = ~np.isin(parts, [0, *(order[:num_kept] + 1)])
+    distances[strays] = np.abs(distances[strays])
+    return num_parts, num_kept
+
+
+def extract_surface(
+    distances: Float[np.ndarray, "X Y Z"], corner: Float[np.ndarray, "3"], spacing: float | Float[np.ndarray, "3"]
+) -> TriangleMesh:
+    """Extract the zero level as a mesh in world units, which is closed at the border of the grid.
+
+    Raises:
+        NerfroError: no voxel is inside.
+    """
+    if not (distances < 0).any():
+        raise NerfroError("the visual hull is empty: no point is inside all masks; check masks and poses")
+    padded = np.pad(distances, 1, constant_values=0.5 * np.max(spacing))
+    sides = tuple(np.broadcast_to(spacing, 3))
+    vertices, faces, _, _ = marching_cubes(padded, 0.0, spacing=sides, gradient_direction="descent")
+    return merge_vertices(vertices.astype(np.float64) + corner - spacing, faces.astype(np.int64))
+
+
+def reaches_border(distances: Float[np.ndarray, "X Y Z"]) -> bool:
+    """Test whether the body touches a side of the grid."""
+    inside = distances < 0
+    return bool(inside.sum() > inside[1:-1, 1:-1, 1:-1].sum())

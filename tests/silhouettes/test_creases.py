@@ -1,0 +1,77 @@
+"""Bodies with sharp edges come out of their silhouettes with sharp edges."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from nerfro.geometry.mesh import TriangleMesh
+from nerfro.silhouettes.creases import has_creases
+from nerfro.silhouettes.moving_mesh import MovingMesh
+from nerfro.silhouettes.rims import RimFinder
+from nerfro.silhouettes.silhouette_fit import fit_surface
+from tests.silhouettes import cameras_around, hull, photographed_softly, volume
+
+
+def box() -> trimesh.Trimesh:
+    return trimesh.creation.box((1.2, 0.9, 0.7))
+
+
+def tilt(mesh: TriangleMesh, normals: np.ndarray) -> float:
+    """Mean angle of a surface to the nearest of some sides, degrees."""
+    crosses = np.cross(*np.diff(mesh.triangles, axis=1).swapaxes(0, 1))
+    area = np.linalg.norm(crosses, axis=1)
+    cosines = (crosses @ normals.T).max(1) / area.clip(1e-12)
+    return float(np.average(np.degrees(np.arccos(cosines.clip(-1, 1))), weights=area))
+
+
+@pytest.mark.slow
+def test_a_fitted_box_has_flat_sides_and_sharp_edges() -> None:
+    """From 24 views of 80x80 pixels; with edges as marching cubes leave them its sides are off by 9 degrees."""
+    silhouettes = photographed_softly(box(), cameras_around(24, 80))
+    fitted = fit_surface(hull(silhouettes, 32), silhouettes)
+    assert fitted.is_closed
+    assert tilt(fitted, box().face_normals) < 0.8
+    assert volume(fitted) == pytest.approx(box().volume, rel=0.01)
+
+
+@pytest.mark.slow
+def test_the_round_side_of_a_cylinder_stays_round() -> None:
+    body = trimesh.creation.cylinder(0.6, 1.0, sections=120)
+    silhouettes = photographed_softly(body, cameras_around(24, 80))
+    fitted = fit_surface(hull(silhouettes, 32), silhouettes)
+    radii = np.linalg.norm(fitted.vertices[np.abs(fitted.vertices[:, 2]) < 0.4, :2], axis=1)
+    assert radii.mean() == pytest.approx(0.6, abs=0.004)
+    assert radii.std() < 0.004
+    caps = fitted.vertices[np.linalg.norm(fitted.vertices[:, :2], axis=1) < 0.5]
+    assert np.abs(np.abs(caps[:, 2]) - 0.5).mean() < 0.006
+
+
+def test_the_outlines_of_a_sharp_body_are_seen_at_its_edges() -> None:
+    """Where normals that are smooth turn away is within the edge, by a tenth of a pixel here."""
+    made = box().subdivide_to_size(0.05)
+    mesh = TriangleMesh(np.asarray(made.vertices), np.asarray(made.faces))
+    rims = RimFinder(mesh, photographed_softly(box(), cameras_around(12, 80))).find()
+    off = rims.misfit / rims.width
+    assert abs(np.median(off)) < 0.02
+    assert np.median(np.abs(off)) < 0.04
+
+
+def test_only_sharp_bodies_have_creases() -> None:
+    ball, sharp = trimesh.creation.icosphere(3), box().subdivide_to_size(0.1)
+    for made, expected in ((ball, False), (sharp, True)):
+        assert has_creases(MovingMesh(np.asarray(made.faces)).surface(np.asarray(made.vertices))) is expected
+
+
+def test_a_vertex_that_is_off_makes_no_crease() -> None:
+    made = trimesh.creation.icosphere(4)
+    vertices = np.asarray(made.vertices).copy()
+    vertices[1000] *= 1.05  # eleven edges around it are sharp by their triangles alone
+    assert len(MovingMesh(np.asarray(made.faces)).surface(vertices).creases) == 0
+
+
+def test_an_open_mesh_has_no_crease_where_it_ends() -> None:
+    """Its border is no sharp edge, and one triangle alone has no other side."""
+    vertices, faces = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.9]]), np.array([[0, 1, 2], [0, 2, 3]])
+    surface = MovingMesh(faces).surface(vertices)
+    assert surface.creases.tolist() == [[0, 2]]
+    assert surface.beside.shape == (1, 2, 3)

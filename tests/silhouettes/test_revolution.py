@@ -1,0 +1,109 @@
+"""Bodies of revolution from their masks: a glass behind something, and what is none."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from nerfro.cameras import Cameras
+from nerfro.geometry.mesh import TriangleMesh
+from nerfro.silhouettes import surface
+from nerfro.silhouettes.revolution import fit_revolution
+from nerfro.silhouettes.silhouettes import mesh_silhouettes
+from nerfro.silhouettes.surface import make_mesh
+from nerfro.silhouettes.visual_hull import Silhouettes
+
+SIZE, VIEWS, SHIFT = 160, 16, np.array([0.05, -0.03, -0.6])
+TURN = trimesh.transformations.rotation_matrix(0.6, [0.5, -0.8, 0.2])[:3, :3]  # of the axis
+
+
+def _cameras() -> Cameras:
+    """Around the axis, 20 to 50 degrees above the foot."""
+    poses = []
+    for view in range(VIEWS):
+        azimuth, raised = 2 * np.pi * view / VIEWS, np.radians(20 + 30 * (view % 3) / 2)
+        back = np.array([np.cos(raised) * np.cos(azimuth), np.cos(raised) * np.sin(azimuth), np.sin(raised)])
+        right = np.cross([0, 0, 1], back) / np.cos(raised)
+        poses.append(TURN @ np.stack([right, np.cross(back, right), back, 4 * back], 1))
+    ones = torch.ones(VIEWS)
+    to_world = torch.from_numpy(np.stack(poses)).float()
+    return Cameras(to_world, 2 * SIZE * ones, 2 * SIZE * ones, SIZE / 2 * ones, SIZE / 2 * ones, SIZE, SIZE, 0.1, 9.0)
+
+
+def _body(outline: list[list[float]]) -> TriangleMesh:
+    body = trimesh.creation.revolve(np.array(outline), sections=96)
+    return TriangleMesh((body.vertices + SHIFT) @ TURN.T, np.asarray(body.faces))
+
+
+def _glass() -> TriangleMesh:
+    return _body([[0, 0], [0.3, 0], [0.3, 0.15], [0.22, 0.3], [0.45, 1.2], [0, 1.2]])
+
+
+def _masks(mesh: TriangleMesh, cameras: Cameras) -> torch.Tensor:
+    return mesh_silhouettes(mesh, cameras, 1).float()
+
+
+def test_a_glass_is_found_whose_foot_is_hidden_in_some_masks() -> None:
+    cameras, glass = _cameras(), _glass()
+    masks = _masks(glass, cameras)
+    seen = masks.clone()
+    seen[:3, 105:] = 0  # something stands before the foot
+    silhouettes = Silhouettes.of(cameras, seen)
+    hull = make_mesh(silhouettes, None, 48, 3, None, 0.0)
+    found = fit_revolution(hull, silhouettes)
+    inside = mesh_silhouettes(found, cameras, 1)
+    overlap = ((inside & (masks > 0)).sum((1, 2)) / (inside | (masks > 0)).sum((1, 2))).numpy()
+    assert overlap.min() > 0.97
+    # As wide as it is, at the brim and around the foot, and as high.
+    points = found.vertices @ TURN - SHIFT
+    radius = np.linalg.norm(points[:, :2], axis=1)
+    assert points[:, 2].min() == pytest.approx(0, abs=0.03)  # no camera sees a low cone below the foot
+    assert points[:, 2].max() == pytest.approx(1.2, abs=0.04)
+    assert radius[np.abs(points[:, 2] - 0.7) < 0.03].max() == pytest.approx(0.322, abs=0.015)
+    assert radius.max() == pytest.approx(0.45, abs=0.02)
+
+
+def test_faces_look_outwards_and_close_the_body() -> None:
+    cameras = _cameras()
+    silhouettes = Silhouettes.of(cameras, _masks(_glass(), cameras))
+    found = fit_revolution(_glass_of_triangles(), silhouettes)
+    body = trimesh.Trimesh(found.vertices, found.faces)
+    assert body.is_watertight
+    assert body.volume > 0
+
+
+def _glass_of_triangles() -> TriangleMesh:
+    """Of triangles of about one size, as hulls have them."""
+    glass = _glass()
+    body = trimesh.Trimesh(glass.vertices, glass.faces).subdivide_to_size(0.06)
+    return TriangleMesh(body.vertices, np.asarray(body.faces))
+
+
+def test_a_box_is_no_body_of_revolution(capsys: pytest.CaptureFixture[str]) -> None:
+    cameras = _cameras()
+    box = trimesh.creation.box([0.9, 0.3, 1.2])
+    mesh = TriangleMesh(np.asarray(box.vertices) @ TURN.T, np.asarray(box.faces))
+    silhouettes = Silhouettes.of(cameras, _masks(mesh, cameras))
+    for symmetry, told in (("axis", "symmetry=axis is ignored"), ("auto", "as a body of revolution")):
+        found = make_mesh(silhouettes, None, 32, 0, None, 0.0, symmetry)  # type: ignore[arg-type]
+        assert told in capsys.readouterr().out
+        sides = np.sort(np.ptp(found.vertices @ TURN, axis=0))
+        assert sides == pytest.approx([0.3, 0.9, 1.2], abs=0.15)
+
+
+def test_what_came_off_a_wheel_is_known_by_its_masks(monkeypatch: pytest.MonkeyPatch) -> None:
+    cameras = _cameras()
+    masks = _masks(_glass(), cameras)
+    masks[:3, 105:] = 0  # something stands before the foot
+    silhouettes = Silhouettes.of(cameras, masks)
+
+    def unevenness(symmetry: str | None, smoothing: float = 0.0, is_revolution: bool = False) -> float:
+        """Of the radii of the part that is a cone."""
+        options = 32, 3, None, smoothing, symmetry, None, is_revolution
+        points = make_mesh(silhouettes, None, *options).vertices @ TURN - SHIFT  # type: ignore[arg-type]
+        cone = points[np.abs(points[:, 2] - 0.7) < 0.3]
+        return float((np.linalg.norm(cone[:, :2], axis=1) - np.interp(cone[:, 2], [0.3, 1.2], [0.22, 0.45])).std())
+
+    assert unevenness("auto") < 0.5 * unevenness(None)
+    monkeypatch.setattr(surface, "fit_surface", None)  # is not called for projections of a body of revolution
+    assert unevenness("auto", 1.0, True) == unevenness("auto")

@@ -1,0 +1,83 @@
+"""Which way is up: cameras that people hold, and glasses that stand on tables."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from nerfro.cameras import Cameras
+from nerfro.geometry.mesh import TriangleMesh
+from nerfro.silhouettes.upright import body_axis, camera_up, find_up
+
+TURN = trimesh.transformations.rotation_matrix(1.1, [0.3, -0.9, 0.4])[:3, :3]  # of the world
+UP = TURN[:, 2]
+
+
+def _cameras(roll: float = 0.05, level: bool = True) -> Cameras:
+    """Around the origin, 10 to 50 degrees above it, each rolled by a random angle (radians); or tumbled."""
+    random, poses = np.random.default_rng(0), []
+    for view in range(24):
+        azimuth, raised = 2 * np.pi * view / 24, random.uniform(0.2, 0.9)
+        back = np.array([np.cos(raised) * np.cos(azimuth), np.cos(raised) * np.sin(azimuth), np.sin(raised)])
+        right = np.cross([0, 0, 1], back) / np.cos(raised)
+        angle = random.normal() * roll if level else random.uniform(0, 6)
+        above = np.cross(back, right)
+        right, above = np.cos(angle) * right + np.sin(angle) * above, np.cos(angle) * above - np.sin(angle) * right
+        poses.append(TURN @ np.stack([right, above, back, 4 * back], 1))
+    ones = torch.ones(24)
+    to_world = torch.from_numpy(np.stack(poses)).float()
+    return Cameras(to_world, 50 * ones, 50 * ones, 20 * ones, 20 * ones, 40, 40, 0.1, 9.0)
+
+
+def _glass(tilt: float = 0.0) -> TriangleMesh:
+    """Conical, with a step, tilted by so many degrees, somewhere in the turned world."""
+    outline = [[0, 0], [0.35, 0], [0.35, 0.2], [0.25, 0.3], [0.5, 1.5], [0, 1.5]]
+    body = trimesh.creation.revolve(np.array(outline), sections=64).subdivide_to_size(0.04)
+    turned = trimesh.transformations.rotation_matrix(np.radians(tilt), [1, 0, 0])[:3, :3]
+    return TriangleMesh(body.vertices @ (TURN @ turned).T + [3.0, -2.0, 1.0], np.asarray(body.faces))
+
+
+def _degrees(first: np.ndarray, second: np.ndarray) -> float:
+    return float(np.degrees(np.arccos(np.clip(first @ second, -1, 1))))
+
+
+def test_cameras_that_were_held_level_tell_up() -> None:
+    up = camera_up(_cameras())
+    assert up is not None
+    assert _degrees(up, UP) < 2
+
+
+def test_cameras_that_were_tumbled_or_stood_in_a_line_tell_nothing() -> None:
+    assert camera_up(_cameras(level=False)) is None
+    assert camera_up(_cameras().select([0] * 8)) is None
+
+
+@pytest.mark.parametrize("tilt", [0.0, 6.0])
+def test_the_axis_of_a_glass_is_found_from_a_direction_beside_it(tilt: float) -> None:
+    expected = TURN @ [0, -np.sin(np.radians(tilt)), np.cos(np.radians(tilt))]
+    axis = body_axis(_glass(tilt), UP)
+    assert axis is not None
+    assert _degrees(axis, expected) < 0.2
+
+
+def test_a_bent_body_has_no_axis() -> None:
+    mesh = _glass()
+    height = (mesh.vertices - [3.0, -2.0, 1.0]) @ UP
+    bent = TriangleMesh(mesh.vertices + 0.3 * height[:, None] ** 2 * TURN[:, 0], mesh.faces)
+    assert body_axis(bent, UP) is None
+
+
+def test_the_axis_is_up_where_cameras_agree() -> None:
+    found = find_up(_cameras(roll=0.08), _glass())
+    assert found is not None
+    assert _degrees(found[0], UP) < 0.2
+    leaning = find_up(_cameras(), _glass(tilt=25))
+    assert leaning is not None
+    assert "cameras" in leaning[1]
+    assert _degrees(leaning[0], UP) < 2
+
+
+def test_a_world_that_stands_upright_stays_as_it_is() -> None:
+    cameras, mesh = _cameras(), _glass()
+    cameras.camera_to_world[:] = torch.from_numpy(TURN.T).float() @ cameras.camera_to_world
+    assert find_up(cameras, TriangleMesh(mesh.vertices @ TURN, mesh.faces)) is None
