@@ -122,7 +122,8 @@ class SceneFile:
         def placed(surface: Any) -> Any:
             if not isinstance(surface, Mapping):
                 return surface
-            return {key: place(value) if key == "file" else placed(value) for key, value in surface.items()}
+            named = {key: place(value) for key, value in surface.items() if key == "file" and isinstance(value, str)}
+            return {key: placed(value) for key, value in surface.items()} | named
 
         bodies = {
             name: replace(body, mesh=place(body.mesh), surface=placed(body.surface))

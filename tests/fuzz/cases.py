@@ -327,7 +327,10 @@ OUTLINES = {"a": [1, 2, 30, 40], "b": [[1, 2], [3, 4], [5, 1]]}
 SCENE = {
     "data": {"type": "blender", "root": ".."},
     "medium": {"resolution": 32, "box_min": [-1.0, -1.0, -1.0]},
-    "bodies": {"glass": {"mesh": "mesh.ply", "ior": 1.5}, "water": {"mesh": "water.ply", "material": "water"}},
+    "bodies": {
+        "glass": {"mesh": "mesh.ply", "ior": 1.5},
+        "water": {"surface": {"name": "distances", "file": "water.npz"}, "material": "water"},
+    },
     "vessel": {"wall": 0.1},
     "surroundings": "near",
     "photograph": [64, 48],
