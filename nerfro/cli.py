@@ -231,7 +231,7 @@ def answer(described: Described, arguments: list[str]) -> None:
     unknown = any(argument.startswith(("--config", "-c", "hydra.searchpath")) for argument in arguments)
     if not unknown:  # other folders of configurations may have other groups
         current = [text for text in arguments if not is_old_name(text)]
-        if {"data", "medium"} & {*described.names[""]}:
+        if {"data", "medium"} & {*described.names.get("", ())}:
             current = [text for text in current if not is_scene_file(text)]
         described.require_known([full_key(text) for text in current])
 
