@@ -41,7 +41,7 @@ _END_BENDING = 10.0  # factor of bending at the ends, where the masks show only 
 _CORNER = 0.002
 # A cone below the foot is cut if its slope exceeds this fraction of the slope that no camera sees as an outline, and if
 # the slope decreases by at least this factor at the edge of the foot.
-_HIDDEN_SLOPE, _EDGE_RATIO = 0.5, 0.6
+_HIDDEN_SLOPE, _EDGE_RATIO = 0.4, 0.6
 # Number of samples along a ray, of samples in each refinement, and width in pixels of the ignored frame.
 _PLACES, _CLOSER, _FRAME = 48, 12, 2
 
