@@ -2,7 +2,7 @@
 
 Pixels inside the silhouette of a clear body show the surroundings in the exit directions of their rays. The surface is
 displaced until the surroundings in the exit directions have the colours of the pixels, with derivatives of the exact
-paths (`samplers.replay`). Three measures make the descent converge:
+paths (`samplers.paths.replay`). Three measures make the descent converge:
 
 - The surroundings are blurred first, because the gradient of a photograph is informative only over the width of its
   details.

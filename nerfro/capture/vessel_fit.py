@@ -30,6 +30,7 @@ _MAX_FILLET = 0.4
 _GLASS, _WATER = COMMON_INDICES["glass"], COMMON_INDICES["water"]
 # Levels of a liquid that are compared with an empty glass, as fractions of the height.
 _LEVELS = (0.3, 0.5, 0.7, 0.9)
+_MAX_LEVEL = 0.999  # fraction of the height; a level of four digits stays below the height
 # Half width of the grid of candidates of each round: a factor for lengths, and a fraction of the height for the level.
 _ROUNDS = ((2.0, 0.1), (1.5, 0.06), (1.5, 0.03))
 _GRID = np.linspace(-1, 1, 5)
@@ -89,6 +90,9 @@ def find_vessel(
     try:
         with bar("vessel") as progress:
             fit = fit_vessel(build, float(np.ptp(across, axis=0).max()), observations, progress)
+        lengths = {name: float(f"{length:.4g}") for name, length in fit.lengths.items()}
+        liquid_ior = _WATER if "level" in lengths else 1.0
+        vessel = build(liquid_ior=liquid_ior, **lengths)
     except NerfroError as error:
         warn(f"no vessel is fitted: {error}")
         return {}, None
@@ -99,9 +103,7 @@ def find_vessel(
     print(f"vessel, {'partly filled' if 'level' in fit.lengths else 'empty'}: {', '.join(values)} world units")
     if fit.unknown:
         warn(f"the photographs do not determine {' and '.join(fit.unknown)}, which keep typical values")
-    lengths = {name: float(f"{length:.4g}") for name, length in fit.lengths.items()}
-    liquid_ior = _WATER if "level" in fit.lengths else 1.0
-    return {"up": up, "ior": _GLASS, "liquid_ior": liquid_ior} | lengths, build(liquid_ior=liquid_ior, **lengths)
+    return {"up": up, "ior": _GLASS, "liquid_ior": liquid_ior} | lengths, vessel
 
 
 def fit_vessel(
@@ -130,17 +132,18 @@ def fit_vessel(
     vessel = filled if best and search.decreases(errors[0], errors[best], _SIGNIFICANT) else empty
     typical |= levels[best] if vessel is filled else {}
     lengths, standard_errors = dict(typical), dict[str, float]()
+    highest = _MAX_LEVEL * empty.height
     for factor, fraction in _ROUNDS:
         for name in typical:
             is_level = name == "level"
             half_width = fraction * empty.height if is_level else np.log(factor)
             middle = lengths[name] if is_level else np.log(lengths[name])
             grid = middle + half_width * _GRID
-            values = grid.clip(max=empty.height) if is_level else np.exp(grid)
+            values = grid.clip(max=highest) if is_level else np.exp(grid)
             sums = np.stack([search.of(vessel.with_lengths(lengths | {name: value})) for value in values.tolist()])
             found = _minimum(grid, mean_errors(sums, search.counts))[0]
             spread = float(_minimum(grid, mean_errors(sums, search.counts, search.samples)).std())
-            lengths[name] = float(min(found, empty.height) if is_level else np.exp(found))
+            lengths[name] = float(min(found, highest) if is_level else np.exp(found))
             standard_errors[name] = spread if is_level else spread * lengths[name]
     unknown = [name for name in typical if standard_errors[name] > _MAX_STANDARD_ERROR * lengths[name]]
     progress(1.0)

@@ -1,8 +1,10 @@
 """Numbers that compiled kernels share with their reference implementations."""
 
-# Squared fraction of |v| below which the component of v along a kick is not corrected (samplers.integrators.leapfrog).
+# Squared fraction of |v| below which the component of v along a kick is not corrected
+# (samplers.paths.integrators.leapfrog).
 MIN_NORMAL_PART = 0.01
-# Largest relative difference of |v|^2 and n^2 after a step that resolves the index (samplers.integrators.leapfrog).
+# Largest relative difference of |v|^2 and n^2 after a step that resolves the index
+# (samplers.paths.integrators.leapfrog).
 RESOLVED = 1e-4
 
 # Number of steps of a ray that crosses the shell of a solid along the normal.

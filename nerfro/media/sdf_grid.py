@@ -116,9 +116,14 @@ class SdfGrid(Solid):
         bounds = np.stack([surface.bounds for surface in surfaces], 1) - self.origin
         self._content_box = torch.from_numpy(np.stack([bounds[0].min(0), bounds[1].max(0)])).float()
         grids = []
-        for surface, box in zip(surfaces, boxes, strict=True):
+        for body, surface, box in zip(members, surfaces, boxes, strict=True):
             relative = torch.from_numpy(box - self.origin).float()  # rounded before the distances are computed
             distances = surface.distances(Grid(relative.double().numpy() + self.origin, resolution, cache=cache))
+            if not (distances < 0).any():
+                raise NerfroError(
+                    f"no vertex of the grid lies inside the body {body.name}; make it thicker than a voxel, or raise "
+                    "medium.resolution"
+                )
             grids.append(DistanceGrid(torch.from_numpy(distances).float(), relative))
         self._set_grids(grids)
 

@@ -56,17 +56,19 @@ class Surface(ABC):
 
     Attributes:
         bounds: lower and upper corner of a box around the surface, world units.
+        known: lower and upper corner of the box in which the distances are exact; None for all of space.
         mesh: triangles of the surface, which `sampler.path.interface=mesh` intersects; None if there are none.
     """
 
     bounds: Float[np.ndarray, "2 3"]
+    known: Float[np.ndarray, "2 3"] | None = None
     mesh: TriangleMesh | None = None
 
     @abstractmethod
     def distances(self, grid: Grid) -> Float[np.ndarray, "X Y Z"]:
         """Return the signed distance to the surface at the vertices of a grid, negative inside, world units.
 
-        Farther from the surface than `grid.band` voxels, any value of the same sign is allowed that is closer to zero.
+        Farther from the surface than `grid.band` voxels, the value may be closer to zero, down to this distance.
         """
 
 

@@ -241,7 +241,8 @@ def with_scene(arguments: Sequence[str], names: Collection[str]) -> list[str]:
     scene = read_scene_file(path)
     chosen = {text.partition("=")[0]: text.partition("=")[2] for text in others if text.partition("=")[0] in names}
     settings = scene.settings(chosen.get("medium"))
-    if scene.provenance.doubts and "medium" in names and not is_given("medium.ior", others):
+    is_known = is_given("medium.ior", others) or chosen.get("medium") == "vessel"
+    if scene.provenance.doubts and "medium" in names and not is_known:
         warn(f"{path}: the photographs do not determine the index ({scene.provenance.doubts[0]}); set medium.ior=")
     kept = {name: value for name, value in settings.items() if name.partition(".")[0] in names and name not in chosen}
     # After the flags of Hydra, and before all other overrides.

@@ -284,7 +284,7 @@ def settle_trainer(config: DictConfig) -> None:
     steps = 10 if config.debug else int(fast)
     config.trainer.max_steps, config.trainer.limit_test_batches = steps, 1
     for phase in config.phase.values():
-        if "steps" in phase:
+        if phase and "steps" in phase:
             phase["steps"] = min(phase["steps"], steps)
     config.evaluation.every, config.evaluation.refine_steps = steps, 0
     config.evaluation.subdivision.side = 1

@@ -43,7 +43,7 @@ def write_mitsuba(scene: TrainedScene, out: Path, config: DictConfig) -> str:
     """Write an .xml scene, with meshes and sky beside the file (`MITSUBA_FILES`).
 
     The glass is a `dielectric`, with partial reflection; the parameter `glass` selects another material, such as
-    `transmitting_glass` (see `scenes.glass`) for a model without partial reflection. The content is a light source
+    `transmitting_glass` (see `synthetic.glass`) for a model without partial reflection. The content is a light source
     with the radiance that is seen from outside. The sensors are the test cameras in their order, or the cameras of
     another split if there are no test cameras. `config` is an `ExportConfig`.
 

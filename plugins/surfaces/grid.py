@@ -34,7 +34,7 @@ class GridSurface(Surface):
             raise NerfroError(f"{file}: the distances must be negative inside the body and positive at the border")
         self._grid = DistanceGrid(torch.from_numpy(distances), torch.from_numpy(box))
         spacing = (box[1] - box[0]) / last
-        self.bounds = box[0] + spacing * np.stack([inside.min(0) - 1, inside.max(0) + 1])
+        self.known, self.bounds = box, box[0] + spacing * np.stack([inside.min(0) - 1, inside.max(0) + 1])
 
     def distances(self, grid: Grid) -> Float[np.ndarray, "X Y Z"]:
         return np.stack([self._grid(torch.from_numpy(plane))[0].numpy() for plane in grid.points])

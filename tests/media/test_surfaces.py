@@ -137,6 +137,8 @@ def test_water_inside_a_wall_of_constant_thickness_is_an_offset_surface() -> Non
         ({"name": "grid", "file": "positive.npz"}, "negative inside the body"),
         ({"name": "grid", "file": "empty.npz"}, "is no grid of distances"),
         ("ball", "needs one of mesh and surface"),
+        ({"name": "offset", "surface": {"name": "ball", "radius": 1}, "distance": -1.5}, "lies inside the body body"),
+        ({"name": "offset", "surface": {"name": "grid", "file": "torus.npz"}, "distance": 0.4}, "out of the grid"),
     ],
 )
 def test_wrong_surfaces_are_refused(surface: Any, message: str) -> None:

@@ -323,7 +323,7 @@ def test_a_camera_inside_the_glass_sees_out(tmp_path: FilePath) -> None:
 def test_media_without_a_surface_are_refused() -> None:
     with pytest.raises(NerfroError, match="medium=sdf_grid"):
         Snell()(random_rays(2, 1.0, seed=0, far=9), Luneburg())
-    with pytest.raises(NerfroError, match="interface=mesh needs a medium made of a mesh"):
+    with pytest.raises(NerfroError, match="interface=mesh needs a medium made of meshes"):
         Snell("mesh")(random_rays(2, 1.0, seed=0, far=9), Ball())
     with pytest.raises(NerfroError, match="max_events=0"):
         Snell(max_events=0)

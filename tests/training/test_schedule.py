@@ -5,7 +5,9 @@ from typing import Any
 from unittest.mock import Mock
 
 import pytest
+import torch
 from lightning.pytorch import LightningModule, Trainer
+from torch import nn
 from torch.optim import Adam
 
 from nerfro.data.base import Views
@@ -61,3 +63,16 @@ def test_steps_of_phases_are_those_of_an_undisturbed_run(stop: int) -> None:
     resumed.load_state_dict(steps(schedule(parted), 0, stop))
     assert steps(resumed, stop, 7) == state
     assert parted == whole
+
+
+def test_a_step_of_a_phase_moves_only_its_parameters() -> None:
+    moved, other = nn.Parameter(torch.ones(1)), nn.Parameter(torch.ones(1))
+    optimizer = Adam([moved, other])
+    (moved + other).sum().backward()
+    optimizer.step()  # Lightning keeps the gradients until the next training step
+    before = other.item()
+    Run(Mock(spec=Renderer), Mock(spec=RayBatches), Mock(spec=Views), optimizer, 0.0).descend(
+        moved.square().sum(), [moved]
+    )
+    assert other.item() == before
+    assert moved.item() < before

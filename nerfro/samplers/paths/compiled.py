@@ -28,7 +28,7 @@ _CAPACITY, _ROOM = 18, 8
 
 
 def snell_on_grid(rays: Rays, medium: SdfGrid, max_events: int, branching: Branching) -> SnellTrace:
-    """Evaluate `samplers.snell.trace_interfaces` by the compiled kernel."""
+    """Evaluate `samplers.paths.snell.trace_interfaces` by the compiled kernel."""
     from nerfro.samplers.paths.snell_cpu import Settings, trace_snell
 
     solids = medium.packed()
@@ -74,7 +74,7 @@ def _polylines(rows: Polylines, counts: Int[np.ndarray, "R"], width: int) -> tup
 def eikonal_on_grid(
     rays: Rays, medium: VoxelGrid | SdfGrid, step: float, tolerance: float, max_steps: int
 ) -> tuple[Path, Bool[Tensor, "R"]]:
-    """Evaluate `samplers.eikonal.march_adaptive` by the compiled kernel."""
+    """Evaluate `samplers.paths.eikonal.march_adaptive` by the compiled kernel."""
     from nerfro.kernels.lookup import NO_SOLIDS, NO_VOXELS
     from nerfro.media.sdf_grid import SdfGrid
     from nerfro.samplers.paths.eikonal_cpu import march_adaptive
@@ -93,7 +93,7 @@ def eikonal_on_grid(
 
 
 def uniform_on_grid(rays: Rays, medium: VoxelGrid, num_steps: int) -> Path:
-    """Evaluate `samplers.eikonal.march_uniform` with Euler steps by the compiled kernel."""
+    """Evaluate `samplers.paths.eikonal.march_uniform` with Euler steps by the compiled kernel."""
     from nerfro.samplers.paths.eikonal_cpu import march_uniform
 
     *vertices, refracted = march_uniform(*_ray_arrays(rays), _voxels(medium), num_steps)

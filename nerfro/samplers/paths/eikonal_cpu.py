@@ -1,6 +1,6 @@
 """Compiled integration of the Eikonal equation through voxel grids and bodies with thin shells, one thread per ray.
 
-The algorithms are those of `samplers.eikonal`, for one ray at a time.
+The algorithms are those of `samplers.paths.eikonal`, for one ray at a time.
 """
 
 from __future__ import annotations

@@ -81,7 +81,7 @@ class Snell(PathSampler):
         return self.trace(rays, medium, replace(self.branching, main_only=True)).path
 
     def refine(self, path: Path, rays: Rays, medium: Medium) -> Path:
-        """Return the path with gradients with respect to rays, indices and distance grids; see `samplers.replay`.
+        """Return the path with gradients with respect to rays, indices and distance grids; see `samplers.paths.replay`.
 
         Gradients are unbounded at grazing and critical angles; omit paths whose `smallest_cosine` is below 0.15.
         """
@@ -100,7 +100,7 @@ class Snell(PathSampler):
 
     def _at_wavelengths(self, medium: Solid) -> list[Solid]:
         """Return the medium at each wavelength."""
-        if self.interface == "mesh" and isinstance(medium, SdfGrid):
+        if self.interface == "mesh" and isinstance(medium, SdfGrid) and medium.meshes:
             medium.intersector  # noqa: B018 (created once, before the variants share it)
         return [medium.at_wavelength(wavelength) for wavelength in self.wavelengths]
 
@@ -126,7 +126,10 @@ class Snell(PathSampler):
         branching = branching or self.branching
         if self.interface == "mesh":
             if not isinstance(medium, SdfGrid) or not medium.meshes:
-                raise NerfroError("sampler.path.interface=mesh needs a medium made of a mesh; take medium=sdf_grid")
+                raise NerfroError(
+                    "sampler.path.interface=mesh needs a medium made of meshes; give each body of medium=sdf_grid a "
+                    "mesh, or set sampler.path.interface=sdf"
+                )
             return _trace_triangles(rays, medium, self.max_events, branching)
         if isinstance(medium, SdfGrid) and rays.origins.device.type == "cpu":
             return snell_on_grid(rays, medium, self.max_events, branching)

@@ -1,6 +1,6 @@
 """Compiled refraction and reflection at the zero level of signed-distance solids, one thread per ray.
 
-The algorithm is `samplers.snell.trace_interfaces`, for one ray at a time. A *segment* is the straight part of a
+The algorithm is `samplers.paths.snell.trace_interfaces`, for one ray at a time. A *segment* is the straight part of a
 polyline between two *events*, refractions or reflections at a surface. If light splits, the transmitted part is
 followed first. The reflected part becomes a *pending branch*, which shares the polyline up to the event; pending
 branches are followed later, the last one first.
@@ -23,7 +23,7 @@ _BLOCK = 64  # number of rays for which a thread allocates scratch memory once
 
 
 class Settings(NamedTuple):
-    """Settings of the trace, see `samplers.snell.Snell` and `samplers.branching.Branching`."""
+    """Settings of the trace, see `samplers.paths.snell.Snell` and `samplers.paths.branching.Branching`."""
 
     max_events: int
     num_splits: int  # first events of a polyline at which light may split
@@ -337,7 +337,7 @@ def _trace_ray(solids, line, near, far, settings, scratch, rows):
 
 @compiled_parallel
 def trace_snell(origins, directions, near, far, solids, settings, capacity, room):
-    """Trace the polylines of all rays, which may split at their first events (`samplers.branching`).
+    """Trace the polylines of all rays, which may split at their first events (`samplers.paths.branching`).
 
     Args:
         origins, directions, near, far: rays [R, ...].

@@ -116,7 +116,7 @@ def _world_length(length, impact, radius):
 
 @compiled
 def _contracted_segments(path, centre, radius, near, segments):
-    """Fill the segments of `samplers.density_grid.ContractedLength` for one polyline; return its total."""
+    """Fill the segments of `samplers.points.density_grid.ContractedLength` for one polyline; return its total."""
     positions, directions, s = path
     cumulative, start_length, closest, impact = segments
     total, last = 0.0, len(s) - 1

@@ -41,9 +41,15 @@ class Run:
         return [own for name, own in named if own.requires_grad and any(fnmatchcase(name, each) for each in patterns)]
 
     def descend(self, loss: Float[Tensor, ""], parameters: Sequence[nn.Parameter]) -> None:
-        """Take a step of the optimizer with some parameters."""
+        """Take a step of the optimizer with some parameters.
+
+        Args:
+            loss: loss of the step. All processes need the same loss, because gradients are not averaged.
+            parameters: parameters that the step changes.
+        """
         # backward() would wait for gradients of other processes.
         gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
+        self.optimizer.zero_grad()  # the gradients of the last training step are still there
         for parameter, gradient in zip(parameters, gradients, strict=True):
             parameter.grad = gradient
         self.optimizer.step()

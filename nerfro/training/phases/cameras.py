@@ -35,8 +35,8 @@ _NUM_CANDIDATES = 6
 class CameraSteps(Phase):
     """Align the training cameras of `camera=refined` before training, and refine them between training steps.
 
-    The alignment uses background and outlines (`camera.panorama`, `capture.outlines`), if the data contain these. The
-    steps are Gauss-Newton steps of all cameras (`camera.gauss_newton`) with a fixed scene.
+    The alignment uses background and outlines (`camera.panorama`, `silhouettes.outlines`), if the data contain these.
+    The steps are Gauss-Newton steps of all cameras (`camera.gauss_newton`) with a fixed scene.
 
     Args:
         start: training step of the first Gauss-Newton step. Earlier, the scene is too inaccurate.
