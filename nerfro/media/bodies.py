@@ -98,7 +98,7 @@ def origin_of(medium: Any) -> Float[np.ndarray, "3"]:
     surfaces = surfaces_of(medium)
     if not surfaces:
         return np.zeros(3)
-    if surfaces[0].get("name") == "mesh":
+    if surfaces[0].get("name") == "mesh" and "file" in surfaces[0]:
         return origin_of_file(resolve_path(surfaces[0]["file"]))
     return local_origin(make_surface(surfaces[0]).bounds)
 

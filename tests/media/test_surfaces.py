@@ -129,6 +129,7 @@ def test_water_inside_a_wall_of_constant_thickness_is_an_offset_surface() -> Non
         ({"radius": 1.0}, "no surface is called ''; known: .*ball"),
         ({"name": "bal"}, "no surface is called 'bal'; known: .*ball"),
         ({"name": "ball"}, "surface=ball needs radius"),
+        ({"name": "mesh"}, "surface=mesh needs file"),
         ({"name": "ball", "radius": -1.0}, "surface=ball: radius=-1.0 is not allowed"),
         ({"name": "ball", "radius": 1.0, "centre": [0, 0]}, "surface.centre=.* give three numbers"),
         ({"name": "box", "sides": [1, 1, 0.1], "rounding": 0.2}, "at most half of the shortest side"),
@@ -146,3 +147,8 @@ def test_wrong_surfaces_are_refused(surface: Any, message: str) -> None:
     np.savez("empty.npz", box=np.zeros((2, 3)))
     with pytest.raises(NerfroError, match=message):
         _medium(surface)
+
+
+def test_the_origin_of_a_mesh_without_a_file_is_refused() -> None:
+    with pytest.raises(NerfroError, match="surface=mesh needs file"):
+        origin_of({"bodies": {"body": {"surface": {"name": "mesh"}, "ior": 1.5}}})
