@@ -24,7 +24,7 @@ from nerfro.registry import discover
 from nerfro.synthetic import path_tracer
 from nerfro.synthetic.scene import Scene
 from nerfro.synthetic.synthesis import SynthesizeConfig, synthesize
-from tests.silhouettes import overlaps_of_convex_body
+from tests.exact_silhouettes import overlaps_of_convex_body
 
 discover()
 photographs = import_module("nerfro_plugins.scenes.photographs")

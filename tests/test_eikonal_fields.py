@@ -34,7 +34,7 @@ from nerfro.training.run_folder import load_checkpoint, restore
 from nerfro.types import Radiance, Samples
 from tests.ball_photographs import save
 from tests.closed_forms import Luneburg
-from tests.silhouettes import cameras_around
+from tests.exact_silhouettes import cameras_around
 
 discover()
 IndexField = find("medium", "index_field").cls

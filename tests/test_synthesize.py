@@ -16,7 +16,7 @@ from nerfro.light import to_srgb
 from nerfro.paths import ASSETS_DIR, CONF_DIR
 from nerfro.synthetic.synthesis import SynthesizeConfig, synthesize
 from nerfro.types import Exits
-from tests.silhouettes import overlaps_of_convex_body
+from tests.exact_silhouettes import overlaps_of_convex_body
 
 EMBEDDED = ASSETS_DIR / "torus"
 SPLITS = {"train": 100, "val": 10, "test": 20}

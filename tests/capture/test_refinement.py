@@ -144,7 +144,7 @@ def test_preprocess_writes_the_refined_surface(preprocess: Callable, monkeypatch
     monkeypatch.setattr(refinement, "refine_surface", fast)
     out, printed = preprocess("room=false")
     assert "surface refined" in printed
-    assert f"medium.mesh={out / 'mesh.ply'}" in printed
+    assert f"scene={out / 'scene.json'}" in printed
     assert load_mesh(out / "mesh.ply").vertices.shape == mesh().vertices.shape
     figures = json.loads((out / "refinement.json").read_text())
     assert min(figures["validation_error"]) < 0.6 * figures["validation_error"][0]

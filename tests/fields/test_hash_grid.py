@@ -10,7 +10,7 @@ from nerfro.fields.selection import evaluate_selected, inside_box
 from nerfro.fields.spherical_harmonics import spherical_harmonics
 from nerfro.geometry.contraction import contract, expand
 from nerfro.types import Samples
-from tests.silhouettes import cameras_around
+from tests.exact_silhouettes import cameras_around
 
 
 def make_samples(num_rays: int = 6, num_samples: int = 9, scale: float = 2.0) -> Samples:

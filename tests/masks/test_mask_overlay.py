@@ -15,8 +15,8 @@ from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.paths import resolve_path
 from nerfro.silhouettes.pose_conventions import overlap
 from nerfro.silhouettes.visual_hull import Silhouettes
+from tests.exact_silhouettes import odd_shape
 from tests.sheet_photographs import look_at
-from tests.silhouettes import odd_shape
 
 SIZE = 64
 FOCAL = 80.0

@@ -9,7 +9,7 @@ from nerfro.silhouettes.creases import has_creases
 from nerfro.silhouettes.moving_mesh import MovingMesh
 from nerfro.silhouettes.rims import RimFinder
 from nerfro.silhouettes.silhouette_fit import fit_surface
-from tests.silhouettes import cameras_around, hull, photographed_softly, volume
+from tests.exact_silhouettes import cameras_around, hull, photographed_softly, volume
 
 
 def box() -> trimesh.Trimesh:

@@ -12,7 +12,7 @@ from nerfro.silhouettes.rims import Rims, find_rims, outlines_of
 from nerfro.silhouettes.silhouette_fit import fit_surface
 from nerfro.silhouettes.silhouettes import is_antialiased
 from nerfro.silhouettes.visual_hull import Silhouettes
-from tests.silhouettes import cameras_around, hull, photographed, photographed_softly
+from tests.exact_silhouettes import cameras_around, hull, photographed, photographed_softly
 
 RADIUS, MIDDLE = 0.7, np.array([0.11, 0.07, -0.05])
 

@@ -22,7 +22,7 @@ from nerfro.silhouettes.visual_hull import (
     reaches_border,
     remove_strays,
 )
-from tests.silhouettes import cameras_around, hull, odd_shape, photographed, photographed_softly, volume
+from tests.exact_silhouettes import cameras_around, hull, odd_shape, photographed, photographed_softly, volume
 
 
 @pytest.fixture(scope="module", name="odd_shape")

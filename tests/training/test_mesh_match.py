@@ -12,7 +12,7 @@ from nerfro.data.base import Views
 from nerfro.errors import NerfroError
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.training.mesh_match import require_match
-from tests.silhouettes import cameras_around, photographed
+from tests.exact_silhouettes import cameras_around, photographed
 
 OBJECT = trimesh.util.concatenate(
     [trimesh.creation.icosphere(2, 0.3), trimesh.creation.box((1, 0.2, 0.2)).apply_translation((0.9, 0, 0.1))]
