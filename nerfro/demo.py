@@ -44,12 +44,13 @@ def _run(command: str, *options: str) -> None:
     """Run a command, and show only the address of its page; errors and progress are on standard error."""
     arguments = [*command_of_module(f"nerfro.{command}"), *options]
     with subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True) as process:
-        signal.signal(signal.SIGINT, lambda number, frame: None)  # the command ends in a line of its own
+        before = signal.signal(signal.SIGINT, lambda number, frame: None)  # the command ends in a line of its own
         for line in process.stdout or ():
             address = re.search(r"http://\S+", line)
             if address is not None:
                 print(line, end="", flush=True)
                 open_page(address[0])
+    signal.signal(signal.SIGINT, before)
     if process.returncode != 0:
         sys.exit(process.returncode)
 

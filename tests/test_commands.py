@@ -3,6 +3,7 @@
 import json
 import re
 import shlex
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -146,6 +147,7 @@ def test_demo_opens_the_page_and_ends_with_the_score_in_one_line(
     assert last.startswith("PSNR 31.3 dB on 1 photographs that were not trained on; page: ")
     commands["nerfro.train"] = ["raise SystemExit(3)"]
     assert run_here("demo")[:2] == (3, "")
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_pages_open_in_graphical_browsers_and_are_printed_over_ssh(

@@ -124,16 +124,6 @@ def interrupted_at_second_picture() -> Iterator[None]:
         yield
 
 
-def test_a_training_that_fails_does_not_keep_the_signals(
-    train_here: Callable[..., Any], tiny_run: list[str], tmp_path: Path
-) -> None:
-    """Later stages of `reconstruct` run in the same process, and Ctrl-C has to end them."""
-    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
-    with mock.patch("nerfro.losses.photometric.Photometric.forward", side_effect=NerfroError("no loss")):
-        assert train_here(*tiny_run, f"hydra.run.dir={tmp_path / 'run'}").code == 1
-    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
-
-
 def test_interrupted_evaluation_says_how_to_go_on(
     train_here: Callable[..., Any], evaluate_here: Callable[..., Any], tiny_run: list[str], tmp_path: Path
 ) -> None:

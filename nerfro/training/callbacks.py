@@ -235,9 +235,6 @@ class StopOnSignal(Callback):
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._restore()
 
-    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        self._restore()
-
     def _restore(self) -> None:
         for number, handler in self._previous.items():
             signal.signal(number, handler)
