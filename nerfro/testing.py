@@ -6,6 +6,7 @@ a broken contract. For plugins with required fields, give the values of these fi
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -156,6 +157,7 @@ def _check_camera(camera: Camera) -> None:
 def _check_path_sampler(sampler: PathSampler) -> None:
     rays = example_rays()
     path = sampler(rays, Ball())
+    _require_type(path, Path)
     num_vertices = path.s.shape[1]
     _require(num_vertices >= 2, "a path has two vertices or more")
     _require(path.num_rays == NUM_RAYS and bool((path.ray.diff() >= 0).all()), "every ray has a polyline, in its order")
@@ -182,6 +184,7 @@ def _check_point_sampler(sampler: PointSampler) -> None:
         rendering: Rendering | None = None
         for _ in range(sampler.num_levels):
             samples = sampler(path, rendering, draws)
+            _require_type(samples, Samples)
             _check_samples(samples, path)
             radiance = Radiance(torch.ones_like(samples.s), samples.positions.sigmoid())
             rendering = composite(samples, radiance, torch.zeros(NUM_RAYS, 3), path)
@@ -207,6 +210,7 @@ def _check_samples(samples: Samples, path: Path) -> None:
 def _check_field(field: Field) -> None:
     samples = example_samples()
     radiance = field(samples)
+    _require_type(radiance, Radiance)
     _require(radiance.density.shape == samples.s.shape, "density is [R, N]")
     _require(radiance.rgb.shape == samples.positions.shape, "rgb is [R, N, 3]")
     _require(bool((radiance.density >= 0).all()), "density is not negative")
@@ -230,7 +234,7 @@ def _check_boundary(boundary: Boundary) -> None:
 def _check_loss(loss: Loss) -> None:
     rendering = example_rendering()
     value = loss([rendering, rendering], example_batch(), RefractiveModel(example_components()).scene)
-    _require(value.shape == (), "a loss is a scalar")
+    _require(value.shape == (), f"a loss is a scalar, and forward returned shape {list(value.shape)}")
     _require(bool(value.isfinite()), "a loss is finite")
 
 
@@ -269,7 +273,9 @@ def _check_metric(metric: ImageMetric) -> None:
 
 def _check_phase(phase: Phase) -> None:
     counts = [phase.steps_before(step) for step in range(1000)]
-    _require(counts == sorted(counts), "the number of steps before a training step does not decrease")
+    for step, (earlier, later) in enumerate(itertools.pairwise(counts)):
+        message = f"it returned {earlier} before step {step} and {later} before step {step + 1}"
+        _require(earlier <= later, f"steps_before is cumulative: {message}")
 
 
 def _check_callback(callback: Any) -> None:
@@ -312,6 +318,11 @@ def _unit(directions: torch.Tensor) -> bool:
 def _require_gradients(module: torch.nn.Module) -> None:
     for name, parameter in module.named_parameters():
         _require(parameter.grad is not None and bool(parameter.grad.isfinite().all()), f"{name} gets a finite gradient")
+
+
+def _require_type(result: object, expected: type) -> None:
+    returned = "None" if result is None else type(result).__name__
+    _require(isinstance(result, expected), f"forward returned {returned}, not {expected.__name__}")
 
 
 def _require(condition: bool, contract: str) -> None:

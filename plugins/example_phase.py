@@ -29,13 +29,11 @@ class ExtraSteps(Phase):
         return training_step // self.every
 
     def step(self, run: Run, number: int, state: dict[str, Any]) -> bool:
-        parameters, renderer = run.parameters(self.learn), run.renderer
-        if not parameters:
-            return False
+        renderer = run.renderer
         with torch.no_grad():
             batch = run.batches.share(0, 1).batch(_OTHER_PIXELS + number)  # the same pixels in all processes
         path = renderer.trace(renderer.scene.camera(batch.rays, batch.ray_view), batch.path)
         radiance = batch.per_pixel(renderer.render_path(path, batch.draws)[-1].rgb)
         error = renderer.scene.colour_space.to_srgb(radiance) - batch.rgb
-        run.descend(error.square().mean(), parameters)
+        run.descend(error.square().mean(), run.parameters(self.learn))
         return True

@@ -47,6 +47,7 @@ def guide_plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, restored_regi
 
 def test_plugins_of_the_guide_keep_their_contracts(guide_plugins: list[str]) -> None:
     named = ["sampler/points=square_root", "loss=half_transparent", "boundary=horizon", "metric=worst_pixel"]
+    named += ["sampler/path=mirage", "surface=lens", "phase=mean_colour"]
     for kind, _, name in (text.partition("=") for text in named):
         check(find(kind, name))
     test, check_of_tutorial = guide_plugins
@@ -56,14 +57,15 @@ def test_plugins_of_the_guide_keep_their_contracts(guide_plugins: list[str]) -> 
     namespace["test_square_root_sampler"]()
 
 
-def test_plugins_of_the_guide_train_where_rays_split(
-    guide_plugins: list[str], train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path: Path
+@pytest.mark.parametrize("path", ["sampler.path.branches=all", "sampler/path=mirage"])
+def test_plugins_of_the_guide_train(
+    path: str, guide_plugins: list[str], train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path: Path
 ) -> None:
     loss = ("+loss.half_transparent.weight=0.1", "+loss.half_transparent.power=2")
-    options = ("sampler/points=square_root", *loss, "boundary=horizon")
+    options = ("sampler/points=square_root", *loss, "boundary=horizon", "+phase.mean_colour={}", path)
     finished = train_here(
         *(option for option in tiny_default_run if not option.startswith(("sampler.points", "boundary."))), *options,
-        "sampler.path.branches=all", "trainer.max_steps=2", f"hydra.run.dir={tmp_path}/run",
+        "trainer.max_steps=2", f"hydra.run.dir={tmp_path}/run",
     )  # fmt: skip
     assert finished.code == 0, finished.err
     assert "2 steps in" in finished.out

@@ -23,7 +23,11 @@ from nerfro.media.base import Medium
 from nerfro.media.surface import Surface
 from nerfro.paths import PLUGINS_DIR
 from nerfro.registry import KINDS, discover, find, plugins, register
+from nerfro.samplers.base import PathSampler
 from nerfro.testing import ContractError, check
+from nerfro.training.phases.base import Phase
+from nerfro.viewing import PLUGIN_EXPORTS
+from nerfro.viewing.exports import find_export
 from tests.conftest import Finished
 
 discover()
@@ -147,6 +151,18 @@ def test_metric_without_a_title_is_called_by_its_name(write_plugin: Callable[[st
     assert find("metric", "worst").cls.title == "worst"
 
 
+LOSS = """
+from nerfro.losses.base import Loss
+from nerfro.registry import register
+
+@register("loss", "squares")
+class Squares(Loss):
+    '''Squared opacity.'''
+    def forward(self, renderings, batch, scene):
+        return batch.per_pixel(renderings[-1].opacity).square()
+"""
+
+
 def ones(medium: Medium, positions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     return torch.ones_like(positions[..., 0]), torch.zeros_like(positions)
 
@@ -157,6 +173,13 @@ def ones(medium: Medium, positions: torch.Tensor) -> tuple[torch.Tensor, torch.T
         ("medium", Medium, {"forward": ones}, r"a medium has a buffer `box` \[2, 3\]"),
         ("medium", Medium, {}, "Broken lacks forward"),
         ("surface", Surface, {"distances": None}, "a surface has `bounds`"),
+        ("sampler/path", PathSampler, {"forward": lambda *_: None}, "forward returned None, not Path"),
+        (
+            "phase",
+            Phase,
+            {"steps_before": lambda _, step: step % 5, "step": None},
+            "steps_before is cumulative: it returned 4 before step 4 and 0 before step 5",
+        ),
         ("data", DataSource, {"load": None, "splits": ["train"]}, "has the attribute `root`"),
     ],
 )
@@ -286,6 +309,21 @@ def test_export_of_a_plugin_writes_its_file(
     assert finished.code == 0, finished.err
     centres = np.loadtxt(out, delimiter=",", skiprows=1)
     np.testing.assert_allclose(np.linalg.norm(centres, axis=1), 4, rtol=1e-6)
+
+
+def test_export_without_a_writer_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(PLUGIN_EXPORTS, "broken", __name__)
+    with pytest.raises(NerfroError, match=r"test_plugins\.py of what=broken defines no EXPORT"):
+        find_export("broken", Path("out.csv"))
+
+
+def test_loss_that_is_no_scalar_is_refused(
+    write_plugin: Callable[[str, str], Path], train_template: Callable[..., Finished]
+) -> None:
+    discover(write_plugin("squares", LOSS))
+    finished = train_template(["+loss.squares.weight=1"])
+    assert finished.code == 1
+    assert "loss=squares returned shape [" in finished.err
 
 
 def test_metric_of_a_plugin_is_in_tables_files_log_and_report(

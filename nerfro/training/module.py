@@ -104,6 +104,8 @@ class TrainingModule(LightningModule):
             self.log(f"weight/{name}", weight)
             if weight > 0:
                 value = loss(renderings, batch, self.scene)
+                if value.ndim > 0:
+                    raise NerfroError(f"loss={name} returned shape {list(value.shape)}; a loss is a scalar")
                 self.log(f"loss/{name}", value)
                 total = total + weight * value
         shown = colour_space.to_display(batch.per_pixel(renderings[-1].rgb.detach()))

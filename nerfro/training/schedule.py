@@ -8,6 +8,7 @@ from typing import Any, cast
 from lightning.pytorch import Callback, LightningModule, Trainer
 
 from nerfro.data.base import Views
+from nerfro.errors import NerfroError
 from nerfro.progress import track
 from nerfro.training.callbacks import StopOnSignal
 from nerfro.training.module import TrainingModule, training_progress
@@ -62,7 +63,10 @@ class Schedule(Callback):
 
     def _step(self, name: str, trainer: Trainer) -> None:
         begun = self._begun[name]
-        if self._phases[name].step(self._run(trainer), begun["num_done"], begun["state"]):
+        taken = self._phases[name].step(self._run(trainer), begun["num_done"], begun["state"])
+        if not isinstance(taken, bool):
+            raise NerfroError(f"phase.{name}: step returned {taken!r}; return True, or False to end the phase")
+        if taken:
             begun["num_done"] += 1
         else:
             begun["ended"] = True

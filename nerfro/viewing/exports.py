@@ -71,11 +71,18 @@ def find_export(what: str, out: Path) -> Export:
     names = (*EXPORTS, *PLUGIN_EXPORTS)
     if what not in names:
         raise NerfroError(f"what={what} is not known; choose {', '.join(names)}")
-    export = EXPORTS[what] if what in EXPORTS else importlib.import_module(PLUGIN_EXPORTS[what]).EXPORT
+    export = EXPORTS[what] if what in EXPORTS else _export_of_plugin(what)
     if out.suffix.lower() not in export.suffixes:
         raise NerfroError(f"out={out} has another ending than the exported file; it must end in "
                           f"{' or '.join(export.suffixes)}")  # fmt: skip
     return export
+
+
+def _export_of_plugin(what: str) -> Export:
+    module = importlib.import_module(PLUGIN_EXPORTS[what])
+    if not hasattr(module, "EXPORT"):
+        raise NerfroError(f"the plugin {module.__file__} of what={what} defines no EXPORT, an exports.Export")
+    return module.EXPORT
 
 
 def _write_sky(scene: TrainedScene, out: Path, config: DictConfig) -> str:

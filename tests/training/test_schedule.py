@@ -11,6 +11,7 @@ from torch import nn
 from torch.optim import Adam
 
 from nerfro.data.base import Views
+from nerfro.errors import NerfroError
 from nerfro.rendering import Renderer
 from nerfro.training.callbacks import steps_by_phase
 from nerfro.training.phases.base import Phase, Run
@@ -36,20 +37,33 @@ class Counted(Phase):
         return number < self.end
 
 
+def steps(schedule: Schedule, first: int, last: int) -> dict[str, Any]:
+    """Take some training steps without a model; returns the state of the schedule."""
+    module = Mock(spec=LightningModule, renderer=Mock(spec=Renderer))
+    data = Mock(batches=Mock(spec=RayBatches))
+    trainer = Mock(spec=Trainer, callbacks=[], datamodule=data, lightning_module=module, optimizers=[Mock(spec=Adam)])
+    trainer.configure_mock(global_step=first, max_steps=100)
+    schedule.on_train_start(trainer, module)
+    for trainer.global_step in range(first, last):
+        schedule.on_train_batch_start(trainer, module, None, 0)
+    return copy.deepcopy(schedule.state_dict())
+
+
+def test_step_without_a_result_is_refused() -> None:
+    phase = Mock(spec=Phase, begin=lambda run: {}, steps_before=lambda step: 1, step=lambda run, number, state: None)
+    with pytest.raises(NerfroError, match=r"phase\.mine: step returned None; return True"):
+        steps(Schedule({"mine": phase}, Mock(spec=Views)), 0, 1)
+
+
+def test_step_without_parameters_is_refused() -> None:
+    renderer = Mock(spec=Renderer, parameters_by_name=lambda: {"background.colour": nn.Parameter(torch.zeros(()))})
+    run = Run(renderer, Mock(spec=RayBatches), Mock(spec=Views), Mock(spec=Adam), 0.0)
+    with pytest.raises(NerfroError, match=r"match no learned parameter; choose from background\.colour"):
+        run.descend(torch.zeros(()), run.parameters(["backgroud.*"]))
+
+
 @pytest.mark.parametrize("stop", [0, 2, 3])
 def test_steps_of_phases_are_those_of_an_undisturbed_run(stop: int) -> None:
-    def steps(schedule: Schedule, first: int, last: int) -> dict[str, Any]:
-        module = Mock(spec=LightningModule, renderer=Mock(spec=Renderer))
-        data = Mock(batches=Mock(spec=RayBatches))
-        trainer = Mock(
-            spec=Trainer, callbacks=[], datamodule=data, lightning_module=module, optimizers=[Mock(spec=Adam)]
-        )
-        trainer.configure_mock(global_step=first, max_steps=100)
-        schedule.on_train_start(trainer, module)
-        for trainer.global_step in range(first, last):
-            schedule.on_train_batch_start(trainer, module, None, 0)
-        return copy.deepcopy(schedule.state_dict())
-
     def schedule(record: list[tuple[str, int, int]]) -> Schedule:
         return Schedule({name: Counted(record, name, end) for name, end in (("a", 9), ("b", 1))}, Mock(spec=Views))
 

@@ -53,7 +53,7 @@ class Background(Phase):
     def step(self, run: Run, number: int, state: dict[str, Any]) -> bool:
         scene, box = run.renderer.scene, occupied_box(run.renderer)
         of_background, learned = run.parameters(["background.*"]), run.parameters(self.learn)
-        if box is None or not of_background or not learned:
+        if box is None or not of_background:
             return False
         num_pixels = min(self.num_pixels, int(_SHARE * run.batches.num_pixels))
         rays, view, rgb = run.batches.missing(box, num_pixels, number, scene.camera)

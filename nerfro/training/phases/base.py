@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerfro.data.base import Views
+from nerfro.errors import NerfroError
 from nerfro.rendering import Renderer
 from nerfro.training.ray_batches import RayBatches
 
@@ -46,7 +47,14 @@ class Run:
         Args:
             loss: loss of the step. All processes need the same loss, because gradients are not averaged.
             parameters: parameters that the step changes.
+
+        Raises:
+            NerfroError: there is no parameter.
         """
+        if not parameters:
+            names = ", ".join(name for name, own in self.renderer.parameters_by_name().items() if own.requires_grad)
+            raise NerfroError(f"the patterns of a phase match no learned parameter; choose from {names or 'none'}, "
+                              "with * for any text")  # fmt: skip
         # backward() would wait for gradients of other processes.
         gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
         self.optimizer.zero_grad()  # the gradients of the last training step are still there
@@ -73,7 +81,12 @@ class Phase(ABC):
 
     @abstractmethod
     def steps_before(self, training_step: int) -> int:
-        """Return the number of steps of this phase that precede a training step."""
+        """Return the total number of steps of this phase before a training step.
+
+        Args:
+            training_step: number of the training step, from 0 on. For one step before every tenth training step, return
+                `training_step // 10`.
+        """
 
     @abstractmethod
     def step(self, run: Run, number: int, state: dict[str, Any]) -> bool:
@@ -85,5 +98,5 @@ class Phase(ABC):
             state: result of `begin`.
 
         Returns:
-            Whether a step was taken; otherwise the phase ends.
+            True if a step was taken, False to end the phase.
         """
