@@ -84,7 +84,7 @@ def read_bodies(bodies: Any, mesh: str | None) -> list[Body]:
 
 
 def surfaces_of(medium: Any) -> list[Mapping[str, Any]]:
-    """Return the surface of each body of a medium's configuration, which may have none."""
+    """Return the surface of each body in the configuration of a medium."""
     if not isinstance(medium, Mapping):
         return []
     bodies, mesh = medium.get("bodies"), medium.get("mesh")
@@ -94,7 +94,7 @@ def surfaces_of(medium: Any) -> list[Mapping[str, Any]]:
 
 
 def origin_of(medium: Any) -> Float[np.ndarray, "3"]:
-    """Return the origin of the positions in a medium, given its configuration; see `Medium.origin`."""
+    """Return the origin of positions, from the configuration of a medium; see `Medium.origin`."""
     surfaces = surfaces_of(medium)
     if not surfaces:
         return np.zeros(3)
@@ -104,7 +104,7 @@ def origin_of(medium: Any) -> Float[np.ndarray, "3"]:
 
 
 def mesh_surface(file: str) -> dict[str, Any]:
-    """Return the settings of a surface that is a mesh."""
+    """Return the settings of a mesh surface."""
     return {"name": "mesh", "file": str(file)}
 
 

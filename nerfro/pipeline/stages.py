@@ -1,4 +1,4 @@
-"""Stages of `python -m nerfro.reconstruct`: commands whose results are reused until their input files change."""
+"""Stages of `python -m nerfro.reconstruct`: commands with results that are kept until an input file changes."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _SEED = 67280421310721  # of torch in a new process
 
 @dataclass(frozen=True)
 class Stage:
-    """A command of nerfro with its input and output files, which runs in this process.
+    """A command of nerfro in this process, with input and output files.
 
     Attributes:
         command: name of the command, as in `python -m nerfro.COMMAND`.
