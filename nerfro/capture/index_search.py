@@ -23,7 +23,7 @@ from nerfro.capture.surroundings import Observations, Pixels, Room, Surroundings
 from nerfro.errors import NerfroError, warn
 from nerfro.files.atomic import write_atomically
 from nerfro.media.base import Medium
-from nerfro.media.solid import Solid
+from nerfro.media.solid import Solid, body_names
 from nerfro.progress import bar
 from nerfro.rendering.scene_file import Provenance
 from nerfro.samplers.paths.snell import Snell
@@ -331,14 +331,13 @@ def find_medium(
     if not request.searches_index:
         return FoundMedium(build_medium(request, settings | {"mesh": location}))
     config = request.config.medium
-    bodies, inner = config.get("bodies"), config.get("inner_meshes", [])
-    num_bodies = 1 + len(inner) if bodies is None else len(bodies)
-    medium = build_medium(request, settings | {"mesh": location} | index_settings(config, [1.5] * num_bodies))
+    names = [*(config.get("bodies") or body_names(1 + len(config.get("inner_meshes", []))))]
+    medium = build_medium(request, settings | {"mesh": location} | index_settings(config, names, [1.5] * len(names)))
     if not isinstance(medium, Solid):
         raise NerfroError("the index of this type of medium cannot be searched for; set medium.ior=, or medium=object")
     found = _search_index(observations, medium, request.folder)
     searched = medium.with_indices(torch.from_numpy(found.values))
-    return FoundMedium(searched, found, index_settings(config, found.values))
+    return FoundMedium(searched, found, index_settings(config, medium.names, found.values))
 
 
 def _search_index(observations: Observations, medium: Solid, folder: Path) -> Estimate:

@@ -177,14 +177,13 @@ def build_medium(request: Request, settings: dict[str, object]) -> Medium:
     return typing.cast(Medium, build(medium | settings))
 
 
-def index_settings(medium: DictConfig, iors: Iterable[float]) -> dict[str, object]:
-    """Return the settings of the medium for the indices of the bodies, which are in the order of their priorities."""
+def index_settings(medium: DictConfig, names: Iterable[str], iors: Iterable[float]) -> dict[str, object]:
+    """Return the settings of the medium for the indices of its bodies, given the names of the bodies."""
     first, *inner = values = [round(float(ior), 4) for ior in iors]
     bodies = medium.get("bodies")
     if bodies is not None:
         given = typing.cast(dict[str, dict[str, Any]], OmegaConf.to_container(bodies, resolve=True))
-        ordered = sorted(given.items(), key=lambda item: item[1].get("priority", 0))
-        return {"bodies": {name: body | {"ior": ior} for (name, body), ior in zip(ordered, values, strict=True)}}
+        return {"bodies": {name: given[name] | {"ior": ior} for name, ior in zip(names, values, strict=True)}}
     return {"ior": first} | ({"inner_iors": inner} if inner else {})
 
 

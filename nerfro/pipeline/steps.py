@@ -86,7 +86,7 @@ def train(config: DictConfig, overrides: list[str], scene: Path, out: Path) -> N
     """Train with the hypothesis that predicts the validation photographs best."""
     inputs = [scene, scene.with_name(MESH)]
     content = read_scene_file(scene)
-    common, candidates = common_options(config, overrides, scene), hypotheses(content)
+    common, candidates = common_options(config, overrides, scene, content.photograph), hypotheses(content)
     if is_given("experiment", common):
         options = []
     elif config.trial_steps == 0:
