@@ -23,7 +23,7 @@ from pathlib import Path as FilePath
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from nerfro.boundaries.base import Boundary
@@ -141,7 +141,7 @@ def refine_surface(
         NerfroError: no pixel shows known surroundings through the object.
     """
     descent = _Descent(mesh, medium, silhouettes, through, surroundings, learn_index, settings)
-    error = descent.validation_error(medium)
+    error = descent.initial_error
     smoothed = descent.smooth_start(error)
     steps, errors, best = [0, 0], [error, smoothed], descent.values()
     done, total = 0, sum(stage.steps for stage in settings.stages)
@@ -263,7 +263,10 @@ class _Descent:
         self.learned = [*self.offsets.levels, self.iors]
         self.training, validation = through.split()
         self.validation = validation.some(_MAX_VALIDATION_PIXELS)
-        self.initial_errors: Tensor | None = None
+        errors, known = self._validation_errors(medium)
+        if not known.any():
+            raise NerfroError("no pixel shows known surroundings through the object; remove refine=true")
+        self.validation, self.initial_errors = self.validation[known], errors[known]
         rims, cameras = RimFinder(mesh, silhouettes).find(), silhouettes.cameras
         self.rims = torch.from_numpy(rims.points).float()
         middle = torch.from_numpy(mesh.bounds.mean(0)).float()
@@ -339,23 +342,27 @@ class _Descent:
                 best, error = candidate, new
         return best, error
 
-    @torch.no_grad()
+    @property
+    def initial_error(self) -> float:
+        """Mean robust error of the validation pixels for the given surface."""
+        return float(self.initial_errors.mean())
+
     def validation_error(self, medium: SdfGrid) -> float:
-        """Compute the mean robust error of the validation pixels with known surroundings for the given surface.
+        """Compute the mean robust error of the validation pixels.
 
         Pixels with unknown surroundings for the new surface keep their initial error, so that visibility of known
         surroundings changes nothing.
         """
+        errors, known = self._validation_errors(medium)
+        return float(torch.where(known, errors, self.initial_errors).mean())
+
+    @torch.no_grad()
+    def _validation_errors(self, medium: SdfGrid) -> tuple[Float[Tensor, "P"], Bool[Tensor, "P"]]:
+        """Compute the robust errors of the validation pixels, and whether their surroundings are known."""
         trace = self.sampler.trace(self.validation.rays, medium)
         radiance, known = self.surroundings.radiance(trace.path.exits())
-        known &= ~trace.exceeded & trace.path.refracted
         errors = robust(radiance - self.validation.radiance, _HALF_WEIGHT)
-        if self.initial_errors is None:
-            if not known.any():
-                raise NerfroError("no pixel shows known surroundings through the object; remove refine=true")
-            self.validation, errors = self.validation[known], errors[known]
-            self.initial_errors, known = errors, known[known]
-        return float(torch.where(known, errors, self.initial_errors).mean())
+        return errors, known & ~trace.exceeded & trace.path.refracted
 
     @torch.no_grad()
     def _traced(self, pixels: Pixels, medium: SdfGrid) -> tuple[Path, Tensor]:

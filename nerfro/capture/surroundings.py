@@ -32,7 +32,7 @@ from nerfro.silhouettes.silhouettes import VALIDATION_EVERY, PixelBlocks, mesh_s
 from nerfro.subdivision import pixel_rays
 from nerfro.types import Exits
 
-# Photographs are downscaled to at most so many pixels per side.
+# Photographs are downscaled to at most so many pixels per side, in linear radiance.
 _MAX_PIXELS = 200
 # Number of steps and pixels per step for distant and near surroundings, and first and last learning rate.
 _SKY_STEPS, _SKY_PIXELS = 300, 16384
@@ -101,7 +101,7 @@ def half_weight(surroundings: Surroundings) -> float:
     return max(_HALF_WEIGHT * float(surroundings.colours.std(0).mean()), 1e-3)
 
 
-def divide_pixels(views: Views, mesh: TriangleMesh, max_pixels: int = _MAX_PIXELS) -> tuple[Pixels, Pixels]:
+def divide_pixels(views: Views, mesh: TriangleMesh) -> tuple[Pixels, Pixels]:
     """Select the pixels beside the object and the pixels inside its silhouette.
 
     Silhouettes are the masks, or projections of the mesh if there are no masks. Pixels on and next to the outline
@@ -110,7 +110,6 @@ def divide_pixels(views: Views, mesh: TriangleMesh, max_pixels: int = _MAX_PIXEL
     Args:
         views: photographs with poses.
         mesh: surface of the object.
-        max_pixels: photographs are downscaled to at most so many pixels per side, in linear radiance.
 
     Returns:
         Pixels beside the object, and pixels inside.
@@ -118,7 +117,7 @@ def divide_pixels(views: Views, mesh: TriangleMesh, max_pixels: int = _MAX_PIXEL
     Raises:
         NerfroError: one of the selections is empty.
     """
-    blocks = PixelBlocks(views.cameras, max_pixels)
+    blocks = PixelBlocks(views.cameras, _MAX_PIXELS)
     cameras = blocks.cameras(views.cameras)
     silhouettes = None if views.masks is not None else mesh_silhouettes(mesh, cameras, 1).float()
     parts: list[list[tuple[Tensor, Tensor]]] = [[], []]

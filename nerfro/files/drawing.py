@@ -20,37 +20,29 @@ LINE_HEIGHT = 22  # pixels
 PAPER, INK, EMPTY = (255, 255, 255), (25, 25, 25), (225, 225, 225)  # EMPTY: grey of missing values
 
 
-def paper(width: int, height: int) -> Image.Image:
-    """Make a white image."""
-    return Image.new("RGB", (width, height), PAPER)
-
-
-def fit(image: Float[Tensor, "h w 3"] | None, width: int, height: int) -> Image.Image:
-    """Resize an image by repeating or averaging pixels; a missing image becomes a grey cell."""
-    if image is None:
-        cell = Image.new("RGB", (width, height), EMPTY)
-        write(cell, "n/a", width // 2, height // 2)
-        return cell
-    pixels = Image.fromarray(to_8bit(image).cpu().numpy())
-    return pixels.resize((width, height), Image.Resampling.NEAREST if width >= pixels.width else Image.Resampling.BOX)
-
-
 def sheet(
     images: Sequence[Float[Tensor, "_ _ 3"]], captions: Sequence[str], width: int, columns: int, title: str = ""
 ) -> Image.Image:
     """Draw sRGB images `width` pixels wide in rows of at most `columns`, with captions below and a title on top."""
     columns, height = min(columns, len(images)), round(width * images[0].shape[0] / images[0].shape[1])
     pitch, start = height + LINE_HEIGHT + GAP, LINE_HEIGHT if title else 0
-    whole = paper(columns * (width + GAP) - GAP, start + -(-len(images) // columns) * pitch - GAP)
-    write(whole, title, whole.width // 2, LINE_HEIGHT // 2)
+    num_rows = -(-len(images) // columns)
+    whole = Image.new("RGB", (columns * (width + GAP) - GAP, start + num_rows * pitch - GAP), PAPER)
+    _write(whole, title, whole.width // 2, LINE_HEIGHT // 2)
     for number, (image, caption) in enumerate(zip(images, captions, strict=True)):
         left, top = number % columns * (width + GAP), start + number // columns * pitch
-        whole.paste(fit(image, width, height), (left, top))
-        write(whole, caption, left + width // 2, top + height + LINE_HEIGHT // 2)
+        whole.paste(_resized(image, width, height), (left, top))
+        _write(whole, caption, left + width // 2, top + height + LINE_HEIGHT // 2)
     return whole
 
 
-def write(image: Image.Image, text: str, x: int, y: int) -> None:
+def _resized(image: Float[Tensor, "h w 3"], width: int, height: int) -> Image.Image:
+    """Resize an image by repeating or averaging pixels."""
+    pixels = Image.fromarray(to_8bit(image).cpu().numpy())
+    return pixels.resize((width, height), Image.Resampling.NEAREST if width >= pixels.width else Image.Resampling.BOX)
+
+
+def _write(image: Image.Image, text: str, x: int, y: int) -> None:
     """Write a text around a centre; a text that would leave the image is moved inwards."""
     # Pillow's own font lacks signs such as ≥ and ↑, which the font of matplotlib has.
     font = ImageFont.truetype(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf", TEXT_SIZE)

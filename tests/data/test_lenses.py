@@ -117,16 +117,19 @@ def test_distortion_is_read_in_the_conventions_of_nerfstudio_and_opencv(file: di
     ],
 )
 @pytest.mark.parametrize("place", ["file", "frame"])
-@pytest.mark.parametrize("source", [BlenderData, OpenCVData, NerfstudioData])
-def test_keys_of_other_projections_are_refused_in_every_format_for_files_and_frames(
-    tmp_path: Path, source: Any, place: str, keys: dict, message: str
-) -> None:
-    root = write_transforms(tmp_path, {"camera_angle_x": ANGLE})
-    node = lambda d: d if place == "file" else d["frames"][2]  # noqa: E731
-    change_json(root / "transforms_train.json", lambda document: node(document).update(keys))
-    with pytest.raises(NerfroError, match=rf"'train/r_.': .*{message}") as caught:
-        source(str(root), near=0.5, far=9.0).load("train")
+def test_keys_of_other_projections_are_refused(place: str, keys: dict, message: str) -> None:
+    file, frame = (WIDE | keys, {}) if place == "file" else (WIDE, keys)
+    with pytest.raises(NerfroError, match=rf"^it: .*{message}") as caught:
+        read_lens(file, frame, SIZE, "it")
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("source", [BlenderData, OpenCVData, NerfstudioData])
+def test_lenses_of_all_frames_are_read_in_every_format(tmp_path: Path, source: Any) -> None:
+    root = write_transforms(tmp_path, {"camera_angle_x": ANGLE})
+    change_json(root / "transforms_train.json", lambda document: document["frames"][2].update(is_fisheye=True))
+    with pytest.raises(NerfroError, match="'train/r_4': is_fisheye=True is not supported"):
+        source(str(root), near=0.5, far=9.0).load("train")
 
 
 def test_blender_files_with_intrinsics_have_their_lens(tmp_path: Path) -> None:

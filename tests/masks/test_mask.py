@@ -217,7 +217,8 @@ def test_a_polygon_covers_the_pixels_whose_centres_it_contains() -> None:
 
 
 def test_mistakes_are_reported_in_one_line(capture: Path, command: Callable[..., str]) -> None:
-    root = f"data.root={capture}"
+    root, two_boxes = f"data.root={capture}", "outlines={p_0:[1,1,9,9],p_5:[1,1,9,9]}"
+    assert "hull_only=true needs masks or outlines of at least 3" in command("mask", root, two_boxes, "hull_only=true")
     assert "no mask to start from" in command("mask", root)
     assert torch.is_grad_enabled()
     assert "q_1 is not an image of the data set; names of the data set look like photos/p_" in command(
@@ -260,14 +261,6 @@ def test_the_hull_is_taken_where_colours_say_something_else(
     overlaps = [overlap(read(root, view), photographs[view][1]) for view in range(1, NUM_VIEWS, 2)]
     assert min(overlaps) > 0.85, overlaps
     assert "7 masks are projections of the body of revolution" in printed
-
-
-def test_a_hull_alone_takes_three_masks(capture: Path, photographs: list, command: Callable[..., str]) -> None:
-    for view in (0, 5):
-        Image.fromarray(np.uint8(255 * photographs[view][1])).save(capture / "photos" / f"mask_p_{view}.png")
-    assert "hull_only=true needs masks or outlines of at least 3" in command(
-        "mask", f"data.root={capture}", "hull_only=true"
-    )
 
 
 def circle(mask: np.ndarray) -> list[tuple[float, float]]:

@@ -140,8 +140,8 @@ def test_fit_is_smooth_though_marching_cubes_triangles_are_not_alike() -> None:
 
 
 def test_fit_is_the_same_in_any_unit_of_length() -> None:
-    silhouettes = photographed(trimesh.creation.box((1.2, 0.9, 0.7)), cameras_around(12, 48))
-    carved = hull(silhouettes, 24)
+    silhouettes = photographed(trimesh.creation.box((1.2, 0.9, 0.7)), cameras_around(12, 32))
+    carved = hull(silhouettes, 16)
     poses = silhouettes.cameras.camera_to_world * torch.tensor([1.0, 1, 1, 8])
     larger = replace(silhouettes, cameras=replace(silhouettes.cameras, camera_to_world=poses))
     scaled = fit_surface(TriangleMesh(8 * carved.vertices, carved.faces), larger)

@@ -57,8 +57,7 @@ class Photographs(DataSource):
         return Views(cameras, torch.zeros(len(places), size, size, 3), None, [f"r_{i}" for i in range(len(places))])
 
 
-@pytest.fixture
-def scene() -> TrainedScene:
+def make_scene() -> TrainedScene:
     sky = EnvironmentMap([64])
     sky.set_lat_long(sky_of(lat_long.directions(128)))
     parts = Components(
@@ -69,6 +68,11 @@ def scene() -> TrainedScene:
         boundary=sky,
     )
     return TrainedScene(RefractiveModel(parts).eval(), Photographs())
+
+
+@pytest.fixture
+def scene() -> TrainedScene:
+    return make_scene()
 
 
 @pytest.fixture

@@ -12,6 +12,7 @@ from nerfro.files import lat_long
 from nerfro.viewing.page import make_page
 from nerfro.viewing.trained_scene import TrainedScene
 from tests.viewing.browser import Browser, needs_chromium
+from tests.viewing.conftest import make_scene
 from tests.viewing.test_page import SHOT, one_ray, picture
 
 pytestmark = needs_chromium
@@ -19,9 +20,14 @@ VIEW = "({ azimuth: page.orbit.azimuth, elevation: page.orbit.elevation, radius:
        "target: page.orbit.target, camera: page.camera, rays: page.rays })"  # fmt: skip
 
 
+@pytest.fixture(scope="module")
+def page() -> str:
+    return make_page(make_scene(), 24)
+
+
 @pytest.fixture
-def browser(scene: TrainedScene, tmp_path: Path) -> Iterator[Browser]:
-    with Browser(make_page(scene, 24), tmp_path, size=(800, 400)) as browser:
+def browser(page: str, tmp_path: Path) -> Iterator[Browser]:
+    with Browser(page, tmp_path, size=(800, 400)) as browser:
         yield browser
 
 
