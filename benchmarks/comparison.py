@@ -16,13 +16,15 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
 from PIL import Image
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
-from nerfro.evaluation.crops import most_different_crop
 from nerfro.evaluation.error_maps import SQUARED_ERROR_LIMIT, squared_error_map
 from nerfro.evaluation.results import RunMetrics, read_metrics_json
 from nerfro.evaluation.tables import Column, Row, Table, to_markdown
@@ -40,6 +42,7 @@ METHODS = {
 }
 SHOWN = ("mipnerf", "refractive", "ablation_noH", "ablation_noBD")
 VIEWS = (1, 3)
+SQUARE = 32  # side of the enlarged square in pixels
 ROOT = Path(__file__).resolve().parent.parent
 
 
@@ -105,7 +108,7 @@ def table(metrics: dict[str, RunMetrics]) -> Table:
     ]
     reasons = [(metric, run.result.notes.get(name)) for name, metric in shown.items() for run in metrics.values()]
     notes = dict.fromkeys(f"{metric.title} n/a: {reason}" for metric, reason in reasons if reason is not None)
-    return Table("Embedded torus, 20 test views", "method", columns, tuple(rows), mark="best", notes=tuple(notes))
+    return Table("Embedded torus, 20 test views", "method", columns, tuple(rows), medals=True, notes=tuple(notes))
 
 
 def grid(runs: Path, metrics: dict[str, RunMetrics]) -> Image.Image:
@@ -114,14 +117,22 @@ def grid(runs: Path, metrics: dict[str, RunMetrics]) -> Image.Image:
     for view in VIEWS:
         reference = load_png(ASSETS_DIR / "torus" / "test" / f"r_{view:03d}.png")
         predictions = [load_png(runs / name / "images" / f"test_{view:03d}.png") for name in SHOWN]
-        crop = most_different_crop(reference, predictions, 32)
-        errors = [magma(squared_error_map(prediction, reference), SQUARED_ERROR_LIMIT) for prediction in predictions]
-        images += [reference, *predictions, *(crop.of(image) for image in (reference, *predictions))]
-        images += [torch.ones_like(reference), *errors]
+        errors = [squared_error_map(prediction, reference) for prediction in predictions]
+        top, left = most_different_square(errors)
+        square = slice(top, top + SQUARE), slice(left, left + SQUARE)
+        images += [reference, *predictions, *(image[square] for image in (reference, *predictions))]
+        images += [torch.ones_like(reference), *(magma(error, SQUARED_ERROR_LIMIT) for error in errors)]
         scores = [f"{metrics[name].result.views[view].scores['psnr']:.2f} dB" for name in SHOWN]
         captions += ["reference", *(METHODS[name] for name in SHOWN), "crop", *scores]
         captions += ["", *(f"squared error, 0 to {SQUARED_ERROR_LIMIT}" for _ in SHOWN)]
     return sheet(images, captions, 256, 1 + len(SHOWN))
+
+
+def most_different_square(errors: Sequence[Float[Tensor, "H W"]]) -> tuple[int, int]:
+    """Return the upper left corner of the square in which the squared errors of the methods vary most."""
+    variance = torch.stack(list(errors)).var(0, correction=0).double()
+    means = avg_pool2d(variance[None, None], SQUARE, stride=1)[0, 0]
+    return divmod(int(means.argmax()), means.shape[1])
 
 
 if __name__ == "__main__":

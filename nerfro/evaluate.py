@@ -15,7 +15,7 @@ import nerfro.startup  # noqa: F401 - before the other imports, which take secon
 from nerfro.cli import entry_point
 from nerfro.evaluation.error_maps import write_error_sheet
 from nerfro.evaluation.folders import match_folders
-from nerfro.evaluation.lpips import find_lpips_networks
+from nerfro.evaluation.lpips import find_lpips_network
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.request import EvaluateConfig, find_device, own_folder, record, require_one_task
 from nerfro.evaluation.results import RunMetrics
@@ -54,15 +54,15 @@ def _evaluate_checkpoint(config: DictConfig) -> None:
     with own_folder(config, path.parent.parent / f"evaluate_{config.split}") as folder:
         scene = scene_of(checkpoint, trained, device)
         views = scene.views(config.split).checked()
-        networks, reasons = find_lpips_networks()
-        metrics = ImageMetrics(networks, reasons, config.protocol == "8bit", prefix=config.split)
+        lpips = find_lpips_network()
+        metrics = ImageMetrics(lpips)
         record(folder, config)
         result, treated = score_split(
-            scene.renderer, views, metrics, folder, scene.subdivision, trained.evaluation.refine_steps
+            scene.renderer, views, metrics, folder, scene.subdivision, config.split, trained.evaluation.refine_steps
         )
         for index, view in enumerate(result.views):
             prediction = load_png(folder / "images" / f"{view.name}.png")
-            write_error_sheet(folder, view.name, prediction, views.images[index], networks)
+            write_error_sheet(folder, view.name, prediction, views.images[index], lpips)
         spent = Throughput()
         if "Throughput" in checkpoint["callbacks"]:  # absent if another Trainer has trained the module
             spent.load_state_dict(checkpoint["callbacks"]["Throughput"])
@@ -81,10 +81,10 @@ def _evaluate_folder(config: DictConfig) -> None:
         pair.load(config.alpha)
     device = find_device(config.device)
     with own_folder(config, predictions / "scores") as folder:
-        networks, reasons = find_lpips_networks()
-        metrics = ImageMetrics(networks, reasons, config.protocol == "8bit")
+        lpips = find_lpips_network()
+        metrics = ImageMetrics(lpips)
         record(folder, config)
-        result = score_folders(pairs, config.alpha, metrics, networks, folder, device)
+        result = score_folders(pairs, config.alpha, metrics, lpips, folder, device)
         report(RunMetrics(result), f"{predictions} against {references}", folder)
     print(f"images and tables: {folder}")
 

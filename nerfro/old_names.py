@@ -41,7 +41,8 @@ RENAMED: dict[str, str | None] = {
     "optimizer.surface_start": None,
     "search": None,
     "labels": None,  # of render
-    "lpips_backbone": None,  # of evaluate
+    "protocol": None,  # of evaluate
+    "lpips_backbone": None,
     "lpips_vgg_backbone": None,
     "evaluation.lpips_backbone": None,
     "evaluation.lpips_vgg_backbone": None,

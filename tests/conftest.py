@@ -20,6 +20,7 @@ import trimesh
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from nerfro.evaluation.lpips import NO_NETWORK, MissingNetwork
 from nerfro.synthetic import llvm
 from nerfro.synthetic.path_tracer import load_mitsuba
 
@@ -158,7 +159,7 @@ def train_here(
     """`python -m nerfro.train` in this process, without looking for LPIPS weights."""
     import nerfro.train
 
-    monkeypatch.setattr(nerfro.train, "find_lpips_networks", lambda: ({}, {}))
+    monkeypatch.setattr(nerfro.train, "find_lpips_network", lambda: NO_NETWORK)
     return functools.partial(run_here, "train")
 
 
@@ -169,7 +170,7 @@ def evaluate_here(
     """`python -m nerfro.evaluate` in this process, on the CPU and without looking for LPIPS weights."""
     import nerfro.evaluate
 
-    monkeypatch.setattr(nerfro.evaluate, "find_lpips_networks", lambda: ({}, {"lpips": "no cable"}))
+    monkeypatch.setattr(nerfro.evaluate, "find_lpips_network", lambda: MissingNetwork("no cable"))
     return functools.partial(run_here, "evaluate", "device=cpu")
 
 
@@ -178,7 +179,7 @@ def train_in(folder: Path, *overrides: str) -> Path:
     import nerfro.train
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(nerfro.train, "find_lpips_networks", lambda: ({}, {}))
+        patch.setattr(nerfro.train, "find_lpips_network", lambda: NO_NETWORK)
         patch.setattr(sys, "argv", ["nerfro.train", *overrides, f"hydra.run.dir={folder}"])
         nerfro.train.main()
     return folder

@@ -35,7 +35,7 @@ def test_folder_of_pictures_is_scored_in_every_region(
     code, out, err = evaluate_here(*arguments, f"out={tmp_path / 'out'}")
     assert code == 0, err
     content = json.loads((tmp_path / "out" / "metrics.json").read_text())
-    assert (content["steps"], content["train_seconds"], content["protocol"]) == (None, None, "8bit")
+    assert (content["steps"], content["train_seconds"]) == (None, None)
     assert [view["name"] for view in content["views"]] == ["glass", "pen"]
     for view in content["views"]:
         prediction, reference = pictures[view["name"]]
@@ -46,7 +46,7 @@ def test_folder_of_pictures_is_scored_in_every_region(
         assert view["regions"]["crop"]["psnr"] == pytest.approx(expected, abs=1e-4)
     mean = sum(view["regions"]["crop"]["psnr"] for view in content["views"]) / 2
     assert content["regions"]["crop"]["psnr"] == pytest.approx(mean)
-    assert content["notes"]["crop.lpips"] == "no cable"
+    assert content["notes"]["lpips"] == "no cable"
     for name in ("metrics", "metrics_mask", "metrics_crop"):
         assert f"{content['views'][1]['name']}," in (tmp_path / "out" / f"{name}.csv").read_text()
     assert "pen" in out
@@ -54,21 +54,6 @@ def test_folder_of_pictures_is_scored_in_every_region(
     for name in pictures:
         with Image.open(tmp_path / "out" / "errors" / f"{name}.png") as sheet:
             assert sheet.width > 5 * 256  # prediction, reference, squared error, SSIM, FLIP
-
-
-def test_sixteen_bits_count_in_the_float_protocol_only(tmp_path: Path, evaluate_here: Callable) -> None:
-    for name, level in (("predictions", 0), ("references", 30)):  # 30 / 65535 rounds to 0 / 255
-        (tmp_path / name).mkdir()
-        Image.fromarray(np.full((HEIGHT, WIDTH), level, np.uint16)).save(tmp_path / name / "a.png")
-    folders = [f"predictions={tmp_path / 'references'}", f"references={tmp_path / 'predictions'}"]
-    scores = {}
-    for protocol in ("8bit", "float"):
-        assert evaluate_here(*folders, f"protocol={protocol}", f"out={tmp_path / protocol}")[0] == 0
-        scores[protocol] = json.loads((tmp_path / protocol / "metrics.json").read_text())
-    assert scores["8bit"]["test"]["psnr"] == 100
-    assert scores["float"]["test"]["psnr"] == pytest.approx(-20 * np.log10(30 / 65535), abs=1e-3)
-    assert scores["float"]["protocol"] == "float"
-    assert scores["float"]["regions"] == {}
 
 
 def test_scores_stay_beside_the_predictions_and_are_not_replaced_unasked(
@@ -105,7 +90,6 @@ def test_damaged_picture_is_told_before_anything_is_scored(
         (["checkpoint=a", "alpha=white"], "alpha=white has no effect with checkpoint=...; remove it"),
         (["predictions=a", "references=b", "root=c"], "root=c has no effect with predictions=...; remove it"),
         (["predictions=a", "references=b", "split=val"], "split=val has no effect with predictions=...; remove it"),
-        (["predictions=a", "references=b", "protocol=9bit"], "protocol='9bit' is not allowed; choose '8bit', 'float'"),
         (["predictions=a", "references=b", "alpha=red"], "alpha='red' is not allowed; choose 'drop', 'white', 'black'"),
         (["predictions=/nowhere", "references=b"], "predictions=/nowhere is not a folder"),
     ],

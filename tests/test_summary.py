@@ -1,22 +1,18 @@
-import csv
-import io
 import json
 import os
 import re
 import statistics
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-import rich.console
 import torch
 from omegaconf import OmegaConf
 
 from nerfro.errors import NerfroError
 from nerfro.evaluation.image_metrics import image_metrics
 from nerfro.evaluation.results import EvaluationResult, RunMetrics, ViewScores, write_metrics_json
-from nerfro.evaluation.tables import Column, Row, Table, to_csv, to_html, to_latex, to_markdown, to_rich
+from nerfro.evaluation.tables import Table
 from nerfro.files.images import save_png
 from nerfro.report.comparison import compare, find_metrics, to_table
 from nerfro.report.runs import find_runs
@@ -206,73 +202,6 @@ def test_run_without_scores_has_those_of_its_later_evaluation(tmp_path: Path) ->
         (run / name).rename(run / "evaluate_test" / name)
     (table,) = tables(run)
     assert cell(table, "a", "torus") == (20.0, None)
-
-
-MEDALS = Table(
-    "t",
-    "method",
-    tuple(
-        Column(title, better, decimals, group)
-        for group in ("A & co", "B")
-        for title, better, decimals in (("PSNR", "higher", 2), ("LPIPS", "lower", 3))
-    ),
-    (
-        Row("a", (22.08, 0.1, 1.0, None), (0.5, None, None, None)),
-        Row("b", (22.081, 0.2, 2.0, None)),
-        Row("c", (22.04, 0.3, 3.0, None)),
-        Row("d", (21.83, 0.4, 4.0, 0.5)),
-    ),
-    mark="medals",
-)
-
-
-def test_medals_follow_the_papers_rule() -> None:
-    assert [[MEDALS.mark_of(i, j) or None for i in range(4)] for j in range(4)] == [
-        ["gold", "gold", "silver", "bronze"],
-        ["gold", "silver", "bronze", None],
-        [None, "bronze", "silver", "gold"],
-        [None, None, None, "gold"],
-    ]
-
-
-def test_markdown_and_csv_with_groups_medals_and_spreads() -> None:
-    lines = to_markdown(MEDALS).splitlines()
-    assert lines[2] == "| method | A & co PSNR ↑ | A & co LPIPS ↓ | B PSNR ↑ | B LPIPS ↓ |"
-    assert lines[4] == "| a | 22.08 ± 0.50 🥇 | 0.100 🥇 | 1.00 | n/a |"
-    heading, first, *_ = csv.reader(io.StringIO(to_csv(MEDALS)))
-    assert heading[:5] == ["method", "A & co PSNR", "A & co PSNR std", "A & co LPIPS", "A & co LPIPS std"]
-    assert first[:5] == ["a", "22.08", "0.5", "0.1", "n/a"]
-    assert len(heading) == len(first) == 9
-
-
-def test_latex_with_groups_medals_and_spreads() -> None:
-    latex = to_latex(MEDALS)
-    assert r" & \multicolumn{2}{c}{A \& co} & \multicolumn{2}{c}{B} \\" in latex
-    assert r"\cmidrule(lr){2-3} \cmidrule(lr){4-5}" in latex
-    assert r"a & \cellcolor[HTML]{F7DC8A}22.08 $\pm$ 0.50 & \cellcolor[HTML]{F7DC8A}0.100 & 1.00 & n/a \\" in latex
-    assert latex.count("{") == latex.count("}")
-    assert "±" not in latex
-
-
-def test_html_is_well_formed_and_tells_medals_without_colours() -> None:
-    root = ElementTree.fromstring(f"<div>{to_html(MEDALS)}</div>")
-    assert [(th.text, th.get("colspan")) for th in root.findall(".//th[@scope='colgroup']")] == [
-        ("A & co", "2"),
-        ("B", "2"),
-    ]
-    cells = root.findall(".//tbody/tr")[0].findall("td")
-    assert ["".join(td.itertext()) for td in cells] == ["22.08 ± 0.50 gold", "0.100 gold", "1.00", "n/a"]
-    assert [td.get("class") for td in cells] == ["gold", "gold", None, None]
-
-
-@pytest.mark.parametrize(("width", "blocks"), [(400, 1), (45, 2)])
-def test_console_stacks_groups_that_do_not_fit_side_by_side(width: int, blocks: int) -> None:
-    console = rich.console.Console(file=io.StringIO(), width=width)
-    console.print(to_rich(MEDALS))
-    text = console.file.getvalue()
-    assert text.count("method") == blocks
-    assert all(number in text for number in ("22.08 ± 0.50 🥇", "0.400", "4.00 🥇", "0.500 🥇"))
-    assert "…" not in text
 
 
 @pytest.fixture

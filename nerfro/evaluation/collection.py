@@ -7,8 +7,8 @@ import torchmetrics
 from torch import Tensor
 
 from nerfro.errors import NerfroError
-from nerfro.evaluation.image_metrics import ImageMetric, build_metrics, image_metrics
-from nerfro.evaluation.lpips import find_lpips_networks
+from nerfro.evaluation.image_metrics import ImageMetric, build_metrics
+from nerfro.evaluation.lpips import NO_NETWORK, find_lpips_network
 from nerfro.registry import discover, find
 
 
@@ -27,7 +27,8 @@ def metrics(*names: str) -> torchmetrics.MetricCollection:
     discover()
     for name in names:
         find("metric", name)
-    found = build_metrics(*find_lpips_networks(names or image_metrics()))
+    wants_lpips = not names or "lpips" in names
+    found = build_metrics(find_lpips_network() if wants_lpips else NO_NETWORK)
     for name in names:
         if found[name].missing is not None:
             raise NerfroError(f"metric={name} is not available: {found[name].missing}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.evaluation import flip
-from nerfro.evaluation.lpips import LpipsNetwork
+from nerfro.evaluation.lpips import MIN_SIZE, NO_NETWORK, LpipsNetwork, MissingNetwork
 from nerfro.evaluation.regions import require_images
 from nerfro.evaluation.ssim import WINDOW, ssim_map
 from nerfro.files.drawing import magma, sheet
@@ -47,9 +46,9 @@ class ErrorMap:
 def error_maps(
     prediction: Float[Tensor, "H W 3"],
     target: Float[Tensor, "H W 3"],
-    lpips_networks: Mapping[str, LpipsNetwork] | None = None,
+    lpips: LpipsNetwork | MissingNetwork = NO_NETWORK,
 ) -> list[ErrorMap]:
-    """Compute the error maps of two images: squared error, 1 - SSIM, LPIPS with each given network, and FLIP.
+    """Compute the error maps of two images: squared error, 1 - SSIM, LPIPS if a network is given, and FLIP.
 
     1 - SSIM and LPIPS are omitted for images that are too small. 1 - SSIM has no values in a border of five pixels,
     because windows there would exceed the image.
@@ -57,7 +56,7 @@ def error_maps(
     Args:
         prediction: rendered image, sRGB in [0, 1].
         target: reference image, sRGB in [0, 1].
-        lpips_networks: networks by name, see `find_lpips_networks`.
+        lpips: network of LPIPS, see `find_lpips_network`.
     """
     size = min(prediction.shape[:2])
     maps = [ErrorMap("squared_error", "squared error", squared_error_map(prediction, target), SQUARED_ERROR_LIMIT)]
@@ -65,11 +64,9 @@ def error_maps(
         border = WINDOW // 2
         values = F.pad(1 - ssim_map(prediction, target).mean(-1), [border] * 4, value=torch.nan)
         maps.append(ErrorMap("ssim", "1 - SSIM", values, 1.0))
-    for name, network in (lpips_networks or {}).items():
-        if size >= network.backbone.min_size:
-            title = f"LPIPS, {network.backbone.published.title}"
-            with torch.no_grad():
-                maps.append(ErrorMap(name, title, network.distance_map(prediction, target), 1.0))
+    if not isinstance(lpips, MissingNetwork) and size >= MIN_SIZE:
+        with torch.no_grad():
+            maps.append(ErrorMap("lpips", "LPIPS", lpips.distance_map(prediction, target), 1.0))
     if flip.is_available():
         maps.append(ErrorMap("flip", "FLIP", flip.flip_map(prediction, target), 1.0))
     return maps
@@ -97,13 +94,13 @@ def write_error_sheet(
     name: str,
     prediction: Float[Tensor, "H W 3"],
     reference: Float[Tensor, "H W 3"],
-    networks: Mapping[str, LpipsNetwork],
+    lpips: LpipsNetwork | MissingNetwork,
 ) -> None:
     """Write a prediction, its reference and its error maps in one row to `folder/errors/<name>.png`.
 
     Images are enlarged by a whole factor without smoothing, so that single pixels remain visible.
     """
-    maps = error_maps(prediction, reference, networks)
+    maps = error_maps(prediction, reference, lpips)
     images = [prediction, reference, *(error.colours() for error in maps)]
     captions = ["prediction", "reference", *(f"{error.title}, 0 to {error.limit:g}" for error in maps)]
     width = -(-_MIN_WIDTH // reference.shape[1]) * reference.shape[1]

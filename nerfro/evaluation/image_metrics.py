@@ -5,7 +5,6 @@ from __future__ import annotations
 import inspect
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from typing import ClassVar, Literal
 
 import torch
@@ -16,7 +15,7 @@ from nerfro.errors import NerfroError
 from nerfro.evaluation.error_maps import squared_error_map
 from nerfro.evaluation.flip import flip
 from nerfro.evaluation.flip import is_available as flip_available
-from nerfro.evaluation.lpips import ALEX, VGG, LpipsNetwork
+from nerfro.evaluation.lpips import MIN_SIZE, NO_NETWORK, LpipsNetwork, MissingNetwork
 from nerfro.evaluation.regions import mean_over, require_images
 from nerfro.evaluation.ssim import WINDOW, ssim
 from nerfro.registry import CHECKS, Plugin, create, plugins, register
@@ -24,7 +23,7 @@ from nerfro.registry import CHECKS, Plugin, create, plugins, register
 MAX_PSNR = 100.0  # dB; the infinite PSNR of equal images has no mean and no representation in JSON
 
 # Order in tables; metrics of other packages follow.
-_BUILT_IN = ("psnr", "ssim", "lpips", "lpips_vgg", "flip")
+_BUILT_IN = ("psnr", "ssim", "lpips", "flip")
 
 
 class ImageMetric(nn.Module, ABC):
@@ -94,18 +93,14 @@ def image_metrics() -> dict[str, type[ImageMetric]]:
     return {plugin.name: plugin.cls for plugin in _in_order()}
 
 
-def build_metrics(
-    lpips_networks: Mapping[str, LpipsNetwork] | None = None, reasons: Mapping[str, str] | None = None
-) -> dict[str, ImageMetric]:
+def build_metrics(lpips: LpipsNetwork | MissingNetwork) -> dict[str, ImageMetric]:
     """Build all registered metrics, by name in the order of tables.
 
     Args:
-        lpips_networks: networks by metric, see `find_lpips_networks`.
-        reasons: reason for each missing network, by metric.
+        lpips: network of LPIPS, see `find_lpips_network`.
     """
-    parts = {"lpips_networks": lpips_networks, "reasons": reasons}
     return {
-        plugin.name: create(plugin, {}, **{part: parts[part] for part in plugin.parts & parts.keys()})
+        plugin.name: create(plugin, {}, **({"lpips": lpips} if "lpips" in plugin.parts else {}))
         for plugin in _in_order()
     }
 
@@ -155,45 +150,26 @@ class Ssim(ImageMetric):
     forward = staticmethod(ssim)
 
 
-class _Lpips(ImageMetric):
-    """LPIPS with one of the networks.
+@register("metric", "lpips")
+class Lpips(ImageMetric):
+    """Learned perceptual image patch similarity.
 
     Args:
-        lpips_networks: networks by metric, see `find_lpips_networks`.
-        reasons: reason for each missing network, by metric.
+        lpips: network, see `find_lpips_network`.
     """
 
+    title = "LPIPS"
     better = "lower"
-    name: ClassVar[str]
+    min_size = MIN_SIZE
 
-    def __init__(
-        self, lpips_networks: Mapping[str, LpipsNetwork] | None = None, reasons: Mapping[str, str] | None = None
-    ) -> None:
+    def __init__(self, lpips: LpipsNetwork | MissingNetwork = NO_NETWORK) -> None:
         super().__init__()
-        self.network = (lpips_networks or {}).get(self.name)
-        self.missing = None if self.network else (reasons or {}).get(self.name, "no network was given")
+        self.missing = lpips.reason if isinstance(lpips, MissingNetwork) else None
+        self.network = None if isinstance(lpips, MissingNetwork) else lpips
 
     def forward(self, prediction: Tensor, target: Tensor, inside: Tensor | None = None) -> Tensor:
         assert self.network is not None
         return self.network(prediction, target, inside)
-
-
-@register("metric", "lpips")
-class Lpips(_Lpips):
-    """Learned perceptual image patch similarity with AlexNet."""
-
-    title = "LPIPS"
-    name = "lpips"
-    min_size = ALEX.min_size
-
-
-@register("metric", "lpips_vgg")
-class LpipsVgg(_Lpips):
-    """Learned perceptual image patch similarity with VGG-16."""
-
-    title = "LPIPS-VGG"
-    name = "lpips_vgg"
-    min_size = VGG.min_size
 
 
 @register("metric", "flip")

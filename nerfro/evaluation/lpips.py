@@ -1,7 +1,7 @@
-"""Learned perceptual image patch similarity (LPIPS v0.1) with features of AlexNet or VGG-16.
+"""Learned perceptual image patch similarity (LPIPS v0.1) with features of AlexNet.
 
-The packages torchmetrics and lpips load the networks from torchvision, whose published builds do not work beside a CPU
-build of torch. Therefore this module implements the networks. The linear heads are those of the package lpips (see the
+The packages torchmetrics and lpips load the network from torchvision, whose published builds do not work beside a CPU
+build of torch. Therefore this module implements the network. The linear heads are those of the package lpips (see the
 licence beside the file), and the values agree with both packages.
 
 Source:
@@ -10,7 +10,8 @@ Source:
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -20,15 +21,16 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from nerfro.errors import NerfroError
-from nerfro.evaluation.pretrained import ALEXNET, VGG16, Published, load_weights
+from nerfro.evaluation.pretrained import load_weights
 from nerfro.evaluation.regions import mean_over, require_images
 from nerfro.paths import ASSETS_DIR
 
-_HEADS = ASSETS_DIR / "_lpips/heads.npz"  # arrays alex<l> and vgg<l> of lpips v0.1
+_HEADS = ASSETS_DIR / "_lpips/heads.npz"  # arrays alex<l> of lpips v0.1
+MIN_SIZE = 31  # pixels; in smaller images, the last pooling has an empty input
 
 
 class Convolution(NamedTuple):
-    """One convolution of a backbone, followed by a ReLU."""
+    """One convolution of AlexNet, followed by a ReLU."""
 
     key: str
     channels_in: int
@@ -36,55 +38,20 @@ class Convolution(NamedTuple):
     kernel: int = 3
     stride: int = 1
     padding: int = 1
-    pooling: int = 0  # window of the max pooling of the input, with stride 2; 0 for no pooling
-    compared: bool = True  # whether LPIPS compares the output
+    pooling: bool = False  # whether a max pooling of 3 x 3 pixels with stride 2 precedes the convolution
 
 
-class Backbone(NamedTuple):
-    """A network that computes the features."""
-
-    published: Published  # weights
-    heads: str  # name of the linear heads in the file of lpips
-    min_size: int  # pixels; in smaller images, the last pooling has an empty input
-    layers: tuple[Convolution, ...]  # convolutions in order
-
-
-ALEX = Backbone(
-    ALEXNET,
-    "alex",
-    31,
-    (
-        Convolution("features.0", 3, 64, kernel=11, stride=4, padding=2),
-        Convolution("features.3", 64, 192, kernel=5, padding=2, pooling=3),
-        Convolution("features.6", 192, 384, pooling=3),
-        Convolution("features.8", 384, 256),
-        Convolution("features.10", 256, 256),
-    ),
-)
-VGG = Backbone(
-    VGG16,
-    "vgg",
-    16,
-    (
-        Convolution("features.0", 3, 64, compared=False),
-        Convolution("features.2", 64, 64),
-        Convolution("features.5", 64, 128, pooling=2, compared=False),
-        Convolution("features.7", 128, 128),
-        Convolution("features.10", 128, 256, pooling=2, compared=False),
-        Convolution("features.12", 256, 256, compared=False),
-        Convolution("features.14", 256, 256),
-        Convolution("features.17", 256, 512, pooling=2, compared=False),
-        Convolution("features.19", 512, 512, compared=False),
-        Convolution("features.21", 512, 512),
-        Convolution("features.24", 512, 512, pooling=2, compared=False),
-        Convolution("features.26", 512, 512, compared=False),
-        Convolution("features.28", 512, 512),
-    ),
+CONVOLUTIONS = (
+    Convolution("features.0", 3, 64, kernel=11, stride=4, padding=2),
+    Convolution("features.3", 64, 192, kernel=5, padding=2, pooling=True),
+    Convolution("features.6", 192, 384, pooling=True),
+    Convolution("features.8", 384, 256),
+    Convolution("features.10", 256, 256),
 )
 
 
 class LpipsNetwork(nn.Module):
-    """LPIPS network: a backbone with five feature layers, and a weight for each channel of these.
+    """LPIPS network: AlexNet with five feature layers, and a weight for each channel of these.
 
     d(x, y) = sum_l mean_hw w_l . (f_l(x) - f_l(y))^2, where f_l has unit length over channels (Eqn. 1 of the paper).
 
@@ -94,20 +61,18 @@ class LpipsNetwork(nn.Module):
     shift: Tensor
     scale: Tensor
 
-    def __init__(self, backbone: Backbone, weights: dict[str, Tensor], heads: Sequence[Float[Tensor, "..."]]) -> None:
+    def __init__(self, weights: dict[str, Tensor], heads: Sequence[Float[Tensor, "..."]]) -> None:
         """Create the network.
 
         Args:
-            backbone: architecture.
-            weights: state dict of the backbone.
-            heads: channel weights of each compared layer.
+            weights: state dict of AlexNet.
+            heads: channel weights of each layer.
 
         Raises:
             NerfroError: a weight is missing or has the wrong shape.
         """
         super().__init__()
-        self.backbone = backbone
-        for i, layer in enumerate(backbone.layers):
+        for i, layer in enumerate(CONVOLUTIONS):
             shape = (layer.channels, layer.channels_in, layer.kernel, layer.kernel)
             self._register(f"kernel{i}", weights, f"{layer.key}.weight", shape)
             self._register(f"bias{i}", weights, f"{layer.key}.bias", (layer.channels,))
@@ -153,16 +118,15 @@ class LpipsNetwork(nn.Module):
             found = list(weights[key].shape) if key in weights else "none"
             raise NerfroError(
                 f"LPIPS weights: expected {key} of shape {list(shape)}, found {found}; "
-                f"use the published file of {self.backbone.published.title}"
+                "use the published file of AlexNet"
             )
         self.register_buffer(name, weights[key].detach().float().clone(), persistent=False)
 
     def _layer_distances(self, prediction: Tensor, target: Tensor) -> list[Float[Tensor, "1 1 _ _"]]:
         require_images(prediction, target)
-        size = self.backbone.min_size
-        if min(prediction.shape[:2]) < size:
+        if min(prediction.shape[:2]) < MIN_SIZE:
             raise NerfroError(
-                f"LPIPS needs at least {size} x {size} pixels, got {list(prediction.shape[:2])}; use SSIM"
+                f"LPIPS needs at least {MIN_SIZE} x {MIN_SIZE} pixels, got {list(prediction.shape[:2])}; use SSIM"
             )
         # Mixed precision would compute features in half precision, with errors of 1e-3 in the distance.
         with torch.autocast(prediction.device.type, enabled=False):
@@ -175,14 +139,23 @@ class LpipsNetwork(nn.Module):
     def _features(self, rgb: Float[Tensor, "H W 3"]) -> list[Float[Tensor, "1 _ _ _"]]:
         x = (2 * rgb.float().permute(2, 0, 1)[None] - 1 - self.shift) / self.scale
         features = []
-        for i, layer in enumerate(self.backbone.layers):
+        for i, layer in enumerate(CONVOLUTIONS):
             if layer.pooling:
-                x = F.max_pool2d(x, layer.pooling, stride=2)
+                x = F.max_pool2d(x, 3, stride=2)
             kernel, bias = getattr(self, f"kernel{i}"), getattr(self, f"bias{i}")
             x = F.relu(F.conv2d(x, kernel, bias, layer.stride, layer.padding))
-            if layer.compared:
-                features.append(x)
+            features.append(x)
         return features
+
+
+@dataclass(frozen=True)
+class MissingNetwork:
+    """Takes the place of a network that is not available, for a stated reason."""
+
+    reason: str
+
+
+NO_NETWORK = MissingNetwork("no network was given")
 
 
 def unit_length(features: Float[Tensor, "1 C h w"]) -> Float[Tensor, "1 C h w"]:
@@ -190,32 +163,16 @@ def unit_length(features: Float[Tensor, "1 C h w"]) -> Float[Tensor, "1 C h w"]:
     return features / (features.square().sum(dim=1, keepdim=True).sqrt() + 1e-10)
 
 
-def load_lpips_network(backbone: Backbone, weights: dict[str, Tensor]) -> LpipsNetwork:
-    """Build a network with the weights of its backbone and the published heads, on the CPU."""
+def load_lpips_network(weights: dict[str, Tensor]) -> LpipsNetwork:
+    """Build a network with the weights of AlexNet and the published heads, on the CPU."""
     with np.load(_HEADS, allow_pickle=False) as file:
-        layers = range(sum(layer.compared for layer in backbone.layers))
-        heads = [torch.from_numpy(file[f"{backbone.heads}{i}"]) for i in layers]
-    return LpipsNetwork(backbone, weights, heads)
+        heads = [torch.from_numpy(file[f"alex{i}"]) for i in range(len(CONVOLUTIONS))]
+    return LpipsNetwork(weights, heads)
 
 
-def find_lpips_networks(
-    metrics: Collection[str] = ("lpips", "lpips_vgg"), download: bool = True
-) -> tuple[dict[str, LpipsNetwork], dict[str, str]]:
-    """Load the networks whose weights are available.
-
-    Args:
-        metrics: metrics whose networks are loaded.
-        download: whether missing weights of AlexNet may be downloaded. The 528 MB of VGG-16 are never downloaded.
-
-    Returns:
-        Networks by the name of the metric, `lpips` and `lpips_vgg`, and the reasons for missing networks.
-    """
-    networks, reasons = {}, {}
-    for metric, backbone, fetched in (("lpips", ALEX, download), ("lpips_vgg", VGG, False)):
-        if metric not in metrics:
-            continue
-        try:
-            networks[metric] = load_lpips_network(backbone, load_weights(backbone.published, fetched))
-        except NerfroError as error:
-            reasons[metric] = str(error)
-    return networks, reasons
+def find_lpips_network() -> LpipsNetwork | MissingNetwork:
+    """Load the network, or return the reason why its weights are not available."""
+    try:
+        return load_lpips_network(load_weights())
+    except NerfroError as error:
+        return MissingNetwork(str(error))

@@ -1,4 +1,4 @@
-"""ImageNet weights of AlexNet and VGG-16, from the cache of torch hub or a download."""
+"""ImageNet weights of AlexNet, from the cache of torch hub or a download."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import pickle
 import socket
 import threading
 import urllib.request
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -18,58 +17,40 @@ from nerfro.errors import NerfroError
 
 CONNECT_SECONDS = 5.0
 STALL_SECONDS = 30.0
+# 233 MB. The file name ends in the first digits of the SHA-256 hash, which is verified.
+ALEXNET = "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth"
 
 
-@dataclass(frozen=True)
-class Published:
-    """Published weights of a network.
-
-    Attributes:
-        title: name of the network.
-        url: address at torchvision. The file name ends in the first digits of the SHA-256 hash, which is verified.
-    """
-
-    title: str
-    url: str
-
-
-ALEXNET = Published("AlexNet", "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth")  # 233 MB
-VGG16 = Published("VGG-16", "https://download.pytorch.org/models/vgg16-397923af.pth")  # 528 MB
-
-
-def load_weights(published: Published, download: bool = True) -> dict[str, Tensor]:
+def load_weights(url: str = ALEXNET) -> dict[str, Tensor]:
     """Load a state dict on the CPU, without executing pickled code.
 
+    A missing file is downloaded into the cache, `torch.hub.get_dir()/checkpoints`, which respects TORCH_HOME. If the
+    server does not answer within five seconds, no further attempt is made in this process.
+
     Args:
-        published: the weights.
-        download: whether to download a missing file into the cache, `torch.hub.get_dir()/checkpoints`, which respects
-            TORCH_HOME. If the server does not answer within five seconds,
-            no further attempt is made in this process.
+        url: address of the weights.
 
     Raises:
         NerfroError: the file cannot be read, or the weights are not cached and cannot be downloaded.
     """
-    title, url = published.title, published.url
     cached = Path(torch.hub.get_dir()) / "checkpoints" / url.rsplit("/", 1)[-1]
-    if not cached.is_file():
-        by_hand = f"download {url} to {cached}"
-        if not download:
-            raise NerfroError(f"no weights; {title} is not in the cache of torch: {by_hand}")
-        reason = unreachable(url)
-        if reason:
-            raise NerfroError(
-                f"no weights; {title} is not in the cache of torch, and there is no network ({reason}): {by_hand}"
-            )
-        before = socket.getdefaulttimeout()
-        # torch hub opens the address without a timeout and could wait for ever.
-        socket.setdefaulttimeout(STALL_SECONDS)
-        try:
-            return torch.hub.load_state_dict_from_url(url, map_location="cpu", check_hash=True, weights_only=True)
-        except (OSError, http.client.HTTPException, RuntimeError) as error:  # RuntimeError: torch hub on a wrong hash
-            raise NerfroError(f"the download of {title} weights failed ({error}); {by_hand}") from error
-        finally:
-            socket.setdefaulttimeout(before)
-    return _read(cached, title)
+    if cached.is_file():
+        return _read(cached)
+    by_hand = f"download {url} to {cached}"
+    reason = unreachable(url)
+    if reason:
+        raise NerfroError(
+            f"no weights; AlexNet is not in the cache of torch, and there is no network ({reason}): {by_hand}"
+        )
+    before = socket.getdefaulttimeout()
+    # torch hub opens the address without a timeout and could wait for ever.
+    socket.setdefaulttimeout(STALL_SECONDS)
+    try:
+        return torch.hub.load_state_dict_from_url(url, map_location="cpu", check_hash=True, weights_only=True)
+    except (OSError, http.client.HTTPException, RuntimeError) as error:  # RuntimeError: torch hub on a wrong hash
+        raise NerfroError(f"the download of AlexNet weights failed ({error}); {by_hand}") from error
+    finally:
+        socket.setdefaulttimeout(before)
 
 
 @functools.lru_cache
@@ -95,13 +76,13 @@ def unreachable(url: str, seconds: float = CONNECT_SECONDS) -> str:
     return reasons[-1]
 
 
-def _read(path: Path, title: str) -> dict[str, Tensor]:
+def _read(path: Path) -> dict[str, Tensor]:
     advice = "delete them to fetch them again"
     try:
         weights = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch.load raises almost any exception on a foreign file
         reason = type(error).__name__ if isinstance(error, pickle.UnpicklingError) else str(error).partition("\n")[0]
-        raise NerfroError(f"{title} weights {path} cannot be read ({reason}); {advice}") from error
+        raise NerfroError(f"AlexNet weights {path} cannot be read ({reason}); {advice}") from error
     if not isinstance(weights, dict) or not all(isinstance(value, Tensor) for value in weights.values()):
-        raise NerfroError(f"{title} weights {path} are not a state dict; {advice}")
+        raise NerfroError(f"AlexNet weights {path} are not a state dict; {advice}")
     return weights

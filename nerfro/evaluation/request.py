@@ -45,8 +45,6 @@ class EvaluateConfig:
     alpha: Annotated[str, Literal["drop", "white", "black"]] = "drop"
     # Folder for images and tables; by default beside the folder of checkpoints, or `scores` in `predictions`.
     out: Optional[str] = None
-    # `8bit` rounds predictions to 8 bits, as in PNG files, before scoring; `float` does not.
-    protocol: Annotated[str, Literal["8bit", "float"]] = "8bit"
     device: str = "auto"  # `cpu`, `cuda`, or `auto` for a GPU if available
     overwrite: bool = False  # whether to replace an earlier evaluation in `out`
 

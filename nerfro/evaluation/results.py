@@ -53,14 +53,11 @@ class EvaluationResult:
 
     Attributes:
         views: scores of each view, in order.
-        notes: reason for each missing score. Keys are `<metric>` for the full image, `<region>.<metric>` for a region,
-            and `mask` for views without both object regions.
-        protocol: `8bit` if predictions were rounded to 8 bits before scoring, otherwise `float`.
+        notes: reasons for missing scores by metric, and under `mask` for views without both object regions.
     """
 
     views: tuple[ViewScores, ...]
     notes: Mapping[str, str] = field(default_factory=dict)
-    protocol: Literal["8bit", "float"] = "8bit"
 
     @property
     def regions(self) -> tuple[Region, ...]:
@@ -133,7 +130,6 @@ def write_metrics_json(path: Path | str, metrics: RunMetrics) -> None:
         "train_seconds": metrics.train_seconds,
         "rays_per_second": metrics.rays_per_second,
         "notes": dict(result.notes),
-        "protocol": result.protocol,
     }
     try:
         text = json.dumps(content, indent=2, allow_nan=False)
@@ -153,12 +149,12 @@ def read_metrics_json(path: Path | str) -> RunMetrics:
         raise NerfroError(f"{path} does not exist; run nerfro.evaluate to create it")
     try:
         content = read_json(path, "run nerfro.evaluate on the run again")
-        notes, protocol = content.get("notes", {}), content.get("protocol", "8bit")
-        if protocol not in ("8bit", "float") or not all(isinstance(note, str) for note in notes.values()):
-            raise TypeError("its notes or its protocol are damaged")
-        result = EvaluationResult(_views(content["views"]), notes, protocol)
+        notes = content.get("notes", {})
+        if not all(isinstance(note, str) for note in notes.values()):
+            raise TypeError("its notes are damaged")
+        result = EvaluationResult(_views(content["views"]), notes)
         treatments = {
-            name: EvaluationResult(_views(treated["views"]), notes, protocol)
+            name: EvaluationResult(_views(treated["views"]), notes)
             for name, treated in content.get("treatments", {}).items()
         }
         amounts = {key: content[key] for key in ("steps", "train_seconds", "rays_per_second")}

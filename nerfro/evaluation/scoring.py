@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,10 +15,10 @@ from nerfro.data.base import Views
 from nerfro.data.image_files import Alpha
 from nerfro.evaluation.error_maps import write_error_sheet
 from nerfro.evaluation.folders import ImagePair
-from nerfro.evaluation.lpips import LpipsNetwork
+from nerfro.evaluation.lpips import LpipsNetwork, MissingNetwork
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.render_view import render_view
-from nerfro.evaluation.results import EvaluationResult
+from nerfro.evaluation.results import EvaluationResult, ViewScores
 from nerfro.files.images import save_png
 from nerfro.progress import track
 from nerfro.rendering import Renderer
@@ -45,6 +45,7 @@ def score_views(
     metrics: ImageMetrics,
     folder: Path,
     subdivision: Subdivision,
+    prefix: str,
     images: Sequence[Images],
 ) -> tuple[list[EvaluationResult], Float[Tensor, "V 3"]]:
     """Render all views, write 8-bit sRGB images to `folder/<subfolder>/<prefix>_NNN.png`, and compute their scores.
@@ -54,9 +55,10 @@ def score_views(
     Args:
         renderer: trained model.
         views: views to score.
-        metrics: metrics of each of the images; their scores of other views do not count.
+        metrics: metrics of each of the images.
         folder: folder of the evaluation.
         subdivision: which pixels get several rays.
+        prefix: beginning of the names of the views, which end with a number of three digits.
         images: images that are made of each rendering.
 
     Returns:
@@ -64,36 +66,39 @@ def score_views(
     """
     scene, height, width = renderer.scene, views.cameras.height, views.cameras.width
     cameras, left = views.cameras.to(scene.device), slice(width // 2)
-    scores, gains = [metrics.emptied() for _ in images], torch.ones(len(views), 3)
+    scores: list[list[ViewScores]] = [[] for _ in images]
+    gains = torch.ones(len(views), 3)
     for view in track("evaluate", range(len(views))):
         radiance = render_view(renderer, cameras, view, subdivision).radiance.view(height, width, 3).cpu()
         target, mask = views.images[view], None if views.masks is None else views.masks[view]
+        name = f"{prefix}_{view:03d}"
         for kind, scored in zip(images, scores, strict=True):
             gain = torch.ones(3)
             if kind.right_halves and scene.camera.exposure is not None:
                 to_srgb, shown = scene.colour_space.to_srgb, radiance[:, left].flatten(0, 1)
                 gain = gains[view] = fit_gain(to_srgb, shown, target[:, left].flatten(0, 1))
             rgb = scene.colour_space.to_display(radiance, gain)
-            save_png(folder / kind.subfolder / f"{metrics.prefix}_{view:03d}.png", rgb)
+            save_png(folder / kind.subfolder / f"{name}.png", rgb)
             part = slice(width // 2, None) if kind.right_halves else slice(None)
             coverage = None if mask is None else mask[:, part].contiguous()
-            scored.update(rgb[:, part].contiguous(), target[:, part].contiguous(), view, coverage)
-    return [scored.result() for scored in scores], gains
+            scored.append(metrics.score(name, rgb[:, part].contiguous(), target[:, part].contiguous(), coverage))
+    return [metrics.result(scored) for scored in scores], gains
 
 
 def score_folders(
     pairs: list[ImagePair],
     alpha: Alpha,
     metrics: ImageMetrics,
-    networks: Mapping[str, LpipsNetwork],
+    lpips: LpipsNetwork | MissingNetwork,
     folder: Path,
     device: torch.device,
 ) -> EvaluationResult:
     """Score each prediction on a device, and write error maps to `folder/errors`."""
-    metrics = metrics.to(device)
+    metrics, scores = metrics.to(device), []
     for pair in track("evaluate", pairs):
         prediction, reference, coverage = pair.load(alpha)
         prediction, reference = prediction.to(device), reference.to(device)
-        metrics.update(prediction, reference, coverage=None if coverage is None else coverage.to(device))
-        write_error_sheet(folder, pair.name, prediction, reference, networks)
-    return metrics.result([pair.name for pair in pairs])
+        coverage = None if coverage is None else coverage.to(device)
+        scores.append(metrics.score(pair.name, prediction, reference, coverage))
+        write_error_sheet(folder, pair.name, prediction, reference, lpips)
+    return metrics.result(scores)

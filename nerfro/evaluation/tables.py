@@ -1,11 +1,10 @@
-"""Tables of scores: contents, and output as console text, CSV, Markdown, LaTeX and HTML."""
+"""Tables of scores: contents, and output as console text, CSV, Markdown and LaTeX."""
 
 from __future__ import annotations
 
 import csv
-import html
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
@@ -33,15 +32,15 @@ from nerfro.files.atomic import write_atomically
 MISSING = "n/a"
 MEDALS = ("gold", "silver", "bronze")
 
-# Format of a cell for each mark. The LaTeX colours are pale, so that black numbers stay readable on these.
-_LATEX = {"": "%s", "best": r"\textbf{%s}"}
-_LATEX |= {
-    medal: rf"\cellcolor[HTML]{{{colour}}}%s"
-    for medal, colour in zip(MEDALS, ("F7DC8A", "DADDE2", "EBC3A0"), strict=True)
+# Format of a cell for each medal. The LaTeX colours are pale, so that black numbers stay readable on these.
+_LATEX = {
+    "": "%s",
+    "gold": r"\cellcolor[HTML]{F7DC8A}%s",
+    "silver": r"\cellcolor[HTML]{DADDE2}%s",
+    "bronze": r"\cellcolor[HTML]{EBC3A0}%s",
 }
-_MARKDOWN = {"": "%s", "best": "**%s**", "gold": "%s 🥇", "silver": "%s 🥈", "bronze": "%s 🥉"}
-_HTML = {"": "<td>%s</td>", "best": "<td><strong>%s</strong></td>"}
-_HTML |= {medal: f'<td class="{medal}">%s<span class="unseen"> {medal}</span></td>' for medal in MEDALS}
+_MARKDOWN = {"": "%s", "gold": "%s 🥇", "silver": "%s 🥈", "bronze": "%s 🥉"}
+_CONSOLE = _MARKDOWN | {"": "%s   "}  # aligned with medals, which are two cells wide
 
 
 @dataclass(frozen=True)
@@ -60,6 +59,11 @@ class Column:
     decimals: int = 2
     group: str = ""
 
+    @property
+    def heading(self) -> str:
+        """Title with an arrow that shows whether higher or lower values are better."""
+        return self.title + {"higher": " ↑", "lower": " ↓", None: ""}[self.better]
+
 
 @dataclass(frozen=True)
 class Row:
@@ -69,13 +73,11 @@ class Row:
         label: heading of the row.
         values: one number per column, or None for a missing number.
         spreads: standard deviation of each number, or None; empty if no number has one.
-        block: heading of this row and its neighbours of the same block. Marks compare the rows of a block.
     """
 
     label: str
     values: tuple[Score, ...]
     spreads: tuple[Score, ...] = ()
-    block: str = ""
 
     def spread(self, column: int) -> Score:
         return self.spreads[column] if self.spreads else None
@@ -90,8 +92,8 @@ class Table:
         label_title: heading of the row labels.
         columns: columns of numbers.
         rows: rows of numbers.
-        summary: rows below a rule, such as means. These are neither ranked nor marked.
-        mark: whether to mark nothing, the `best` value of each column, or the best three with `medals`.
+        summary: rows below a rule, such as means, which get no medals.
+        medals: whether to mark the best three values of each column.
         notes: footnotes, such as the reason for a missing number.
     """
 
@@ -100,7 +102,7 @@ class Table:
     columns: tuple[Column, ...]
     rows: tuple[Row, ...]
     summary: tuple[Row, ...] = ()
-    mark: Literal["", "best", "medals"] = ""
+    medals: bool = False
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -111,29 +113,28 @@ class Table:
                         f"table {self.title!r}: {len(numbers)} values of {row.label!r} for {len(self.columns)} columns"
                     )
 
-    def mark_of(self, row: int, column: int) -> str:
-        """Return the mark of a number in `rows`: "best", one of `MEDALS`, or an empty string.
+    def medal_of(self, row: int, column: int) -> str:
+        """Return the medal of a number in `rows`, one of `MEDALS`, or an empty string.
 
         Numbers that are printed alike have the same rank, because readers cannot distinguish them. The number after two
         equal best ones is second, as in the table of the paper.
         """
         better, decimals = self.columns[column].better, self.columns[column].decimals
         value = self.rows[row].values[column]
-        if not self.mark or better is None or value is None:
+        if not self.medals or better is None or value is None:
             return ""
-        values = [other.values[column] for other in self.rows if other.block == self.rows[row].block]
+        values = (other.values[column] for other in self.rows)
         distinct = {round(other, decimals) for other in values if other is not None}
         rank = sorted(distinct, reverse=better == "higher").index(round(value, decimals))
-        marks = MEDALS if self.mark == "medals" else ("best",)
-        return marks[rank] if rank < len(marks) else ""
+        return MEDALS[rank] if rank < len(MEDALS) else ""
 
     def cells(self, row: Row) -> list[str]:
         """Return the numbers of a row as printed."""
         return [_cell(value, row.spread(j), self.columns[j].decimals) for j, value in enumerate(row.values)]
 
-    def marked_cells(self, row: int, forms: Mapping[str, str]) -> list[str]:
-        """Return the cells of one of `rows`, formatted by mark; `forms` maps each mark to a format with `%s`."""
-        return [forms[self.mark_of(row, j)] % cell for j, cell in enumerate(self.cells(self.rows[row]))]
+    def cells_with_medals(self, row: int, forms: Mapping[str, str]) -> list[str]:
+        """Return the cells of one of `rows`; `forms` maps each medal, and no medal, to a format with `%s`."""
+        return [forms[self.medal_of(row, j)] % cell for j, cell in enumerate(self.cells(self.rows[row]))]
 
     def without_empty_columns(self) -> Table:
         """Omit columns without any number in `rows`, unless no column has one."""
@@ -156,18 +157,13 @@ class Table:
 def views_table(result: EvaluationResult, title: str, region: Region = FULL) -> Table:
     """Tabulate the scores of each view in one region, with means, and notes about missing scores."""
     scores = {view.name: {name: view.score(name, region) for name in image_metrics()} for view in result.views}
-    notes = [_mask_note(result) if region != FULL else "", _missing_note(result, region)]
-    return _scores_table(title, "view", scores, notes, {"mean": result.means(region)})
+    return _scores_table(title, "view", scores, _missing_notes(result, [region]), {"mean": result.means(region)})
 
 
 def regions_table(result: EvaluationResult, title: str) -> Table:
     """Tabulate the mean scores of each region, with notes about missing scores."""
     scores = {str(region): result.means(region) for region in result.regions}
-    regions: dict[str, list[str]] = {}
-    for region in result.regions:
-        regions.setdefault(_missing_note(result, region), []).append(region)
-    notes = [f"{', '.join(names)}: {note}" for note, names in regions.items() if note]
-    return _scores_table(title, "region", scores, [_mask_note(result), *notes])
+    return _scores_table(title, "region", scores, _missing_notes(result, result.regions))
 
 
 def treatments_table(metrics: RunMetrics, title: str) -> Table:
@@ -215,54 +211,30 @@ def write_table(table: Table, stem: Path | str) -> list[Path]:
 def to_rich(table: Table) -> rich.console.Group:
     """Format a table for the console: `rich.print(to_rich(table))`.
 
-    If the console is too narrow for all groups of columns, the groups are stacked.
+    Groups of columns are separate tables, one below the other, so that a comparison of many scenes fits the console.
     """
-    # A caption would be wrapped to the width of the table, so footnotes are separate texts.
-    return rich.console.Group(_Drawn(table), *(rich.text.Text(note, style="dim") for note in table.notes))
+    # A title or caption of a rich table would be wrapped to the width of the table.
+    drawn: list[rich.console.RenderableType] = [rich.text.Text(table.title, style="italic")]
+    start = 0
+    for group, num_columns in table.groups():
+        drawn.append(_rich_group(table, group, slice(start, start + num_columns)))
+        start += num_columns
+    return rich.console.Group(*drawn, *(rich.text.Text(note, style="dim") for note in table.notes))
 
 
-@dataclass(frozen=True)
-class _Drawn:
-    """Renderable table that splits into blocks of whole column groups to fit the width of the console."""
-
-    table: Table
-
-    def __rich_console__(
-        self, console: rich.console.Console, options: rich.console.ConsoleOptions
-    ) -> Iterator[rich.table.Table]:
-        unbounded = options.update(max_width=10_000)
-        start = stop = 0
-        for _, num_columns in self.table.groups():
-            wider = self._block(start, stop + num_columns)
-            if stop > start and console.measure(wider, options=unbounded).maximum > options.max_width:
-                yield self._block(start, stop)
-                start = stop
-            stop += num_columns
-        yield self._block(start, stop)
-
-    def _block(self, start: int, stop: int) -> rich.table.Table:
-        table, columns = self.table, range(start, stop)
-        grouped = any(column.group for column in table.columns)
-        title = rich.text.Text(table.title) if start == 0 else None
-        drawn = rich.table.Table(title=title, box=rich.box.SIMPLE_HEAD)
-        drawn.add_column(rich.text.Text(table.label_title), vertical="bottom", overflow="fold")
-        for j in columns:
-            column = table.columns[j]
-            above = column.group if j == start or column.group != table.columns[j - 1].group else ""
-            heading = f"{above}\n{_heading(column)}" if grouped else _heading(column)
-            drawn.add_column(rich.text.Text(heading), justify="right", no_wrap=True)
-        for i, row in enumerate(table.rows):
-            cells = [self._text(i, j) for j in columns]
-            drawn.add_row(rich.text.Text(row.label), *cells, end_section=i == len(table.rows) - 1)
-        for row in table.summary:
-            drawn.add_row(*map(rich.text.Text, (row.label, *table.cells(row)[start:stop])), style="bold")
-        return drawn
-
-    def _text(self, i: int, j: int) -> rich.text.Text:
-        cell, mark = self.table.cells(self.table.rows[i])[j], self.table.mark_of(i, j)
-        if self.table.mark != "medals":
-            return rich.text.Text(cell, style="bold" if mark else "")
-        return rich.text.Text(_MARKDOWN[mark] % cell if mark else f"{cell}   ")  # a medal is two cells wide
+def _rich_group(table: Table, group: str, columns: slice) -> rich.table.Table:
+    drawn = rich.table.Table(title=rich.text.Text(group) if group else None, box=rich.box.SIMPLE_HEAD)
+    drawn.add_column(rich.text.Text(table.label_title), overflow="fold")
+    for column in table.columns[columns]:
+        drawn.add_column(rich.text.Text(column.heading), justify="right", no_wrap=True)
+    for i, row in enumerate(table.rows):
+        cells = table.cells_with_medals(i, _CONSOLE if table.medals else _MARKDOWN)[columns]
+        texts = (rich.text.Text(text) for text in (row.label, *cells))
+        drawn.add_row(*texts, end_section=i == len(table.rows) - 1)
+    for row in table.summary:
+        texts = (rich.text.Text(text) for text in (row.label, *table.cells(row)[columns]))
+        drawn.add_row(*texts, style="bold")
+    return drawn
 
 
 def to_csv(table: Table) -> str:
@@ -275,9 +247,9 @@ def to_csv(table: Table) -> str:
     rows = (*table.rows, *table.summary)
     spread = any(row.spreads for row in rows)
     headings = [f"{column.group} {column.title}".strip() for column in table.columns]
-    writer.writerow(
-        [table.label_title, *(h for name in headings for h in ((name, f"{name} std") if spread else (name,)))]
-    )
+    if spread:
+        headings = [text for heading in headings for text in (heading, f"{heading} std")]
+    writer.writerow([table.label_title, *headings])
     for row in rows:
         cells = [
             MISSING if number is None else repr(number)
@@ -294,11 +266,11 @@ def to_markdown(table: Table) -> str:
     def line(cells: Sequence[str]) -> str:
         return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
-    headings = [f"{column.group} {_heading(column)}".strip() for column in table.columns]
+    headings = [f"{column.group} {column.heading}".strip() for column in table.columns]
     lines = [f"**{table.title}**", "", line([table.label_title, *headings])]
     lines.append("|" + "|".join([":---", *("---:" for _ in table.columns)]) + "|")
     for i, row in enumerate(table.rows):
-        lines.append(line([row.label, *table.marked_cells(i, _MARKDOWN)]))
+        lines.append(line([row.label, *table.cells_with_medals(i, _MARKDOWN)]))
     for row in table.summary:
         lines.append(line([f"*{row.label}*", *(f"*{cell}*" for cell in table.cells(row))]))
     lines += [text for note in table.notes for text in ("", note)]
@@ -319,7 +291,7 @@ def to_latex(table: Table) -> str:
     lines += [_latex_row(headings), r"\midrule"]
     for i, row in enumerate(table.rows):
         # The numbers and "n/a" contain no special character but the sign of a standard deviation.
-        cells = [cell.replace("±", r"$\pm$") for cell in table.marked_cells(i, _LATEX)]
+        cells = [cell.replace("±", r"$\pm$") for cell in table.cells_with_medals(i, _LATEX)]
         lines.append(_latex_row([_latex(row.label), *cells]))
     if table.summary:
         lines.append(r"\midrule")
@@ -328,41 +300,6 @@ def to_latex(table: Table) -> str:
     lines += [r"\bottomrule", r"\end{tabular}"]
     lines += [rf"\par\smallskip{{\footnotesize {_latex(note)}}}" for note in table.notes]
     return "\n".join([*lines, r"\end{table}"]) + "\n"
-
-
-def to_html(table: Table) -> str:
-    """Format a table as an HTML `<table>`, with footnotes as paragraphs of class `note`.
-
-    Best values are `<strong>`. Cells with medals have the name of the medal as class, and as text of class `unseen`.
-    """
-    grouped = any(column.group for column in table.columns)
-    lines = ["<table>", f"<caption>{html.escape(table.title)}</caption>", "<thead>", "<tr>"]
-    rows = 2 if grouped else 1
-    lines.append(f'<th scope="col" rowspan="{rows}">{html.escape(table.label_title)}</th>')
-    if grouped:
-        lines += [f'<th scope="colgroup" colspan="{n}">{html.escape(name)}</th>' for name, n in table.groups()]
-        lines.append("</tr><tr>")
-    lines += [f'<th scope="col">{html.escape(_heading(column))}</th>' for column in table.columns]
-    lines += ["</tr>", "</thead>", "<tbody>"]
-    for i, row in enumerate(table.rows):
-        if row.block and (i == 0 or row.block != table.rows[i - 1].block):
-            heading = f'<th class="block" scope="rowgroup" colspan="{len(table.columns) + 1}">'
-            lines.append(f"<tr>{heading}{html.escape(row.block)}</th></tr>")
-        cells = "".join(table.marked_cells(i, _HTML))
-        lines.append(f'<tr><th scope="row">{html.escape(row.label)}</th>{cells}</tr>')
-    lines.append("</tbody>")
-    if table.summary:
-        lines.append("<tfoot>")
-        for row in table.summary:
-            cells = "".join(f"<td>{html.escape(text)}</td>" for text in table.cells(row))
-            lines.append(f'<tr><th scope="row">{html.escape(row.label)}</th>{cells}</tr>')
-        lines.append("</tfoot>")
-    lines.append("</table>")
-    return "\n".join([*lines, *(f'<p class="note">{html.escape(note)}</p>' for note in table.notes)]) + "\n"
-
-
-def _heading(column: Column) -> str:
-    return column.title + {"higher": " ↑", "lower": " ↓", None: ""}[column.better]
 
 
 def _scores_table(
@@ -379,23 +316,20 @@ def _scores_table(
         tuple(Row(label, tuple(scores[name] for name in known)) for label, scores in part.items())
         for part in (rows, summary or {})
     )
-    table = Table(title, label_title, columns, body, foot, notes=tuple(note for note in notes if note))
+    table = Table(title, label_title, columns, body, foot, notes=tuple(notes))
     return table.without_empty_columns()
 
 
-def _mask_note(result: EvaluationResult) -> str:
-    return f"Mask and crop {MISSING}: {result.notes['mask']}" if "mask" in result.notes else ""
-
-
-def _missing_note(result: EvaluationResult, region: Region) -> str:
-    """Name the metrics that are missing in a region, with the reasons, in one line."""
-    by_reason: dict[str, list[str]] = {}
+def _missing_notes(result: EvaluationResult, regions: Sequence[Region]) -> list[str]:
+    """Give the reasons for scores that are missing in any of the regions."""
+    notes = []
+    if "mask" in result.notes and list(regions) != [FULL]:
+        notes.append(f"Mask and crop {MISSING}: {result.notes['mask']}")
     for name, metric in image_metrics().items():
-        reason = result.notes.get(name if region == FULL else f"{region}.{name}")
-        if reason is not None:
-            by_reason.setdefault(short(reason), []).append(metric.title)
-    missing = ", ".join(f"{', '.join(titles)} ({reason})" for reason, titles in by_reason.items())
-    return f"{MISSING}: {missing}" if missing else ""
+        is_missing = any(result.mean(name, region) is None for region in regions)
+        if is_missing and name in result.notes:
+            notes.append(f"{metric.title} {MISSING}: {short(result.notes[name])}")
+    return notes
 
 
 def _cell(value: Score, spread: Score, decimals: int) -> str:

@@ -39,6 +39,7 @@ def score_split(
     metrics: ImageMetrics,
     folder: Path,
     subdivision: Subdivision,
+    prefix: str,
     refine_steps: int = 0,
 ) -> tuple[EvaluationResult, dict[str, EvaluationResult]]:
     """Score views with the given cameras, and once more for each applicable treatment.
@@ -55,7 +56,8 @@ def score_split(
     Returns:
         Scores with the given cameras, and the scores of each treatment by name.
     """
-    scene, settings, results = renderer.scene, (metrics, folder, subdivision), dict[str, EvaluationResult]()
+    scene, results = renderer.scene, dict[str, EvaluationResult]()
+    settings = metrics, folder, subdivision, prefix
     images = {AS_GIVEN: Images("images")}
     if scene.camera.moves:
         [results[AS_GIVEN]], _ = score_views(renderer, views, *settings, [*images.values()])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 from nerfro.errors import NerfroError
 from nerfro.evaluation.image_metrics import ImageMetric, image_metrics
@@ -77,30 +77,9 @@ def to_table(comparison: Comparison, metrics: Mapping[str, type[ImageMetric]], r
         for name, metric in metrics.items()
         if (reason := _reason(run, name, region))
     )
-    title = "; ".join(
-        [
-            comparison.budget.title,
-            *_common_description(comparison, region),
-            _describe_seeds(comparison),
-        ]
-    )
-    mark: Literal["", "medals"] = "medals" if len(rows) > 1 else ""
-    table = Table(title, "method", tuple(columns), tuple(rows), mark=mark, notes=tuple(notes))
-    return table.without_empty_columns()
-
-
-def combine(compared: Sequence[tuple[Comparison, Table]]) -> Table:
-    """Combine the tables of all budgets in one, with a block of rows for each budget and without empty columns."""
-    columns = dict.fromkeys(column for _, table in compared for column in table.columns)
-    rows = []
-    for comparison, table in compared:
-        for row in table.rows:
-            found = {column: (row.values[number], row.spread(number)) for number, column in enumerate(table.columns)}
-            values, spreads = zip(*(found.get(column, (None, None)) for column in columns), strict=True)
-            rows.append(Row(row.label, values, spreads, comparison.budget.label))
-    notes = dict.fromkeys(note for _, table in compared for note in table.notes)
-    titles = dict.fromkeys("; ".join(table.title.split("; ")[1:]) for _, table in compared)
-    table = Table(" / ".join(titles), "method", tuple(columns), tuple(rows), mark="medals", notes=tuple(notes))
+    descriptions = [*_common_description(comparison, region), _describe_seeds(comparison)]
+    title = "; ".join([comparison.budget.title, *descriptions])
+    table = Table(title, "method", tuple(columns), tuple(rows), medals=len(rows) > 1, notes=tuple(notes))
     return table.without_empty_columns()
 
 
@@ -112,7 +91,7 @@ def find_metrics(names: Sequence[str] | None = None) -> dict[str, type[ImageMetr
     """
     known = image_metrics()
     if names is None:
-        names = [name for name in known if name != "lpips_vgg"]
+        names = list(known)
     if not names:
         raise NerfroError(f"metrics: the list is empty; choose from {', '.join(known)}")
     for name in names:
@@ -198,7 +177,7 @@ def _scene_titles(test_sets: set[EvaluationSet], titles: Mapping[str, str]) -> d
     named = {}
     for scene in ordered:
         namesakes = [other for other in ordered if other.name == scene.name]
-        extra = [p for p in _properties(scene) if p and any(p not in _properties(other) for other in ordered)]
+        extra = [p for p in _properties(scene) if any(p not in _properties(other) for other in ordered)]
         if len({other.root for other in namesakes}) > 1:
             extra.append(scene.root)
         extra += [f"{k}={v}" for k, v in scene.options if len({dict(o.options).get(k) for o in namesakes}) > 1]
@@ -206,31 +185,26 @@ def _scene_titles(test_sets: set[EvaluationSet], titles: Mapping[str, str]) -> d
     return named
 
 
-def _properties(test_set: EvaluationSet) -> tuple[str, str, str]:
-    """Describe the images of a test set; the last text is empty for the default protocol."""
+def _properties(test_set: EvaluationSet) -> tuple[str, str]:
+    """Describe the images of a test set."""
     views = f"{test_set.num_views} {test_set.split} view{'s' if test_set.num_views != 1 else ''}"
-    protocol = "" if test_set.protocol == "8bit" else "not rounded to 8 bits"
-    return views, f"{test_set.width} x {test_set.height} pixels", protocol
+    return views, f"{test_set.width} x {test_set.height} pixels"
 
 
 def _common_description(comparison: Comparison, region: Region) -> list[str]:
     """Describe the properties that all test sets share; the titles of the test sets contain the others."""
     properties = [set(texts) for texts in zip(*map(_properties, comparison.scenes), strict=True)]
-    common = [text for texts in properties if len(texts) == 1 for text in texts if text]
+    common = [text for texts in properties if len(texts) == 1 for text in texts]
     return common + ([f"scores of the {region}"] if region != FULL else [])
 
 
 def _describe_seeds(comparison: Comparison) -> str:
     """Describe the number of runs per score."""
-    counts = {place: len(runs) for place, runs in comparison.cells.items()}
-    if set(counts.values()) == {1}:
+    counts = [len(runs) for runs in comparison.cells.values()]
+    least, most = min(counts), max(counts)
+    if most == 1:
         return "one run each"
-    if len(set(counts.values())) == 1:
-        return f"mean ± standard deviation over {next(iter(counts.values()))} seeds"
-    several = [
-        f"{method} on {comparison.scenes[scene]} {number}" for (method, scene), number in counts.items() if number > 1
-    ]
-    return f"mean ± standard deviation over seeds: {', '.join(several)}; one run elsewhere"
+    return f"mean ± standard deviation over {most if least == most else f'{least} to {most}'} seeds"
 
 
 def _score(runs: Sequence[Run], metric: str, region: Region) -> tuple[float | None, float | None]:
@@ -247,5 +221,5 @@ def _reason(run: Run, metric: str, region: Region) -> str | None:
     if run.metrics.result.mean(metric, region) is not None:
         return None
     notes = run.metrics.result.notes
-    keys = (metric,) if region == FULL else (f"{region}.{metric}", "mask")
+    keys = (metric,) if region == FULL else (metric, "mask")
     return next((notes[key] for key in keys if key in notes), f"not among the scores of {shown(run.folder)}")

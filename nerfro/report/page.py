@@ -8,16 +8,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from markupsafe import Markup
 from omegaconf import OmegaConf
 
 from nerfro.errors import NerfroError
 from nerfro.evaluation.error_maps import SQUARED_ERROR_LIMIT
-from nerfro.evaluation.tables import Table, to_html
+from nerfro.evaluation.tables import Table
 from nerfro.files.drawing import magma
 from nerfro.files.templates import fill_template
 from nerfro.paths import PACKAGE_DIR
-from nerfro.report.comparison import Comparison, combine
+from nerfro.report.comparison import Comparison
 from nerfro.report.runs import Run, device, duration, shown
 from nerfro.report.views import JPEG_QUALITY, PNG_SIDE, SceneImages, Selection, embed_image, scene_images
 
@@ -59,6 +58,7 @@ class Section:
 
     id: str
     title: str
+    table: Table
     methods: Sequence[str]
     scenes: Sequence[SceneSection]
     runs: Sequence[Provenance]
@@ -70,16 +70,16 @@ def report_page(compared: Sequence[tuple[Comparison, Table]], unfinished: Sequen
         Section(
             id=f"b{number}",
             title=comparison.budget.title,
+            table=table,
             methods=comparison.methods,
             scenes=_scenes(f"b{number}", comparison, selection),
             runs=[_provenance(comparison, run) for run in comparison.runs],
         )
-        for number, (comparison, _) in enumerate(compared)
+        for number, (comparison, table) in enumerate(compared)
     ]
     ramp = magma(torch.linspace(0, 1, 256)[None], 1)
     return fill_template(
         _TEMPLATES / "page.html.jinja",
-        table=Markup(to_html(combine(compared))),
         sections=sections,
         unfinished=unfinished,
         error_ramp=embed_image(ramp),

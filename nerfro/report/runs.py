@@ -76,7 +76,6 @@ class EvaluationSet:
         split: split of the data set.
         num_views: number of scored images.
         width, height: size of the images in pixels.
-        protocol: "8bit" or "float", see `EvaluationResult`.
         options: other options of the data format, except the bounds of rays.
     """
 
@@ -85,7 +84,6 @@ class EvaluationSet:
     num_views: int
     width: int
     height: int
-    protocol: str
     options: tuple[tuple[str, str], ...]
 
     @property
@@ -208,7 +206,6 @@ def read_run(folder: Path) -> Run:
                 num_views=len(metrics.result.views),
                 width=width,
                 height=height,
-                protocol=metrics.result.protocol,
                 options=tuple(options),
             ),
             evaluated_at=(scores / "metrics.json").stat().st_mtime,

@@ -1,4 +1,4 @@
-"""Images of the report: some views of a scene by every method, with error maps and insets."""
+"""Images of the report: some views of a scene by every method, with error maps."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from torch import Tensor
 
 from nerfro.data.base import Views
 from nerfro.errors import NerfroError
-from nerfro.evaluation.crops import Crop, most_different_crop
 from nerfro.evaluation.error_maps import squared_error_colours
 from nerfro.evaluation.image_metrics import image_metrics
 from nerfro.evaluation.results import FULL, Region, Score
@@ -23,8 +22,6 @@ from nerfro.report.comparison import Comparison
 from nerfro.report.runs import EvaluationSet, Run
 from nerfro.training.config import build_data
 
-NUM_CROPS = 2
-CROP_DIVISOR = 4  # ratio of the shorter side of an image to the side of an inset
 PNG_SIDE = 256  # pixels; larger images are embedded as JPEG to limit the size of the page
 JPEG_QUALITY = 95
 
@@ -77,7 +74,6 @@ class SceneImages:
         width, height: size of each image in pixels.
         views: views to choose from.
         figure: one of the views, shown as the figure.
-        crops: insets of the figure.
         methods: titles of the methods by index; methods without a run on this scene are absent.
         seeds: seeds of the runs that rendered the images.
     """
@@ -86,7 +82,6 @@ class SceneImages:
     height: int
     views: tuple[View, ...]
     figure: View
-    crops: tuple[Crop, ...]
     methods: Mapping[int, str]
     seeds: Sequence[int]
 
@@ -111,13 +106,11 @@ def scene_images(comparison: Comparison, test_set: EvaluationSet, selection: Sel
         index: _view(index, references.images[index], runs, titles, selection)
         for index in sorted({round(i) for i in np.linspace(0, test_set.num_views - 1, count)} | {figure})
     }
-    reference, predictions = references.images[figure], [_prediction(run, figure) for run in runs.values()]
     return SceneImages(
         width=test_set.width,
         height=test_set.height,
         views=tuple(views.values()),
         figure=views[figure],
-        crops=_choose_crops(reference, predictions),
         methods=titles,
         seeds=sorted({run.seed for run in runs.values()}),
     )
@@ -153,14 +146,6 @@ def _view(
 
 def _prediction(run: Run, index: int) -> Float[Tensor, "H W 3"]:
     return load_png(run.scores / "images" / f"{run.metrics.result.views[index].name}.png")
-
-
-def _choose_crops(reference: Tensor, predictions: Sequence[Tensor]) -> tuple[Crop, ...]:
-    size = max(min(reference.shape[:2]) // CROP_DIVISOR, 1)
-    crops: list[Crop] = []
-    for _ in range(NUM_CROPS):
-        crops.append(most_different_crop(reference, predictions, size, apart_from=crops))
-    return tuple(crops)
 
 
 def embed_image(rgb: Float[Tensor, "H W 3"]) -> str:

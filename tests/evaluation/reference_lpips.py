@@ -2,10 +2,10 @@
 
     python reference_lpips.py INPUT.pt OUTPUT.pt
 
-torchmetrics takes the backbones from torchvision, which does not load beside a CPU build of torch. Here a module of
-that name that holds nothing but AlexNet and VGG-16 stands in for it, which is why this cannot run inside the test
-process. INPUT holds predictions and targets [B, 3, H, W] in [0, 1]; OUTPUT for `alex` and for `vgg` the state dict of
-the backbone, the distances and the distance maps.
+torchmetrics takes the backbone from torchvision, which does not load beside a CPU build of torch. Here a module of
+that name that holds nothing but AlexNet stands in for it, which is why this cannot run inside the test process. INPUT
+holds predictions and targets [B, 3, H, W] in [0, 1]; OUTPUT the state dict of AlexNet, the distances and the distance
+maps.
 """
 
 import sys
@@ -39,22 +39,6 @@ class AlexNet(nn.Module):
         initialise(self.features)
 
 
-class VGG16(nn.Module):
-    """The feature layers of torchvision's VGG-16, in its numbering, with seeded He initialisation."""
-
-    def __init__(self):
-        super().__init__()
-        torch.manual_seed(8)
-        layers, channels = [], 3
-        for width, num_convolutions in ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3)):
-            for _ in range(num_convolutions):
-                layers += [nn.Conv2d(channels, width, kernel_size=3, padding=1), nn.ReLU(inplace=True)]
-                channels = width
-            layers.append(nn.MaxPool2d(kernel_size=2, stride=2))
-        self.features = nn.Sequential(*layers)
-        initialise(self.features)
-
-
 def initialise(layers):
     for module in layers:
         if isinstance(module, nn.Conv2d):
@@ -69,20 +53,17 @@ def main():
     torchvision = types.ModuleType("torchvision")
     torchvision.models = types.ModuleType("torchvision.models")
     torchvision.models.alexnet = lambda weights: AlexNet()
-    torchvision.models.vgg16 = lambda weights: VGG16()
-    torchvision.models.AlexNet_Weights = torchvision.models.VGG16_Weights = types.SimpleNamespace(DEFAULT=None)
+    torchvision.models.AlexNet_Weights = types.SimpleNamespace(DEFAULT=None)
     sys.modules["torchvision"] = torchvision
     sys.modules["torchvision.models"] = torchvision.models
     lpips._TORCHVISION_AVAILABLE = True
     pictures = torch.load(sys.argv[1])
-    results = {}
-    for name, backbone in (("alex", AlexNet), ("vgg", VGG16)):
-        distance, distance_map = (lpips._LPIPS(net=name, spatial=spatial) for spatial in (False, True))
-        results[name] = {
-            "backbone": backbone().state_dict(),
-            "distances": distance(*pictures, normalize=True).flatten(),
-            "maps": distance_map(*pictures, normalize=True)[:, 0],
-        }
+    distance, distance_map = (lpips._LPIPS(net="alex", spatial=spatial) for spatial in (False, True))
+    results = {
+        "backbone": AlexNet().state_dict(),
+        "distances": distance(*pictures, normalize=True).flatten(),
+        "maps": distance_map(*pictures, normalize=True)[:, 0],
+    }
     torch.save(results, sys.argv[2])
 
 

@@ -4,12 +4,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfro.errors import NerfroError
-from nerfro.evaluation.crops import Crop, most_different_crop
 from nerfro.evaluation.error_maps import error_maps, squared_error_map, triptych, write_error_sheet
 from nerfro.evaluation.flip import flip
 from nerfro.evaluation.image_metrics import psnr
-from nerfro.evaluation.lpips import ALEX
+from nerfro.evaluation.lpips import NO_NETWORK
 from nerfro.evaluation.ssim import ssim
 from nerfro.files.drawing import magma
 from nerfro.files.images import load_png, round_to_8bit
@@ -33,8 +31,6 @@ def test_scale_is_fixed_and_not_fitted_to_the_values() -> None:
 class Difference(torch.nn.Module):
     """Stands in for a network of LPIPS."""
 
-    backbone = ALEX
-
     def distance_map(self, prediction: Tensor, target: Tensor) -> Tensor:
         return (prediction - target).abs().mean(-1)
 
@@ -42,7 +38,7 @@ class Difference(torch.nn.Module):
 @pytest.mark.usefixtures("unchecked")
 def test_means_of_the_maps_are_the_metrics() -> None:
     prediction, target = torch.rand(2, 40, 36, 3, generator=torch.Generator().manual_seed(0))
-    maps = {error.name: error for error in error_maps(prediction, target, {"lpips": Difference()})}
+    maps = {error.name: error for error in error_maps(prediction, target, Difference())}
     assert list(maps) == ["squared_error", "ssim", "lpips", "flip"]
     assert all(error.values.shape == (40, 36) for error in maps.values())
     assert -10 * maps["squared_error"].values.mean().log10() == pytest.approx(psnr(prediction, target).item(), abs=1e-5)
@@ -64,31 +60,19 @@ def test_border_without_a_window_has_no_similarity_and_is_grey() -> None:
 @pytest.mark.usefixtures("unchecked")
 def test_maps_that_a_picture_is_too_small_for_are_left_out() -> None:
     prediction, target = torch.rand(2, 10, 30, 3, generator=torch.Generator().manual_seed(0))
-    maps = error_maps(prediction, target, {"lpips": Difference()})
+    maps = error_maps(prediction, target, Difference())
     assert [error.name for error in maps] == ["squared_error", "flip"]
 
 
 def test_sheet_shows_pictures_and_maps(tmp_path: Path) -> None:
     prediction, target = torch.rand(2, 64, 128, 3, generator=torch.Generator().manual_seed(0))
-    write_error_sheet(tmp_path, "a", prediction, target, {})
+    write_error_sheet(tmp_path, "a", prediction, target, NO_NETWORK)
     sheet = load_png(tmp_path / "errors" / "a.png")
     for column, shown in enumerate((prediction, target, magma(squared_error_map(prediction, target), 0.05))):
         enlarged = round_to_8bit(shown).repeat_interleave(2, 0).repeat_interleave(2, 1)
         left = column * (256 + 6)
         torch.testing.assert_close(sheet[22 : 22 + 128, left : left + 256], enlarged)
         assert sheet[22 + 128 :, left : left + 256].min() < 0.2, "a caption in ink"
-
-
-def test_automatic_crop_finds_where_methods_differ() -> None:
-    reference = torch.rand(24, 32, 3, generator=torch.Generator().manual_seed(0))
-    alike, different = reference + 0.05, reference + 0.05
-    different[10:16, 4:10] += 0.5
-    alike[0:6, 20:26] += 3.0  # a large error that all methods share tells nothing about them
-    different[0:6, 20:26] += 3.0
-    assert most_different_crop(reference, [alike, different], 6) == Crop(top=10, left=4, size=6)
-    assert most_different_crop(reference, [different], 6) == Crop(top=0, left=20, size=6)
-    with pytest.raises(NerfroError, match="crop of 25 pixels"):
-        most_different_crop(reference, [reference], 25)
 
 
 def test_triptych_holds_prediction_reference_and_error() -> None:

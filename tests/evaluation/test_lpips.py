@@ -9,8 +9,15 @@ import torchmetrics
 from torch import Tensor
 
 from nerfro.errors import NerfroError
-from nerfro.evaluation import pretrained
-from nerfro.evaluation.lpips import ALEX, VGG, Backbone, LpipsNetwork, find_lpips_networks, load_lpips_network
+from nerfro.evaluation import lpips, pretrained
+from nerfro.evaluation.lpips import (
+    CONVOLUTIONS,
+    MIN_SIZE,
+    LpipsNetwork,
+    MissingNetwork,
+    find_lpips_network,
+    load_lpips_network,
+)
 
 
 class Reference(NamedTuple):
@@ -20,10 +27,10 @@ class Reference(NamedTuple):
     results: dict[str, Tensor]
 
 
-def random_weights(backbone: Backbone) -> dict[str, Tensor]:
+def random_weights() -> dict[str, Tensor]:
     generator = torch.Generator().manual_seed(3)
     weights = {}
-    for layer in backbone.layers:
+    for layer in CONVOLUTIONS:
         fan_in = layer.channels_in * layer.kernel**2
         shape = (layer.channels, layer.channels_in, layer.kernel, layer.kernel)
         weights[f"{layer.key}.weight"] = torch.randn(shape, generator=generator) * (2 / fan_in) ** 0.5
@@ -33,19 +40,21 @@ def random_weights(backbone: Backbone) -> dict[str, Tensor]:
 
 @pytest.fixture(scope="module")
 def network() -> LpipsNetwork:
-    return load_lpips_network(ALEX, random_weights(ALEX))
+    return load_lpips_network(random_weights())
 
 
 @pytest.fixture(scope="module")
-def published(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict]:
-    """The values of torchmetrics with both backbones."""
+def reference(tmp_path_factory: pytest.TempPathFactory) -> Reference:
+    """The values of torchmetrics, and our network with the same backbone and the published heads."""
     folder = tmp_path_factory.mktemp("published")
     torch.save(pictures(), folder / "pictures.pt")
     program = [sys.executable, str(Path(__file__).with_name("reference_lpips.py"))]
     command = [*program, str(folder / "pictures.pt"), str(folder / "results.pt")]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
-    return torch.load(folder / "results.pt", weights_only=True)
+    results = torch.load(folder / "results.pt", weights_only=True)
+    predictions, targets = (images.movedim(1, -1) for images in pictures())
+    return Reference(load_lpips_network(results["backbone"]), predictions, targets, results)
 
 
 def pictures() -> tuple[Tensor, Tensor]:
@@ -55,14 +64,6 @@ def pictures() -> tuple[Tensor, Tensor]:
     predictions = (targets + 0.2 * torch.randn(targets.shape, generator=generator)).clamp(0, 1)
     predictions[2] = targets[2].roll(5, dims=-1)
     return predictions, targets
-
-
-@pytest.fixture(scope="module", params=[ALEX, VGG])
-def reference(request: pytest.FixtureRequest, published: dict[str, dict]) -> Reference:
-    """The values of torchmetrics, and our network with the same backbone and the published heads."""
-    results = published[request.param.heads]
-    predictions, targets = (images.movedim(1, -1) for images in pictures())
-    return Reference(load_lpips_network(request.param, results["backbone"]), predictions, targets, results)
 
 
 def test_distance_is_that_of_torchmetrics(reference: Reference) -> None:
@@ -80,11 +81,9 @@ def test_distance_map_is_that_of_torchmetrics(reference: Reference) -> None:
         torch.testing.assert_close(reference.network.distance_map(prediction, target), expected, atol=1e-6, rtol=0)
 
 
-@pytest.mark.parametrize("backbone", [ALEX, VGG])
-def test_heads_are_the_published_ones_to_the_last_bit(backbone: Backbone) -> None:
+def test_heads_are_the_published_ones_to_the_last_bit(network: LpipsNetwork) -> None:
     folder = Path(torchmetrics.functional.image.__file__).with_name("lpips_models")
-    published = torch.load(folder / f"{backbone.heads}.pth", map_location="cpu", weights_only=True)
-    network = load_lpips_network(backbone, random_weights(backbone))
+    published = torch.load(folder / "alex.pth", map_location="cpu", weights_only=True)
     assert len(published) == 5
     for i in range(5):
         assert torch.equal(network.get_buffer(f"head{i}"), published[f"lin{i}.model.1.weight"])
@@ -98,16 +97,16 @@ def test_distance_on_a_mask_is_the_mean_of_the_map_there(network: LpipsNetwork) 
     assert network(prediction, target, inside).item() == pytest.approx(expected.item(), abs=1e-7)
 
 
-@pytest.mark.parametrize("backbone", [ALEX, VGG])
-def test_smallest_picture_is_the_smallest_that_the_backbone_takes(backbone: Backbone) -> None:
-    size = backbone.min_size
-    network = load_lpips_network(backbone, random_weights(backbone))
-    assert torch.isfinite(network(torch.rand(size, size, 3), torch.rand(size, size, 3)))
-    with pytest.raises(NerfroError, match=f"at least {size} x {size} pixels"):
-        network(torch.rand(size - 1, 64, 3), torch.rand(size - 1, 64, 3))
-    network.backbone = backbone._replace(min_size=0)
+def test_smallest_picture_is_the_smallest_that_the_network_takes(
+    network: LpipsNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fits, smaller = torch.rand(2, MIN_SIZE, MIN_SIZE, 3), torch.rand(2, MIN_SIZE - 1, 64, 3)
+    assert torch.isfinite(network(*fits))
+    with pytest.raises(NerfroError, match=f"at least {MIN_SIZE} x {MIN_SIZE} pixels"):
+        network(*smaller)
+    monkeypatch.setattr(lpips, "MIN_SIZE", 0)
     with pytest.raises(RuntimeError):  # the limit is not stricter than it must be
-        network(torch.rand(size - 1, 64, 3), torch.rand(size - 1, 64, 3))
+        network(*smaller)
 
 
 def test_distance_does_not_depend_on_mixed_precision(network: LpipsNetwork) -> None:
@@ -123,36 +122,23 @@ def test_model_that_holds_the_network_neither_trains_nor_stores_it(network: Lpip
     assert network.state_dict() == {}
 
 
-def test_missing_networks_are_reported_with_the_reason(tmp_path: Path, monkeypatch) -> None:
+def test_a_missing_network_is_reported_with_the_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    networks, reasons = find_lpips_networks(download=False)
-    assert networks == {}
-    assert reasons.keys() == {"lpips", "lpips_vgg"}
-    for name, title in (("lpips", "AlexNet"), ("lpips_vgg", "VGG-16")):
-        assert reasons[name].startswith(f"no weights; {title} is not in the cache of torch")
-        assert f" to {tmp_path}" in reasons[name]
-        assert "\n" not in reasons[name]
-
-
-def test_vgg_is_taken_from_the_cache_but_never_fetched(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    monkeypatch.setattr(pretrained, "unreachable", lambda url: "asked" if "vgg" in url else "no cable")
-    networks, reasons = find_lpips_networks()
-    assert networks == {}
-    assert "no cable" in reasons["lpips"]
-    assert "asked" not in reasons["lpips_vgg"]
+    monkeypatch.setattr(pretrained, "unreachable", lambda url: "no cable")
+    found = find_lpips_network()
+    assert isinstance(found, MissingNetwork)
+    reason = found.reason
+    assert reason.startswith("no weights; AlexNet is not in the cache of torch, and there is no network (no cable)")
+    assert f" to {tmp_path}" in reason
+    assert "\n" not in reason
     cache = tmp_path / "hub" / "checkpoints"
     cache.mkdir(parents=True)
-    torch.save(random_weights(VGG), cache / "vgg16-397923af.pth")
-    networks, reasons = find_lpips_networks(download=False)
-    assert list(networks) == ["lpips_vgg"]
-    assert list(reasons) == ["lpips"]
+    torch.save(random_weights(), cache / "alexnet-owt-7be5be79.pth")
+    assert isinstance(find_lpips_network(), LpipsNetwork)
 
 
 def test_weights_of_another_network_are_refused() -> None:
-    other = random_weights(ALEX)
+    other = random_weights()
     other["features.3.weight"] = other["features.3.weight"][:, :3]
     with pytest.raises(NerfroError, match=r"features\.3\.weight of shape \[192, 64, 5, 5\], found \[192, 3, 5, 5\]"):
-        load_lpips_network(ALEX, other)
-    with pytest.raises(NerfroError, match=r"use the published file of VGG-16"):
-        load_lpips_network(VGG, random_weights(ALEX))
+        load_lpips_network(other)

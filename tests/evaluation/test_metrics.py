@@ -17,21 +17,28 @@ import nerfro
 from nerfro.errors import NerfroError
 from nerfro.evaluation.flip import flip, flip_map
 from nerfro.evaluation.image_metrics import MAX_PSNR, psnr
-from nerfro.evaluation.lpips import ALEX
+from nerfro.evaluation.lpips import MissingNetwork
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.regions import crop_rectangle, mean_over, object_pixels
+from nerfro.evaluation.results import EvaluationResult
 from nerfro.evaluation.ssim import ssim, ssim_map
-from nerfro.files.images import load_png, save_png
+from nerfro.files.images import load_png, round_to_8bit, save_png
 
 
 def pictures(seed: int = 0, height: int = 37, width: int = 45) -> tuple[Tensor, Tensor]:
-    """A smooth picture with an edge, and the same with noise, a shift and a flat part."""
+    """A smooth picture of 8 bits with an edge, and the same with noise, a shift and a flat part."""
     generator = torch.Generator().manual_seed(seed)
     y, x = torch.meshgrid(torch.linspace(0, 1, height), torch.linspace(0, 1, width), indexing="ij")
     target = torch.stack([0.5 + 0.4 * torch.sin(9 * x), y, (x > y).float()], dim=-1)
     prediction = target.roll(1, dims=1) + 0.1 * torch.randn(target.shape, generator=generator)
     prediction[:15] = 0.5
-    return prediction.clamp(0, 1), target
+    return round_to_8bit(prediction), round_to_8bit(target)
+
+
+def scored(*compared: tuple[Tensor, ...], metrics: ImageMetrics | None = None) -> EvaluationResult:
+    """Score pairs of pictures, each with the coverage by the object if there is one."""
+    metrics = metrics or ImageMetrics()
+    return metrics.result([metrics.score(f"v{number}", *images) for number, images in enumerate(compared)])
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -51,46 +58,29 @@ def test_psnr_on_a_mask_is_that_of_its_pixels() -> None:
 
 def test_equal_pictures_score_best_and_finite() -> None:
     _, target = pictures()
-    metrics = ImageMetrics(round_predictions=False)
-    metrics.update(target, target)
-    assert metrics.result().mean("psnr") == MAX_PSNR
-    assert metrics.result().mean("ssim") == pytest.approx(1.0)
+    result = scored((target, target))
+    assert result.mean("psnr") == MAX_PSNR
+    assert result.mean("ssim") == pytest.approx(1.0)
 
 
 def test_mean_psnr_is_the_mean_over_views_and_not_over_pixels() -> None:
     target = torch.full((16, 16, 3), 0.4)
-    metrics = ImageMetrics(round_predictions=False)
-    metrics.update(target + 0.1, target)
-    metrics.update(target + 0.001, target)
-    assert metrics.result().mean("psnr") == pytest.approx((20 + 60) / 2, abs=1e-3)
+    result = scored((target + 0.2, target), (target + 1 / 255, target))
+    assert result.mean("psnr") == pytest.approx(-10 * math.log10(0.2 / 255), abs=1e-3)
 
 
 def test_numbers_can_be_computed_again_from_the_written_pictures(tmp_path: Path) -> None:
-    metrics, again = ImageMetrics(), ImageMetrics(round_predictions=False)
-    for view in range(3):
-        prediction, target = pictures(view)
-        prediction = prediction * 1.2 - 0.1  # parts that cannot be displayed are clipped
-        save_png(tmp_path / f"test_{view:03d}.png", prediction)
-        metrics.update(prediction, target)
-        again.update(load_png(tmp_path / f"test_{view:03d}.png"), target)
-    assert [row.scores for row in metrics.result().views] == [row.scores for row in again.result().views]
-
-
-def test_float_protocol_clips_but_does_not_round() -> None:
-    target = torch.zeros(16, 16, 3)
-    metrics = ImageMetrics(round_predictions=False)
-    metrics.update(target + 0.001, target)  # a quarter of a level
-    metrics.update(target - 0.5, target)
-    first, second = (row.scores["psnr"] for row in metrics.result().views)
-    assert first == pytest.approx(60, abs=1e-3)
-    assert second == MAX_PSNR
-    assert metrics.result().protocol == "float"
+    prediction, target = pictures()
+    prediction = prediction * 1.2 - 0.1  # parts that cannot be displayed are clipped
+    save_png(tmp_path / "a.png", prediction)
+    written = load_png(tmp_path / "a.png")
+    result = scored((prediction, target))
+    assert result.mean("psnr") == pytest.approx(psnr(written, target).item())
+    assert result.mean("ssim") == pytest.approx(ssim(written, target).item())
 
 
 class HalfOfTheDifference(torch.nn.Module):
     """Stands in for a network of LPIPS."""
-
-    backbone = ALEX
 
     def forward(self, prediction: Tensor, target: Tensor, inside: Tensor | None = None) -> Tensor:
         return mean_over((prediction - target).abs().mean(-1), inside) / 2
@@ -99,13 +89,9 @@ class HalfOfTheDifference(torch.nn.Module):
 @pytest.mark.usefixtures("unchecked")
 def test_lpips_of_a_view_is_that_of_its_network() -> None:
     target = torch.zeros(32, 32, 3)
-    metrics = ImageMetrics({"lpips_vgg": HalfOfTheDifference()}, {"lpips": "no AlexNet"}, round_predictions=False)
-    metrics.update(target + 0.5, target)
-    result = metrics.result()
-    assert result.mean("lpips_vgg") == pytest.approx(0.25)
-    assert result.mean("lpips") is None
-    assert result.notes.keys() == {"lpips"}
-    assert result.notes["lpips"] == "no AlexNet"
+    result = scored((target + 0.4, target), metrics=ImageMetrics(HalfOfTheDifference()))
+    assert result.mean("lpips") == pytest.approx(0.2)
+    assert result.notes == {}
 
 
 @pytest.mark.usefixtures("unchecked")
@@ -116,9 +102,7 @@ def test_every_region_has_the_scores_of_its_pixels() -> None:
     coverage[100:103, 80:95] = 0.3
     inside = coverage > 0.5
     network = HalfOfTheDifference()
-    metrics = ImageMetrics({"lpips": network}, {"lpips_vgg": "not asked for"}, round_predictions=False)
-    metrics.update(prediction, target, coverage=coverage)
-    result = metrics.result()
+    result = scored((prediction, target, coverage), metrics=ImageMetrics(network))
     crop = slice(60 - 17, 100 + 17), slice(80 - 17, 95 + 17)
     regions = {
         "full": (prediction, target, None),
@@ -134,75 +118,44 @@ def test_every_region_has_the_scores_of_its_pixels() -> None:
 
 
 def test_views_without_the_object_have_the_full_image_only() -> None:
-    metrics = ImageMetrics()
-    prediction, target = pictures()
-    metrics.update(prediction, target, coverage=torch.ones(target.shape[:2]))
-    metrics.update(prediction, target, coverage=torch.zeros(target.shape[:2]))
-    metrics.update(prediction, target)
-    result = metrics.result()
+    images = pictures()
+    full = torch.ones(images[0].shape[:2])
+    result = scored((*images, full), (*images, 0 * full), images)
     assert [view.score("psnr", "mask") is None for view in result.views] == [False, True, True]
     assert [view.score("psnr") is None for view in result.views] == [False, False, False]
     assert result.mean("psnr", "mask") is None
-    assert result.notes["mask"] == "the mask is missing or empty in test_001, test_002"
+    assert result.notes["mask"] == "the mask is missing or empty in v1, v2"
 
 
 def test_views_without_masks_have_no_regions() -> None:
-    metrics = ImageMetrics()
-    metrics.update(*pictures())
-    assert metrics.result().regions == ("full",)
-    assert metrics.result().views[0].regions == {}
-    assert not any("." in key for key in metrics.result().notes)
-
-
-def test_names_are_those_that_are_given() -> None:
-    metrics = ImageMetrics()
-    metrics.update(*pictures(0))
-    metrics.update(*pictures(1))
-    assert [view.name for view in metrics.result(["glass", "pen"]).views] == ["glass", "pen"]
+    result = scored(pictures())
+    assert result.regions == ("full",)
+    assert result.views[0].regions == {}
 
 
 def test_missing_metrics_are_none_with_a_reason() -> None:
-    metrics = ImageMetrics(reasons={"lpips": "no cable", "lpips_vgg": "no file"})
-    metrics.update(*pictures())
-    metrics.update(*pictures(height=10))
-    result = metrics.result()
+    result = scored(pictures(), pictures(height=10), metrics=ImageMetrics(MissingNetwork("no cable")))
     assert result.mean("psnr") is not None
     assert result.mean("flip") is not None
     assert [row.scores["ssim"] is None for row in result.views] == [False, True]
     assert result.mean("ssim") is None
-    assert result.notes == {
-        "ssim": "images below 11 pixels",
-        "lpips": "no cable",
-        "lpips_vgg": "no file",
-    }
+    assert result.notes == {"ssim": "images, masks or crops below 11 pixels", "lpips": "no cable"}
 
 
-def test_views_are_ordered_by_number_and_repeated_ones_count_once() -> None:
-    metrics = ImageMetrics(prefix="val")
-    for view in (2, 0, 2):
-        metrics.update(*pictures(view), view=view)
-    result = metrics.result()
-    assert [row.name for row in result.views] == ["val_000", "val_002"]
-    assert result.views[1].scores["psnr"] != result.views[0].scores["psnr"]
-
-
-def test_emptied_metrics_have_no_views() -> None:
-    metrics = ImageMetrics()
-    metrics.update(*pictures())
+def test_an_evaluation_without_views_is_refused() -> None:
     with pytest.raises(NerfroError, match="no view was scored"):
-        metrics.emptied().result()
-    assert len(metrics.result().views) == 1
+        scored()
 
 
 @pytest.mark.usefixtures("unchecked")
 def test_pictures_that_cannot_be_compared_are_refused() -> None:
-    metrics = ImageMetrics()
+    black = torch.zeros(16, 16, 3)
     with pytest.raises(NerfroError, match=r"\[16, 16, 3\] with a reference \[16, 17, 3\]"):
-        metrics.update(torch.zeros(16, 16, 3), torch.zeros(16, 17, 3))
+        scored((black, torch.zeros(16, 17, 3)))
     with pytest.raises(NerfroError, match="NaN"):
-        metrics.update(torch.full((16, 16, 3), math.nan), torch.zeros(16, 16, 3))
+        scored((math.nan * black, black))
     with pytest.raises(NerfroError, match=r"mask \[16, 17\] does not fit an image \[16, 16, 3\]"):
-        metrics.update(torch.zeros(16, 16, 3), torch.zeros(16, 16, 3), coverage=torch.ones(16, 17))
+        scored((black, black, torch.ones(16, 17)))
 
 
 @pytest.mark.usefixtures("unchecked")

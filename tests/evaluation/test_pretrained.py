@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from nerfro.errors import NerfroError
 from nerfro.evaluation import pretrained
-from nerfro.evaluation.pretrained import ALEXNET, Published, load_weights, unreachable
+from nerfro.evaluation.pretrained import ALEXNET, load_weights, unreachable
 
 WEIGHTS = {"features.0.weight": torch.arange(6.0)}
 
@@ -72,7 +72,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 def cached_alexnet() -> Path:
     folder = Path(torch.hub.get_dir(), "checkpoints")
     folder.mkdir(parents=True, exist_ok=True)
-    return folder / ALEXNET.url.rpartition("/")[2]
+    return folder / ALEXNET.rpartition("/")[2]
 
 
 def right_name() -> str:
@@ -84,23 +84,26 @@ def assert_same(weights: dict[str, torch.Tensor]) -> None:
     torch.testing.assert_close(weights["features.0.weight"], WEIGHTS["features.0.weight"])
 
 
-def test_weights_are_fetched_once_and_then_read_from_the_cache(site: str, cache: Path) -> None:
+def test_weights_are_fetched_once_and_then_read_from_the_cache(
+    site: str, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     url = f"{site}/{right_name()}"
-    assert_same(load_weights(Published("AlexNet", url)))
+    assert_same(load_weights(url))
     assert (cache / right_name()).is_file()
-    assert_same(load_weights(Published("AlexNet", url), download=False))
+    monkeypatch.setattr(pretrained, "unreachable", None)  # not asked again
+    assert_same(load_weights(url))
 
 
 def test_weights_with_another_hash_are_refused_and_not_kept(site: str, cache: Path) -> None:
     with pytest.raises(NerfroError, match="hash"):
-        load_weights(Published("AlexNet", f"{site}/alexnet-00000000.pth"))
+        load_weights(f"{site}/alexnet-00000000.pth")
     assert list(cache.iterdir()) == []
 
 
 def test_stalled_download_is_given_up_and_leaves_nothing(site: str, cache: Path, monkeypatch) -> None:
     monkeypatch.setattr(pretrained, "STALL_SECONDS", 0.3)
     with pytest.raises(NerfroError, match="timed out"):
-        load_weights(Published("AlexNet", f"{site}/stalling/{right_name()}"))
+        load_weights(f"{site}/stalling/{right_name()}")
     assert list(cache.iterdir()) == []
     assert socket.getdefaulttimeout() is None
 
@@ -115,7 +118,7 @@ def test_refused_connection_is_the_reason_in_one_line() -> None:
     with socket.create_server(("127.0.0.1", 0)) as closed:
         port = closed.getsockname()[1]
     with pytest.raises(NerfroError, match=r"no network \(Connection refused\)") as caught:
-        load_weights(Published("AlexNet", f"http://127.0.0.1:{port}/alexnet-00000000.pth"))
+        load_weights(f"http://127.0.0.1:{port}/alexnet-00000000.pth")
     assert "\n" not in str(caught.value)
 
 
@@ -131,7 +134,7 @@ def test_any_text_file_is_refused_in_one_line_that_says_what_to_give(
     cached = cached_alexnet()
     cached.write_text(text, encoding="latin-1", errors="replace")
     with pytest.raises(NerfroError, match=rf"AlexNet weights {cached} .*; delete them to fetch them again") as caught:
-        load_weights(ALEXNET)
+        load_weights()
     assert "\n" not in str(caught.value)
     assert "weights_only" not in str(caught.value)
 
@@ -146,5 +149,5 @@ class Code:
 def test_pickled_code_is_not_executed(capsys) -> None:
     torch.save({"features.0.weight": Code()}, cached_alexnet())
     with pytest.raises(NerfroError, match="cannot be read"):
-        load_weights(ALEXNET)
+        load_weights()
     assert "must never run" not in capsys.readouterr().out

@@ -32,7 +32,7 @@ def result() -> EvaluationResult:
             {"mask": scores(psnr=24.0), "crop": scores(psnr=26.0)},
         ),
     )
-    return EvaluationResult(views, {"lpips": "no network", "mask.ssim": "masks too small"}, "float")
+    return EvaluationResult(views, {"lpips": "no network", "mask.ssim": "masks too small"})
 
 
 def refuse(constant: str) -> None:

@@ -19,79 +19,88 @@ from nerfro.evaluation.tables import (
 TABLE = Table(
     title="50% of a_b & c",
     label_title="method",
-    columns=(Column("PSNR", "higher", 2), Column("LPIPS", "lower", 3), Column("steps", None, 0)),
-    rows=(
-        Row("mip_nerf|sky", (22.314999, None, 1500.0)),
-        Row("refractive", (25.461, 0.1304, 1500.0)),
-        Row("w/o #H", (25.4579, 0.25, 1500.0)),
+    columns=(
+        Column("PSNR", "higher", 2, "A & co"),
+        Column("LPIPS", "lower", 3, "A & co"),
+        Column("PSNR", "higher", 2, "B"),
+        Column("steps", None, 0, "B"),
     ),
-    summary=(Row("mean", (24.41, None, 1500.0)),),
-    mark="best",
+    rows=(
+        Row("mip_nerf|sky", (22.081, None, 1.0, 1500.0)),
+        Row("w/o #H", (22.08, 0.25, 2.0, 1500.0), (0.5, None, None, None)),
+        Row("refractive", (25.461, 0.1304, 3.0, 1500.0)),
+        Row("straight", (21.8, 0.4, 4.0, 1500.0)),
+    ),
+    summary=(Row("mean", (22.8555, None, 2.5, 1500.0)),),
+    medals=True,
     notes=("LPIPS n/a: no file at a_long_path/" + "x" * 100,),
 )
 
 
-def best_cells(table: Table) -> set[tuple[int, int]]:
-    return {(i, j) for i in range(len(table.rows)) for j in range(len(table.columns)) if table.mark_of(i, j) == "best"}
-
-
-def on_console(table: Table, styled: bool = False) -> str:
-    console = rich.console.Console(file=io.StringIO(), width=400, force_terminal=styled, color_system="standard")
-    console.print(to_rich(table))
-    return console.file.getvalue()
-
-
-def test_best_follows_the_direction_of_the_column_and_values_that_print_alike_tie() -> None:
-    assert best_cells(TABLE) == {(1, 0), (2, 0), (1, 1)}
+def test_medals_follow_the_papers_rule() -> None:
+    """Values that print alike have the same medal, and the next one is not left out."""
+    assert [[TABLE.medal_of(i, j) or None for i in range(4)] for j in range(4)] == [
+        ["silver", "silver", "gold", "bronze"],
+        [None, "silver", "gold", "bronze"],
+        [None, "bronze", "silver", "gold"],
+        [None, None, None, None],
+    ]
 
 
 def test_csv_reads_back_every_digit() -> None:
     lines = [line for line in to_csv(TABLE).splitlines() if not line.startswith("#")]
     heading, *body = csv.reader(lines)
-    assert heading == ["method", "PSNR", "LPIPS", "steps"]
+    titles = ("A & co PSNR", "A & co LPIPS", "B PSNR", "B steps")
+    assert heading == ["method", *(text for title in titles for text in (title, f"{title} std"))]
     for row, cells in zip((*TABLE.rows, *TABLE.summary), body, strict=True):
-        assert cells[0] == row.label
-        assert tuple(None if cell == "n/a" else float(cell) for cell in cells[1:]) == row.values
+        numbers = tuple(None if cell == "n/a" else float(cell) for cell in cells[1:])
+        assert (cells[0], numbers[::2]) == (row.label, row.values)
+        assert numbers[1::2] == (row.spreads or (None,) * 4)
 
 
 def test_markdown_has_as_many_cells_in_every_line() -> None:
     lines = [line for line in to_markdown(TABLE).splitlines() if line.startswith("|")]
     cells = [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines]
-    assert {len(row) for row in cells} == {4}
-    assert cells[0] == ["method", "PSNR ↑", "LPIPS ↓", "steps"]
-    assert cells[2] == [r"mip_nerf\|sky", "22.31", "n/a", "1500"]
-    assert cells[3] == ["refractive", "**25.46**", "**0.130**", "1500"]
-    assert cells[5] == ["*mean*", "*24.41*", "*n/a*", "*1500*"]
+    assert {len(row) for row in cells} == {5}
+    assert cells[0] == ["method", "A & co PSNR ↑", "A & co LPIPS ↓", "B PSNR ↑", "B steps"]
+    assert cells[2] == [r"mip_nerf\|sky", "22.08 🥈", "n/a", "1.00", "1500"]
+    assert cells[3] == ["w/o #H", "22.08 ± 0.50 🥈", "0.250 🥈", "2.00 🥉", "1500"]
+    assert cells[6] == ["*mean*", "*22.86*", "*n/a*", "*2.50*", "*1500*"]
 
 
 def test_latex_is_a_booktabs_table_with_special_characters_escaped() -> None:
     latex = to_latex(TABLE)
-    assert re.search(r"(?<!\\)[_#%]", latex) is None
+    assert re.search(r"(?<!\\)[_#%]|±", latex) is None
     assert r"\caption{50\% of a\_b \& c}" in latex
     assert latex.count("{") == latex.count("}")
-    for rule in (r"\toprule", r"\midrule", r"\bottomrule"):
+    for rule in (r"\toprule", r"\midrule", r"\bottomrule", r"\cmidrule(lr){2-3} \cmidrule(lr){4-5}"):
         assert rule in latex
     body = latex[latex.index(r"\toprule") : latex.index(r"\bottomrule")]
-    rows = [line for line in body.splitlines() if line.endswith(r"\\")]
-    assert [len(re.findall(r"(?<!\\)&", row)) for row in rows] == [3] * 5
-    assert rows[0] == r"method & PSNR $\uparrow$ & LPIPS $\downarrow$ & steps \\"
-    assert rows[2] == r"refractive & \textbf{25.46} & \textbf{0.130} & 1500 \\"
+    groups, headings, *rows = [line for line in body.splitlines() if line.endswith(r"\\")]
+    assert groups == r" & \multicolumn{2}{c}{A \& co} & \multicolumn{2}{c}{B} \\"
+    assert headings == r"method & PSNR $\uparrow$ & LPIPS $\downarrow$ & PSNR $\uparrow$ & steps \\"
+    assert [len(re.findall(r"(?<!\\)&", row)) for row in rows] == [4] * 5
+    silver = r"\cellcolor[HTML]{DADDE2}"
+    assert rows[1].startswith(rf"w/o \#H & {silver}22.08 $\pm$ 0.50 & {silver}0.250 & ")
+    special = to_latex(Table("\\ ~ ^ { } $", "x", (Column("y"),), (Row("z", (1.0,)),)))
+    assert r"\caption{\textbackslash{} \textasciitilde{} \textasciicircum{} \{ \} \$}" in special
 
 
-def test_latex_prints_every_special_character_as_itself() -> None:
-    latex = to_latex(Table("\\ ~ ^ { } $", "x", (Column("y"),), (Row("z", (1.0,)),)))
-    assert r"\caption{\textbackslash{} \textasciitilde{} \textasciicircum{} \{ \} \$}" in latex
-
-
-def test_console_shows_every_number_and_the_footnote_in_one_line() -> None:
-    text = on_console(TABLE)
-    for expected in ("50% of a_b & c", "mip_nerf|sky", "22.31", "0.130", "n/a", "mean", TABLE.notes[0]):
-        assert expected in text
-    assert re.search(r"\x1b\[1m[^\x1b]*25\.46", on_console(TABLE, styled=True))
+def test_console_shows_each_group_of_columns_in_a_table_of_its_own() -> None:
+    console = rich.console.Console(file=io.StringIO(), width=45)
+    console.print(to_rich(TABLE))
+    first, second = re.split(r"^ *B *$", console.file.getvalue(), flags=re.MULTILINE)
+    for expected in ("50% of a_b & c", "A & co", "mip_nerf|sky", "22.08 ± 0.50 🥈", "0.130 🥇", "n/a", "mean"):
+        assert expected in first
+    assert "4.00 🥇" in second
+    assert TABLE.notes[0] in second.replace("\n", "")
+    assert "…" not in first + second
 
 
 def test_console_prints_square_brackets_as_they_are() -> None:
-    assert "[red]x" in on_console(Table("t", "view", (Column("PSNR"),), (Row("[red]x", (1.0,)),)))
+    console = rich.console.Console(file=io.StringIO())
+    console.print(to_rich(Table("t", "view", (Column("PSNR"),), (Row("[red]x", (1.0,)),))))
+    assert "[red]x" in console.file.getvalue()
 
 
 @pytest.mark.parametrize("row", [Row("a", (1.0,)), Row("a", (1.0, 2.0), (0.1,))])

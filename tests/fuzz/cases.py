@@ -119,7 +119,7 @@ def options_of_other_commands(world: World, draw: random.Random) -> str | None:
                   "medium.inner_iors", "sampler.path.max_events",
                   "sampler.path.interface", "near", "far", "rays", "plot", "out", "overwrite"],
         "evaluate": ["split", "root", "chunk_size", "subdivision.side", "subdivision.divergence", "masks", "alpha",
-                     "protocol", "device", "predictions", "references", "overwrite"],
+                     "device", "predictions", "references", "overwrite"],
         "summary": ["metrics", "region", "methods", "scenes", "views", "report"],
         "preprocess": ["mesh", "resolution", "box_min", "wrong_masks", "keep", "smoothing", "medium.ior",
                        "data.near", "data.downscale", "data.mask_labels"],
