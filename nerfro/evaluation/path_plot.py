@@ -24,7 +24,7 @@ _MARGIN = 0.15
 
 
 def draw_paths(path: Path, medium: Medium, file: FilePath) -> None:
-    """Write a plot of a few paths and the medium to a PNG file; see `_plot_paths`."""
+    """Write a plot of a few paths and the medium to a PNG file; see `plot_paths`."""
     with atomic_file(file) as stream:
         _draw(path, medium).print_png(stream)
 
@@ -40,12 +40,12 @@ def _draw(path: Path, medium: Medium, dpi: int = 150) -> FigureCanvasAgg:
 
     figure = Figure(figsize=(7, 7), layout="constrained", dpi=dpi)
     canvas = FigureCanvasAgg(figure)
-    _plot_paths(figure.add_subplot(), path, medium)
+    plot_paths(figure.add_subplot(), path, medium)
     canvas.draw()
     return canvas
 
 
-def _plot_paths(axes: Axes, path: Path, medium: Medium) -> None:
+def plot_paths(axes: Axes, path: Path, medium: Medium) -> None:
     """Plot paths over the refractive index in the plane that contains most of the paths.
 
     The plane passes through the centre of the medium's box, and all paths are projected onto it. Branches of split

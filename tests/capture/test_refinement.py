@@ -140,14 +140,14 @@ def preprocess(tmp_path: Path, run_here: Callable) -> Callable:
 
 
 def test_preprocess_writes_the_refined_surface(preprocess: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
-    fast = functools.partial(refine_surface, settings=SHORT)
-    monkeypatch.setattr(refinement, "refine_surface", fast)
+    quick = RefinementSettings((Stage(75, 5e-4, (3.0, 1.0)),), 2000, (8, 16))
+    monkeypatch.setattr(refinement, "refine_surface", functools.partial(refine_surface, settings=quick))
     out, printed = preprocess("room=false")
     assert "surface refined" in printed
     assert f"scene={out / 'scene.json'}" in printed
     assert load_mesh(out / "mesh.ply").vertices.shape == mesh().vertices.shape
     figures = json.loads((out / "refinement.json").read_text())
-    assert min(figures["validation_error"]) < 0.6 * figures["validation_error"][0]
+    assert min(figures["validation_error"]) < 0.8 * figures["validation_error"][0]
 
 
 def test_a_surface_that_cannot_be_refined_stays_as_it_is(preprocess: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
