@@ -44,14 +44,8 @@ class Solids(NamedTuple):
     coefficients: Float[np.ndarray, "N"]
     start: Int[np.ndarray, "K"]
     shape: Int[np.ndarray, "K 3"]
-    # Distances of blocks of cells to the surface, the first block of each body, its numbers of blocks, and blocks per
-    # world unit.
-    clearance: Float[np.ndarray, "M"]
-    clearance_start: Int[np.ndarray, "K"]
-    clearance_shape: Int[np.ndarray, "K 3"]
-    inverse_clearance: Float[np.ndarray, "K 3"]
-    # Smaller blocks: lowest and highest derivatives of the spline, number of empty blocks around (negative inside the
-    # body), and as above.
+    # Blocks of cells: lowest and highest derivatives of the spline, number of empty blocks around (negative inside the
+    # body), the first block of each body, its numbers of blocks, and blocks per world unit.
     slopes: Float[np.ndarray, "B 3 2"]
     empty: Int8[np.ndarray, "B"]
     block_start: Int[np.ndarray, "K"]
@@ -70,8 +64,8 @@ NO_VOXELS = Voxels(np.empty((0, 0, 0, 4), np.float32), np.empty((0, 0, 0), np.fl
 _corners, _lengths, _counts, _numbers = np.empty((0, 3)), np.empty(0), np.empty((0, 3), np.int64), np.empty(0, np.int64)
 _values, _bounds, _bytes = np.empty(0, np.float32), np.empty((0, 3, 2), np.float32), np.empty(0, np.int8)
 NO_SOLIDS = Solids(
-    _corners, _corners, _corners, _lengths, _values, _numbers, _counts, _values, _numbers, _counts, _corners, _bounds,
-    _bytes, _numbers, _counts, _corners, _lengths, False, 0.0, *np.empty((2, 3)),
+    _corners, _corners, _corners, _lengths, _values, _numbers, _counts, _bounds, _bytes, _numbers, _counts, _corners,
+    _lengths, False, 0.0, *np.empty((2, 3)),
 )  # fmt: skip
 
 
@@ -193,28 +187,6 @@ def body_distance(solids, body, x, y, z):
 
 
 @compiled
-def solid_clearance(solids, x, y, z, enough):
-    """Return a lower bound of the distance to the nearest shell (`media.solid`); tight if less than `enough`.
-
-    The lookup of a block is cheap. The signed distances are only evaluated near surfaces.
-    """
-    nearest = math.inf
-    for body in range(len(solids.iors)):
-        nx, ny, nz, beyond = nearest_in_box(solids.low[body], solids.high[body], x, y, z)
-        low, per, counts = solids.low[body], solids.inverse_clearance[body], solids.clearance_shape[body]
-        bx, by, bz = blocks_from(low, per, nx, ny, nz)
-        i, j, k = block_at(counts, bx, by, bz)
-        free = float(solids.clearance[block_number(solids.clearance_start[body], counts, i, j, k)])
-        nearest = min(nearest, math.sqrt(beyond + free * free) if beyond > 0.0 else free)
-    if nearest - solids.shell > enough:
-        return nearest - solids.shell
-    nearest = math.inf
-    for body in range(len(solids.iors)):
-        nearest = min(nearest, SAFE_SHARE * abs(body_distance(solids, body, x, y, z)))
-    return max(nearest - solids.shell, 0.0)
-
-
-@compiled
 def solid_index(solids, x, y, z):
     """Return index, gradient of the index and clearance of bodies with smooth shells (`media.solid`)."""
     shell, nested = solids.shell, solids.nested
@@ -302,46 +274,6 @@ def blocks_from(low, inverse_size, x, y, z):
 
 
 @compiled
-def lengths_of_block(rx, ry, rz):
-    """Return the length of a line per block along each axis, given the blocks per unit length."""
-    qx, qy, qz = math.inf, math.inf, math.inf
-    if rx != 0.0:
-        qx = 1.0 / rx
-    if ry != 0.0:
-        qy = 1.0 / ry
-    if rz != 0.0:
-        qz = 1.0 / rz
-    return qx, qy, qz
-
-
-@compiled
-def _end_along(i, reach, b, q):
-    """Return the distance at which a line leaves along one axis; infinite for parallel lines, even on a face."""
-    if math.isinf(q):
-        return math.inf
-    return ((i + reach if q > 0.0 else i + 1.0 - reach) - b) * q
-
-
-@compiled
-def end_of_blocks(i, j, k, reach, bx, by, bz, qx, qy, qz):
-    """Return the distance at which a line leaves the blocks that are less than `reach` away from block (i, j, k)."""
-    i, j, k, reach = float(i), float(j), float(k), float(reach)
-    end_y, end_z = _end_along(j, reach, by, qy), _end_along(k, reach, bz, qz)
-    return min(_end_along(i, reach, bx, qx), min(end_y, end_z))
-
-
-@compiled
-def slope_along(bounds, dx, dy, dz):
-    """Bound the slope of a body's distance along a line, given bounds of its derivatives along the axes [3, 2]."""
-    least, most, direction = 0.0, 0.0, (dx, dy, dz)
-    for axis in range(3):
-        one, other = direction[axis] * bounds[axis, 0], direction[axis] * bounds[axis, 1]
-        least += min(one, other)
-        most += max(one, other)
-    return least, most
-
-
-@compiled
 def box_span(low, high, x, y, z, dx, dy, dz):
     """Return the distances at which a line enters and leaves a box; enter > leave if the line misses the box."""
     enter, leave = -math.inf, math.inf
@@ -364,31 +296,3 @@ def distance_out(low, high, x, y, z, dx, dy, dz):
     """Return a distance after which a ray from inside a box, or from near the box, is outside."""
     shortest = min(high[0] - low[0], high[1] - low[1], high[2] - low[2])
     return max(box_span(low, high, x, y, z, dx, dy, dz)[1], 0.0) + BEYOND_BOX * shortest
-
-
-@compiled
-def put_vertex(row, count, x, y, z, dx, dy, dz, length):
-    """Append a vertex to a polyline; vertices beyond the capacity are only counted.
-
-    Args:
-        row: positions, directions and arc lengths of the polyline.
-        count: number of its vertices.
-        x, y, z, dx, dy, dz, length: position, direction and arc length of the new vertex.
-    """
-    positions, directions, s = row
-    if count < s.shape[0]:
-        positions[count, 0], positions[count, 1], positions[count, 2] = x, y, z
-        directions[count, 0], directions[count, 1], directions[count, 2] = dx, dy, dz
-        s[count] = length
-    return count + 1
-
-
-@compiled
-def repeat_last(row, count):
-    """Fill the rest of a polyline with the last vertex."""
-    positions, directions, s = row
-    last = min(count, s.shape[0]) - 1
-    for i in range(last + 1, s.shape[0]):
-        for axis in range(3):
-            positions[i, axis], directions[i, axis] = positions[last, axis], directions[last, axis]
-        s[i] = s[last]

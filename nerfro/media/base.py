@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import torch
@@ -16,23 +14,6 @@ from nerfro.types import WORLD_ORIGIN, Path
 
 Scalars = Float[Tensor, "*batch"]
 Vectors = Float[Tensor, "*batch 3"]
-
-
-class lazy_buffer:  # noqa: N801 (used like functools.cached_property)
-    """Decorator for a tensor-valued method: the first access computes the tensor and registers a non-persistent buffer.
-
-    Unlike with `functools.cached_property`, the tensor moves to other devices together with the module.
-    """
-
-    def __init__(self, compute: Callable[[Any], Tensor]) -> None:
-        self._compute, self._name, self.__doc__ = compute, f"_{compute.__name__}", compute.__doc__
-
-    def __get__(self, module: nn.Module, owner: type) -> Tensor:
-        if self._name not in module._buffers:
-            with torch.inference_mode(False):  # the first access may be in evaluation, and training needs it too
-                module.register_buffer(self._name, self._compute(module), persistent=False)
-        return module.get_buffer(self._name)
-
 
 # Steps along the diagonal of a medium that does not override `step_length`.
 _STEPS_PER_DIAGONAL = 512

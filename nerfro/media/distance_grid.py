@@ -15,13 +15,14 @@ from torch import Tensor, nn
 from nerfro.geometry.interpolation import quadratic_spline, spline_coefficients
 from nerfro.kernels.constants import constant
 from nerfro.kernels.tolerances import MIN_SEARCH_STEP
-from nerfro.media.base import Scalars, Vectors, lazy_buffer
+from nerfro.media.base import Scalars, Vectors
 
 # Half width in voxels of the band around the surface in which the distance is exact. It covers the support of the
 # spline and the step that brackets the surface.
 BAND = 3.0
-# Cells along each side of the blocks that store a lower bound of the distance, and of the blocks that store whether
-# they may contain a surface. docs/lab/rendering_speed.md has times for 3 and 4 cells.
+# Cells along each side of the blocks of the interactive page, which store a lower bound of the distance, and of the
+# blocks of the kernels, which store whether they may contain a surface. docs/lab/rendering_speed.md has times for 3 and
+# 4 cells.
 BLOCK, SURFACE_BLOCK = 4, 3
 # A quadratic spline that is extrapolated by half a cell at a corner is a sum of coefficients whose positive weights add
 # up to 2.19 and whose negative weights to -1.19. It is positive if the largest coefficient is less than 1.84 times the
@@ -71,17 +72,8 @@ class DistanceGrid(nn.Module):
         along = torch.where(beyond == 0, phi[..., None] * gradients, beyond) / distance[..., None]
         return torch.where(outside, distance, phi), torch.where(outside[..., None], along, gradients)
 
-    def clearance(self, positions: Vectors) -> Scalars:
-        """Return a lower bound of the distance to the surface, from the blocks and without gradients."""
-        grid, positions = self.coarse_clearance, positions.detach()
-        nearest = positions.maximum(self.box[0]).minimum(self.box[1])
-        block = ((nearest - self.box[0]) / self.spacing / BLOCK).floor().long()
-        x, y, z = torch.minimum(block.clamp(min=0), constant(grid.shape, grid.device) - 1).unbind(-1)
-        return torch.hypot(torch.linalg.vector_norm(positions - nearest, dim=-1), grid[x, y, z].to(positions))
-
-    @lazy_buffer
     def coarse_clearance(self) -> Float[Tensor, "x y z"]:
-        """Lower bound of the distance to the surface from any point of each block of `BLOCK`^3 cells, world units."""
+        """Return a lower bound of the distance to the surface from each block of `BLOCK`^3 cells, for the page."""
         blocks = torch.tensor(self.distances.shape).sub(1).div(BLOCK, rounding_mode="floor").add(1).tolist()
         nearest = self.distances.abs().cpu()
         for axis, count in enumerate(blocks):
@@ -91,11 +83,10 @@ class DistanceGrid(nn.Module):
         spacing = self.spacing.cpu()
         # A point is within half a cell diagonal of a vertex, and the spline does not pass exactly through the data.
         margin = 0.5 * torch.linalg.vector_norm(spacing) + 0.25 * spacing.min()
-        return (nearest - margin).clamp(min=0).to(self.distances.device)
+        return (nearest - margin).clamp(min=0)
 
-    @lazy_buffer
     def coarse_slopes(self) -> Float[Tensor, "x y z 3 2"]:
-        """Lowest and highest derivative of the spline along the axes in each block of `SURFACE_BLOCK`^3 cells.
+        """Bound the derivatives of the spline along the axes in each block of `SURFACE_BLOCK`^3 cells.
 
         A derivative is a weighted mean of differences of neighbouring coefficients, which therefore bound it. At the
         border of the grid splines are extrapolated, and the bounds are infinite.
@@ -111,9 +102,8 @@ class DistanceGrid(nn.Module):
         found[self._border_blocks()] = found.new_tensor([-torch.inf, torch.inf])
         return found
 
-    @lazy_buffer
     def empty_blocks(self) -> Int8[Tensor, "x y z"]:
-        """Lower bound of the Chebyshev distance to the next block of `SURFACE_BLOCK`^3 cells that may hold the surface.
+        """Bound the Chebyshev distance to the next block of `SURFACE_BLOCK`^3 cells that may hold the surface.
 
         Values of blocks inside the body are negative, and 0 means that the block itself may hold the surface. A block
         without sign changes of the coefficients does not, because the values of a spline lie between its coefficients.
@@ -157,14 +147,12 @@ class DistanceGrids(nn.ModuleList):
         low, high = np.stack([grid.box.double().cpu().numpy() for grid in self], axis=1)
         shape = np.array([grid.distances.shape for grid in self])
         inverse_spacing = (shape - 1) / (high - low)
-        clearance, clearance_start, clearance_shape = _flat(grid.coarse_clearance for grid in self)
-        empty, block_start, block_shape = _flat(grid.empty_blocks for grid in self)
+        empty, block_start, block_shape = _flat(grid.empty_blocks() for grid in self)
         coefficients, start, _ = _flat(grid.coefficients.detach() for grid in self)
-        slopes = np.concatenate([grid.coarse_slopes.cpu().numpy().reshape(-1, 3, 2) for grid in self])
+        slopes = np.concatenate([grid.coarse_slopes().numpy().reshape(-1, 3, 2) for grid in self])
         return (
-            low, high, inverse_spacing, MIN_SEARCH_STEP * (high - low).min(1), coefficients, start, shape, clearance,
-            clearance_start, clearance_shape, inverse_spacing / BLOCK, slopes, empty, block_start, block_shape,
-            inverse_spacing / SURFACE_BLOCK,
+            low, high, inverse_spacing, MIN_SEARCH_STEP * (high - low).min(1), coefficients, start, shape,
+            slopes, empty, block_start, block_shape, inverse_spacing / SURFACE_BLOCK,
         )  # fmt: skip
 
 

@@ -16,7 +16,7 @@ from nerfro.errors import NerfroError
 from nerfro.geometry.intersection import LayeredIntersector, Triangles
 from nerfro.geometry.mesh import TriangleMesh, local_origin
 from nerfro.kernels.available import require_bytes
-from nerfro.media.base import Medium, Scalars, Vectors
+from nerfro.media.base import Medium, Vectors
 from nerfro.media.bodies import Body, mesh_surface, read_bodies
 from nerfro.media.distance_grid import DistanceGrid, DistanceGrids
 from nerfro.media.material import materials_of
@@ -199,13 +199,6 @@ class SdfGrid(Solid):
         starts = np.cumsum([0, *(len(mesh.vertices) for mesh in self.meshes)])
         faces = [mesh.faces + start for mesh, start in zip(self.meshes, starts, strict=False)]
         return TriangleMesh(np.concatenate([mesh.vertices for mesh in self.meshes]), np.concatenate(faces))
-
-    def clearance(self, positions: Vectors) -> Scalars:
-        """Return the distance to the nearest shell: a lower bound from the blocks, or near a shell the distance."""
-        coarse = torch.stack([grid.clearance(positions) for grid in self.grids]).amin(0) - self.shell
-        near = coarse <= 0
-        coarse[near] = super().clearance(positions[near])
-        return coarse
 
     def signed_distances(self, positions: Vectors) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K 3"]]:
         """Interpolate the distances by splines, with their exact gradients."""

@@ -19,7 +19,7 @@ from nerfro.geometry.occupancy import occupancy_fraction
 from nerfro.geometry.signed_distance import distance_to_set
 from nerfro.kernels.available import require_bytes
 from nerfro.kernels.constants import constant
-from nerfro.media.base import Medium, Scalars, Vectors, lazy_buffer
+from nerfro.media.base import Medium, Scalars, Vectors
 from nerfro.media.surface import MeshSurface
 from nerfro.registry import register
 
@@ -50,6 +50,8 @@ class VoxelGrid(Medium):
     """
 
     table: Float[Tensor, "X Y Z 4"]  # n and grad n (per world unit) at each vertex
+    # Lower bound of the distance to the next cell with grad n != 0, for any point of each cell, world units.
+    clearance_grid: Float[Tensor, "U V W"]
     occupancy: Float[Tensor, "X Y Z"]  # fraction inside the mesh, before smoothing
 
     def __init__(
@@ -117,6 +119,7 @@ class VoxelGrid(Medium):
         spacing = (box[1] - box[0]) / (torch.tensor(n.shape) - 1)
         table = torch.cat([n[..., None], gradient(n, spacing)], -1)
         self.register_buffer("table", table, persistent=False)
+        self.register_buffer("clearance_grid", _clearance_of(table, spacing, box), persistent=False)
 
     @property
     def indices(self) -> Float[Tensor, "K"]:
@@ -144,19 +147,6 @@ class VoxelGrid(Medium):
         n = torch.where(inside, values[..., 0], 1.0)
         return n, torch.where(inside[..., None], values[..., 1:], 0.0)
 
-    @lazy_buffer
-    def clearance_grid(self) -> Float[Tensor, "U V W"]:
-        """Lower bound of the distance to the next cell with grad n != 0, for any point of each cell, world units."""
-        varies = (self.table[..., 1:] != 0).any(-1).cpu()
-        for axis in range(3):
-            length = varies.shape[axis] - 1
-            varies = varies.narrow(axis, 0, length) | varies.narrow(axis, 1, length)
-        spacing = self.spacing.double().cpu().numpy()
-        # The distance between two cell centres exceeds that between any of their points by at most a cell diagonal.
-        distance = distance_to_set(varies.numpy(), spacing) - np.linalg.norm(spacing)
-        diagonal = float(torch.linalg.vector_norm(self.box[1] - self.box[0]))
-        return torch.from_numpy(distance.clip(0, diagonal)).to(self.table)
-
     def clearance(self, positions: Vectors) -> Scalars:
         """Return the distance within which grad n is zero, world units."""
         grid = self.clearance_grid
@@ -167,6 +157,21 @@ class VoxelGrid(Medium):
     def step_length(self, directions: Vectors, gradients: Vectors) -> Scalars:
         """Return half a voxel."""
         return (0.5 * self.spacing.min()).expand(directions.shape[:-1])
+
+
+def _clearance_of(
+    table: Float[Tensor, "X Y Z 4"], spacing: Float[Tensor, "3"], box: Float[Tensor, "2 3"]
+) -> Float[Tensor, "U V W"]:
+    """Compute `VoxelGrid.clearance_grid`."""
+    varies = (table[..., 1:] != 0).any(-1)
+    for axis in range(3):
+        length = varies.shape[axis] - 1
+        varies = varies.narrow(axis, 0, length) | varies.narrow(axis, 1, length)
+    cell = spacing.double().numpy()
+    # The distance between two cell centres exceeds that between any of their points by at most a cell diagonal.
+    distance = distance_to_set(varies.numpy(), cell) - np.linalg.norm(cell)
+    diagonal = float(torch.linalg.vector_norm(box[1] - box[0]))
+    return torch.from_numpy(distance.clip(0, diagonal)).to(table)
 
 
 def grid_box(

@@ -68,11 +68,11 @@ def bake_surface(renderer: Renderer) -> Baked:
         )
     wavelengths = getattr(renderer.path_sampler, "wavelengths", [0.0] * 3)
     colours = np.reshape(wavelengths, (3, -1))[:, len(wavelengths) // 6].tolist()  # of the middle band of each channel
-    solids = _on_same_grid(medium).packed()
-    bodies = range(len(solids.low))
+    on_grid = _on_same_grid(medium)
+    solids, bodies = on_grid.packed(), range(len(on_grid.grids))
     spacing = 1 / solids.inverse_spacing
     steps = _BAND * spacing.max(1) / 32767
-    clearance = solids.clearance.reshape(len(bodies), *solids.clearance_shape[0]).astype(np.float64)
+    clearance = np.stack([grid.coarse_clearance().double().numpy() for grid in on_grid.grids])
     units = clearance.max((1, 2, 3)).clip(min=1e-9) / 255
     coefficients = solids.coefficients.reshape(len(bodies), *solids.shape[0]).astype(np.float64)
     # The grids of all bodies follow each other along z.

@@ -92,7 +92,7 @@ def test_coarse_clearance_is_a_lower_bound() -> None:
     grid = _nested_balls(43).grids[0]
     block = 4 * 3 / 42
     positions = torch.rand(2000, 3) * 3 - 1.5
-    coarse = grid.clearance(positions)
+    coarse = grid.coarse_clearance()[((positions + 1.5) / block).long().unbind(-1)]
     exact = (positions.norm(dim=-1) - 0.9).abs()
     assert (coarse <= exact + 1e-6).all()
     # Short by the diagonals of a block and a cell, at most.
@@ -104,7 +104,7 @@ def test_coarse_slopes_bound_all_derivatives() -> None:
     block = SURFACE_BLOCK * 3 / 42
     positions = torch.rand(20000, 3, dtype=torch.float64) * 3 - 1.5
     x, y, z = ((positions + 1.5) / block).long().unbind(-1)
-    bounds = torch.stack([grid.coarse_slopes.double()[x, y, z] for grid in medium.grids], 1)
+    bounds = torch.stack([grid.coarse_slopes().double()[x, y, z] for grid in medium.grids], 1)
     gradients = medium.signed_distances(positions)[1]
     assert (bounds[..., 0] <= gradients + 1e-5).all()
     assert (gradients <= bounds[..., 1] + 1e-5).all()
@@ -117,7 +117,7 @@ def test_coarse_slopes_bound_all_derivatives() -> None:
 def test_no_surface_is_in_blocks_that_are_said_to_be_empty() -> None:
     medium = _nested_balls(43)
     block = SURFACE_BLOCK * 3 / 42
-    empty = medium.grids[0].empty_blocks
+    empty = medium.grids[0].empty_blocks()
     positions = torch.rand(20000, 3, dtype=torch.float64) * 3 - 1.5
     places = ((positions + 1.5) / block).long().clamp(max=len(empty) - 1)
     signs = medium.grids[0](positions)[0] < 0

@@ -17,9 +17,6 @@ from tests.closed_forms import Luneburg, RoundedBox, Slab, angle, grid_points, m
 BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
 
 
-# --- one step of the integrators ---
-
-
 # --- adaptive steps ---
 
 

@@ -16,9 +16,6 @@ from nerfro.kernels.lookup import (
     blocks_from,
     box_span,
     distance_out,
-    put_vertex,
-    repeat_last,
-    solid_clearance,
     solid_index,
     voxel_index,
 )
@@ -59,6 +56,34 @@ def _kick(h, px, py, pz, vx, vy, vz, n, gx, gy, gz):
 
 
 @compiled
+def _put_vertex(row, count, x, y, z, dx, dy, dz, length):
+    """Append a vertex to a polyline; vertices beyond the capacity are only counted.
+
+    Args:
+        row: positions, directions and arc lengths of the polyline.
+        count: number of its vertices.
+        x, y, z, dx, dy, dz, length: position, direction and arc length of the new vertex.
+    """
+    positions, directions, s = row
+    if count < s.shape[0]:
+        positions[count, 0], positions[count, 1], positions[count, 2] = x, y, z
+        directions[count, 0], directions[count, 1], directions[count, 2] = dx, dy, dz
+        s[count] = length
+    return count + 1
+
+
+@compiled
+def _repeat_last(row, count):
+    """Fill the rest of a polyline with the last vertex."""
+    positions, directions, s = row
+    last = min(count, s.shape[0]) - 1
+    for i in range(last + 1, s.shape[0]):
+        for axis in range(3):
+            positions[i, axis], directions[i, axis] = positions[last, axis], directions[last, axis]
+        s[i] = s[last]
+
+
+@compiled
 def _march_ray_uniformly(voxels, origin, direction, near, far, num_steps, row):
     """Trace one ray by `integrators.euler` and write its vertices; returns whether the index varied along the path."""
     table, low, inverse_spacing = voxels.table, voxels.low, voxels.inverse_spacing
@@ -71,7 +96,7 @@ def _march_ray_uniformly(voxels, origin, direction, near, far, num_steps, row):
     bent = False
     for step in range(num_steps):
         norm = math.sqrt(vx * vx + vy * vy + vz * vz)
-        put_vertex(row, step, x, y, z, vx / norm, vy / norm, vz / norm, s)
+        _put_vertex(row, step, x, y, z, vx / norm, vy / norm, vz / norm, s)
         bent = bent or gx != 0.0 or gy != 0.0 or gz != 0.0
         if step == num_steps - 1:
             break
@@ -114,27 +139,13 @@ def _box_of(voxels, solids):
 
 
 @compiled
-def _voxel_clearance(voxels, x, y, z):
-    """Return the distance around a point's cell within which the index is constant."""
-    bx, by, bz = blocks_from(voxels.low, voxels.inverse_spacing, x, y, z)
-    return voxels.clearance[block_at(voxels.clearance.shape, bx, by, bz)]
-
-
-@compiled
-def _free_length(voxels, solids, x, y, z, enough):
-    """Return a lower bound of the distance without a change of the index; the bound is tight if less than `enough`."""
-    if len(solids.iors) == 0:
-        return _voxel_clearance(voxels, x, y, z)
-    return solid_clearance(solids, x, y, z, enough)
-
-
-@compiled
 def _look_up(voxels, solids, x, y, z):
-    """Return the index, its gradient, and the distance without a change of the index."""
-    if len(solids.iors) == 0:
-        n, gx, gy, gz = voxel_index(voxels.table, voxels.low, voxels.inverse_spacing, x, y, z)
-        return n, gx, gy, gz, float(_voxel_clearance(voxels, x, y, z))
-    return solid_index(solids, x, y, z)
+    """Return the index, its gradient, and a lower bound of the distance without a change of the index."""
+    if len(solids.iors) > 0:
+        return solid_index(solids, x, y, z)
+    n, gx, gy, gz = voxel_index(voxels.table, voxels.low, voxels.inverse_spacing, x, y, z)
+    bx, by, bz = blocks_from(voxels.low, voxels.inverse_spacing, x, y, z)
+    return n, gx, gy, gz, float(voxels.clearance[block_at(voxels.clearance.shape, bx, by, bz)])
 
 
 @compiled
@@ -157,29 +168,24 @@ def _march_ray(voxels, solids, origin, direction, near, far, settings, row):
     dx, dy, dz = float(direction[0]), float(direction[1]), float(direction[2])
     s, end = float(near), float(far)
     x, y, z = origin[0] + s * dx, origin[1] + s * dy, origin[2] + s * dz
-    count, refracted, exceeded = put_vertex(row, 0, x, y, z, dx, dy, dz, s), False, False
+    count, refracted, exceeded = _put_vertex(row, 0, x, y, z, dx, dy, dz, s), False, False
     enter, leave = box_span(low, high, x, y, z, dx, dy, dz)
     if enter < leave and leave > 0.0 and enter < end - s:
         # Position, direction and arc length of the last recorded vertex.
         kx, ky, kz, kdx, kdy, kdz, ks = x, y, z, dx, dy, dz, s
         jump = max(enter, 0.0)
         x, y, z, s = x + jump * dx, y + jump * dy, z + jump * dz, s + jump
-        vx, vy, vz = dx, dy, dz
-        known, n, gx, gy, gz, free = False, 1.0, 0.0, 0.0, 0.0, 0.0
+        n, gx, gy, gz, free = _look_up(voxels, solids, x, y, z)
+        vx, vy, vz = n * dx, n * dy, n * dz
         exceeded = True
         for _ in range(max_steps):
-            if not known:
-                free = _free_length(voxels, solids, x, y, z, skip)
-                if free <= skip:
-                    n, gx, gy, gz, free = _look_up(voxels, solids, x, y, z)
-                    vx, vy, vz = n * dx, n * dy, n * dz
-                    known = True
             if free > skip:
                 if (dx - kdx) ** 2 + (dy - kdy) ** 2 + (dz - kdz) ** 2 > MIN_TURN:
-                    count = put_vertex(row, count, x, y, z, dx, dy, dz, s)
+                    count = _put_vertex(row, count, x, y, z, dx, dy, dz, s)
                     kx, ky, kz, kdx, kdy, kdz, ks = x, y, z, dx, dy, dz, s
                 x, y, z, s = x + free * dx, y + free * dy, z + free * dz, s + free
-                known = False
+                n, gx, gy, gz, free = _look_up(voxels, solids, x, y, z)
+                vx, vy, vz = n * dx, n * dy, n * dz
             else:
                 varied = gx != 0.0 or gy != 0.0 or gz != 0.0
                 ds = _step_length(solids, step, dx, dy, dz, gx, gy, gz)
@@ -195,19 +201,19 @@ def _march_ray(voxels, solids, origin, direction, near, far, settings, row):
                 ahead = s - ks
                 ex, ey, ez = x - kx - ahead * kdx, y - ky - ahead * kdy, z - kz - ahead * kdz
                 if ex * ex + ey * ey + ez * ez > tolerance * tolerance:
-                    count = put_vertex(row, count, x, y, z, dx, dy, dz, s)
+                    count = _put_vertex(row, count, x, y, z, dx, dy, dz, s)
                     kx, ky, kz, kdx, kdy, kdz, ks = x, y, z, dx, dy, dz, s
             outside = x < low[0] or x > high[0] or y < low[1] or y > high[1] or z < low[2] or z > high[2]
             if outside:
                 exceeded = False
                 break
         if (dx - kdx) ** 2 + (dy - kdy) ** 2 + (dz - kdz) ** 2 > MIN_TURN:
-            count = put_vertex(row, count, x, y, z, dx, dy, dz, s)
+            count = _put_vertex(row, count, x, y, z, dx, dy, dz, s)
     ahead = end - s
     if refracted:  # a bent path ends outside of the box
         ahead = max(ahead, distance_out(low, high, x, y, z, dx, dy, dz))
-    count = put_vertex(row, count, x + ahead * dx, y + ahead * dy, z + ahead * dz, dx, dy, dz, s + ahead)
-    repeat_last(row, count)
+    count = _put_vertex(row, count, x + ahead * dx, y + ahead * dy, z + ahead * dz, dx, dy, dz, s + ahead)
+    _repeat_last(row, count)
     return count, refracted, exceeded
 
 

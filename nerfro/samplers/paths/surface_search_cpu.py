@@ -15,10 +15,7 @@ from nerfro.kernels.lookup import (
     block_number,
     blocks_from,
     box_span,
-    end_of_blocks,
     grid_of,
-    lengths_of_block,
-    slope_along,
     spline_value,
 )
 
@@ -51,6 +48,46 @@ def _distance_at(coefficients, grid, line, t):
     """Return the signed distance to a body's surface at arc length t of a line inside the body's box."""
     x, y, z, dx, dy, dz = line
     return spline_value(coefficients, grid, x + t * dx, y + t * dy, z + t * dz)
+
+
+@compiled
+def lengths_of_block(rx, ry, rz):
+    """Return the length of a line per block along each axis, given the blocks per unit length."""
+    qx, qy, qz = math.inf, math.inf, math.inf
+    if rx != 0.0:
+        qx = 1.0 / rx
+    if ry != 0.0:
+        qy = 1.0 / ry
+    if rz != 0.0:
+        qz = 1.0 / rz
+    return qx, qy, qz
+
+
+@compiled
+def _end_along(i, reach, b, q):
+    """Return the distance at which a line leaves along one axis; infinite for parallel lines, even on a face."""
+    if math.isinf(q):
+        return math.inf
+    return ((i + reach if q > 0.0 else i + 1.0 - reach) - b) * q
+
+
+@compiled
+def end_of_blocks(i, j, k, reach, bx, by, bz, qx, qy, qz):
+    """Return the distance at which a line leaves the blocks that are less than `reach` away from block (i, j, k)."""
+    i, j, k, reach = float(i), float(j), float(k), float(reach)
+    end_y, end_z = _end_along(j, reach, by, qy), _end_along(k, reach, bz, qz)
+    return min(_end_along(i, reach, bx, qx), min(end_y, end_z))
+
+
+@compiled
+def _slope_along(bounds, dx, dy, dz):
+    """Bound the slope of a body's distance along a line, given bounds of its derivatives along the axes [3, 2]."""
+    least, most, direction = 0.0, 0.0, (dx, dy, dz)
+    for axis in range(3):
+        one, other = direction[axis] * bounds[axis, 0], direction[axis] * bounds[axis, 1]
+        least += min(one, other)
+        most += max(one, other)
+    return least, most
 
 
 @compiled
@@ -155,7 +192,7 @@ def _surface_ahead(solids, body, inside, line, limit):
         wall, lowest, highest = t, -math.inf, math.inf
         if reach == 0:
             wall = max(t, end_of_blocks(i, j, k, 1, bx, by, bz, qx, qy, qz))
-            lowest, highest = slope_along(solids.slopes[block], dx, dy, dz)
+            lowest, highest = _slope_along(solids.slopes[block], dx, dy, dz)
         while True:
             at_before, at_point = at_point, _distance_at(coefficients, grid, line, t)
             if (at_point < 0.0) != inside:

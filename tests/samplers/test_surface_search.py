@@ -2,7 +2,7 @@ import math
 
 import pytest
 
-from nerfro.kernels.lookup import end_of_blocks, lengths_of_block
+from nerfro.samplers.paths.surface_search_cpu import end_of_blocks, lengths_of_block
 
 
 @pytest.mark.parametrize("x", [20.0, 20.5, 21.0, 21.0 + 1e-9])
