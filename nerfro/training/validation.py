@@ -24,10 +24,9 @@ from nerfro.types import Batch, mean_per_pixel
 
 # Number of validation pixels, and largest number of their views.
 _NUM_PIXELS, _MAX_VIEWS = 2048, 32
-# A model overfits if validation PSNR is _LOST dB below its maximum while training PSNR has increased by _GAINED dB, or
-# if validation PSNR is _GAP dB below training PSNR. Chosen on photographs and rendered scenes: the gap is 0 to 2 dB for
-# good runs, and 6 to 9 dB with floating density in front of the cameras.
-_LOST, _GAINED, _GAP = 1.0, 0.5, 4.0
+# Difference of training and validation PSNR in dB from which a model overfits. Chosen on photographs and rendered
+# scenes: good runs have 0 to 2 dB, and runs with floating density in front of the cameras have 6 to 9 dB.
+_GAP = 4.0
 
 
 @dataclass(frozen=True)
@@ -95,28 +94,16 @@ class ValidationPixels:
 
 
 class OverfittingWarning(Callback):
-    """Print a warning once if the model overfits.
+    """Print a warning once if validation PSNR is 4 dB below training PSNR in two successive validations.
 
-    The model overfits if, in two successive validations, validation PSNR is 1 dB below its maximum while training PSNR
-    has increased by 0.5 dB, or if validation PSNR is 4 dB below training PSNR. Training PSNR is averaged over all
-    batches since the last validation.
-
-    Attributes:
-        comparable: whether validation and training PSNR can be compared. If cameras are refined, validation views have
-            less accurate cameras than training views.
-        warned: whether the warning was printed.
+    Training PSNR is averaged over all batches since the last validation. There is no warning if cameras are refined,
+    because validation views then have less accurate cameras than training views.
     """
 
     def __init__(self) -> None:
-        self.comparable = True
         # Sum of the mean squared errors of batches since the last validation, and number of batches.
         self._error, self._steps = 0.0, 0
-        self._best, self._best_step, self._training_at_best = -math.inf, 0, -math.inf
-        self._overfitted = self.warned = False
-
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        assert isinstance(pl_module, TrainingModule)
-        self.comparable = not pl_module.scene.camera.moves
+        self._num_gaps = 0  # number of successive validations with a large difference
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Batch, batch_idx: int
@@ -125,7 +112,8 @@ class OverfittingWarning(Callback):
             self._error, self._steps = self._error + outputs["squared_error"], self._steps + 1
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        if not self._steps or "val/psnr" not in trainer.callback_metrics:
+        assert isinstance(pl_module, TrainingModule)
+        if not self._steps or "val/psnr" not in trainer.callback_metrics or pl_module.scene.camera.moves:
             return
         training = -10 * math.log10(max(float(self._error) / self._steps, 1e-10))
         self._error, self._steps = 0.0, 0
@@ -140,28 +128,21 @@ class OverfittingWarning(Callback):
             step: number of completed steps.
             validation, training: PSNR of validation pixels and of training pixels, dB.
         """
-        if validation > self._best:
-            self._best, self._best_step, self._training_at_best = validation, step, training
-        lost = self._best - validation >= _LOST and training - self._training_at_best >= _GAINED
-        overfits = lost or (self.comparable and training - validation >= _GAP)
-        warns, self._overfitted = overfits and self._overfitted and not self.warned, overfits
-        if not warns:
-            return None
-        self.warned = True
-        decrease = f", {self._best - validation:.1f} dB less than after {self._best_step}" if lost else ""
-        shorter = f", or train for {self._best_step} steps" if lost else ""
-        return (
-            f"the model overfits: validation PSNR is {validation:.1f} dB after {step} steps{decrease}; training PSNR "
-            f"is {training:.1f} dB. Take more photographs, check the poses and, for glass, surface and index "
-            f"(medium...){shorter}; see docs/tutorials/photographs.md, Few photographs"
-        )
+        if self._num_gaps < 2:  # otherwise the warning was printed
+            self._num_gaps = self._num_gaps + 1 if training - validation >= _GAP else 0
+            if self._num_gaps == 2:
+                return (
+                    f"the model overfits: validation PSNR is {validation:.1f} dB after {step} steps; training PSNR is "
+                    f"{training:.1f} dB. Take more photographs, check the poses and, for glass, surface and index "
+                    "(medium...); see docs/tutorials/photographs.md, Few photographs"
+                )
+        return None
 
     def state_dict(self) -> dict[str, Any]:
-        names = ("_best", "_best_step", "_training_at_best", "_overfitted", "warned")
-        return {name: getattr(self, name) for name in names}
+        return {"num_gaps": self._num_gaps}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        vars(self).update(state_dict)
+        self._num_gaps = state_dict["num_gaps"]
 
 
 def _psnr(prediction: Float[Tensor, "P 3"], target: Float[Tensor, "P 3"]) -> Float[Tensor, ""]:
