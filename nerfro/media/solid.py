@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -73,7 +73,6 @@ class Solid(Medium):
             raise NerfroError(f"the medium has {len(materials)} bodies; at most {_MAX_BODIES} are allowed")
         self.materials = nn.ModuleList(materials)  # type: ignore[assignment]
         self.names = list(names) or body_names(len(materials))
-        self.register_load_state_dict_pre_hook(_read_old_parameters)
 
     def __repr__(self) -> str:
         size = " x ".join(f"{side:.3g}" for side in (self.box[1] - self.box[0]).tolist())
@@ -204,13 +203,3 @@ class Solid(Medium):
 def body_names(num_bodies: int) -> list[str]:
     """Return the names of bodies to which the configuration gives none: `object` for one, numbers for several."""
     return ["object"] if num_bodies == 1 else [str(body + 1) for body in range(num_bodies)]
-
-
-def _read_old_parameters(module: Any, state: dict[str, Tensor], prefix: str, *_: object) -> None:
-    """Read the parameters of earlier releases, which held the values of all bodies."""
-    for old, new in (("iors", "ior"), ("_absorption", "_absorption")):
-        values = state.pop(f"{prefix}{old}", None)
-        if values is not None:
-            for body, value in enumerate(values):
-                if isinstance(getattr(module.materials[body], new), nn.Parameter):  # the air of a vessel has none
-                    state[f"{prefix}materials.{body}.{new}"] = value
