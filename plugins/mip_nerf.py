@@ -45,8 +45,8 @@ class MipNerfField(Field):
 
     def forward(self, samples: Samples) -> Radiance:
         mean, variance = frustum_gaussians(samples)
-        position = integrated_positional_encoding(mean, variance, 0, self.position_degree)
-        direction = positional_encoding(samples.directions, 0, DIRECTION_DEGREE)
+        position = integrated_positional_encoding(mean, variance, self.position_degree)
+        direction = positional_encoding(samples.directions, DIRECTION_DEGREE)
         return Radiance(*self.mlp(position, direction))
 
 

@@ -31,4 +31,4 @@ class Skybox(Boundary):
         self.rgb = glorot_linear(self.trunk.num_outputs, 3)
 
     def forward(self, exits: Exits) -> Float[Tensor, "*batch 3"]:
-        return padded_sigmoid(self.rgb(self.trunk(positional_encoding(exits.directions, 0, DIRECTION_DEGREE))))
+        return padded_sigmoid(self.rgb(self.trunk(positional_encoding(exits.directions, DIRECTION_DEGREE))))

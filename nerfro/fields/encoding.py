@@ -12,27 +12,24 @@ from torch import Tensor
 DIRECTION_DEGREE = 4
 
 
-def positional_encoding(
-    x: Float[Tensor, "*batch D"], min_degree: int, max_degree: int, identity: bool = True
-) -> Float[Tensor, "*batch F"]:
-    """Encode x by sines and cosines at octaves 2^min .. 2^(max-1) (NeRF, Eqn. 4).
+def positional_encoding(x: Float[Tensor, "*batch D"], num_octaves: int) -> Float[Tensor, "*batch F"]:
+    """Encode x by sines and cosines at the octaves 1, 2, 4, ... (NeRF, Eqn. 4).
 
     As in mip-NeRF's code, frequencies have no factor pi and x is not normalized.
 
     Returns:
-        x (if `identity`), all sines, and all cosines; F = D (2 octaves + identity).
+        x, all sines, and all cosines; F = D (2 num_octaves + 1).
     """
-    scales = 2.0 ** torch.arange(min_degree, max_degree, device=x.device, dtype=x.dtype)
+    scales = 2.0 ** torch.arange(num_octaves, device=x.device, dtype=x.dtype)
     angles = (x[..., None, :] * scales[:, None]).flatten(-2)
-    waves = torch.sin(torch.cat([angles, angles + 0.5 * math.pi], dim=-1))
-    return torch.cat([x, waves], dim=-1) if identity else waves
+    return torch.cat([x, torch.sin(torch.cat([angles, angles + 0.5 * math.pi], dim=-1))], dim=-1)
 
 
 def integrated_positional_encoding(
-    mean: Float[Tensor, "*batch 3"], variance: Float[Tensor, "*batch 3"], min_degree: int, max_degree: int
+    mean: Float[Tensor, "*batch 3"], variance: Float[Tensor, "*batch 3"], num_octaves: int
 ) -> Float[Tensor, "*batch F"]:
     """Return expected sines and cosines of a Gaussian with diagonal covariance (mip-NeRF, Eqn. 13)."""
-    scales = 2.0 ** torch.arange(min_degree, max_degree, device=mean.device, dtype=mean.dtype)
+    scales = 2.0 ** torch.arange(num_octaves, device=mean.device, dtype=mean.dtype)
     angles = (mean[..., None, :] * scales[:, None]).flatten(-2)
     damping = torch.exp(-0.5 * (variance[..., None, :] * scales[:, None] ** 2).flatten(-2))
     return torch.cat([torch.sin(angles) * damping, torch.sin(angles + 0.5 * math.pi) * damping], dim=-1)

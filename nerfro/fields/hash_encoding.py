@@ -12,7 +12,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerfro.errors import NerfroError
 from nerfro.kernels.constants import constant
 
 # Features per vertex. The compiled kernels assume two, which one 64-bit load fetches.
@@ -50,13 +49,6 @@ class GridLevels:
 
 def grid_levels(num_levels: int, base_resolution: int, finest_resolution: int, log2_table_size: int) -> GridLevels:
     """Return levels with resolutions in geometric progression (Eqns. 2 and 3)."""
-    if num_levels < 1 or not 1 <= base_resolution <= finest_resolution:
-        raise NerfroError(
-            f"hash grid of {num_levels} levels from {base_resolution} to {finest_resolution} cells is not possible; "
-            "set num_levels >= 1 and 1 <= base_resolution <= finest_resolution"
-        )
-    if not 4 <= log2_table_size <= 24:
-        raise NerfroError(f"log2_table_size={log2_table_size} is outside 4 to 24; usual values are 14 to 19")
     growth = math.log(finest_resolution / base_resolution) / max(num_levels - 1, 1)
     # The small addend prevents the last level from being rounded down to one cell less than requested.
     resolutions = [math.floor(base_resolution * math.exp(level * growth) + 1e-6) for level in range(num_levels)]

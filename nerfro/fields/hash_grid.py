@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from nerfro.allowed import Count, Depth, Positive, Range, Width, corners_of_box
+from nerfro.allowed import Depth, Positive, Range, Width, corners_of_box
 from nerfro.cameras import Cameras
 from nerfro.fields import hash_encoding
 from nerfro.fields import spherical_harmonics as harmonics
@@ -68,7 +68,7 @@ class HashGridField(Field):
         box_max: Sequence[float] = (1.0, 1.0, 1.0),
         radius: Positive | None = None,
         num_levels: Depth = 12,
-        finest_resolution: Count = 256,
+        finest_resolution: Annotated[int, Range(at_least=_COARSEST_RESOLUTION)] = 256,
         log2_table_size: Annotated[int, Range(at_least=4, at_most=24)] = 15,
         width: Width = 64,
         direction_bands: Annotated[int, Range(at_least=1, at_most=harmonics.MAX_BANDS)] = 4,
@@ -92,11 +92,6 @@ class HashGridField(Field):
         num_harmonics = harmonics.spherical_harmonics(torch.zeros(1, 3), direction_bands).shape[-1]
         self.density_mlp = _mlp(hash_encoding.NUM_FEATURES * num_levels, width, 1, _GEOMETRY_FEATURES)
         self.colour_mlp = _mlp(_GEOMETRY_FEATURES + num_harmonics, width, 2, 3)
-
-    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
-        if self.observed is not None:  # earlier checkpoints do not contain it
-            state_dict.setdefault(f"{prefix}observed", torch.ones_like(self.observed))
-        super()._load_from_state_dict(state_dict, prefix, *rest)
 
     @property
     def bounds(self) -> Float[Tensor, "2 3"] | None:

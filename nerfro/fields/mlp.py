@@ -9,7 +9,6 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from nerfro.allowed import Depth, Width, checked
 from nerfro.errors import NerfroError
 from nerfro.kernels.linear import Linear
 
@@ -19,14 +18,13 @@ RGB_PADDING = 1e-3
 _BLACK = -4.0
 
 
-@checked("MLP")
 class SkipMLP(nn.Module):
     """ReLU layers with a skip connection: the input is concatenated to the output of layer `skip` (counted from 1).
 
     Weights are Glorot-uniform and biases are zero, as in the authors' code.
     """
 
-    def __init__(self, num_inputs: int, width: Width, depth: Depth, skip: int) -> None:
+    def __init__(self, num_inputs: int, width: int, depth: int, skip: int) -> None:
         super().__init__()
         self.skip = skip
         inputs = [num_inputs] + [width + num_inputs * (i == skip) for i in range(1, depth)]

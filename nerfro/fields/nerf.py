@@ -62,6 +62,6 @@ class NerfField(Field):
         self, positions: Float[Tensor, "*batch 3"], directions: Float[Tensor, "*batch 3"]
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
         """Evaluate density and colour at positions for unit directions."""
-        position = positional_encoding(positions, 0, self.position_degree)
-        direction = positional_encoding(directions, 0, DIRECTION_DEGREE)
+        position = positional_encoding(positions, self.position_degree)
+        direction = positional_encoding(directions, DIRECTION_DEGREE)
         return self.mlp(position, direction)

@@ -6,14 +6,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.errors import NerfroError
-
 MAX_BANDS = 4
 
 
 def spherical_harmonics(directions: Float[Tensor, "*batch 3"], num_bands: int) -> Float[Tensor, "*batch K"]:
     """Evaluate the K = num_bands^2 orthonormal real harmonics of degrees l < num_bands, by degree and order."""
-    check_bands(num_bands)
     x, y, z = directions.unbind(-1)
     xx, yy, zz = x * x, y * y, z * z
     harmonics = [torch.full_like(x, 0.28209479177387814)]
@@ -38,9 +35,3 @@ def spherical_harmonics(directions: Float[Tensor, "*batch 3"], num_bands: int) -
             0.5900435899266435 * x * (xx - 3 * yy),
         ]
     return torch.stack(harmonics, dim=-1)
-
-
-def check_bands(num_bands: int) -> None:
-    """Raise an error if a number of bands is not implemented."""
-    if not 1 <= num_bands <= MAX_BANDS:
-        raise NerfroError(f"{num_bands} bands of spherical harmonics are not supported; set 1 to {MAX_BANDS}")

@@ -11,7 +11,6 @@ from numba import prange
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from nerfro.fields.spherical_harmonics import check_bands
 from nerfro.kernels.compilation import compiled_parallel
 
 # The reference's factors, by degree.
@@ -26,7 +25,6 @@ _TEN, _FIFTEEN = np.float32(10), np.float32(15)
 
 def spherical_harmonics(directions: Float[Tensor, "P 3"], num_bands: int) -> Float[Tensor, "P K"]:
     """Evaluate `nerfro.fields.spherical_harmonics.spherical_harmonics` on the CPU."""
-    check_bands(num_bands)
     return _Harmonics.apply(directions.float().contiguous(), num_bands)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Optional
+from typing import Annotated, Literal, Optional
 
 import numpy as np
 from jaxtyping import Float
@@ -40,7 +40,7 @@ class ContentConfig:
 
     # `box`: a box, with the background outside of it. `all`: all of space, contracted outside of a ball, with the
     # background at infinity.
-    space: str = "box"
+    space: Annotated[str, Literal["box", "all"]] = "box"
     # Lower corner of the box, world units, relative to the origin of the medium; the ball is centred in the box. None
     # takes the bounds of the object, or for the ball the point that the cameras face.
     box_min: Optional[list[float]] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
@@ -61,11 +61,9 @@ def settle_content(config: DictConfig, medium: Medium, cameras: Cameras | None =
         cameras: cameras of the training views; None to read them from the data if they are needed.
 
     Raises:
-        NerfroError: one corner is given without the other, the space is unknown, or the cameras face no common point.
+        NerfroError: one corner is given without the other, or the cameras face no common point.
     """
     content = config.content
-    if content.space not in ("box", "all"):
-        raise NerfroError(f"content.space={content.space} is not allowed; choose box, all")
     if (content.box_min is None) != (content.box_max is None):
         raise NerfroError(
             "content.box_min and content.box_max belong together; give both, or neither for the object's bounds"

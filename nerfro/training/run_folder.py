@@ -208,8 +208,6 @@ def restore(checkpoint: dict, config: DictConfig) -> Renderer:
     """Build the trained model of a checkpoint."""
     prefix = "renderer."
     weights = {n.removeprefix(prefix): w for n, w in checkpoint["state_dict"].items() if n.startswith(prefix)}
-    if not weights:
-        raise NerfroError("an earlier release wrote this checkpoint, with other names of weights; train the run again")
     renderer = build_model(config)
     try:
         renderer.load_state_dict(weights)

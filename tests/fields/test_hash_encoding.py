@@ -3,7 +3,6 @@
 import pytest
 import torch
 
-from nerfro.errors import NerfroError
 from nerfro.fields import hash_encoding
 from nerfro.fields import hash_encoding_cpu as kernels
 from nerfro.kernels.constants import constant
@@ -28,15 +27,6 @@ def test_levels_grow_geometrically_and_hash_only_what_does_not_fit() -> None:
     assert LEVELS.dense == (True, True, False, False, False)
     assert LEVELS.sizes == (125, 729, 1024, 1024, 1024)
     assert LEVELS.num_entries == sum(LEVELS.sizes)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [((0, 4, 8, 10), "num_levels >= 1"), ((2, 8, 4, 10), "base_resolution <= finest"), ((2, 4, 8, 40), "4 to 24")],
-)
-def test_impossible_grids_are_refused(arguments: tuple[int, int, int, int], message: str) -> None:
-    with pytest.raises(NerfroError, match=message):
-        hash_encoding.grid_levels(*arguments)
 
 
 @pytest.mark.parametrize("encode", [hash_encoding.hash_encode, kernels.hash_encode])

@@ -151,6 +151,10 @@ def test_one_direction_band_makes_colour_independent_of_direction() -> None:
         ({"box_min": [0.0, 0, 0], "box_max": [1.0, 0, 1]}, "min below max"),
         ({"box_min": [0.0, 0]}, "three numbers"),
         ({"width": 0}, "width=0 is not allowed; take at least 1"),
+        ({"num_levels": 0}, "num_levels=0 is not allowed; take at least 1"),
+        ({"finest_resolution": 15}, "finest_resolution=15 is not allowed; take at least 16"),
+        ({"log2_table_size": 25}, "log2_table_size=25 is not allowed; take at least 4 and at most 24"),
+        ({"direction_bands": 5}, "direction_bands=5 is not allowed; take at least 1 and at most 4"),
     ],
 )
 def test_impossible_fields_are_refused(settings: dict, message: str) -> None:
@@ -200,9 +204,9 @@ def test_space_close_to_a_camera_is_empty_unless_three_cameras_see_it(num_camera
         assert torch.equal(found, torch.where(empty, 0, expected))
 
 
-def test_checkpoints_without_observed_cells_have_none_that_are_empty() -> None:
+def test_checkpoints_contain_the_observed_cells() -> None:
     field, restored = make_field(radius=2.0), make_field(radius=2.0)
-    restored.begin(cameras_around(12, 16))
-    restored.load_state_dict({name: value for name, value in field.state_dict().items() if name != "observed"})
+    field.begin(cameras_around(12, 16))
+    restored.load_state_dict(field.state_dict())
     points = torch.rand(1000, 3, generator=torch.Generator().manual_seed(0)) * 8 - 4
     assert torch.equal(restored.density(points), field.density(points))

@@ -82,10 +82,10 @@ def test_mip_nerf_field_sees_the_size_of_the_cone() -> None:
     assert not torch.allclose(field(samples).density, field(wider).density)
 
 
-@pytest.mark.parametrize(("width", "depth"), [(0, 4), (8, 0)])
-def test_empty_networks_are_refused(width: int, depth: int) -> None:
-    with pytest.raises(NerfroError, match="=0 is not allowed; take at least 1"):
-        SkipMLP(3, width, depth, 1)
+@pytest.mark.parametrize("setting", ["width", "depth", "view_width"])
+def test_empty_networks_are_refused(setting: str) -> None:
+    with pytest.raises(NerfroError, match=f"{setting}=0 is not allowed; take at least 1"):
+        NerfField(**{setting: 0})  # type: ignore[arg-type]
 
 
 def test_nerf_field_with_a_box_equals_one_without_inside_and_is_empty_outside() -> None:

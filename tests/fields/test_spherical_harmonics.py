@@ -5,7 +5,6 @@ import math
 import pytest
 import torch
 
-from nerfro.errors import NerfroError
 from nerfro.fields import spherical_harmonics_cpu as kernel
 from nerfro.fields.spherical_harmonics import spherical_harmonics
 
@@ -39,11 +38,6 @@ def test_each_degree_is_closed_under_rotation() -> None:
     for degree in range(4):
         power = harmonics[:, degree**2 : (degree + 1) ** 2].square().sum(-1)
         torch.testing.assert_close(power, torch.full_like(power, (2 * degree + 1) / (4 * math.pi)))
-
-
-def test_too_many_bands_are_refused() -> None:
-    with pytest.raises(NerfroError, match="1 to 4"):
-        spherical_harmonics(torch.zeros(1, 3), 5)
 
 
 @pytest.mark.parametrize("num_bands", [1, 2, 3, 4])

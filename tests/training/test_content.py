@@ -5,6 +5,7 @@ import pytest
 import torch
 from omegaconf import DictConfig, OmegaConf
 
+from nerfro.allowed import check_settings
 from nerfro.cameras import Cameras
 from nerfro.errors import NerfroError
 from nerfro.media.analytic import Vacuum
@@ -68,5 +69,7 @@ def test_a_box_covers_nothing_else_and_needs_no_cameras() -> None:
 
 
 def test_unknown_spaces_are_refused() -> None:
-    with pytest.raises(NerfroError, match="space=some is not allowed; choose box, all"):
-        of_all_space(space="some")
+    config = OmegaConf.structured(TrainConfig)
+    config.content.space = "some"
+    with pytest.raises(NerfroError, match=r"content\.space='some' is not allowed; choose 'box', 'all'"):
+        check_settings(config, TrainConfig)
