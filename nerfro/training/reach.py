@@ -7,6 +7,7 @@ import torch
 from nerfro.boundaries.constant import ConstantBoundary
 from nerfro.errors import NerfroError, warn
 from nerfro.fields.base import Field
+from nerfro.geometry.interpolation import intersect_box
 from nerfro.rays import Rays
 from nerfro.rendering import Renderer
 from nerfro.types import Batch
@@ -44,8 +45,7 @@ def require_reach(renderer: Renderer, batch: Batch) -> None:
 def _require_object(renderer: Renderer, rays: Rays) -> None:
     """Refuse bounds of the rays without the object between them, for all rays towards its box."""
     box = renderer.scene.medium.content_box.to(rays.origins)
-    crossings = (box[:, None] - rays.origins) / rays.directions
-    enters, leaves = crossings.amin(0).amax(-1), crossings.amax(0).amin(-1)
+    enters, leaves = intersect_box(box, rays.origins, rays.directions)
     meets = (leaves > enters.clamp(min=0)) & bool((box[1] > box[0]).all())
     for name, bound, wrong, side in (
         ("near", rays.near, rays.near >= leaves, "behind"),

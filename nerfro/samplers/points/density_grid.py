@@ -37,28 +37,6 @@ _FEWEST, _HEAVY = 8, 0.5
 
 
 @dataclass(frozen=True)
-class LengthInBox:
-    """Arc length from a path's first entry into a box to its last exit.
-
-    Attributes:
-        first: arc length of the first entry.
-        total: arc length from there to the last exit.
-    """
-
-    first: Float[Tensor, "P"]
-    total: Float[Tensor, "P"]
-
-    @classmethod
-    def of(cls, path: Path, box: Float[Tensor, "2 3"]) -> LengthInBox:
-        first, last = path.span(box)
-        return cls(first, last - first)
-
-    def arc_length(self, length: Float[Tensor, "P N"]) -> Float[Tensor, "P N"]:
-        """Convert lengths from 0 to `total` to arc lengths."""
-        return self.first[:, None] + length
-
-
-@dataclass(frozen=True)
 class ContractedLength:
     """Length of a polyline in contracted space, from `near` to practical infinity.
 
@@ -213,20 +191,27 @@ class DensityGridSampler(PointSampler):
         """Draw samples with PyTorch; the reference implementation of the compiled kernel."""
         u = self._quantiles(path, draws)
         if self.radius is None:
-            measure: LengthInBox | ContractedLength = LengthInBox.of(path, self.box)
+            first, last = path.span(self.box)
+            total = last - first
         else:
-            measure = ContractedLength.of(path, self.centre, self.radius, self.near)
-        places = torch.linspace(0, 1, self.num_bins + 1, device=u.device) * measure.total[:, None]
-        positions, _ = path.at(measure.arc_length(midpoints(places)).to(path.s.dtype))
+            contracted = ContractedLength.of(path, self.centre, self.radius, self.near)
+            total = contracted.total
+
+        def arc_length(length: Float[Tensor, "P N"]) -> Float[Tensor, "P N"]:
+            """Convert lengths from 0 to `total` to arc lengths."""
+            return first[:, None] + length if self.radius is None else contracted.arc_length(length)
+
+        places = torch.linspace(0, 1, self.num_bins + 1, device=u.device) * total[:, None]
+        positions, _ = path.at(arc_length(midpoints(places)).to(path.s.dtype))
         estimated = (self.lookup(self.contracted(positions)) * places.diff(dim=1)).clamp(max=self._max_bin_depth)
         weights, _ = volume_weights(estimated, torch.ones_like(estimated))
         share = weights / weights.sum(-1, keepdim=True).clamp(min=1e-6)
         places = invert_cdf(places, share + self._floor, u)
-        edges = measure.arc_length(places).to(path.s.dtype)
+        edges = arc_length(places).to(path.s.dtype)
         if self.radius is None:
             samples = cone_samples(path, edges)
         else:
-            samples = Samples.along(path, measure.arc_length(midpoints(places)).to(path.s.dtype), edges)
+            samples = Samples.along(path, arc_length(midpoints(places)).to(path.s.dtype), edges)
             scale = contraction_scale(samples.positions, self.centre, self.radius)
             lengths = (places.diff(dim=1) / scale).to(path.s.dtype)
             samples = replace(samples, lengths=lengths, measure=places.to(path.s.dtype))

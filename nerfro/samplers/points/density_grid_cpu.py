@@ -10,6 +10,7 @@ from numba import prange
 
 from nerfro.geometry.contraction import FAR, NEAREST
 from nerfro.kernels.compilation import compiled, compiled_parallel
+from nerfro.kernels.lookup import box_span
 from nerfro.kernels.philox import fill_uniform
 
 _BLOCK = 64  # rays that share a thread's scratch memory
@@ -69,16 +70,9 @@ def _span(path, low, high):
     last_vertex = len(s) - 1
     first, last = s[last_vertex], -np.inf
     for vertex in range(last_vertex):
-        enter, leave = 0.0, s[vertex + 1] - s[vertex]
-        for axis in range(3):
-            start, slope = positions[vertex, axis], directions[vertex, axis]
-            if slope == 0.0:
-                if start < low[axis] or start > high[axis]:
-                    leave = -1.0
-                continue
-            to_low, to_high = (low[axis] - start) / slope, (high[axis] - start) / slope
-            enter = max(enter, min(to_low, to_high))
-            leave = min(leave, max(to_low, to_high))
+        start, direction = positions[vertex], directions[vertex]
+        enter, leave = box_span(low, high, start[0], start[1], start[2], direction[0], direction[1], direction[2])
+        enter, leave = max(enter, 0.0), min(leave, s[vertex + 1] - s[vertex])
         if enter < leave:
             first = min(first, s[vertex] + enter)
             last = max(last, s[vertex] + leave)
