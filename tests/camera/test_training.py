@@ -133,7 +133,7 @@ def test_a_run_whose_cameras_learn_goes_on_as_if_it_had_not_stopped(
     train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path: Path
 ) -> None:
     options = ["camera=refined", "camera.lens=true", "camera.exposure=true", "phase.cameras={start: 2, every: 2}"]
-    options += [*tiny_default_run, "optimizer.final_learning_rate=1e-2"]
+    options += [*tiny_default_run, "evaluation=none", "optimizer.final_learning_rate=1e-2"]
     states = []
     for name, parts in (("whole", [[6]]), ("parted", [[2], [6]])):
         for i, (steps,) in enumerate(parts):
@@ -154,8 +154,8 @@ def test_cameras_wait_for_the_scene(
     for steps, moves in ((2, False), (3, True)):
         folder = tmp_path / f"run{steps}"
         done = train_here(
-            "camera=refined", "phase.cameras.start=2", *tiny_default_run, *LEARNED_SKY, f"trainer.max_steps={steps}",
-            f"hydra.run.dir={folder}",
+            "camera=refined", "phase.cameras.start=2", *tiny_default_run, *LEARNED_SKY, "evaluation=none",
+            f"trainer.max_steps={steps}", f"hydra.run.dir={folder}",
         )  # fmt: skip
         assert done.code == 0, done.err
         state = load_checkpoint(folder / "checkpoints" / "last.ckpt")[0]["state_dict"]
@@ -165,7 +165,7 @@ def test_cameras_wait_for_the_scene(
 def test_cameras_move_by_sky_and_masks_before_training_and_their_priors_are_kept(
     train_here: Callable[..., Any], tiny_default_run: list[str], tiny_scene: Path, tmp_path: Path
 ) -> None:
-    options = ["camera=refined", *tiny_default_run, "trainer.max_steps=1"]
+    options = ["camera=refined", *tiny_default_run, "evaluation=none", "trainer.max_steps=1"]
     kept, cameras = [], []
     for masks in (False, True):
         if masks:
