@@ -59,16 +59,13 @@ class Stratified(PointSampler):
             return self._draw_vertices(path, draws)
         near, far = (path.near, path.far) if self.box is None else path.span(self.box)
         cones = self.cast == "cones"
-        fractions = (
-            self._cone_fractions(path, draws)
-            if cones
-            else (self._bins(path.s) + self._offsets(path, draws)) / self.num_samples
-        )
+        fractions = self._cone_fractions(path, draws) if cones else self._point_fractions(path, draws)
         s = near[:, None] + fractions * (far - near)[:, None]
         return cone_samples(path, s) if cones else point_samples(path, s)
 
-    def _bins(self, like: Tensor) -> Float[Tensor, "N"]:
-        return torch.arange(self.num_samples, device=like.device, dtype=like.dtype)
+    def _point_fractions(self, path: Path, draws: Draws | None) -> Float[Tensor, "P N"]:
+        bins = torch.arange(self.num_samples, device=path.s.device, dtype=path.s.dtype)
+        return (bins + self._offsets(path, draws)) / self.num_samples
 
     def _offsets(self, path: Path, draws: Draws | None) -> Float[Tensor, "P N"]:
         if draws is not None:
