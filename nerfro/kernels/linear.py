@@ -20,17 +20,27 @@ _ROWS = 512
 
 
 class Linear(nn.Linear):
-    """`torch.nn.Linear` with first derivatives, by oneDNN for large inputs on processors with AVX-512."""
+    """`torch.nn.Linear` with first derivatives, by `linear`."""
 
     def forward(self, *inputs: Float[Tensor, "*batch _"]) -> Float[Tensor, "*batch O"]:
         """Apply the layer to one or several inputs, which are concatenated."""
-        first, *others = inputs
-        if torch.compiler.is_compiling() or not _suits_onednn(first):
-            joined = torch.cat([first, *(other.to(first.dtype) for other in others)], -1) if others else first
-            return super().forward(joined)
-        result = _Linear.apply(self.weight, self.bias, *(part.reshape(-1, part.shape[-1]) for part in inputs))
-        # PyTorch would copy a view before an operator in place.
-        return result if first.ndim == 2 else result.view(*first.shape[:-1], self.out_features)
+        return linear(self.weight, self.bias, *inputs)
+
+
+def linear(
+    weight: Float[Tensor, "O I"], bias: Float[Tensor, "O"], *inputs: Float[Tensor, "*batch _"]
+) -> Float[Tensor, "*batch O"]:
+    """Apply a linear layer to one or several inputs, which are concatenated.
+
+    Large inputs are multiplied by oneDNN on processors with AVX-512.
+    """
+    first, *others = inputs
+    if torch.compiler.is_compiling() or not _suits_onednn(first):
+        joined = torch.cat([first, *(other.to(first.dtype) for other in others)], -1) if others else first
+        return nn.functional.linear(joined, weight, bias)
+    result = _Linear.apply(weight, bias, *(part.reshape(-1, part.shape[-1]) for part in inputs))
+    # PyTorch would copy a view before an operator in place.
+    return result if first.ndim == 2 else result.view(*first.shape[:-1], len(weight))
 
 
 def _suits_onednn(x: Float[Tensor, "*batch I"]) -> bool:

@@ -38,6 +38,19 @@ def test_forward_equals_a_slow_loop_over_layers() -> None:
     torch.testing.assert_close(mlp(x), y)
 
 
+def test_bottleneck_and_view_layer_equal_two_layers_with_their_gradients() -> None:
+    mlp = RadianceMLP(6, 5, width=8, depth=2, skip=1, view_width=4)
+    torch.nn.init.normal_(mlp.bottleneck.bias)
+    position, direction = torch.randn(9, 6), torch.randn(9, 5)
+    features = mlp.trunk(position)
+    two_layers = mlp.view(torch.cat([mlp.bottleneck(features), direction], -1)).clamp(min=0)
+    colours = mlp(position, direction)[1], padded_sigmoid(mlp.rgb(two_layers))
+    torch.testing.assert_close(*colours)
+    layers = [*mlp.trunk.parameters(), *mlp.bottleneck.parameters(), *mlp.view.parameters()]
+    for fused, separate in zip(*(torch.autograd.grad(rgb.square().sum(), layers) for rgb in colours), strict=True):
+        torch.testing.assert_close(fused, separate)
+
+
 def test_published_nerf_has_its_number_of_weights() -> None:
     def linear(num_inputs: int, num_outputs: int) -> int:
         return (num_inputs + 1) * num_outputs
