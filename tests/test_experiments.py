@@ -24,12 +24,13 @@ EXPERIMENTS = sorted(path.stem for path in (CONF_DIR / "experiment").glob("*.yam
 ABLATIONS = [name for name in EXPERIMENTS if "ablation_" in name or "_no" in name]
 SCENES = sorted(path.stem for path in (CONF_DIR / "scene").glob("*.yaml"))
 
-# The embedded scene at 16x16 pixels, its ten validation views instead of the test views, and one small batch.
+# The embedded scene at 16x16 pixels, two of its validation views instead of the test views, and one small batch.
 SMALL = [
     "data.downscale=8",
     "evaluation.split=val",
     "evaluation.every=1",
     "batches.size=16",
+    "trainer.limit_test_batches=2",
     "trainer.accelerator=cpu",
     "trainer.max_steps=2",
     "trainer.max_time=null",
@@ -76,7 +77,7 @@ def test_experiment_trains_for_two_steps(experiment: str, train_here: Callable[.
     assert finished.code == 0, finished.err
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert metrics["steps"] == 2
-    assert len(metrics["views"]) == 10
+    assert len(metrics["views"]) == 2
     assert OmegaConf.load(tmp_path / "config.yaml").name == experiment
 
 
