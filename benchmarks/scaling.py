@@ -29,18 +29,15 @@ import numpy as np
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from PIL import Image
-from training import Training
+from training import SCENE, Training, write_images
 
 from nerfro.evaluation.render_view import render_view
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
-from nerfro.paths import ASSETS_DIR
 from nerfro.registry import build
 from nerfro.subdivision import Subdivision
 from nerfro.training.validation import ValidationPixels
 from nerfro.types import Batch
 
-SCENE = ASSETS_DIR / "torus"
 AXES = {
     "pixels": [128, 64, 256, 512, 1024, 1600],
     "views": [100, 25, 50, 200, 400],
@@ -119,20 +116,6 @@ def run_row(row: dict[str, int], steps: int, psnr: float, options: list[str], by
     if process.returncode != 0:
         raise SystemExit(f"failed: {row}")
     return json.loads(output.splitlines()[-1])
-
-
-def write_images(folder: Path, pixels: int, views: int) -> None:
-    """Write images of the embedded scene, scaled and repeated."""
-    for split, count in (("train", views), ("test", 5)):
-        document = json.loads((SCENE / f"transforms_{split}.json").read_text())
-        frames = []
-        for number in range(count):
-            frame = document["frames"][number % len(document["frames"])]
-            file = folder / f"{split}_{number:03d}.png"
-            given = Image.open(SCENE / f"{frame['file_path']}.png").convert("RGB")
-            given.resize((pixels, pixels), Image.Resampling.BICUBIC).save(file, compress_level=1)
-            frames.append({"file_path": file.stem, "transform_matrix": frame["transform_matrix"]})
-        (folder / f"transforms_{split}.json").write_text(json.dumps(document | {"frames": frames}))
 
 
 def write_bodies(folder: Path, count: int) -> list[str]:

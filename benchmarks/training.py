@@ -2,7 +2,7 @@
 
     python benchmarks/training.py step                        # a step of the paper's recipe, plain and fast
     python benchmarks/training.py curve                       # their losses over 200 steps
-    python benchmarks/training.py profile refractive          # where a step's milliseconds go
+    python benchmarks/training.py profile refractive          # parts of a step beside the bounds of the machine
     python benchmarks/training.py paths                       # what live tracing costs of a step; see docs for one core
     python benchmarks/training.py branches                    # what light that splits costs of a step
     python benchmarks/training.py budget 00:00:05:00          # default preset and paper's recipe, given the same time
@@ -14,11 +14,13 @@ The embedded scene, all cores unless OMP_NUM_THREADS and NUMBA_NUM_THREADS say o
 from __future__ import annotations
 
 import argparse
+import json
 import logging
 import os
 import platform
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
@@ -32,14 +34,18 @@ import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig
+from PIL import Image
 from torch.profiler import ProfilerActivity, profile, record_function
 from torch.utils.flop_counter import FlopCounterMode
 
 import nerfro
 from nerfro.evaluation.render_view import render_view
 from nerfro.evaluation.results import read_metrics_json
+from nerfro.fields.hash_grid import HashGridField
 from nerfro.kernels.allocator import keep_freed_memory
+from nerfro.kernels.available import fast_bfloat16
 from nerfro.paths import ASSETS_DIR, CONF_DIR
+from nerfro.rays import Rays
 from nerfro.registry import build, discover
 from nerfro.rendering import Renderer
 from nerfro.subdivision import Subdivision
@@ -51,8 +57,9 @@ from nerfro.training.trainer import lightning_precision
 from nerfro.types import Batch
 
 ROOT = Path(__file__).resolve().parent.parent
-EMBEDDED = ("+scene=torus", f"data.root={ASSETS_DIR / 'torus'}", "data.downscale=1")
-MESH = f"medium.mesh={ASSETS_DIR / 'torus' / 'mesh.ply'}"
+SCENE = ASSETS_DIR / "torus"
+EMBEDDED = ("+scene=torus", f"data.root={SCENE}", "data.downscale=1")
+MESH = f"medium.mesh={SCENE / 'mesh.ply'}"
 PLAIN, FAST = "paper_refractive", "paper_fast"
 
 
@@ -66,6 +73,7 @@ def main() -> None:
     for name, default in (("curve", 200), ("profile", 20), ("paths", 11), ("branches", 9)):
         trained[name].add_argument("--steps", type=int, default=default)
     trained["profile"].add_argument("experiment")
+    trained["profile"].add_argument("--pixels", type=int, nargs="+", default=[128, 400, 800])
     trained["budget"].add_argument("budget", metavar="time")
     trained["budget"].add_argument("--out", type=Path, default=ROOT / "outputs" / "training_benchmark")
     for part in trained.values():
@@ -196,49 +204,136 @@ def report_curve(steps: int, rays: int, options: list[str]) -> None:
         print(f"| {name} | {means} | {np.abs(loss - losses['plain']).mean():.4f} |")
 
 
-def report_profile(experiment: str, steps: int, options: list[str]) -> None:
-    """Share of a step's time by part, its matrix work, and the rate of that work against the machine's."""
-    paper = experiment.startswith("paper")
-    training = paper_recipe(experiment, *options) if paper else Training(f"+experiment={experiment}", *options)
-    model, module = training.renderer, training.module
-    training.run(3)
+def report_profile(experiment: str, pixels: list[int], steps: int, options: list[str]) -> None:
+    """Print the processor time of the parts of a step beside the bounds that the machine sets.
+
+    Args:
+        experiment: name of the experiment.
+        pixels: sides of the images, to which the images of the embedded scene are scaled.
+        steps: number of measured steps.
+        options: further options of nerfro.train.
+    """
+    limits = Limits()
+    columns = []
+    for side in pixels:
+        with tempfile.TemporaryDirectory() as folder:
+            write_images(Path(folder), side, 100)
+            settings = [f"data.root={folder}", "data=blender", MESH, *options]
+            paper = experiment.startswith("paper")
+            training = (
+                paper_recipe(experiment, *settings) if paper else Training(f"+experiment={experiment}", *settings)
+            )
+            columns.append(parts_of_step(training, steps, limits))
+    print(f"| part of a step, `{experiment}` | {' | '.join(f'{side} pixels, ms | bound | ratio' for side in pixels)} |")
+    print("|---|" + "---|" * 3 * len(pixels))
+    for name in columns[0]:
+        cells = (
+            f"{ms:.1f} | {f'{bound:.1f} | {ms / bound:.1f}' if bound else ' | '}"
+            for ms, bound in (column[name] for column in columns)
+        )
+        print(f"| {name} | {' | '.join(cells)} |")
+    print(f"\n| bound | measured |\n|---|---|\n{limits}")
+
+
+class Limits:
+    """Rates of the machine, each the best of ten measurements.
+
+    Attributes:
+        products: operations per second of a product of 4096x64 and 64x64, by number format.
+        bytes: bytes per second of a sum of arrays of 16 MB.
+        read: seconds of a random read of 8 bytes from 16 MB.
+        operator: seconds of an operator of PyTorch on one number.
+    """
+
+    def __init__(self) -> None:
+        self.products = {dtype: matrix_rate(dtype, 4096, 64) for dtype in (torch.float32, torch.bfloat16)}
+        values, result = torch.rand(2, 2**22), torch.rand(2**22)
+        self.bytes = 3 * result.nbytes / fastest(lambda: torch.add(*values, out=result))
+        table, rows = torch.rand(2**21, dtype=torch.float64), torch.randint(2**21, (2**20,))
+        self.read = fastest(lambda: table.index_select(0, rows)) / len(rows)
+        one = torch.ones(1)
+        self.operator = fastest(lambda: [torch.add(one, one, out=one) for _ in range(1000)]) / 1000
+
+    def __str__(self) -> str:
+        single, half = (rate / 1e12 for rate in self.products.values())
+        return (
+            f"| product of 4096x64 and 64x64, float32; bfloat16 | {single:.2f}; {half:.2f} TFLOP/s |\n"
+            f"| sum of arrays of 16 MB | {self.bytes / 1e9:.0f} GB/s |\n"
+            f"| random read from 16 MB | {1e9 * self.read:.1f} ns |\n"
+            f"| operator of PyTorch on one number | {1e6 * self.operator:.1f} µs |"
+        )
+
+
+def parts_of_step(training: Training, steps: int, limits: Limits) -> dict[str, tuple[float, float]]:
+    """Return milliseconds of the parts of a step and the bound of each; 0 for no bound.
+
+    Rays are traced in the training thread, because the profiler measures only this thread.
+    """
+    model, data = training.renderer, TracedInStep(training.batches, None, 0)
+    training.run(3, data)
     with FlopCounterMode(display=False) as counter:
-        training.run(1)
-    flops = counter.get_total_flops()
-    seconds = float(np.mean(training.run(steps).seconds[1:]))
-    parts = {
-        "point sampling": [(model.point_sampler, "forward")],
-        "fields, forward": [(field, "forward") for field in model.scene.fields],
-        "boundary, forward": [(model.scene.boundary, "forward")],
-        "losses, forward": [(loss, "forward") for loss in module.losses.values()],
-    }
-    around = {
-        "batch of pixels and paths, or waiting for it": [(RayDataModule, "transfer_batch_to_device")],
-        "update of the density grid": [(model.point_sampler, "after_step")],
-        "backward pass": [(torch.Tensor, "backward")],
-    }
-    whole = {"training step": [(module, "training_step")], "Adam": [(torch.optim.Adam, "step")]}
+        training.run(1, data)
+    whole = float(np.median(training.run(steps + 1, data).processor[1:]))
     with ExitStack() as stack:
-        for name, methods in (parts | around | whole).items():
-            for owner, method in methods:
-                label(stack, owner, method, name)
-        with profile(activities=[ProfilerActivity.CPU]) as measured:
-            training.run(steps)
-    events = {event.key: event.cpu_time_total / 1e3 / steps for event in measured.key_averages()}
-    ms = {name: events.get(name, 0.0) for name in (parts | around | whole)}
-    # Lightning runs the whole step inside the optimiser's.
-    ms["Adam"] -= ms["training step"] + ms["backward pass"]
-    ms["compositing, logging"] = ms.pop("training step") - sum(ms[name] for name in parts)
-    print(f"| {experiment}, {training.num_rays} rays | ms a step |\n|---|---|")
-    for name, value in ms.items():
-        print(f"| {name} | {value:.2f} |")
-    print(f"| all of a step, without the profiler | {1e3 * seconds:.2f} |\n")
-    print(
-        f"{flops / 1e9:.1f} GFLOP of matrix products a step: {flops / seconds / 1e12:.3f} TFLOP/s over the whole step."
-    )
-    for dtype in (torch.float32, torch.bfloat16):
-        rate = matrix_rate(dtype) / 1e12
-        print(f"A product of 65536x256 and 256x256 in {str(dtype)[6:]} runs at {rate:.2f} TFLOP/s.")
+        label(stack, TracedInStep, "transfer_batch_to_device", "tracing")
+        label(stack, model.point_sampler, "forward", "samples")
+        with profile(activities=[ProfilerActivity.CPU], record_shapes=True) as measured:
+            training.run(steps, data)
+    events = measured.key_averages(group_by_input_shape=True)
+
+    def seconds(*names: str) -> float:
+        return sum(event.cpu_time_total for event in events if event.key in names) / 1e6 / steps
+
+    def of_function(name: str) -> float:
+        return seconds(name, f"{name}Backward")
+
+    def reads(function: str, for_each: int) -> float:
+        """Return the number of reads of a function and its gradient, given the number for each row."""
+        names = (function, f"{function}Backward")
+        return for_each * sum(event.count * event.input_shapes[0][0] for event in events if event.key in names) / steps
+
+    products = ("aten::mm", "aten::addmm", "aten::bmm", "mkldnn::_linear_pointwise")
+    (field, *_), sky = model.scene.fields, model.scene.boundary
+    hashed, sky_levels = (len(getattr(part, "levels", ())) for part in (field, sky))
+    rounds = isinstance(field, HashGridField) and fast_bfloat16("cpu")
+    rounds = rounds or training.config.trainer.precision != "32-true"
+    num_parameters = sum(own.numel() for own in training.module.parameters())
+    rate = limits.products[torch.bfloat16 if rounds else torch.float32]
+    batch = training.batches.batch(0)
+    parts = {
+        "tracing": (seconds("tracing"), len(batch.rays) * seconds_per_ray(training, batch.rays)),
+        "matrix products": (seconds(*products), counter.get_total_flops() / rate),
+        "hash encoding": (of_function("_HashEncode"), limits.read * reads("_HashEncode", 8 * hashed)),
+        "samples": (seconds("samples"), limits.read * getattr(model.point_sampler, "num_bins", 0) * len(batch.path.s)),
+        "background": (of_function("_Lookup"), limits.read * reads("_Lookup", 4 * sky_levels)),
+        "Adam": (seconds("aten::_fused_adam_"), 28 * num_parameters / limits.bytes),
+    }
+    rest = whole - sum(busy for busy, _ in parts.values())
+    small = sum(event.count for event in events if event.key.startswith("aten::")) / steps
+    parts |= {"other operators and Python": (rest, small * limits.operator)}
+    parts |= {"whole step": (whole, sum(bound for _, bound in parts.values()))}
+    return {name: (1e3 * busy, 1e3 * bound) for name, (busy, bound) in parts.items()}
+
+
+def seconds_per_ray(training: Training, rays: Rays) -> float:
+    """Return the time of a ray if the rays of sixteen batches are traced in one call."""
+    many = rays[torch.arange(len(rays)).repeat(16)]
+    model = training.renderer
+    return fastest(lambda: model.path_sampler(many, model.scene.medium), turns=3) / len(many)
+
+
+def write_images(folder: Path, pixels: int, views: int) -> None:
+    """Write images of the embedded scene, scaled and repeated."""
+    for split, count in (("train", views), ("test", 5)):
+        document = json.loads((SCENE / f"transforms_{split}.json").read_text())
+        frames = []
+        for number in range(count):
+            frame = document["frames"][number % len(document["frames"])]
+            file = folder / f"{split}_{number:03d}.png"
+            given = Image.open(SCENE / f"{frame['file_path']}.png").convert("RGB")
+            given.resize((pixels, pixels), Image.Resampling.BICUBIC).save(file, compress_level=1)
+            frames.append({"file_path": file.stem, "transform_matrix": frame["transform_matrix"]})
+        (folder / f"transforms_{split}.json").write_text(json.dumps(document | {"frames": frames}))
 
 
 class ReadyBatches(RayDataModule):
@@ -348,10 +443,15 @@ def wrap(stack: ExitStack, owner: object, method: str, context: Callable[[], Abs
     stack.callback(lambda: setattr(owner, method, original) if shadowed else delattr(owner, method))
 
 
-def matrix_rate(dtype: torch.dtype, turns: int = 10) -> float:
-    """Floating-point operations per second of a product with a layer of 256 units."""
-    a, b = torch.randn(65536, 256).to(dtype), torch.randn(256, 256).to(dtype)
-    return 2 * a.shape[0] * b.shape[0] * b.shape[1] / min(timed(lambda: a @ b) for _ in range(turns))
+def matrix_rate(dtype: torch.dtype, rows: int, width: int) -> float:
+    """Return the operations per second of a product with a square matrix."""
+    left, right = torch.randn(rows, width).to(dtype), torch.randn(width, width).to(dtype)
+    return 2 * rows * width**2 / fastest(lambda: left @ right)
+
+
+def fastest(task: Callable[[], object], turns: int = 10) -> float:
+    """Return the processor time of the fastest of several calls."""
+    return min(spent(task)[1] for _ in range(turns))
 
 
 def timed(task: Callable[[], object]) -> float:
