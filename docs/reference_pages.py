@@ -23,7 +23,7 @@ from nerfro.registry import KINDS, Plugin, discover, plugins
 from nerfro.training import lightning_callbacks  # noqa: F401 - registers callbacks
 from nerfro.training.config import TrainConfig
 
-_CHOOSE = {"loss": "+loss.NAME.weight=0.1", "callbacks": "+callbacks=NAME"}
+_CHOOSE = {"loss": "+loss.NAME.weight=0.1", "phase": "+phase.NAME={}", "callbacks": "callbacks=NAME"}
 _BODY = "bodies={BODY: {surface: {name: NAME}, ior: 1.5}}"
 
 

@@ -11,7 +11,7 @@ import functools
 import inspect
 import math
 import types
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Real
 from pathlib import Path
@@ -60,6 +60,17 @@ class Range:
         ends = dataclasses.asdict(self).items()
         limits = " and ".join(f"{word.replace('_', ' ')} {end}" for word, end in ends if end is not None)
         return limits or "a finite number"
+
+
+@dataclass(frozen=True)
+class Names:
+    """Names to which plugins add, such as those of exports; the help of a command lists the names.
+
+    Attributes:
+        of: returns the names.
+    """
+
+    of: Callable[[], Iterable[str]]
 
 
 class Refused(str):

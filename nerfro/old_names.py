@@ -85,20 +85,24 @@ def renamed_override(override: str) -> str:
     """Replace old names in a command-line override, with a warning for each.
 
     Raises:
-        NerfroError: the setting is gone.
+        NerfroError: the setting is gone, or the override cannot be written with the new name.
     """
-    prefix, key, equals, value = cast(
-        re.Match, re.fullmatch(r"(~|\+*)([^=]*)(=?)(.*)", full_key(override), re.DOTALL)
-    ).groups()
+    prefix, key, equals, value = _split(override)
     group, at, package = key.partition("@")
-    new_value = re.sub(r"\w+", lambda name: _renamed_option(group, name[0]), value)
-    new_package = _renamed_key(package if at else key)
-    if new_package is None:
+    value = re.sub(r"\w+", lambda name: _renamed_option(group, name[0]), value)
+    renamed = _renamed_key(package if at else key)
+    if renamed is None:
         raise NerfroError(_gone(key))
-    renamed = f"{prefix}{group + at if at else ''}{new_package}{equals}{new_value}"
-    # Hydra reads names with dots only inside of a mapping and without quotes, and adds them only with a plus sign.
-    renamed = re.sub(r"(optimizer\.groups)\[(.+)\]\.(\w+)=(.*)", r"\1={\2: {\3: \4}}", renamed)
-    return f"+{renamed}".replace('"', "") if renamed.startswith("optimizer.groups=") else renamed
+    of_group = re.fullmatch(r"optimizer\.groups\[(.+)\]\.(\w+)", renamed)
+    if of_group is not None:
+        pattern, name = of_group.groups()
+        if prefix == "~" or not re.fullmatch(r"[^][(){}]+", value):
+            raise NerfroError(f"{override}: write 'optimizer.groups={{{pattern}: {{{name}: VALUE}}}}' instead")
+        renamed, value = "optimizer.groups", ",".join(f"{{{pattern}: {{{name}: {each}}}}}" for each in value.split(","))
+    if renamed == "optimizer.groups" and equals:
+        # Hydra reads names with dots only inside of a mapping and without quotes, and adds them only with a plus sign.
+        prefix, value = prefix or "+", value.replace('"', "")
+    return f"{prefix}{group + at if at else ''}{renamed}{equals}{value}"
 
 
 def renamed_config(config: DictConfig, origin: Path) -> DictConfig:
@@ -137,8 +141,11 @@ def rename_in_file(config: DictConfig, package: str, file: str) -> None:
 
 
 def is_old_name(argument: str) -> bool:
-    """Test whether a command-line override names an old setting."""
-    return any(f"{argument.lstrip('+~')}.".startswith(old) for old in RENAMED)
+    """Test whether a command-line override names an old setting or option."""
+    _, key, _, value = _split(argument)
+    group, _, package = key.partition("@")
+    is_old_option = any(f"{group}={name}" in RENAMED for name in re.findall(r"\w+", value))
+    return is_old_option or _entry(package or key) is not None
 
 
 def renamed_default(group: str, entry: object) -> object:
@@ -164,12 +171,24 @@ def _renamed_option(group: str, name: str) -> str:
 
 
 def _renamed_key(key: str) -> str | None:
-    for old, new in RENAMED.items():
-        if key == old or key.startswith(f"{old}."):
-            if new is not None:
-                warn(_since(old, new))
-            return new and new + key.removeprefix(old)
-    return key
+    old = _entry(key)
+    if old is None:
+        return key
+    new = RENAMED[old]
+    if new is not None:
+        warn(_since(old, new))
+    return new and new + key.removeprefix(old)
+
+
+def _entry(key: str) -> str | None:
+    """Return the old name that a key has, or that is the name of a node with the key; None for current names."""
+    return next((old for old in RENAMED if f"{key}.".startswith(f"{old}.")), None)
+
+
+def _split(override: str) -> tuple[str, ...]:
+    """Split a command-line override into prefix, key, equals sign and value."""
+    parts = re.fullmatch(r"(~|\+*)([^=]*)(=?)(.*)", full_key(override), re.DOTALL)
+    return cast(re.Match, parts).groups()
 
 
 def _move(config: DictConfig, old: str, new: str | None) -> bool:

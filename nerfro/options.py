@@ -31,7 +31,14 @@ from nerfro.errors import NerfroError, nearest_of
 from nerfro.paths import CONF_DIR, PACKAGE_DIR, cache_dir
 from nerfro.registry import ENTRY_POINTS, KINDS, SEVERAL, Plugin, plugin_folders, plugins, type_name
 
-ADDED_GROUPS = ("evaluation", "experiment", "scene", "sweep")  # groups without a default in conf/train.yaml
+# Groups without a default in conf/train.yaml.
+ADDED_GROUPS = ("callbacks", "evaluation", "experiment", "scene", "sweep")
+# Options that add a plugin of a type that a run, or a medium, may have several of.
+_ADDED_PLUGINS = {
+    "loss": "+loss.NAME.weight=0.1",
+    "phase": "+phase.NAME={}",
+    "surface": "+bodies.BODY.surface.name=NAME",
+}
 _TOOLS = re.compile(r"#\s*(noqa|type:).*?(?= - (?!OmegaConf)|#|$)")  # comments for linters
 _WIDTH = 100  # characters in a line of the help
 
@@ -90,6 +97,9 @@ class Described:
                 if re.fullmatch(r"\w+", value) and value not in (*self.choices[key], "null"):
                     raise NerfroError(f"{key}={value} does not exist; {nearest_of(value, self.choices[key])}")
                 continue
+            if key in _ADDED_PLUGINS and re.fullmatch(r"\w+", value) and key in self.names.get("", ()):
+                option = _ADDED_PLUGINS[key].replace("NAME", value)
+                raise NerfroError(f"{argument}: a training may have several of this type; write {option}")
             if argument.startswith("+") and "." not in key:  # perhaps a group of another package
                 continue
             parts = key.split(".")
@@ -114,9 +124,11 @@ def describe_command(command: str, schema: type, folder: Path) -> Described:
     with initialize_config_dir(str(folder), version_base="1.3"):
         config = compose(command, return_hydra_config=True)
         groups = [kind for kind in KINDS if isinstance(OmegaConf.select(config, kind.replace("/", ".")), DictConfig)]
-        groups += ["logger", *ADDED_GROUPS] if command == "train" else []
+        groups = list(dict.fromkeys([*groups, "logger", *ADDED_GROUPS])) if command == "train" else groups
         loader = GlobalHydra.instance().config_loader()
-        choices = {group: loader.get_group_options(group) for group in groups}
+        choices = {group: loader.get_group_options(group) for group in groups if group not in _ADDED_PLUGINS}
+    kinds = [*groups, *(["surface"] if "medium" in groups else [])]
+    added = {option: [p.name for p in plugins(kind)] for kind, option in _ADDED_PLUGINS.items() if kind in kinds}
     names = _names(schema)
     names[""] += [group.partition("/")[0] for group in groups]
     options = list(schema_options(schema, config, yaml_comments(folder / f"{command}.yaml")))
@@ -132,7 +144,9 @@ def describe_command(command: str, schema: type, folder: Path) -> Described:
         for place, node in nodes.items():
             plugin = next((plugin for plugin in of_kind if plugin.target == node.get("_target_")), None)
             options += [] if plugin is None else plugin_options(plugin, f"{place}.", node)
-    return Described(_page(command, options, choices, config.hydra.runtime.choices), names, choices)
+    chosen = {group: f"{group}={config.hydra.runtime.choices.get(group, 'NAME')}" for group in choices}
+    listed = {chosen[group]: found for group, found in choices.items()} | added
+    return Described(_page(command, options, listed), names, choices)
 
 
 def usage(command: str) -> str:
@@ -142,13 +156,10 @@ def usage(command: str) -> str:
     return f"{_sentence(first.rpartition('`: ')[2])}\n{examples}\n"
 
 
-def _page(
-    command: str, options: Sequence[Option], choices: Mapping[str, Sequence[str]], chosen: Mapping[str, str]
-) -> str:
+def _page(command: str, options: Sequence[Option], choices: Mapping[str, Sequence[str]]) -> str:
     lines = [usage(command), *(["Choices:"] if choices else [])]
-    for group, names in choices.items():
-        text = f"  {group}={chosen.get(group, 'NAME')}  ({', '.join(names)})"
-        lines.append(textwrap.fill(text, _WIDTH, subsequent_indent=" " * 6))
+    for choice, names in choices.items():
+        lines.append(textwrap.fill(f"  {choice}  ({', '.join(names)})", _WIDTH, subsequent_indent=" " * 6))
     lines += [""] if choices else []
     sections: dict[str, list[Option]] = {}
     for option in options:

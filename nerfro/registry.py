@@ -27,7 +27,7 @@ from hydra.utils import instantiate
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from nerfro.allowed import Range, check, checked
+from nerfro.allowed import Names, Range, check, checked
 from nerfro.errors import NerfroError
 from nerfro.paths import PLUGINS_DIR
 
@@ -484,6 +484,9 @@ def type_name(hint: Any) -> str:
     if origin is Annotated:
         limits = [str(limit) for limit in args[1:] if isinstance(limit, Range)]
         choices = [limit for limit in args[1:] if get_origin(limit) is Literal]
+        names = [f"`{name}`" for limit in args[1:] if isinstance(limit, Names) for name in limit.of()]
+        if names:
+            return ", ".join(names)
         return type_name(choices[0]) if choices else ", ".join([type_name(args[0]), *limits])
     if type(None) in args:
         return "; ".join(type_name(arg) for arg in args if arg is not type(None)) + "; or null"

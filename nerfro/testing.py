@@ -1,24 +1,32 @@
 """Contracts of plugins. The test suite checks all registered plugins, including yours.
 
 `check(plugin)` builds the plugin with its defaults, calls the plugin as the model does, and raises `ContractError` for
-a broken contract. For plugins with required fields, give the values of these fields.
+a broken contract. For plugins with required fields, give the values of these fields. `check_export` tests an export.
 """
 
 from __future__ import annotations
 
+import contextlib
+import io
 import itertools
 import math
-from collections.abc import Callable, Mapping
-from typing import Any
+import pickle
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path as FilePath
+from typing import Any, Literal
 
 import numpy as np
 import torch
+from omegaconf import OmegaConf
 
 from nerfro.boundaries.base import Boundary
 from nerfro.boundaries.constant import ConstantBoundary
+from nerfro.boundaries.skybox import Skybox
 from nerfro.camera.base import Camera
 from nerfro.cameras import Cameras
-from nerfro.data.base import DataSource
+from nerfro.data.base import DataSource, Views
 from nerfro.draws import Draws
 from nerfro.evaluation.image_metrics import ImageMetric
 from nerfro.fields.base import Field
@@ -34,8 +42,11 @@ from nerfro.samplers.base import PathSampler, PointSampler
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.paths.straight import Straight
 from nerfro.samplers.points.stratified import Stratified, point_samples
-from nerfro.training.phases.base import Phase
+from nerfro.training.phases.base import Phase, Run
+from nerfro.training.ray_batches import RayBatches
 from nerfro.types import Batch, Exits, Path, Radiance, Rays, Rendering, Samples
+from nerfro.viewing.exports import ExportConfig, export_of
+from nerfro.viewing.trained_scene import TrainedScene
 
 NUM_RAYS = 24
 
@@ -61,14 +72,20 @@ def check(plugin: Plugin, fields: Mapping[str, object] | None = None) -> None:
     missing = sorted(getattr(plugin.cls, "__abstractmethods__", ()))
     _require(not missing, f"{plugin.cls.__name__} lacks {', '.join(missing)}")
     built = build({"_target_": plugin.target, **(fields or {})}, components=example_components())
-    try:
+    with _named(f"{plugin.kind}={plugin.name}"):
         check_contract(built)
+
+
+@contextlib.contextmanager
+def _named(plugin: str) -> Iterator[None]:
+    """Report any error of a plugin's author as a broken contract of the plugin."""
+    try:
+        yield
     except ContractError:
         raise
-    except Exception as error:  # any error of a plugin's author
+    except Exception as error:
         first_line = str(error).strip().partition("\n")[0]
-        raise ContractError(f"contract broken: {plugin.kind}={plugin.name} raised {type(error).__name__}: "
-                            f"{first_line}") from error  # fmt: skip
+        raise ContractError(f"contract broken: {plugin} raised {type(error).__name__}: {first_line}") from error
 
 
 def example_rays(num_rays: int = NUM_RAYS) -> Rays:
@@ -81,43 +98,104 @@ def example_rays(num_rays: int = NUM_RAYS) -> Rays:
     return Rays(origins, directions, 1e-3 * like, 2 * like, 6 * like)
 
 
-def example_path(num_rays: int = NUM_RAYS) -> Path:
-    """Return paths through a glass ball."""
-    return Snell()(example_rays(num_rays), Ball())
+def example_path(num_rays: int = NUM_RAYS, branches: Literal["none", "all"] = "none") -> Path:
+    """Return paths through a glass ball; with `branches="all"`, rays split at its surface."""
+    return Snell(branches=branches)(example_rays(num_rays), Ball())
 
 
-def example_samples() -> Samples:
-    """Return sixteen samples on each example path."""
-    path = example_path()
+def example_samples(path: Path | None = None) -> Samples:
+    """Return sixteen samples on each polyline of a path, by default of the example path."""
+    path = example_path() if path is None else path
     fractions = torch.linspace(0.0, 0.95, 16)
     return point_samples(path, path.near[:, None] + fractions * (path.far - path.near)[:, None])
 
 
-def example_rendering() -> Rendering:
-    """Render the example samples with a smooth density; densities and colours require gradients."""
-    samples = example_samples()
-    density = torch.exp(-samples.positions.square().sum(-1)).requires_grad_()
+def example_rendering(path: Path | None = None, scale: float = 1.0) -> Rendering:
+    """Render samples with a smooth density; densities and colours require gradients.
+
+    Args:
+        path: rendered path, by default the example path.
+        scale: factor of the density.
+    """
+    path = example_path() if path is None else path
+    samples = example_samples(path)
+    density = (scale * torch.exp(-samples.positions.square().sum(-1))).requires_grad_()
     rgb = torch.sigmoid(samples.positions).requires_grad_()
-    return composite(samples, Radiance(density, rgb), torch.full((NUM_RAYS, 3), 0.3), example_path())
+    return composite(samples, Radiance(density, rgb), torch.full((len(path.ray), 3), 0.3), path)
 
 
-def example_batch(num_rays: int = NUM_RAYS) -> Batch:
-    """Return a batch of the example rays, one through each grey pixel, with two small training cameras."""
+def example_views() -> Views:
+    """Return two grey photographs of 16 x 16 pixels."""
     pose = torch.eye(4)[:3].repeat(2, 1, 1)
     pose[:, 2, 3] = 4
     two = torch.full((2,), 8.0)
     cameras = Cameras(pose, two, two, two, two, width=16, height=16, near=2.0, far=6.0)
-    every = torch.arange(num_rays)
+    return Views(cameras, torch.full((2, 16, 16, 3), 0.5), None, ["first", "second"])
+
+
+def example_batch(num_rays: int = NUM_RAYS, rays_per_pixel: int = 1) -> Batch:
+    """Return a batch of the example rays through grey pixels, with the cameras of the example views."""
+    pixel = torch.arange(num_rays) // rays_per_pixel
+    every = pixel.unique()
     return Batch(
         rays=example_rays(num_rays),
-        pixel=every,
+        pixel=pixel,
         index=every,
         view=every % 2,
-        rgb=torch.full((num_rays, 3), 0.5),
-        teaches_background=torch.ones(num_rays, dtype=torch.bool),
-        cameras=cameras,
+        rgb=torch.full((len(every), 3), 0.5),
+        teaches_background=torch.ones(len(every), dtype=torch.bool),
+        cameras=example_views().cameras,
         draws=example_draws(num_rays),
     )
+
+
+def example_run() -> Run:
+    """Return a small model with a learned background, its batches and its optimizer; equal in every call."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        model = RefractiveModel(replace(example_components(), boundary=Skybox(width=8, depth=1)))
+    batches = RayBatches(example_views(), NUM_RAYS, "all_images")
+    optimizer = torch.optim.Adam(model.parameters_by_name().values())
+    return Run(model, batches, example_views(), optimizer, spent=0.0)
+
+
+class _ExampleData(DataSource):
+    """The example views as a data set."""
+
+    root = FilePath()
+    splits = ["train", "test"]  # noqa: RUF012 - a constant
+
+    def load(self, split: str) -> Views:
+        return example_views()
+
+
+def check_export(name: str) -> None:
+    """Check an export: write a file of a small scene.
+
+    Args:
+        name: name of the export, as in `what=NAME`.
+
+    Raises:
+        ContractError: the export breaks a contract.
+        NerfroError: there is no such export.
+    """
+    export = export_of(name)
+    endings: Sequence[str] = export.suffixes
+    _require(
+        not isinstance(endings, str) and len(endings) > 0 and all(e == e.lower() and e[:1] == "." for e in endings),
+        f"suffixes={endings!r} are not a tuple of endings in lower case with a dot, such as ('.csv',)",
+    )
+    box = torch.tensor([[-1.0] * 3, [1.0] * 3])
+    scene = TrainedScene(example_run().renderer.eval(), _ExampleData(), content=box)
+    with tempfile.TemporaryDirectory() as folder:
+        out = FilePath(folder, f"scene{endings[0]}")
+        config = OmegaConf.structured(ExportConfig(checkpoint="-", what=name, out=str(out)))
+        with _named(f"what={name}"):
+            text = export.write(scene, out, config)
+        _require(isinstance(text, str) and text != "", "write returns a description of the file, which is printed")
+        _require(out.is_file(), "write writes the file `out`")
+        others = {file.name for file in FilePath(folder).iterdir()} - {file.name for file in export.files(out)}
+        _require(not others, f"companions lacks the endings of {', '.join(sorted(others))}")
 
 
 def example_draws(num_rays: int = NUM_RAYS, step: int = 0) -> Draws:
@@ -138,14 +216,22 @@ def _check_medium(medium: Medium) -> None:
 
 
 def _check_surface(surface: Surface) -> None:
-    _require(getattr(surface, "bounds", None) is not None, "a surface has `bounds` [2, 3], its lower and upper corner")
-    size = np.ptp(surface.bounds, axis=0)
-    distances = surface.distances(Grid(surface.bounds + 0.2 * size * [[-1], [1]], 24))
+    bounds = np.asarray(getattr(surface, "bounds", None))
+    _require(bounds.shape == (2, 3), "a surface has `bounds` [2, 3], its lower and upper corner")
+    _require(bool((bounds[0] < bounds[1]).all()), "the lower corner of `bounds` is first")
+    grid = Grid(bounds + 0.2 * np.ptp(bounds, axis=0) * [[-1], [1]], 24)
+    distances = surface.distances(grid)
     _require(distances.shape == (24, 24, 24), "distances returns one number for each vertex of the grid")
-    outside, inside = distances[[0, -1]], distances < 0
-    _require(bool(inside.any() and (outside > 0).all()), "distances are negative inside and positive outside")
-    slope = np.abs(np.diff(distances, axis=0)).max() * 23 / (1.4 * size[0])
-    _require(bool(slope < 1.01), "distances change by at most one per unit of length")
+    _require(bool(np.isfinite(distances).all()), "distances are finite")
+    outside = ((grid.points < bounds[0]) | (grid.points > bounds[1])).any(-1)
+    _require(bool((distances < 0).any()), "distances are negative inside")
+    _require(bool((distances[outside] > 0).all()), "distances are positive outside of `bounds`")
+    spacing = np.ptp(grid.box, axis=0) / (grid.resolution - 1)
+    steepest = max(np.abs(np.diff(distances, axis=axis)).max() / spacing[axis] for axis in range(3))
+    _require(bool(steepest < 1.01), "distances change by at most one per unit of length")
+    near = np.abs(distances) < grid.band * spacing.min()
+    slope = np.linalg.norm(np.gradient(distances, *spacing), axis=0)[near]
+    _require(not near.any() or bool(np.median(slope) > 0.9), "distances are exact within `grid.band` voxels")
 
 
 def _check_camera(camera: Camera) -> None:
@@ -232,10 +318,29 @@ def _check_boundary(boundary: Boundary) -> None:
 
 
 def _check_loss(loss: Loss) -> None:
-    rendering = example_rendering()
-    value = loss([rendering, rendering], example_batch(), RefractiveModel(example_components()).scene)
-    _require(value.shape == (), f"a loss is a scalar, and forward returned shape {list(value.shape)}")
-    _require(bool(value.isfinite()), "a loss is finite")
+    scene = example_run().renderer.scene
+    split = example_path(branches="all")
+    for case, renderings, batch in (
+        ("", [example_rendering(), example_rendering()], example_batch()),
+        (" for rays that split, and pixels with two rays", [example_rendering(split)], example_batch(rays_per_pixel=2)),
+        (" for empty pixels", [example_rendering(scale=0.0)], example_batch()),
+        (" for opaque pixels", [example_rendering(scale=1e4)], example_batch()),
+    ):
+        with _named(f"a loss{case}"):
+            value = loss(renderings, batch, scene)
+        _require_type(value, torch.Tensor)
+        _require(value.shape == (), f"a loss is a scalar{case}, and forward returned shape {list(value.shape)}")
+        _require(bool(value.isfinite()), f"a loss is finite{case}")
+        again = loss(renderings, batch, scene)
+        _require(torch.equal(value, again), "a loss takes random numbers only from batch.draws")
+        _require(
+            value.requires_grad or float(value) == 0, "a loss depends on the renderings or on the scene with gradients"
+        )
+        if value.requires_grad:
+            inputs = [t for each in renderings for t in (each.rgb, each.weights, each.transmittance)]
+            gradients = torch.autograd.grad(value, [*inputs, *scene.parameters()], allow_unused=True)
+            finite = all(bool(gradient.isfinite().all()) for gradient in gradients if gradient is not None)
+            _require(finite, f"a loss has finite gradients{case}")
 
 
 def _check_model(model: Renderer) -> None:
@@ -273,9 +378,34 @@ def _check_metric(metric: ImageMetric) -> None:
 
 def _check_phase(phase: Phase) -> None:
     counts = [phase.steps_before(step) for step in range(1000)]
+    _require(all(isinstance(count, int) and count >= 0 for count in counts), "steps_before returns integers from 0 on")
     for step, (earlier, later) in enumerate(itertools.pairwise(counts)):
         message = f"it returned {earlier} before step {step} and {later} before step {step + 1}"
         _require(earlier <= later, f"steps_before is cumulative: {message}")
+    learned = [_after_step(phase, seed) for seed in range(2)]
+    _require(all(map(torch.equal, *learned)), "random numbers of a step depend on its number, as those of run.batches")
+
+
+def _after_step(phase: Phase, seed: int) -> list[torch.Tensor]:
+    """Return all parameters after the first step of a phase, with a seed of other random numbers."""
+    run = example_run()
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        state = phase.begin(run)
+        _require(isinstance(state, dict), f"begin returns a dictionary, not {state!r}")
+        checkpoint = io.BytesIO()
+        torch.save(state, checkpoint)
+        checkpoint.seek(0)
+        try:
+            torch.load(checkpoint, weights_only=True)
+        except pickle.UnpicklingError as error:
+            raise ContractError("contract broken: begin returns tensors, numbers, texts, lists and dictionaries, which "
+                                "a checkpoint can contain") from error  # fmt: skip
+        taken = phase.step(run, 0, state)
+    _require(isinstance(taken, bool), f"step returns True, or False to end the phase, not {taken!r}")
+    parameters = list(run.renderer.parameters_by_name().values())
+    _require(all(bool(parameter.isfinite().all()) for parameter in parameters), "parameters are finite after a step")
+    return [parameter.detach() for parameter in parameters]
 
 
 def _check_callback(callback: Any) -> None:

@@ -19,7 +19,7 @@ from nerfro.composition import RenamingFiles
 from nerfro.errors import NerfroError, warn
 from nerfro.failures import errors_in_one_line, in_one_line
 from nerfro.files.foreign_config import foreign_config
-from nerfro.old_names import RENAMED, renamed_override
+from nerfro.old_names import RENAMED, is_old_name, renamed_override
 from nerfro.paths import CONF_DIR, resolve_path, user_path
 from nerfro.registry import discover, plugins
 from nerfro.training.config import TrainConfig
@@ -150,12 +150,14 @@ OLD_NAMES = {
         ("+experiment=mirror,nerf", "+experiment=glass,nerf"),
         ("name=near", "name=near"),
         ("batches.hidden_too=1", "batches.hidden_too=1"),
+        ("medium.old_depths=1", "medium.old_depths=1"),
     ],
 )
 def test_old_names_in_overrides_are_replaced_with_a_warning(
     old: str, new: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("nerfro.old_names.RENAMED", OLD_NAMES)
+    assert is_old_name(old) == (old != new)
     assert renamed_override(old) == new
     printed = capsys.readouterr().out
     assert ("since this release" in printed) == (old != new)
@@ -206,6 +208,14 @@ def test_groups_of_parameters_are_added_to_those_of_the_experiment() -> None:
     for old in ("optimizer.medium_start=7", f'optimizer.groups={{"{pattern}": {{start: 7}}}}'):
         config = composed("+experiment=unknown", renamed_override(old))
         assert config.optimizer.groups[pattern] == {"learning_rate": 1e-3, "start": 7}
+    swept = renamed_override("optimizer.medium_start=7,8")
+    choices = OverridesParser.create().parse_override(swept).sweep_string_iterator()
+    starts = [composed(f"+optimizer.groups={choice}").optimizer.groups[pattern].start for choice in choices]
+    assert starts == [7, 8]
+    for old in ("~optimizer.medium_start", "optimizer.medium_start=range(1,3)"):
+        with pytest.raises(NerfroError) as refused:
+            renamed_override(old)
+        assert str(refused.value) == f"{old}: write 'optimizer.groups={{{pattern}: {{start: VALUE}}}}' instead"
     run = foreign_config("optimizer: {medium_start: 7}", CONF_DIR / "config.yaml")
     assert run == {"optimizer": {"groups": {pattern: {"start": 7}}}}
 

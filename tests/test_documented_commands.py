@@ -19,12 +19,15 @@ from omegaconf import DictConfig, OmegaConf
 
 from nerfro.allowed import check_names, check_settings
 from nerfro.cli import _added, _quoted
+from nerfro.errors import NerfroError
 from nerfro.old_names import full_key, renamed_override
 from nerfro.options import Described, describe_command, usage
 from nerfro.overrides import is_scene_file
 from nerfro.paths import CONF_DIR, PACKAGE_DIR
 from nerfro.registry import KINDS, discover, plugins
-from nerfro.viewing.exports import find_export
+from nerfro.synthetic import SCENES
+from nerfro.viewing import PLUGIN_EXPORTS
+from nerfro.viewing.exports import EXPORTS, find_export
 
 CHECKOUT = PACKAGE_DIR.parent
 PAGES = {
@@ -135,6 +138,17 @@ def test_job_files_are_scripts() -> None:
     for file in files:
         checked = subprocess.run(["bash", "-n"], input=file, capture_output=True, text=True)
         assert checked.stderr == "", file
+
+
+def test_help_lists_what_plugins_add() -> None:
+    names: dict[str, list[str]] = {"export": [*EXPORTS, *PLUGIN_EXPORTS], "synthesize": list(SCENES)}
+    names["train"] = [plugin.name for plugin in plugins()]
+    names["trace"] = [plugin.name for kind in ("medium", "surface", "sampler/path") for plugin in plugins(kind)]
+    for command, added in names.items():
+        page = described(command, len(plugins()))
+        assert set(added) <= set(re.findall(r"\w+", page.help)), command
+    with pytest.raises(NerfroError, match=r"write \+loss\.opaque\.weight=0\.1"):
+        described("train", len(plugins())).require_known(["loss=opaque"])
 
 
 @pytest.mark.parametrize("command", sorted(entry_points()))

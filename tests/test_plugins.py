@@ -1,5 +1,6 @@
 """Plugins from plugins/, from other folders, and from installed packages; and the command that lists them."""
 
+import contextlib
 import csv
 import json
 import os
@@ -13,21 +14,25 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from omegaconf import DictConfig
 from PIL import Image
+from torch import nn
 
 import nerfro.registry
 from nerfro.data.base import DataSource, Views
 from nerfro.data.blender import BlenderData
 from nerfro.errors import NerfroError
+from nerfro.losses.base import Loss
 from nerfro.media.base import Medium
 from nerfro.media.surface import Surface
 from nerfro.paths import PLUGINS_DIR
 from nerfro.registry import KINDS, discover, find, plugins, register
 from nerfro.samplers.base import PathSampler
-from nerfro.testing import ContractError, check
-from nerfro.training.phases.base import Phase
+from nerfro.testing import ContractError, check, check_export
+from nerfro.training.phases.base import Phase, Run
 from nerfro.viewing import PLUGIN_EXPORTS
-from nerfro.viewing.exports import find_export
+from nerfro.viewing.exports import Export, find_export
+from nerfro.viewing.trained_scene import TrainedScene
 from tests.conftest import Finished
 
 discover()
@@ -167,12 +172,68 @@ def ones(medium: Medium, positions: torch.Tensor) -> tuple[torch.Tensor, torch.T
     return torch.ones_like(positions[..., 0]), torch.zeros_like(positions)
 
 
+CUBE = np.array([[-1.0] * 3, [1.0] * 3])
+
+
+def ball(change: Callable[[np.ndarray], np.ndarray], bounds: np.ndarray = CUBE) -> dict[str, object]:
+    """Return the members of a surface whose distances are those of a unit ball, changed."""
+    return {"bounds": bounds, "distances": lambda _, grid: change(np.linalg.norm(grid.points, axis=-1) - 1)}
+
+
+def loss(forward: Callable[..., object]) -> dict[str, object]:
+    return {"forward": lambda _, renderings, batch, scene: forward(renderings[-1], batch)}
+
+
+def phase(step: Callable[[nn.Parameter], object] = lambda _: True, **members: object) -> dict[str, object]:
+    """Return the members of a phase with one step, which may change a parameter."""
+
+    def first(run: Run) -> nn.Parameter:
+        return next(iter(run.renderer.parameters_by_name().values()))
+
+    return {"steps_before": lambda _, step: 1, "step": lambda _, run, number, state: step(first(run)), **members}
+
+
+def noise(parameter: nn.Parameter) -> bool:
+    parameter.data.add_(torch.rand_like(parameter))
+    return True
+
+
+def overflow(parameter: nn.Parameter) -> bool:
+    parameter.data.fill_(torch.inf)
+    return True
+
+
 @pytest.mark.parametrize(
     ("kind", "base", "members", "contract"),
     [
         ("medium", Medium, {"forward": ones}, r"a medium has a buffer `box` \[2, 3\]"),
         ("medium", Medium, {}, "Broken lacks forward"),
         ("surface", Surface, {"distances": None}, "a surface has `bounds`"),
+        ("surface", Surface, {"distances": None, "bounds": CUBE[0]}, r"a surface has `bounds` \[2, 3\]"),
+        ("surface", Surface, ball(lambda d: d, CUBE[::-1]), "the lower corner of `bounds` is first"),
+        ("surface", Surface, ball(lambda d: d[1:]), "one number for each vertex"),
+        ("surface", Surface, ball(lambda d: d * np.nan), "distances are finite"),
+        ("surface", Surface, ball(np.abs), "distances are negative inside"),
+        ("surface", Surface, ball(lambda d: d, 0.5 * CUBE), "positive outside of `bounds`"),
+        ("surface", Surface, ball(lambda d: 2 * d), "change by at most one per unit of length"),
+        ("surface", Surface, ball(lambda d: 0.5 * d), "exact within `grid.band` voxels"),
+        ("loss", Loss, {"forward": lambda *_: None}, "forward returned None, not Tensor"),
+        ("loss", Loss, loss(lambda r, _: r.opacity), r"a loss is a scalar, and forward returned shape \[24\]"),
+        ("loss", Loss, loss(lambda r, b: (r.rgb - b.rgb).mean()), "pixels with two rays raised RuntimeError: The size"),
+        ("loss", Loss, loss(lambda r, _: (r.weights.sum(-1) - r.opacity).mean()), "rays that split, .* RuntimeError"),
+        ("loss", Loss, loss(lambda r, _: r.opacity.log().mean()), "a loss is finite for empty pixels"),
+        ("loss", Loss, loss(lambda r, _: r.transmittance.log().mean()), "a loss is finite for opaque pixels"),
+        ("loss", Loss, loss(lambda r, _: r.opacity.sqrt().mean()), "a loss has finite gradients for empty pixels"),
+        ("loss", Loss, loss(lambda r, _: r.opacity.mean() * torch.rand(())), "random numbers only from batch.draws"),
+        ("loss", Loss, loss(lambda r, _: r.opacity.mean().detach()), "depends on the renderings or on the scene"),
+        ("phase", Phase, phase(steps_before=lambda _, step: step / 2), "steps_before returns integers from 0 on"),
+        ("phase", Phase, phase(steps_before=lambda _, step: step - 1), "steps_before returns integers from 0 on"),
+        ("phase", Phase, phase(begin=lambda _, run: None), "begin returns a dictionary, not None"),
+        ("phase", Phase, phase(begin=lambda _, run: {"a": Path("b")}), "which a checkpoint can contain"),
+        ("phase", Phase, phase(lambda _: None), "step returns True, or False to end the phase, not None"),
+        ("phase", Phase, phase(overflow), "parameters are finite after a step"),
+        ("phase", Phase, phase(noise), "random numbers of a step depend on its number"),
+        ("phase", Phase, phase(lambda parameter: parameter.typo), "phase=broken raised AttributeError"),
         ("sampler/path", PathSampler, {"forward": lambda *_: None}, "forward returned None, not Path"),
         (
             "phase",
@@ -309,6 +370,44 @@ def test_export_of_a_plugin_writes_its_file(
     assert finished.code == 0, finished.err
     centres = np.loadtxt(out, delimiter=",", skiprows=1)
     np.testing.assert_allclose(np.linalg.norm(centres, axis=1), 4, rtol=1e-6)
+
+
+def writer(*names: str, text: str | None = "a file") -> Callable[..., str | None]:
+    """Return a function that writes files beside the given one, and returns a description."""
+
+    def write(scene: TrainedScene, out: Path, config: DictConfig) -> str | None:
+        for name in names:
+            out.with_name(name).touch()
+        return text
+
+    return write
+
+
+@pytest.mark.parametrize(
+    ("export", "contract"),
+    [
+        (Export((), writer()), r"suffixes=\(\) are not a tuple of endings"),
+        (Export((".CSV",), writer()), "in lower case with a dot"),
+        (Export((".csv",), writer()), "write writes the file `out`"),
+        (Export((".csv",), lambda scene, out, config: 1 / 0), "what=broken raised ZeroDivisionError"),  # type: ignore[arg-type, return-value]
+        (Export((".csv",), writer("scene.csv", text="")), "write returns a description"),
+        (Export((".csv",), writer("scene.csv", "scene.mtl")), r"companions lacks the endings of scene\.mtl"),
+        (Export((".csv",), writer("scene.csv", "scene.mtl"), (".mtl",)), None),
+    ],
+)
+def test_check_names_the_broken_contract_of_an_export(
+    export: Export, contract: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "broken_export", SimpleNamespace(EXPORT=export))  # type: ignore[arg-type]
+    monkeypatch.setitem(PLUGIN_EXPORTS, "broken", "broken_export")
+    with contextlib.nullcontext() if contract is None else pytest.raises(ContractError, match=contract):
+        check_export("broken")
+
+
+def test_exports_keep_their_contract(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NERFRO_PLUGINS", str(PLUGINS_DIR / "opt_in"))
+    for name in ("cameras", "sky"):
+        check_export(name)
 
 
 def test_export_without_a_writer_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

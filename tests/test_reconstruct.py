@@ -318,6 +318,7 @@ def test_what_was_found_chooses_the_experiment(
         (("images=PHOTOS",), "the photographs have no masks; add mask='view=true' to draw the outline"),
         (("data.root=PHOTOS", "masks=PHOTOS"), "masks= needs images="),
         (("images=PHOTOS/none",), "none is not a folder; it should hold the images"),
+        (("images=PHOTOS", "train=--help"), "train='--help': --help is a flag; give options of the form key=value"),
         (("images=PHOTOS/film",), "film holds no image, but .mp4 files; allowed are"),
         (("images=PHOTOS/two",), "2 photographs do not determine poses and shape"),
     ],

@@ -52,13 +52,14 @@ def test_a_scene_survives_moving_its_folder(tmp_path: Path, monkeypatch: pytest.
 
 def test_the_command_line_has_precedence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bodies, vessel = {"object": {"mesh": "mesh.ply", "ior": 1.4}}, {"wall": 0.1, "ior": 1.52}
-    content = {"data": DATA, "bodies": bodies, "vessel": vessel}
+    content = {"data": DATA | {"downscale": 2.0}, "bodies": bodies, "vessel": vessel}
     file = write(tmp_path / "surface" / "scene.json", **content, medium={"resolution": 64})
-    expected = {"data": "opencv", "data.root": str(tmp_path), "medium.resolution": 64,
+    expected = {"data": "opencv", "data.root": str(tmp_path), "data.downscale": 2, "medium.resolution": 64,
                 "medium.mesh": str(tmp_path / "surface" / "mesh.ply"), "medium.ior": 1.4}  # fmt: skip
     assert settings(f"scene={file}") == expected
-    given = {"medium.ior": 1.6, "data": "blender"}
-    assert settings("medium.ior=1.6", f"scene={file}", "data=blender") == expected | given
+    assert settings("medium.ior=1.6", f"scene={file}", "data=opencv") == expected | {"medium.ior": 1.6}
+    of_other_data = {name: value for name, value in expected.items() if name != "data.downscale"}
+    assert settings(f"scene={file}", "data=blender") == of_other_data | {"data": "blender"}
     as_vessel = {"medium": "vessel", "medium.wall": 0.1, "medium.ior": 1.52}
     assert settings(f"scene={file}", "medium=vessel") == expected | as_vessel
     assert with_scene(["seed=1"], NODES) == ["seed=1"]

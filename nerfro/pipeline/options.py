@@ -57,8 +57,15 @@ def have_poses(config: DictConfig, overrides: list[str]) -> bool:
     """Check the options, and return whether the photographs have poses.
 
     Raises:
-        NerfroError: options are missing or contradict each other.
+        NerfroError: options are missing, contradict each other, or are flags for a stage.
     """
+    for stage in ("calibrate", "mask", "preprocess", "train"):
+        for option in shlex.split(config[stage]):
+            if option.startswith("-"):
+                raise NerfroError(
+                    f"{stage}={config[stage]!r}: {option} is a flag; give options of the form key=value, which "
+                    f"`nerfro {stage} --help` explains"
+                )
     if config.images is not None and config.video is not None:
         raise NerfroError("images= and video= are both given; give one of the two")
     posed = config.images is None and config.video is None

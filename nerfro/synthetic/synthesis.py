@@ -10,7 +10,7 @@ from typing import Annotated, Optional
 
 from omegaconf import MISSING, DictConfig
 
-from nerfro.allowed import Count, Natural, NotNegative, Positive, Range
+from nerfro.allowed import Count, Names, Natural, NotNegative, Positive, Range
 from nerfro.errors import NerfroError
 from nerfro.files.folder_lock import lock_folder
 from nerfro.paths import user_path
@@ -20,6 +20,8 @@ from nerfro.synthetic import SCENES
 from nerfro.synthetic.dataset import DataSet, Views
 from nerfro.synthetic.path_tracer import PathTracer, load_mitsuba
 from nerfro.synthetic.scene import Scene
+
+SceneName = Annotated[str, Names(lambda: SCENES)]
 
 
 @dataclass
@@ -35,7 +37,7 @@ class ViewCounts:
 class SynthesizeConfig:
     """Options of `nerfro.synthesize`; conf/synthesize/synthesize.yaml gives and explains the defaults."""
 
-    scene: str = MISSING
+    scene: SceneName = MISSING
     out: str = MISSING
     resolution: Annotated[int, Range(at_least=8, at_most=16384)] = MISSING
     spp: Count = MISSING

@@ -16,6 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from nerfro.allowed import (
     Count,
+    Names,
     Natural,
     NotNegative,
     NumRays,
@@ -33,13 +34,15 @@ from nerfro.evaluation.results import Region
 from nerfro.media.analytic import Vacuum
 from nerfro.media.bodies import origin_of
 from nerfro.paths import resolve_path, scene_name
-from nerfro.registry import build, check_node, configure, create, find, require_lightning
+from nerfro.registry import build, check_node, configure, create, find, plugins, require_lightning
 from nerfro.rendering import Components, Renderer
 from nerfro.subdivision import Subdivision
 from nerfro.synthetic import SCENES
 from nerfro.training.backdrop import settle_backdrop
 from nerfro.training.content import ContentConfig, settle_content
 from nerfro.training.optimizer import OptimizerConfig
+
+Score = Annotated[str, Names(lambda: [plugin.name for plugin in plugins("metric")])]  # of a region: mask.NAME
 
 
 @dataclass
@@ -193,7 +196,7 @@ class TrainConfig:
     # Settings of each callback, by the registered name of the callback.
     callbacks: dict[str, Any] = dataclasses.field(default_factory=dict)
     # Score that training returns to sweepers of Hydra: a metric, or `<region>.<metric>`, such as mask.psnr.
-    optimized_metric: str = "psnr"
+    optimized_metric: Score = "psnr"
     debug: bool = False  # a run of ten steps that scores one view
     # Checkpoint to resume from, or `last` for the newest checkpoint of this experiment.
     ckpt_path: Optional[str] = None  # noqa: UP045

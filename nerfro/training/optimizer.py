@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Optional
@@ -14,8 +14,10 @@ from torch import nn
 from nerfro.allowed import Natural, NotNegative, Positive, checked
 from nerfro.errors import NerfroError
 
-# Patterns of groups that a scene without these parameters ignores.
-OPTIONAL_GROUPS = ("background.*", "bodies.*.material.ior", "bodies.*.material.absorption", "cameras.exposure")
+# Patterns that have no effect in a scene without these parameters.
+OPTIONAL_PATTERNS = (
+    "background.*", "bodies.*.material.ior", "bodies.*.material.absorption", "cameras.*", "cameras.exposure",
+)  # fmt: skip
 # Name of the group of all parameters that no pattern matches.
 COMMON = "common"
 
@@ -57,17 +59,32 @@ class OptimizerConfig:
         Raises:
             NerfroError: a pattern matches no parameter.
         """
-        for pattern in self.groups:
-            if pattern not in OPTIONAL_GROUPS and not any(fnmatchcase(name, pattern) for name in parameters):
-                raise NerfroError(
-                    f"optimizer.groups: {pattern} matches no learned parameter; choose from {', '.join(parameters)}, "
-                    "with * for any text"
-                )
+        require_matches("optimizer.groups", self.groups, parameters)
         groups: dict[str, list[nn.Parameter]] = {}
         for name, parameter in parameters.items():
             matching = (pattern for pattern in reversed(self.groups) if fnmatchcase(name, pattern))
             groups.setdefault(next(matching, COMMON), []).append(parameter)
         return groups
+
+
+def require_matches(where: str, patterns: Iterable[str], names: Iterable[str]) -> None:
+    """Refuse patterns that match no name of a parameter, unless they are in `OPTIONAL_PATTERNS`.
+
+    Args:
+        where: start of the error message.
+        patterns: patterns of names, in which an asterisk stands for any text.
+        names: names of all learned parameters.
+
+    Raises:
+        NerfroError: a pattern matches no parameter.
+    """
+    known = list(names)
+    for pattern in patterns:
+        if pattern not in OPTIONAL_PATTERNS and not any(fnmatchcase(name, pattern) for name in known):
+            raise NerfroError(
+                f"{where}: {pattern} matches no learned parameter; choose from {', '.join(known) or 'none'}, with * "
+                "for any text"
+            )
 
 
 def learning_rate_factor(step: int, progress: float, config: OptimizerConfig) -> float:

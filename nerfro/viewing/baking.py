@@ -23,6 +23,7 @@ from nerfro.media.distance_grid import BLOCK
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.solid import Solid
 from nerfro.rendering import ColourSpace, Renderer
+from nerfro.samplers.paths.snell import Snell
 from nerfro.types import Exits
 from nerfro.viewing import packing
 from nerfro.viewing.changes import absorption_of
@@ -66,8 +67,10 @@ def bake_surface(renderer: Renderer) -> Baked:
             f"an interactive page shows bodies with a surface, and the index of {type(medium).__name__} varies "
             "in space; render a film of this run, or train with medium=sdf_grid"
         )
-    wavelengths = getattr(renderer.path_sampler, "wavelengths", [0.0] * 3)
-    colours = np.reshape(wavelengths, (3, -1))[:, len(wavelengths) // 6].tolist()  # of the middle band of each channel
+    # The page traces as `Snell` does, after a training with another sampler with the default settings.
+    snell = renderer.path_sampler if isinstance(renderer.path_sampler, Snell) else Snell()
+    wavelengths = np.reshape(snell.wavelengths, (3, -1))
+    colours = wavelengths[:, wavelengths.shape[1] // 2].tolist()  # the middle band of each channel
     on_grid = _on_same_grid(medium)
     solids, bodies = on_grid.packed(), range(len(on_grid.grids))
     spacing = 1 / solids.inverse_spacing
@@ -94,7 +97,7 @@ def bake_surface(renderer: Renderer) -> Baked:
             "clearances": units.tolist(),
             "block": BLOCK,
             "shortest": float(solids.min_step.min()),
-            "events": getattr(renderer.path_sampler, "max_events", 16),
+            "events": snell.max_events,
         },
         {"distances": packing.two_bytes(slices), "clearance": blocks[..., None].astype(np.uint8)},
     )

@@ -8,11 +8,11 @@ import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Optional
+from typing import Annotated, Optional
 
 from omegaconf import MISSING, DictConfig
 
-from nerfro.allowed import Count, Positive
+from nerfro.allowed import Count, Names, Positive
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
 from nerfro.files.cache import save_arrays
@@ -23,13 +23,15 @@ from nerfro.viewing.page import make_page
 from nerfro.viewing.trained_scene import SKY_HEIGHT, TrainedScene
 from nerfro.viewing.volume import RESOLUTION, sample_field
 
+ExportName = Annotated[str, Names(lambda: (*EXPORTS, *PLUGIN_EXPORTS))]
+
 
 @dataclass
 class ExportConfig:
     """Options of `python -m nerfro.export`."""
 
     checkpoint: str = MISSING  # run folder, or a checkpoint in it
-    what: str = MISSING  # page, sky, volume, or an export of a plugin, such as mesh and mitsuba
+    what: ExportName = MISSING  # content and kind of the file
     out: str = MISSING  # output file; its ending selects the format
     # Grid vertices along the longest side of the volume (default 128), or rows of the sky (default 512).
     resolution: Optional[Count] = None
@@ -67,22 +69,30 @@ def find_export(what: str, out: Path) -> Export:
     Raises:
         NerfroError: the name is unknown, or the file has another ending.
     """
-    discover()
-    names = (*EXPORTS, *PLUGIN_EXPORTS)
-    if what not in names:
-        raise NerfroError(f"what={what} is not known; choose {', '.join(names)}")
-    export = EXPORTS[what] if what in EXPORTS else _export_of_plugin(what)
+    export = export_of(what)
     if out.suffix.lower() not in export.suffixes:
         raise NerfroError(f"out={out} has another ending than the exported file; it must end in "
                           f"{' or '.join(export.suffixes)}")  # fmt: skip
     return export
 
 
-def _export_of_plugin(what: str) -> Export:
+def export_of(what: str) -> Export:
+    """Return the export of a name.
+
+    Raises:
+        NerfroError: the name is unknown, or the module of the plugin defines no export.
+    """
+    discover()
+    names = (*EXPORTS, *PLUGIN_EXPORTS)
+    if what not in names:
+        raise NerfroError(f"what={what} is not known; choose {', '.join(names)}")
+    if what in EXPORTS:
+        return EXPORTS[what]
     module = importlib.import_module(PLUGIN_EXPORTS[what])
-    if not hasattr(module, "EXPORT"):
+    export = getattr(module, "EXPORT", None)
+    if not isinstance(export, Export):
         raise NerfroError(f"the plugin {module.__file__} of what={what} defines no EXPORT, an exports.Export")
-    return module.EXPORT
+    return export
 
 
 def _write_sky(scene: TrainedScene, out: Path, config: DictConfig) -> str:

@@ -22,6 +22,7 @@ from nerfro.geometry.mesh import TriangleMesh
 from nerfro.paths import user_path
 from nerfro.progress import track
 from nerfro.rendering import Renderer
+from nerfro.samplers.paths.snell import Snell
 from nerfro.subdivision import Subdivision
 from nerfro.types import Exits
 from nerfro.variants import variant
@@ -136,7 +137,8 @@ class TrainedScene:
     @property
     def surface(self) -> list[TriangleMesh]:
         """Surfaces on which rays bend, starting with the outer body; world units."""
-        return surface_of(self.renderer.scene.medium, getattr(self.renderer.path_sampler, "interface", "sdf") == "mesh")
+        sampler = self.renderer.path_sampler
+        return surface_of(self.renderer.scene.medium, isinstance(sampler, Snell) and sampler.interface == "mesh")
 
     @property
     def field(self) -> Field:

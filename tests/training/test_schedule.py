@@ -58,8 +58,10 @@ def test_step_without_a_result_is_refused() -> None:
 def test_step_without_parameters_is_refused() -> None:
     renderer = Mock(spec=Renderer, parameters_by_name=lambda: {"background.colour": nn.Parameter(torch.zeros(()))})
     run = Run(renderer, Mock(spec=RayBatches), Mock(spec=Views), Mock(spec=Adam), 0.0)
-    with pytest.raises(NerfroError, match=r"match no learned parameter; choose from background\.colour"):
-        run.descend(torch.zeros(()), run.parameters(["backgroud.*"]))
+    with pytest.raises(NerfroError, match=r"backgroud\.\* matches no learned .* choose from background\.colour"):
+        run.parameters(["background.*", "backgroud.*"])
+    with pytest.raises(NerfroError, match="changes no parameter"):
+        run.descend(torch.zeros(()), run.parameters(["cameras.*"]))
 
 
 @pytest.mark.parametrize("stop", [0, 2, 3])

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from nerfro.data.base import Views
 from nerfro.errors import NerfroError
 from nerfro.rendering import Renderer
+from nerfro.training.optimizer import require_matches
 from nerfro.training.ray_batches import RayBatches
 
 
@@ -37,9 +38,14 @@ class Run:
     spent: float
 
     def parameters(self, patterns: Sequence[str]) -> list[nn.Parameter]:
-        """Return the learned parameters whose names match a pattern, see `Scene.parameters_by_name`."""
-        named = self.renderer.parameters_by_name().items()
-        return [own for name, own in named if own.requires_grad and any(fnmatchcase(name, each) for each in patterns)]
+        """Return the learned parameters whose names match a pattern, see `Scene.parameters_by_name`.
+
+        Raises:
+            NerfroError: a pattern matches no parameter.
+        """
+        learned = {name: own for name, own in self.renderer.parameters_by_name().items() if own.requires_grad}
+        require_matches("the patterns of a phase", patterns, learned)
+        return [own for name, own in learned.items() if any(fnmatchcase(name, each) for each in patterns)]
 
     def descend(self, loss: Float[Tensor, ""], parameters: Sequence[nn.Parameter]) -> None:
         """Take a step of the optimizer with some parameters.
@@ -52,9 +58,7 @@ class Run:
             NerfroError: there is no parameter.
         """
         if not parameters:
-            names = ", ".join(name for name, own in self.renderer.parameters_by_name().items() if own.requires_grad)
-            raise NerfroError(f"the patterns of a phase match no learned parameter; choose from {names or 'none'}, "
-                              "with * for any text")  # fmt: skip
+            raise NerfroError("a step of a phase changes no parameter, because its patterns match no learned one")
         # backward() would wait for gradients of other processes.
         gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
         self.optimizer.zero_grad()  # the gradients of the last training step are still there
