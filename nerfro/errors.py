@@ -29,7 +29,7 @@ def first_of(names: Sequence[str]) -> str:
 
 def nearest_of(name: str, names: Sequence[str]) -> str:
     """Suggest the most similar of the known names, or list all known names if none is similar."""
-    names = sorted(other for other in names if other != "_target_")
+    names = sorted({*names} - {"_target_"})
     near = difflib.get_close_matches(name, names, n=1)
     return f"did you mean {near[0]}?" if near else f"known: {', '.join(names) or 'none'}"
 

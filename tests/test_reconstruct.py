@@ -89,7 +89,8 @@ class Pretended:
     """
 
     def __init__(self, out: Path) -> None:
-        self.out, self.near = out, False
+        self.out = out
+        self.surroundings: str | None = "far"
         self.doubts, self.unsupported, self.medium = list[str](), list[str](), {"type": "object"}
         self.psnr = {"straight": 20.0, "unknown": 22.0, "glass": 21.0, "glass_room": 21.0}  # by experiment
         self.ran: list[tuple[str, list[str]]] = []
@@ -122,11 +123,11 @@ class Pretended:
         if name == "mask":
             self.write("masks.png")
         if name == "preprocess":
-            bodies, distance = {"object": {"mesh": "mesh.ply", "ior": 1.4}}, "near" if self.near else "far"
+            bodies = {"object": {"mesh": "mesh.ply", "ior": 1.4}}
             self.write("surface/mesh.ply")
             self.write("surface/scene.json", {
                 "data": {"type": "opencv", "root": ".."}, "medium": self.medium, "bodies": bodies,
-                "vessel": {"wall": 0.01}, "surroundings": distance, "photograph": [512, 384],
+                "vessel": {"wall": 0.01}, "surroundings": self.surroundings, "photograph": [512, 384],
                 "provenance": {"doubts": self.doubts, "unsupported": self.unsupported},
             })  # fmt: skip
         if name == "train":
@@ -298,7 +299,7 @@ def test_what_was_found_chooses_the_experiment(
     reconstruct: Reconstruct, pretended: Pretended, tiny_scene: Path
 ) -> None:
     asked = "data=blender", f"data.root={tiny_scene}", "outlines={r_0:[1,2,9,9]}", "medium=vessel", "medium.wall=0.1"
-    pretended.near, pretended.doubts, pretended.medium = True, ["shallow"], {"type": "vessel", "wall": 0.1}
+    pretended.surroundings, pretended.doubts, pretended.medium = "near", ["shallow"], {"type": "vessel", "wall": 0.1}
     done = reconstruct(*asked, f"out={pretended.out}")
     assert pretended.names == ["mask"], "its sheet lies in the data's folder"
     assert "mask failed" in done.err
@@ -349,6 +350,16 @@ def test_sigterm_ends_a_stage_like_ctrl_c() -> None:
     with pytest.raises(KeyboardInterrupt), terminated_in_one_line():
         signal.raise_signal(signal.SIGTERM)
     assert signal.getsignal(signal.SIGTERM) == before
+
+
+def test_unknown_surroundings_end_before_training(reconstruct: Reconstruct, pretended: Pretended, photos: Path) -> None:
+    pretended.surroundings = None
+    asked = f"images={photos}", f"masks={photos.parent / 'silhouettes'}", f"out={pretended.out}", "trial_steps=0"
+    done = reconstruct(*asked)
+    assert done.code == 1
+    assert "scene.json does not tell whether the surroundings are near" in done.err
+    assert pretended.names == ["calibrate", "preprocess"]
+    assert reconstruct(*asked, "train=+experiment=glass_room").code == 0
 
 
 def test_posed_photographs_of_a_ball_become_a_scene(

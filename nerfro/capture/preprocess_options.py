@@ -43,7 +43,7 @@ class PreprocessConfig:
         medium: medium that is built from the surface (options of the group `medium`).
         refine: after the search for the index, refine the surface until its refractions match the photographs.
         mesh: known surface, which is compared with the masks; replaces the hull.
-        room: whether the surroundings are near, for the search of the index; by default the photographs decide.
+        room: whether the surroundings are near; by default, the search for the index decides.
         out: output folder; by default data.root.
         resolution: number of voxels along the longest side of the hull.
         box_min, box_max: corners of the box of the hull, world units; by default estimated from cameras and masks.

@@ -216,9 +216,10 @@ class Observations:
 
     @property
     def distance(self) -> str | None:
-        """Distance of the surroundings, `near` or `far`; None if they have not been reconstructed."""
+        """Distance of the surroundings, `near` or `far`; None if neither given nor reconstructed."""
         known = self.__dict__.get("surroundings")
-        return None if known is None else "near" if isinstance(known.boundary, Room) else "far"
+        near = self._room if known is None else isinstance(known.boundary, Room)
+        return None if near is None else "near" if near else "far"
 
     @cached_property
     def through(self) -> Pixels:
@@ -231,7 +232,7 @@ class Observations:
         with bar("surroundings") as progress:
             found = learn_surroundings(self._divided[0], self._mesh, self._room, progress)
         distance = "near" if isinstance(found.boundary, Room) else "far away"
-        print(f"surroundings: {distance}; {found.unexplained:.1%} of the variance of validation views is unexplained")
+        print(f"surroundings: {distance}; {1 - found.unexplained:.1%} of the variance of validation views is explained")
         return found
 
     @cached_property

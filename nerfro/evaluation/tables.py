@@ -197,7 +197,7 @@ def report(metrics: RunMetrics, title: str, folder: Path, brief: bool = False) -
     if brief or len(result.regions) > 1:
         rich.print(to_rich(regions_table(result, f"mean of {len(result.views)} views")))
     if metrics.treatments:
-        rich.print(to_rich(treatments_table(metrics, "means of the full images, or of right halves")))
+        rich.print(to_rich(treatments_table(metrics, "means; fitted treatments show only right halves")))
 
 
 def write_table(table: Table, stem: Path | str) -> list[Path]:

@@ -89,6 +89,11 @@ def train(config: DictConfig, overrides: list[str], scene: Path, out: Path) -> N
     common, candidates = common_options(config, overrides, scene, content.photograph), hypotheses(content)
     if is_given("experiment", common):
         options = []
+    elif content.surroundings is None:
+        raise NerfroError(
+            f"{scene} does not tell whether the surroundings are near, because no stage needed them; write "
+            '"surroundings": "near" (an object in a room) or "far" into the file, and repeat this command'
+        )
     elif config.trial_steps == 0:
         options = candidates[1].options
     else:
