@@ -95,7 +95,8 @@ class Described:
                 raise NerfroError(f"{argument}: all registered metrics are scored, so there is nothing to choose")
             if key in self.choices:
                 if re.fullmatch(r"\w+", value) and value not in (*self.choices[key], "null"):
-                    raise NerfroError(f"{key}={value} does not exist; {nearest_of(value, self.choices[key])}")
+                    own = "; --config-dir FOLDER adds your experiments" if key == "experiment" else ""
+                    raise NerfroError(f"{key}={value} does not exist; {nearest_of(value, self.choices[key])}{own}")
                 continue
             if key in _ADDED_PLUGINS and re.fullmatch(r"\w+", value) and key in self.names.get("", ()):
                 option = _ADDED_PLUGINS[key].replace("NAME", value)

@@ -201,7 +201,7 @@ def refine(
         print(f"surface unchanged: {change}, which is not significant")
     else:
         moved = float(torch.from_numpy(refined.mesh.vertices - mesh.vertices).norm(dim=-1).median())
-        print(f"surface refined: {change}; median displacement {moved:.2g} world units")
+        print(f"surface refined and used: {change}; median displacement {moved:.2g} world units")
     figures = {"steps": refined.steps, "validation_error": [round(error, 5) for error in refined.errors]}
     write_atomically(folder / FIGURES, json.dumps(figures, indent=1) + "\n")
     return refined.mesh

@@ -143,7 +143,7 @@ def test_preprocess_writes_the_refined_surface(preprocess: Callable, monkeypatch
     quick = RefinementSettings((Stage(75, 5e-4, (3.0, 1.0)),), 2000, (8, 16))
     monkeypatch.setattr(refinement, "refine_surface", functools.partial(refine_surface, settings=quick))
     out, printed = preprocess("room=false")
-    assert "surface refined" in printed
+    assert "surface refined and used" in printed
     assert f"scene={out / 'scene.json'}" in printed
     assert load_mesh(out / "mesh.ply").vertices.shape == mesh().vertices.shape
     figures = json.loads((out / "refinement.json").read_text())
