@@ -135,7 +135,7 @@ class Training:
             self.config: DictConfig = compose("train", [*overrides])
         pl.seed_everything(self.config.seed, verbose=False)
         wanted, views = self.config.batches, build(self.config.data).load("train")
-        self.renderer: Renderer = build_model(self.config)
+        self.renderer: Renderer = build_model(self.config, views)
         self.module = TrainingModule.of(self.renderer, self.config)
         batches = RayBatches(views, wanted.size, wanted.batching, self.config.seed, jitter=wanted.jitter)
         self.batches = traced(batches, self.renderer, self.config)

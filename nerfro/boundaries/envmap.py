@@ -21,6 +21,8 @@ from nerfro.types import Exits
 # Softplus of 0 is log 2.
 _GREY = 0.5 / math.log(2)
 _BLACK = 1e-3
+# Texels along each side of a face of the levels, if neither a list nor photographs define them.
+_RESOLUTIONS = (4, 8, 16, 32, 64, 128, 256)
 
 
 @register("boundary", "envmap")
@@ -31,8 +33,8 @@ class EnvironmentMap(Boundary):
     to an even grey or to a given image.
 
     Args:
-        resolutions: texels along each side of a face (90 degrees) of each level. The finest texel of the default is
-            0.35 degrees wide.
+        resolutions: texels along each side of a face (90 degrees) of each level. None derives the finest level from the
+            width of a pixel of the photographs.
         image: initial equirectangular image with z up (.png, .jpg, .hdr or .exr); None for grey.
     """
 
@@ -40,10 +42,11 @@ class EnvironmentMap(Boundary):
 
     def __init__(
         self,
-        resolutions: list[Count] = (4, 8, 16, 32, 64, 128, 256),  # type: ignore[assignment]
+        resolutions: list[Count] | None = None,
         image: str | None = None,
     ) -> None:
         super().__init__()
+        resolutions = list(_RESOLUTIONS) if resolutions is None else resolutions
         if len(resolutions) == 0:
             raise NerfroError("boundary=envmap: resolutions is empty; give one or more")
         self.levels = cube_map.CubeLevels(tuple(resolutions))

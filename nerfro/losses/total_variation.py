@@ -17,6 +17,8 @@ from nerfro.types import Batch, Exits, Rendering
 
 # Random pairs of directions for each step.
 _NUM_PAIRS = 1024
+# Angle in degrees, if neither a setting nor photographs define it.
+_ANGLE = 0.7
 
 
 @register("loss", "total_variation")
@@ -27,14 +29,15 @@ class TotalVariation(Loss):
     and Fatemi, 1992), and covers the whole sphere, including directions in which no training ray leaves.
 
     Args:
-        angle: angle between the two directions in degrees, about one texel of the background.
+        angle: angle between the two directions in degrees. None derives it from the photographs: two texels of the
+            finest level of the background.
     """
 
     weight = 1e-3
 
-    def __init__(self, angle: Annotated[float, Range(more_than=0, less_than=90)] = 0.7) -> None:
+    def __init__(self, angle: Annotated[float, Range(more_than=0, less_than=90)] | None = None) -> None:
         super().__init__()
-        self.angle = angle
+        self.angle = _ANGLE if angle is None else angle
 
     def forward(self, renderings: list[Rendering], batch: Batch, scene: Scene) -> Float[Tensor, ""]:
         index = torch.arange(_NUM_PAIRS, device=batch.rgb.device)

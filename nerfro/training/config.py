@@ -38,6 +38,7 @@ from nerfro.registry import build, check_node, configure, create, find, plugins,
 from nerfro.rendering import Components, Renderer
 from nerfro.subdivision import Subdivision
 from nerfro.synthetic import SCENES
+from nerfro.training.angular_resolution import settle_angular_resolution
 from nerfro.training.backdrop import settle_backdrop
 from nerfro.training.content import ContentConfig, settle_content
 from nerfro.training.optimizer import OptimizerConfig
@@ -358,6 +359,7 @@ def build_model(config: DictConfig, training: Views | None = None) -> Renderer:
     camera = build(config.camera)
     if training is not None:
         settle_backdrop(config, training.images)
+        settle_angular_resolution(config, training.cameras)
         camera.begin(training.cameras)
     components = Components(
         medium=medium,

@@ -15,8 +15,8 @@ from nerfro.rendering import Renderer
 from nerfro.training.phases.base import Phase, Run
 from nerfro.types import Exits
 
-# Largest fraction of all pixels that is drawn in a step.
-_SHARE = 0.01
+# Fraction of all pixels that is drawn in a step, and largest number, which bounds the memory.
+_SHARE, _MOST_PIXELS = 0.01, 2**16
 # The phase ends if fewer of the drawn pixels miss the object.
 _MIN_PIXELS = 64
 # Factor of the learning rate of the background in the first and in the last step.
@@ -33,7 +33,8 @@ class Background(Phase):
     Args:
         steps: number of steps; 0 for no pretraining.
         time_share: largest fraction of `trainer.max_time`, so that short runs train the scene, too.
-        num_pixels: number of pixels that are drawn in a step; at most 1 % of all pixels are drawn.
+        num_pixels: number of pixels that are drawn in a step; None for 1 % of all pixels, so that 600 steps draw each
+            pixel several times, but at most 65536.
         learn: patterns of the names of the learned parameters. Exposures are learned as well, because a background that
             averages photographs of different exposures would slow them down.
     """
@@ -42,7 +43,7 @@ class Background(Phase):
         self,
         steps: Natural = 600,
         time_share: Share = 0.2,
-        num_pixels: Count = 16384,
+        num_pixels: Count | None = None,
         learn: list[str] = ["background.*", "cameras.*"],  # noqa: B006 (the registry reads and copies it)
     ) -> None:
         self.steps, self.time_share, self.num_pixels, self.learn = steps, time_share, num_pixels, learn
@@ -55,7 +56,7 @@ class Background(Phase):
         of_background, learned = run.parameters(["background.*"]), run.parameters(self.learn)
         if box is None or not of_background:
             return False
-        num_pixels = min(self.num_pixels, int(_SHARE * run.batches.num_pixels))
+        num_pixels = self.num_pixels or min(int(_SHARE * run.batches.num_pixels), _MOST_PIXELS)
         rays, view, rgb = run.batches.missing(box, num_pixels, number, scene.camera)
         progress = max(number / self.steps, run.spent / self.time_share)
         if len(rays) < _MIN_PIXELS or progress >= 1:

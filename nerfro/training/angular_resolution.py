@@ -1,0 +1,40 @@
+"""Angular resolution of the background, derived from the width of a pixel of the photographs."""
+
+from __future__ import annotations
+
+import math
+
+from omegaconf import DictConfig
+
+from nerfro.cameras import Cameras
+from nerfro.registry import find
+
+# Texels along each side of a face of the coarsest level, and bounds of the finest one. The optimizer visits all texels
+# in each step, so that a level of 1024 would take more time than the rays.
+_COARSEST, _FEWEST, _MOST = 4, 64, 512
+# Angle between two compared directions, in texels of the finest level.
+_COMPARED_TEXELS = 2
+
+
+def settle_angular_resolution(config: DictConfig, cameras: Cameras) -> None:
+    """Set the missing resolutions of `boundary=envmap`, and the missing angle of `loss=total_variation`.
+
+    A texel of the finest level is about as wide as a pixel. If a volume covers all of space, the background shows only
+    what is far behind the photographed scene, and keeps the levels of its constructor.
+
+    Args:
+        config: configuration of a run, see `TrainConfig`; it is changed.
+        cameras: cameras of the training views.
+    """
+    if config.boundary._target_ != find("boundary", "envmap").target:
+        return
+    if config.content.space == "all":
+        return
+    if config.boundary.get("resolutions") is None:
+        finest = 0.5 * math.pi * float(cameras.fx.double().median())
+        finest = min(max(2 ** round(math.log2(finest)), _FEWEST), _MOST)
+        levels = range(int(math.log2(_COARSEST)), int(math.log2(finest)) + 1)
+        config.boundary.resolutions = [2**level for level in levels]
+    variation = config.loss.get("total_variation")
+    if variation and variation.get("angle") is None:
+        config.loss.total_variation.angle = _COMPARED_TEXELS * 90 / max(config.boundary.resolutions)
