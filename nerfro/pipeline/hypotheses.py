@@ -9,8 +9,8 @@ from nerfro.rendering.scene_file import SceneFile
 
 # Number of training photographs that score the hypotheses.
 _NUM_VALIDATION_VIEWS = 5
-# Steps of straight rays in the time of one step of bent rays, on the real glass (docs/lab/glass_of_water.md).
-_STRAIGHT_SPEED = 1.5
+# Steps of straight rays in the processor time of one step of bent rays (docs/lab/simulated_glassware.md).
+_STRAIGHT_SPEED = 1.25
 
 
 @dataclass(frozen=True)
