@@ -112,7 +112,7 @@ def test_a_vessel_is_fitted_where_it_is_asked_for(preprocess: Callable[..., str]
     command = shlex.split(printed.split("train on the vessel: ")[1])
     assert command[3:] == [f"scene={capture / 'scene.json'}", "medium=vessel"]
     scene = read_scene_file(capture / "scene.json")
-    assert (scene.settings()["medium.ior"], scene.settings("vessel")["medium.ior"]) == (1.33, 1.52)
+    assert (scene.settings()["medium.ior"], scene.settings(medium="vessel")["medium.ior"]) == (1.33, 1.52)
     assert all(0 < scene.vessel[name] < RADIUS for name in ("wall", "foot", "fillet"))
 
 

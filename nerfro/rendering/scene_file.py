@@ -83,7 +83,7 @@ class SceneFile:
             settings |= {"inner_meshes": [body.mesh for body in inner], "inner_iors": [body.ior for body in inner]}
         return settings
 
-    def settings(self, data_type: str | None = None, medium: str | None = None) -> dict[str, object]:
+    def settings(self, *, data_type: str | None = None, medium: str | None = None) -> dict[str, object]:
         """Return the settings of the groups `data` and `medium` by their full names.
 
         Args:
@@ -243,7 +243,7 @@ def with_scene(arguments: Sequence[str], names: Collection[str]) -> list[str]:
     path = user_path(files[0].partition("=")[2].strip("'\""))
     scene = read_scene_file(path)
     chosen = {text.partition("=")[0]: text.partition("=")[2] for text in others if text.partition("=")[0] in names}
-    settings = scene.settings(chosen.get("data"), chosen.get("medium"))
+    settings = scene.settings(data_type=chosen.get("data"), medium=chosen.get("medium"))
     is_known = is_given("medium.ior", others) or chosen.get("medium") == "vessel"
     if scene.provenance.doubts and "medium" in names and not is_known:
         warn(f"{path}: the photographs do not determine the index ({scene.provenance.doubts[0]}); set medium.ior=")
