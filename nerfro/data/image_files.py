@@ -53,13 +53,12 @@ def read_size(path: Path) -> tuple[int, int, int]:
 def _read_8bit(image: Image.Image, bits: int) -> UInt8[np.ndarray, "H W C"]:
     if image.mode == "P" and image.palette is None:
         raise OSError("it has no palette")
-    # PNG files may state one colour that is transparent. Pillow scales levels of 2 and 4 bits, but not this colour.
-    if image.mode == "L" and "transparency" in image.info and bits in (2, 4):
-        image.info["transparency"] *= 255 // (2**bits - 1)
-    elif image.mode == "1" and "transparency" in image.info:  # Pillow before version 13 ignores this colour
-        black = image.info["transparency"] == 0
+    # PNG files may state one colour that is transparent. Pillow scales grey levels to 8 bits, but this colour only if
+    # it has one bit, and not in all versions.
+    if image.mode in ("1", "L") and "transparency" in image.info and bits < 8:
+        colour = image.info["transparency"] * 255 // (2**bits - 1)
         image = image.convert("L")
-        image.info["transparency"] = 0 if black else 255
+        image.info["transparency"] = min(colour, 255)
     if image.mode not in ("L", "LA", "RGB", "RGBA") or "transparency" in image.info:
         grey, transparent = image.mode in ("1", "L"), image.has_transparency_data
         image = image.convert(("LA" if transparent else "L") if grey else "RGBA" if transparent else "RGB")

@@ -52,6 +52,7 @@ def score_split(
     - `refined`: in addition, each test camera is refined individually.
 
     Gains and refined cameras are fitted on the left halves of the photographs, and the right halves are scored.
+    `score_views` explains the arguments; `refine_steps` is the number of steps for each test camera.
 
     Returns:
         Scores with the given cameras, and the scores of each treatment by name.

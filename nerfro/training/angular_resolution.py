@@ -26,9 +26,7 @@ def settle_angular_resolution(config: DictConfig, cameras: Cameras) -> None:
         config: configuration of a run, see `TrainConfig`; it is changed.
         cameras: cameras of the training views.
     """
-    if config.boundary._target_ != find("boundary", "envmap").target:
-        return
-    if config.content.space == "all":
+    if config.content.space == "all" or config.boundary._target_ != find("boundary", "envmap").target:
         return
     if config.boundary.get("resolutions") is None:
         finest = 0.5 * math.pi * float(cameras.fx.double().median())
