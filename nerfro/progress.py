@@ -19,9 +19,13 @@ _FORMAT = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}"
 class _LogFile:
     """Writes each state of a bar as one line of standard error, which is not a terminal."""
 
+    _last = ""
+
     def write(self, text: str) -> None:
-        if text.strip():
-            sys.stderr.write(f"{text.strip()}\n")
+        line = text.strip()
+        if line and line != self._last:  # tqdm writes the final state again when a bar is closed
+            self._last = line
+            sys.stderr.write(f"{line}\n")
 
     def flush(self) -> None:
         sys.stderr.flush()
@@ -39,7 +43,8 @@ def progress_bar(description: str, total: float | None, items: Iterable[Any] | N
     form = _FORMAT
     if not sys.stderr.isatty():
         form = form.replace("|{bar}|", "")
-        options |= {"file": _LogFile(), "mininterval": _LOG_SECONDS}
+        # With miniters=0, the monitor thread of tqdm does not add lines between two intervals.
+        options |= {"file": _LogFile(), "mininterval": _LOG_SECONDS, "miniters": 0}
     return tqdm(items, description, total, bar_format=form, dynamic_ncols=True, **{"delay": DELAY, **options})
 
 

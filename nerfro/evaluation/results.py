@@ -22,8 +22,9 @@ Score = float | None  # None if not available; the notes contain the reason
 
 Region = Literal["full", "mask", "crop"]  # see nerfro/evaluation/regions.py
 FULL: Region = "full"
-# Names of the scores under `test`, with the cameras and exposures of the data set, and of scores with fitted exposures.
-AS_GIVEN, EXPOSED = "as given", "exposed"
+# Scores with the given cameras and exposure, with fitted exposures, and with fitted cameras; docs/reference/metrics.md.
+AS_GIVEN, EXPOSED, REFINED = "as given", "exposed", "refined"
+FITTED = (EXPOSED, REFINED)  # to the left halves of the photographs; the scores belong to the right halves
 OBJECT_REGIONS: tuple[Region, ...] = ("mask", "crop")  # regions that require a mask of the object
 
 

@@ -20,6 +20,7 @@ from nerfro.errors import NerfroError
 from nerfro.evaluation.image_metrics import image_metrics
 from nerfro.evaluation.results import (
     AS_GIVEN,
+    FITTED,
     FULL,
     EvaluationResult,
     Region,
@@ -168,7 +169,10 @@ def regions_table(result: EvaluationResult, title: str) -> Table:
 
 def treatments_table(metrics: RunMetrics, title: str) -> Table:
     """Tabulate the mean scores of the test views under each treatment (see `nerfro.evaluation.treatments`)."""
-    treated = {name: result.means() for name, result in metrics.treatments.items()}
+    treated = {
+        f"{name}, right halves" if name in FITTED else name: result.means()
+        for name, result in metrics.treatments.items()
+    }
     return _scores_table(title, "test views", {AS_GIVEN: metrics.result.means()} | treated, [])
 
 
@@ -197,7 +201,7 @@ def report(metrics: RunMetrics, title: str, folder: Path, brief: bool = False) -
     if brief or len(result.regions) > 1:
         rich.print(to_rich(regions_table(result, f"mean of {len(result.views)} views")))
     if metrics.treatments:
-        rich.print(to_rich(treatments_table(metrics, "means; fitted treatments show only right halves")))
+        rich.print(to_rich(treatments_table(metrics, "means; compare only rows of the same pixels")))
 
 
 def write_table(table: Table, stem: Path | str) -> list[Path]:

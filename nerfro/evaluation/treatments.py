@@ -19,7 +19,7 @@ from nerfro.cameras import Cameras
 from nerfro.data.base import Views
 from nerfro.data.pixel_store import PixelStore
 from nerfro.evaluation.metrics import ImageMetrics
-from nerfro.evaluation.results import AS_GIVEN, EXPOSED, EvaluationResult
+from nerfro.evaluation.results import AS_GIVEN, EXPOSED, REFINED, EvaluationResult
 from nerfro.evaluation.scoring import Images, score_views
 from nerfro.rays import Rays
 from nerfro.rendering import Renderer
@@ -70,7 +70,7 @@ def score_split(
     results |= dict(zip(images, scores, strict=True))
     if refine_steps:
         views = replace(views, cameras=refine_on_left(renderer, views, gains, refine_steps))
-        [results["refined"]], _ = score_views(renderer, views, *settings, [Images("images_refined", True)])
+        [results[REFINED]], _ = score_views(renderer, views, *settings, [Images("images_refined", True)])
     return results.pop(AS_GIVEN), results
 
 

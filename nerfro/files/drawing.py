@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -27,12 +28,13 @@ def sheet(
     columns, height = min(columns, len(images)), round(width * images[0].shape[0] / images[0].shape[1])
     pitch, start = height + LINE_HEIGHT + GAP, LINE_HEIGHT if title else 0
     num_rows = -(-len(images) // columns)
-    whole = Image.new("RGB", (columns * (width + GAP) - GAP, start + num_rows * pitch - GAP), PAPER)
-    _write(whole, title, whole.width // 2, LINE_HEIGHT // 2)
+    length = max(columns * (width + GAP) - GAP, math.ceil(_font().getlength(title)))
+    whole = Image.new("RGB", (length, start + num_rows * pitch - GAP), PAPER)
+    _write(whole, title, whole.width // 2, LINE_HEIGHT // 2, length)
     for number, (image, caption) in enumerate(zip(images, captions, strict=True)):
         left, top = number % columns * (width + GAP), start + number // columns * pitch
         whole.paste(_resized(image, width, height), (left, top))
-        _write(whole, caption, left + width // 2, top + height + LINE_HEIGHT // 2)
+        _write(whole, caption, left + width // 2, top + height + LINE_HEIGHT // 2, width)
     return whole
 
 
@@ -42,13 +44,15 @@ def _resized(image: Float[Tensor, "h w 3"], width: int, height: int) -> Image.Im
     return pixels.resize((width, height), Image.Resampling.NEAREST if width >= pixels.width else Image.Resampling.BOX)
 
 
-def _write(image: Image.Image, text: str, x: int, y: int) -> None:
-    """Write a text around a centre; a text that would leave the image is moved inwards."""
+def _font(size: float = TEXT_SIZE) -> ImageFont.FreeTypeFont:
     # Pillow's own font lacks signs such as ≥ and ↑, which the font of matplotlib has.
-    font = ImageFont.truetype(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf", TEXT_SIZE)
-    draw = ImageDraw.Draw(image)
-    half = draw.textlength(text, font=font) / 2
-    draw.text((min(max(x, half), image.width - half), y), text, fill=INK, font=font, anchor="mm")
+    return ImageFont.truetype(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf", size)
+
+
+def _write(image: Image.Image, text: str, x: int, y: int, width: int) -> None:
+    """Write a text around a centre, in smaller letters if the text is wider than `width`."""
+    size = TEXT_SIZE * min(1.0, width / max(_font().getlength(text), 1))
+    ImageDraw.Draw(image).text((x, y), text, fill=INK, font=_font(size), anchor="mm")
 
 
 def magma(values: Float[Tensor, "H W"], limit: float) -> Float[Tensor, "H W 3"]:

@@ -32,7 +32,7 @@ from nerfro.poses.reconstruction import numeric_order
 from nerfro.silhouettes.outline_hull import AGREES, FEWEST_VIEWS
 
 _SHEET = "masks.png"
-_TILE, _COLUMNS, _NAME_LENGTH = 220, 6, 16  # width of a tile in pixels, tiles per row, characters of a name
+_TILE, _COLUMNS = 220, 6  # width of a tile in pixels, tiles per row
 _OUTSIDE = (0.0, 0.0, 90.0)  # 8-bit colour that is added outside the mask
 
 
@@ -198,7 +198,7 @@ def mask_sheet(
     for view in order:
         inside, image = (torch.from_numpy(array[::stride, ::stride]) for array in (found.masks[view], images[view]))
         pictures.append(torch.where(inside[..., None], image / 255, image / 1020 + torch.tensor(_OUTSIDE) / 255))
-        captions.append(f"{labels.get(view, 'given')}  {frames[view].image.stem[-_NAME_LENGTH:]}")
+        captions.append(f"{labels.get(view, 'given')}  {frames[view].image.stem}")
     legend = f"overlap of {found.segmenter} and visual hull; " if found.overlaps else ""
     legend += f"hull: the mask is the projection of the {found.shape}; dark: outside the mask"
     return sheet(pictures, captions, _TILE, _COLUMNS, legend)

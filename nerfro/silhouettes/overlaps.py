@@ -24,7 +24,6 @@ SHEET, REPORT = "overlays.png", "overlaps.json"
 _MAX_PIXELS = 256  # per side; larger images are subsampled
 _MAX_VIEWS, _COLUMNS = 48, 8
 _WIDTH = 192  # width of a tile, in pixels
-_NAME_LENGTH = 16  # number of last characters of a name that fit below a tile
 _BOTH, _MASK_ONLY, _SURFACE_ONLY = (60, 190, 90), (235, 60, 45), (40, 110, 240)
 
 
@@ -94,7 +93,7 @@ def _draw_overlays(views: Views, mesh: TriangleMesh, overlaps: Float[np.ndarray,
     for view, ours in zip(chosen, mesh_silhouettes(mesh, cameras, stride), strict=True):
         theirs = views.masks[view][::stride, ::stride] > 0.5
         pictures.append(_tinted(views.images[view][::stride, ::stride], ours, theirs))
-        captions.append(f"{overlaps[view]:.3f}  {views.names[view][-_NAME_LENGTH:]}")
+        captions.append(f"{overlaps[view]:.3f}  {views.names[view]}")
     legend = f"green: both, red: mask only, blue: surface only; worst {len(chosen)} of {len(views)} views"
     save_image(folder / SHEET, sheet(pictures, captions, _WIDTH, _COLUMNS, legend))
 
