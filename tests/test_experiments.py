@@ -110,6 +110,12 @@ def test_the_papers_eight_scenes_are_there() -> None:
     assert set(SCENES) == {"torus", "ship", "deerglobe", "starlamp", "dolphin", "ball", "glass", "pen"}
 
 
+@pytest.mark.parametrize("experiment", ["nerf", "paper_ablation_noH", "mipnerf_sky", "glass_room", "eikonal_fields"])
+def test_an_experiment_takes_another_point_sampler(experiment: str) -> None:
+    config = composed(f"+experiment={experiment}", "sampler/points=logarithmic", "sampler.points.num_samples=7")
+    assert {key: value for key, value in config.sampler.points.items() if key != "_target_"} == {"num_samples": 7}
+
+
 def test_experiments_stack() -> None:
     config = composed("+experiment=[ablation_noH,ablation_noBD]")
     assert "num_samples" in config.sampler.points
