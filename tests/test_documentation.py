@@ -47,7 +47,7 @@ def guide_plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, restored_regi
 
 def test_plugins_of_the_guide_keep_their_contracts(guide_plugins: list[str]) -> None:
     named = ["sampler/points=square_root", "loss=half_transparent", "boundary=horizon", "metric=worst_pixel"]
-    named += ["sampler/path=mirage", "surface=lens", "phase=mean_colour"]
+    named += ["sampler/points=coarse_to_fine", "sampler/path=mirage", "surface=lens", "phase=mean_colour"]
     for kind, _, name in (text.partition("=") for text in named):
         check(find(kind, name))
     test, check_of_tutorial = guide_plugins

@@ -25,7 +25,7 @@ class ReconstructConfig:
         images: folder of photographs without poses.
         video: video instead of photographs; the sharpest of its frames are used.
         frames: number of frames to take from the video.
-        masks: folder of the masks, `<photograph>` or `mask_<photograph>` with the ending of any image format.
+        masks: folder of the masks, PNG or JPEG files named `<photograph>` or `mask_<photograph>`.
         outlines: outlines of the object in some photographs, as for `python -m nerfro.mask`.
         out: output folder.
         trial_steps: number of steps of the training that tries each hypothesis about the object on validation
