@@ -1,1 +1,1 @@
-"""What lies beyond the volume: exit direction -> colour."""
+"""Boundary models: background radiance as a function of the exits of paths."""

@@ -1,4 +1,4 @@
-"""The base class of backgrounds: radiance from beyond the volume."""
+"""Base class of boundary models, which represent the background radiance."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ from nerfro.types import Exits
 
 
 class Boundary(nn.Module, ABC):
-    """Background radiance: light that arrives from beyond the volume, C'(d) of the paper's Eqn. 5."""
+    """Background radiance, C'(d) (paper, Eqn. 5): linear radiance that arrives from outside of the volume."""
 
     @abstractmethod
     def forward(self, exits: Exits) -> Float[Tensor, "*batch 3"]:
         """Evaluate the background radiance.
 
         Args:
-            exits: lines on which light arrives; a background at infinity needs their directions alone.
+            exits: last segments of paths. A background at infinity depends only on the directions.
 
         Returns:
-            Linear radiance, at least 0 and without upper bound.
+            Linear radiance of each exit, not negative and without upper bound.
         """
 
 
 def background_radiance(
     boundary: Boundary, exits: Exits, teaches: Bool[Tensor, "P"] | None = None
 ) -> Float[Tensor, "P 3"]:
-    """Evaluate the background radiance, whose parameters learn from some exits alone.
+    """Evaluate the background radiance, with gradients of the parameters from selected exits only.
 
     Args:
         boundary: the background.
-        exits: where polylines leave the volume.
-        teaches: exits from which the parameters learn; None for all. What bends the rays learns from all exits.
+        exits: last segments of polylines.
+        teaches: exits from which the parameters learn; None for all. The exits themselves always have gradients.
     """
     radiance = boundary(exits)
     if teaches is None or not radiance.requires_grad:

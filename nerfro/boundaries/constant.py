@@ -15,7 +15,7 @@ from nerfro.types import Exits
 
 @register("boundary", "constant")
 class ConstantBoundary(Boundary):
-    """The same radiance in every direction, black by default, as NeRF and mip-NeRF assume.
+    """Represent the background by one radiance in all directions, black by default as in NeRF and mip-NeRF.
 
     Args:
         rgb: linear radiance of the three channels.

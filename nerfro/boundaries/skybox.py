@@ -15,7 +15,7 @@ from nerfro.types import Exits
 
 @register("boundary", "skybox")
 class Skybox(Boundary):
-    """4x128 MLP of the encoded direction, after NeRFactor's normal field (paper, Eqn. 5, F_psi).
+    """Represent the background by a 4x128 MLP of the encoded exit direction (paper, Eqn. 5, F_psi).
 
     The radiance is a sigmoid and at most 1, as in the authors' code. Bright lamps are therefore clipped.
 

@@ -100,7 +100,7 @@ class RunMetrics:
 
     Attributes:
         result: scores of the test views.
-        steps: number of optimisation steps; None for images of another program.
+        steps: number of optimizer steps; None for images of another program.
         train_seconds: wall-clock time of training in seconds, without evaluation; None without training.
         rays_per_second: training throughput; None without training.
         treatments: scores of the same views with corrected cameras or exposures; see `nerfro.evaluation.treatments`.

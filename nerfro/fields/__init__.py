@@ -1,1 +1,1 @@
-"""Radiance fields: samples -> density, colour."""
+"""Radiance fields: density and radiance of samples."""

@@ -1,1 +1,1 @@
-"""Compiled kernels, each behind the plain-torch reference that it is tested against."""
+"""Shared functions of compiled kernels; tests compare each kernel with a reference implementation in PyTorch."""

@@ -1,1 +1,1 @@
-"""Training losses: renderings, batch, model -> scalar."""
+"""Training losses: scalar functions of renderings, batch and scene."""

@@ -43,5 +43,5 @@ class Loss(nn.Module, ABC):
         Args:
             renderings: one rendering for each sampling level, the finest last.
             batch: training pixels and rays.
-            scene: everything that is learned.
+            scene: medium, fields, background and cameras.
         """

@@ -19,9 +19,9 @@ _MIN_TRANSMITTANCE = 0.5
 class BoundaryRegulariser(Loss):
     """Penalize |T C'(d) - C| where the final transmittance T is above 1/2 (paper, Eqn. 8).
 
-    The background alone should explain such pixels. Only the density of the finest level learns, because the colour of
-    the background is detached; the loss removes fog in front of the surface. Channels are summed, and the sum over
-    rays is divided by the number of rays plus one, as in the authors' code.
+    The background should explain such pixels without the field, so the loss removes fog in front of the surface. Only
+    the density of the finest level learns, because the colour of the background is detached. Channels are summed, and
+    the sum over rays is divided by the number of rays plus one, as in the authors' code.
 
     Args:
         refracted_only: whether to count only rays that meet the medium.

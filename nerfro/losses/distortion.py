@@ -14,7 +14,7 @@ from nerfro.types import Batch, Rendering
 
 @register("loss", "distortion")
 class Distortion(Loss):
-    """Penalize the spread of the weights of the finest level along each path, such as fog (mip-NeRF 360, Eqn. 15).
+    """Penalize weights of the finest level that are spread along a path, as in fog (mip-NeRF 360, Eqn. 15).
 
     Arc length is measured in units of the length of the path, far - near, so that the loss does not depend on the scale
     of the scene. If space is contracted, contracted length is measured in units of the total contracted length, and
@@ -41,6 +41,10 @@ def distortion(weights: Float[Tensor, "R N"], edges: Float[Tensor, "R N+1"]) -> 
     The integral is sum_ij w_i w_j |m_i - m_j| + 1/3 sum_i w_i^2 (e_{i+1} - e_i), with interval midpoints m (mip-NeRF
     360, Eqn. 15). Because midpoints ascend, the double sum is twice the sum over i of w_i (m_i W_i - M_i), where W_i
     and M_i are the sums of w_j and w_j m_j over j < i, and takes linear time.
+
+    Args:
+        weights: rendering weights of the intervals.
+        edges: bounds of the intervals, ascending.
     """
     midpoints = 0.5 * (edges[:, 1:] + edges[:, :-1])
     # Only distances matter. Positions relative to the mean reduce cancellation between the two sums.

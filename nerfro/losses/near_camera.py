@@ -20,8 +20,8 @@ class NearCamera(Loss):
     """Penalize density between the cameras and the content, with a weight that decreases with the distance.
 
     The weight of a sample at arc length s is max(1 - s / d, 0), where d is the distance of the camera from the centre
-    of the content's box. Few rays cross the space close to a camera, so floating density there, which hides everything
-    else from other directions, contradicts no photograph. The loss is similar to the occlusion loss of FreeNeRF (Yang
+    of the content's box. Few rays cross the space close to a camera. Floating density in this space contradicts no
+    photograph, but hides the scene from other directions. The loss is similar to the occlusion loss of FreeNeRF (Yang
     et al. 2023, Eqn. 8).
 
     Args:

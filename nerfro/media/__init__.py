@@ -1,1 +1,1 @@
-"""Refractive index: x -> (n, grad n)."""
+"""Media: refractive index and its gradient as functions of position."""

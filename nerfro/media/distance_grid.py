@@ -88,7 +88,7 @@ class DistanceGrid(nn.Module):
     def coarse_slopes(self) -> Float[Tensor, "x y z 3 2"]:
         """Bound the derivatives of the spline along the axes in each block of `SURFACE_BLOCK`^3 cells.
 
-        A derivative is a weighted mean of differences of neighbouring coefficients, which therefore bound it. At the
+        A derivative is a weighted mean of differences of neighbouring coefficients, so their extremes bound it. At the
         border of the grid splines are extrapolated, and the bounds are infinite.
         """
         spacing = self.spacing.cpu()
@@ -106,8 +106,8 @@ class DistanceGrid(nn.Module):
         """Bound the Chebyshev distance to the next block of `SURFACE_BLOCK`^3 cells that may hold the surface.
 
         Values of blocks inside the body are negative, and 0 means that the block itself may hold the surface. A block
-        without sign changes of the coefficients does not, because the values of a spline lie between its coefficients.
-        This does not hold at the border of the grid, where splines are extrapolated.
+        without sign changes of the coefficients holds no surface, because the values of a spline lie between its
+        coefficients. This does not hold at the border of the grid, where splines are extrapolated.
         """
         lowest, highest = _extremes(self._coefficients_of_blocks(), [SURFACE_BLOCK + 3] * 3)
         outside = lowest > torch.where(self._border_blocks(), highest / _CONTINUED, 0)

@@ -165,7 +165,7 @@ class SdfGrid(Solid):
     def grown(self, outwards: Float[Tensor, "X Y Z"]) -> SdfGrid:
         """Return the same bodies with the outer surface displaced.
 
-        The displacement is subtracted from the distances, so that these are exact only for small displacements.
+        The displacement is subtracted from the distances, so the distances are exact only for small displacements.
 
         Args:
             outwards: outward displacement at the vertices of the outer body's grid, world units.

@@ -186,7 +186,7 @@ class Solid(Medium):
         return torch.where(in_box, n, 1.0), torch.where(in_box[..., None], gradient, 0.0)
 
     def clearance(self, positions: Vectors) -> Scalars:
-        """Return most of the distance to the nearest shell, world units."""
+        """Return a lower bound of the distance to the nearest shell, world units."""
         phi, _ = self.signed_distances(positions)
         return (SAFE_SHARE * phi.abs().amin(-1) - self.shell).clamp(min=0)
 

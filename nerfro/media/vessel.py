@@ -28,8 +28,8 @@ from nerfro.variants import variant
 class SdfVessel(SdfGrid):
     """A wall of glass around a cavity that contains a liquid up to a level, and air above the liquid.
 
-    The bodies are nested. The outer body is the wall. The cavity is the part of it that is deeper than the wall and
-    above the foot, and contains air. The liquid is the part of the cavity below the level. Liquid therefore touches
+    The bodies are nested. The outer body is the wall. The cavity contains air, and is the part of the outer body deeper
+    than the wall and above the foot. The liquid is the part of the cavity below the level. Liquid therefore touches
     glass without a gap. A vessel without a level is full and has no air. The wall may be much thinner than a voxel,
     because each of its surfaces is a smooth distance field.
 

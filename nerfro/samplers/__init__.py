@@ -1,1 +1,1 @@
-"""How rays become paths, and where paths are sampled."""
+"""Path samplers, which turn rays into paths, and point samplers, which choose arc lengths on paths."""

@@ -21,7 +21,7 @@ class PathSampler(nn.Module, ABC):
 
     Attributes:
         needs_medium: whether the sampler queries the medium; otherwise no medium is built.
-        branching: which parts of light that is partly reflected are followed.
+        branching: rule that selects the branches of partly reflected light.
     """
 
     needs_medium = True

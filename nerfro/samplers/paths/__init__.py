@@ -1,1 +1,1 @@
-"""How rays become paths: straight, refracted, or integrated through a continuous index."""
+"""Path samplers: straight rays, refraction at surfaces, and integration through a continuous index."""

@@ -22,7 +22,7 @@ def distance_to_end(
     directions: Float[Tensor, "R 3"],
     s: Float[Tensor, "R"],
 ) -> Float[Tensor, "R"]:
-    """Return the distance from the last event of rays to far, or for bent rays to outside of the box if farther."""
+    """Return the distance from the last event of each ray to far; bent rays end outside of the box, if farther."""
     _, leave = intersect_box(box, positions, directions)
     out = leave.clamp(min=0) + BEYOND_BOX * (box[1] - box[0]).min()
     return torch.where(refracted, torch.maximum(far - s, out), far - s)
@@ -43,7 +43,7 @@ class SnellTrace(NamedTuple):
 
 
 class Crossed(NamedTuple):
-    """Bodies and surface of vertices, see `Path`; by default of a vertex in air."""
+    """Bodies and surface of vertices, see `Path`. The default is a vertex in air."""
 
     body: Int[Tensor, "A"] | int = 0
     surface: Int[Tensor, "A"] | int = -1

@@ -50,10 +50,10 @@ def reflectance(
     n_before: Float[Tensor, "R"],
     n_after: Float[Tensor, "R"],
 ) -> Float[Tensor, "R"]:
-    """Compute the reflectance of a surface for unpolarised light by the Fresnel equations; 1 for total reflection.
+    """Compute the reflectance of a surface for unpolarized light by the Fresnel equations; 1 for total reflection.
 
     With r = n_before / n_after and cosines c, c', the reflectance is the mean of ((r c - c') / (r c + c'))^2 for light
-    polarised across the plane of incidence and ((c - r c') / (c + r c'))^2 for light polarised in the plane.
+    polarized across the plane of incidence and ((c - r c') / (c + r c'))^2 for light polarized in the plane.
     See `refract` for the arguments.
     """
     cosine = (directions * normals).sum(-1).abs()

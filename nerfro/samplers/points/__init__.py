@@ -1,1 +1,1 @@
-"""Where paths are sampled."""
+"""Point samplers, which choose arc lengths on paths."""
