@@ -275,7 +275,8 @@ def parts_of_step(training: Training, steps: int, limits: Limits) -> dict[str, t
         training.run(1, data)
     whole = float(np.median(training.run(steps + 1, data).processor[1:]))
     with ExitStack() as stack:
-        label(stack, TracedInStep, "transfer_batch_to_device", "tracing")
+        label(stack, RayBatches, "batch", "tracing")
+        label(stack, model.point_sampler, "choose_ahead", "samples")
         label(stack, model.point_sampler, "forward", "samples")
         with profile(activities=[ProfilerActivity.CPU], record_shapes=True) as measured:
             training.run(steps, data)
@@ -336,7 +337,16 @@ def write_images(folder: Path, pixels: int, views: int) -> None:
         (folder / f"transforms_{split}.json").write_text(json.dumps(document | {"frames": frames}))
 
 
-class ReadyBatches(RayDataModule):
+class TracedInStep(RayDataModule):
+    """Paths are traced when a step asks for them, as where the medium learns."""
+
+    def train_dataloader(self) -> Iterator[int]:
+        steps = super().train_dataloader()
+        self.end_thread()
+        return steps
+
+
+class ReadyBatches(TracedInStep):
     """The batches of the first steps again and again, traced before training starts."""
 
     def __init__(self, batches: RayBatches, num_steps: int) -> None:
@@ -346,14 +356,6 @@ class ReadyBatches(RayDataModule):
 
     def transfer_batch_to_device(self, batch: int, device: torch.device, dataloader_idx: int) -> Batch:
         return self.ready[batch]
-
-
-class TracedInStep(RayDataModule):
-    """Paths are traced when a step asks for them, as where the medium learns."""
-
-    def transfer_batch_to_device(self, batch: int, device: torch.device, dataloader_idx: int) -> Batch:
-        with torch.no_grad():
-            return self.batches.batch(batch)
 
 
 def report_paths(turns: int, steps: int, options: list[str]) -> None:

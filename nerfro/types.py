@@ -55,6 +55,8 @@ class Path:
         absorption: absorption coefficients of air and of each body for red, green and blue, per world unit; empty if
             all media are clear.
         band: number of the wavelength of the polyline in dispersive media; otherwise 0.
+        samples: samples of the first sampling level, if they were chosen with the path; selected or joined polylines
+            have none.
     """
 
     positions: Float[Tensor, "P S 3"]
@@ -71,6 +73,7 @@ class Path:
     triangle: Int[Tensor, "P S"]
     absorption: Float[Tensor, "B 3"]
     band: Int[Tensor, "P"]
+    samples: Samples | None = None
 
     @classmethod
     def unbranched(
@@ -110,7 +113,8 @@ class Path:
                 columns[name].append(value)
             num_rays += path.num_rays
         splits, absorption = any(columns.pop("splits")), max(columns.pop("absorption"), key=len)
-        together = {name: torch.cat(values) for name, values in columns.items()}
+        columns.pop("samples")
+        together: dict[str, Any] = {name: torch.cat(values) for name, values in columns.items()}
         return cls(splits=splits, absorption=absorption, **together)
 
     def __repr__(self) -> str:
@@ -187,7 +191,7 @@ class Path:
         """Select polylines; each becomes the only polyline of a new ray."""
         rows = {name: value[index] for name, value in vars(self).items() if name not in _OF_PATHS}
         rows["ray"] = torch.arange(len(rows["s"]), device=self.s.device)
-        return replace(self, **rows)
+        return replace(self, samples=None, **rows)
 
     def of_rays(self, rows: Int[Tensor, "C"]) -> Path:
         """Select rays with all their polylines."""
@@ -236,7 +240,7 @@ class Path:
 
 # Fields of `Path` with a column for each vertex, and fields without rows.
 _OF_VERTICES = frozenset({"positions", "directions", "s", "body", "surface", "across", "triangle"})
-_OF_PATHS = frozenset({"splits", "absorption"})
+_OF_PATHS = frozenset({"splits", "absorption", "samples"})
 
 
 @dataclass(frozen=True)

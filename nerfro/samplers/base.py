@@ -83,6 +83,14 @@ class PointSampler(nn.Module, ABC):
             Samples in ascending arc length; `Samples.along` looks up positions and directions on the path.
         """
 
+    def choose_ahead(self, path: Path, draws: Draws) -> Path:
+        """Return a traced path with the samples of its first level, or the path itself to sample it in the step.
+
+        A thread may choose the samples of the next step during a step, so they may depend on the state that
+        `after_step` updates, but on no learned parameter.
+        """
+        return path
+
     def after_step(self, fields: Sequence[Field], draws: Draws) -> None:
         """Update the state of the sampler after a training step.
 

@@ -6,6 +6,7 @@ import itertools
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from typing import Generic, TypeVar, cast
 
 import torch
@@ -58,7 +59,7 @@ class RayDataModule(LightningDataModule):
         self.batches = shared.to(device, cast(torch.dtype, module.dtype))
         self.end_thread()
         if device.type == "cpu" and can_prefetch(module.renderer):
-            self._ahead = Prefetcher(self.batches.batch, spare_core=not multiplies_large_matrices(module.renderer))
+            self._ahead = Prefetcher(self._batch, spare_core=not multiplies_large_matrices(module.renderer))
         # Lightning calls this method after restoring a checkpoint, so a resumed run continues with the next batch.
         return itertools.count(self.trainer.global_step)
 
@@ -77,12 +78,17 @@ class RayDataModule(LightningDataModule):
         assert self.trainer is not None
         if not self.trainer.training:
             return batch  # the number of a validation view, or none
-        if self._overfit_batches:
-            batch %= self._overfit_batches
-        if self._ahead is not None:
-            return self._ahead(batch)
         with torch.no_grad():
-            return self.batches.batch(batch)
+            return self._batch(batch) if self._ahead is None else self._ahead(batch)
+
+    def _batch(self, step: int) -> Batch:
+        """Make the batch of a step, and choose the samples on its paths."""
+        assert self.trainer is not None
+        batch = self.batches.batch(step % self._overfit_batches if self._overfit_batches else step)
+        if batch.path is None:
+            return batch
+        sampler = cast(TrainingModule, self.trainer.lightning_module).renderer.point_sampler
+        return replace(batch, path=sampler.choose_ahead(batch.path, batch.draws))
 
     def teardown(self, stage: str) -> None:
         self.end_thread()
@@ -91,10 +97,10 @@ class RayDataModule(LightningDataModule):
     def on_exception(self, exception: BaseException) -> None:
         self.end_thread()
 
-    def discard_prefetched(self) -> None:
-        """Discard the prefetched batch before the medium or the cameras change."""
+    def prefetch(self) -> None:
+        """Begin to make the batch of the next step, once everything on which it depends is up to date."""
         if self._ahead is not None:
-            self._ahead.forget()
+            self._ahead.begin_next()
 
     def end_thread(self) -> None:
         if self._ahead is not None:
@@ -118,7 +124,7 @@ class Prefetcher(Generic[Made]):
 
     def __init__(self, make: Callable[[int], Made], spare_core: bool = True) -> None:
         self._make = make
-        self._next: tuple[int, Future[Made]] | None = None
+        self._step, self._begun = -1, Future[Made]()
         # PyTorch has a number of threads per thread, and new threads inherit the last one.
         self._num_threads = torch.get_num_threads()
         self._thread = ThreadPoolExecutor(1, "paths", lambda: torch.set_num_threads(1))
@@ -127,17 +133,16 @@ class Prefetcher(Generic[Made]):
 
     def __call__(self, step: int) -> Made:
         """Return the batch of a step; errors of the thread are raised here."""
-        if self._next is None or self._next[0] != step:
-            self._next = (step, self._thread.submit(self._without_gradients, step))
-        batch = self._next[1].result()
-        self._next = (step + 1, self._thread.submit(self._without_gradients, step + 1))
-        return batch
+        if self._step != step:
+            self._begin(step)
+        return self._begun.result()
 
-    def forget(self) -> None:
-        """Wait for the prefetched batch and discard it."""
-        if self._next is not None:
-            self._next[1].exception()
-            self._next = None
+    def begin_next(self) -> None:
+        """Begin to make the batch that follows the last one."""
+        self._begin(self._step + 1)
+
+    def _begin(self, step: int) -> None:
+        self._step, self._begun = step, self._thread.submit(self._without_gradients, step)
 
     def close(self) -> None:
         """End the thread, and return its core to PyTorch."""

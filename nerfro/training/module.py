@@ -132,6 +132,7 @@ class TrainingModule(LightningModule):
         # At the end of the previous step, the update would follow the checkpoint, and a resumed run would miss it.
         if self.global_step > 0:
             self.renderer.point_sampler.after_step(list(self.scene.fields), batch.draws)  # type: ignore[arg-type]
+        self.trainer.datamodule.prefetch()  # type: ignore[attr-defined]
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """Return all learned parameters by optimizer group.

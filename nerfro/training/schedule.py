@@ -52,7 +52,6 @@ class Schedule(Callback):
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: object, batch_idx: int) -> None:
         for name in self._begun:
             for _ in self._due(name, trainer.global_step):
-                trainer.datamodule.discard_prefetched()  # type: ignore[attr-defined]
                 self._step(name, trainer)
 
     def _due(self, name: str, training_step: int) -> Iterator[int]:

@@ -2,6 +2,7 @@
 
 import gc
 import threading
+import time
 import weakref
 from collections.abc import Callable
 from pathlib import Path
@@ -18,10 +19,12 @@ from nerfro.media.sdf_grid import SdfGrid
 from nerfro.rendering import Renderer, Scene
 from nerfro.samplers.paths.eikonal import Eikonal
 from nerfro.samplers.paths.snell import Snell
+from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.training.data_module import Prefetcher, RayDataModule, can_prefetch, multiplies_large_matrices
 from nerfro.training.module import TrainingModule
 from nerfro.training.ray_batches import RayBatches
-from nerfro.types import Rays
+from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
+from nerfro.types import Batch, Rays
 from tests.closed_forms import grid_points
 from tests.pretended_gpu import GPU, PretendedGpu
 
@@ -60,21 +63,13 @@ def ahead():
     assert not running()
 
 
-def test_what_was_made_ahead_is_made_again_where_it_is_forgotten(ahead) -> None:
-    made: list[int] = []
-    one = ahead(lambda step: made.append(step) or len(made))
-    assert one(0) == 1
-    one.forget()
-    assert made == [0, 1]
-    assert one(1) == 3
-
-
 def test_paths_made_ahead_are_those_of_the_step_in_any_order(ahead, ball: SdfGrid) -> None:
     sampler = Snell()
     make: Any = lambda step: sampler(rays(300, step), ball)  # noqa: E731
     one = ahead(make)
     for step in (0, 1, 2, 7, 8, 3):
         expected, got = make(step), one(step)
+        one.begin_next()
         for name in ("positions", "directions", "s", "exit_directions", "body"):
             assert torch.equal(getattr(got, name), getattr(expected, name))
 
@@ -83,6 +78,7 @@ def test_the_next_one_is_made_while_the_step_works(ahead) -> None:
     begun = threading.Event()
     one = ahead(lambda step: begun.set() if step == 1 else None)
     one(0)
+    one.begin_next()
     assert begun.wait(10), "nobody has asked for step 1 yet"
 
 
@@ -94,6 +90,7 @@ def test_what_goes_wrong_in_the_thread_is_raised_where_the_batch_is_asked_for(ah
 
     one = ahead(make)
     assert [one(0), one(1)] == [0, 1]
+    one.begin_next()
     with pytest.raises(ValueError, match="no rays"):
         one(2)
 
@@ -129,6 +126,29 @@ def test_nothing_is_traced_ahead_where_paths_learn_or_python_is_needed(ball: Sdf
     assert not can_prefetch(model(Snell())), "one core has nobody who waits"
 
 
+def test_weights_depend_neither_on_the_thread_nor_on_an_interruption(
+    train_here: Callable[..., Any], tiny_default_run: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The thread chooses samples by the density grid, which changes in every second step here."""
+
+    def weights(name: str, cores: set[int], *overrides: str) -> dict[str, torch.Tensor]:
+        monkeypatch.setattr("os.sched_getaffinity", lambda pid: cores, raising=False)
+        # A batch that is begun before the update is finished before the update.
+        monkeypatch.setattr(DensityGridSampler, "after_step", lambda *given: time.sleep(0.05) or update(*given))
+        even = ["optimizer.learning_rate=1e-2", "optimizer.final_learning_rate=1e-2"]
+        options = [*even, "evaluation=none", "trainer.max_steps=7", "sampler.points.update_every=2", *overrides]
+        finished = train_here(*tiny_default_run, *options, f"hydra.run.dir={tmp_path / name}")
+        assert finished.code == 0, finished.err
+        return load_checkpoint(tmp_path / name / LAST_CHECKPOINT)[0]["state_dict"]
+
+    update = DensityGridSampler.after_step
+    expected = weights("one core", {0})
+    weights("resumed", {0, 1}, "trainer.max_steps=4")
+    for found in (weights("two cores", {0, 1}), weights("resumed", {0, 1}, "ckpt_path=last")):
+        assert [name for name, value in expected.items() if not torch.equal(found[name], value)] == []
+    assert any(name.endswith("point_sampler.density") and value.any() for name, value in expected.items())
+
+
 @pytest.mark.parametrize("learns", [True, False])
 def test_a_batch_is_made_when_its_step_begins_if_paths_learn(
     learns: bool, ball: SdfGrid, monkeypatch: pytest.MonkeyPatch
@@ -136,7 +156,8 @@ def test_a_batch_is_made_when_its_step_begins_if_paths_learn(
     """Lightning fetches one step early, so what it fetches must not be the batch."""
     monkeypatch.setattr("os.sched_getaffinity", lambda pid: {0, 1}, raising=False)
     made: list[int] = []
-    batches: Any = Mock(spec=RayBatches, batch=lambda step: made.append(step) or step * 10)
+    batch = Mock(spec=Batch, path=None)
+    batches: Any = Mock(spec=RayBatches, batch=lambda step: made.append(step) or batch)
     batches.share = lambda rank, size: batches
     batches.to = lambda device, dtype: batches
     batches.forget = lambda: None
@@ -149,7 +170,7 @@ def test_a_batch_is_made_when_its_step_begins_if_paths_learn(
     steps = iter(data.train_dataloader())
     first, _second = next(steps), next(steps)
     assert not made
-    assert data.transfer_batch_to_device(first, torch.device("cpu"), 0) == 50
+    assert data.transfer_batch_to_device(first, torch.device("cpu"), 0) is batch
     assert bool(running()) != learns
     assert made == [5] or not learns
     data.trainer.training = False  # type: ignore[misc]

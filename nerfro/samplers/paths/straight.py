@@ -21,6 +21,9 @@ class Straight(PathSampler):
         """Return a path of two vertices for each ray."""
         return straight_path(rays)
 
+    def releases_gil(self, medium: Medium) -> bool:
+        return True
+
     def refine(self, path: Path, rays: Rays, medium: Medium) -> Path:
         return straight_path(rays[path.ray])
 

@@ -147,16 +147,20 @@ class DensityGridSampler(PointSampler):
         self.register_buffer("inside", inside, persistent=False)
 
     def forward(self, path: Path, previous: Rendering | None, draws: Draws | None = None) -> Samples:
-        with torch.no_grad():
-            draw = self.draw_compiled if path.s.device.type == "cpu" else self.draw
-            samples = draw(path, draws)
-            if draws is not None:
-                samples = replace(samples, occupied=self._queried(path, samples))
+        samples = self._chosen(path, draws) if path.samples is None else path.samples
         # The kernel returns positions without gradients, which only some paths have.
         if not path.positions.requires_grad:
             return samples
         along = Samples.along(path, samples.s, samples.edges)
         return replace(along, occupied=samples.occupied, lengths=samples.lengths, measure=samples.measure)
+
+    def choose_ahead(self, path: Path, draws: Draws) -> Path:
+        return replace(path, samples=self._chosen(path, draws))
+
+    @torch.no_grad()
+    def _chosen(self, path: Path, draws: Draws | None) -> Samples:
+        samples = (self.draw_compiled if path.s.device.type == "cpu" else self.draw)(path, draws)
+        return samples if draws is None else replace(samples, occupied=self._queried(path, samples))
 
     def _quantiles(self, path: Path, draws: Draws | None) -> Float[Tensor, "P E"]:
         """Compute the values of the cumulative weights at which edges of samples lie.
