@@ -78,6 +78,9 @@ def _taps(face, x, y, n, padded, padded_offset):
     u, v = x - np.float32(column), y - np.float32(row)
     at_corner = (column == 0 or column == n) and (row == 0 or row == n)
     missing = (1 if column == n else 0) + (2 if row == n else 0) if at_corner else -1
+    if 0 < column < n and 0 < row < n:  # between texels of one face
+        inside = (face * n + row - 1) * n + column - 1
+        return (inside, inside + 1, inside + n, inside + n + 1), u, v, missing
     width = n + 2
     first = padded_offset + (face * width + row) * width + column
     texels = (padded[first], padded[first + 1], padded[first + width], padded[first + width + 1])
@@ -103,12 +106,14 @@ def _forward(face, coordinates, padded, resolutions, offsets, texels, total):
         padded_offset = 0
         for level in range(resolutions.shape[0]):
             n = resolutions[level]
-            texel, u, v, missing = _taps(face[p], coordinates[p, 0], coordinates[p, 1], n, padded, padded_offset)
-            weight = _weights(u, v, missing)
-            for corner in range(4):
-                entry = offsets[level] + texel[corner]
-                for channel in range(3):
-                    total[p, channel] += weight[corner] * texels[entry, channel]
+            (a, b, c, d), u, v, missing = _taps(face[p], coordinates[p, 0], coordinates[p, 1], n, padded, padded_offset)
+            w0, w1, w2, w3 = _weights(u, v, missing)
+            of_level = texels[offsets[level] :]
+            for channel in range(3):
+                total[p, channel] += (
+                    w0 * of_level[a, channel] + w1 * of_level[b, channel]
+                    + w2 * of_level[c, channel] + w3 * of_level[d, channel]
+                )  # fmt: skip
             padded_offset += 6 * (n + 2) * (n + 2)
 
 
