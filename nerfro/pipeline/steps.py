@@ -28,7 +28,10 @@ from nerfro.training.run_folder import CONFIG_FILE
 # Smallest gain of bent rays over straight rays in short trainings, in dB. On a simulated empty glass, a gain of 0.33 dB
 # in the trial became a gain of 0.75 dB after four minutes (docs/lab/simulated_glassware.md).
 _MIN_GAIN = 0.25
-_NEVERTHELESS = "to use bent rays nevertheless, add train=+experiment=NAME"
+_NEVERTHELESS = (
+    "to use bent rays nevertheless, add trial_steps=0 for a solid body, or train='+experiment=glass_room "
+    "medium=vessel' for a fitted vessel"
+)
 _FEWEST = 3  # photographs
 _MASKS = ("masks/*", "masks/*/*", "mask_*", "*/mask_*")  # where loaders search for masks
 
@@ -123,7 +126,7 @@ def _best_hypothesis(tried: Sequence[Hypothesis], runs: Sequence[Path]) -> Hypot
         return tried[0]
     scores = []
     print("\nPSNR of short trainings on validation photographs, in dB:")
-    print(f"  {'hypothesis':<20}{'image':>9}{'object':>9}")
+    print(f"  {'hypothesis':<20}{'image':>9}{'object':>9}{'mean':>9}")
     for hypothesis, run in zip(tried, runs, strict=True):
         metrics = read_metrics_json(run / "metrics.json")
         # The exposures of validation photographs are unknown. Their right halves may lack the object.
@@ -131,14 +134,16 @@ def _best_hypothesis(tried: Sequence[Hypothesis], runs: Sequence[Path]) -> Hypot
         result = metrics.result if result.mean("psnr", "mask") is None else result
         image, inside = result.mean("psnr", FULL) or 0.0, result.mean("psnr", "mask")
         scores.append(image if inside is None else 0.5 * (image + inside))
-        print(f"  {hypothesis.name:<20}{image:>9.2f}{'n/a' if inside is None else f'{inside:.2f}':>9}")
+        print(
+            f"  {hypothesis.name:<20}{image:>9.2f}{'n/a' if inside is None else f'{inside:.2f}':>9}{scores[-1]:>9.2f}"
+        )
     bent = max(range(1, len(tried)), key=scores.__getitem__)
     best = tried[bent if scores[bent] >= scores[0] + _MIN_GAIN else 0]
     print(f"training continues with: {best.name}")
     if best is tried[0]:
         doubts = [hypothesis.doubt for hypothesis in tried if hypothesis.doubt]
         reason = doubts[0] if doubts else "the surface or the index is not accurate enough, or the object is opaque"
-        print(f"bent rays are not clearly better: {reason}; {_NEVERTHELESS}")
+        print(f"the mean of bent rays is not higher by {_MIN_GAIN} dB: {reason}; {_NEVERTHELESS}")
     return best
 
 
