@@ -203,12 +203,7 @@ def test_what_changed_is_followed_by_what_is_made_of_it(
 @pytest.mark.parametrize(
     ("doubts", "psnr", "chosen", "printed"),
     [
-        (
-            [],
-            {"straight": 21.8},
-            "straight rays",
-            "the mean of bent rays is not higher by 0.25 dB: the surface or the index",
-        ),
+        ([], {"straight": 21.8}, "straight rays", "bent rays is not higher by 0.25 dB: the surface or the index"),
         ([], {"straight": 21.7}, "solid body", "training continues with: solid body"),
         ([], {"glass": 23.0}, "vessel", "training continues with: vessel"),
         (["shallow"], {"straight": 23.0}, "straight rays", "the photographs do not determine its index"),

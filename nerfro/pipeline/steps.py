@@ -134,9 +134,8 @@ def _best_hypothesis(tried: Sequence[Hypothesis], runs: Sequence[Path]) -> Hypot
         result = metrics.result if result.mean("psnr", "mask") is None else result
         image, inside = result.mean("psnr", FULL) or 0.0, result.mean("psnr", "mask")
         scores.append(image if inside is None else 0.5 * (image + inside))
-        print(
-            f"  {hypothesis.name:<20}{image:>9.2f}{'n/a' if inside is None else f'{inside:.2f}':>9}{scores[-1]:>9.2f}"
-        )
+        shown = "n/a" if inside is None else f"{inside:.2f}"
+        print(f"  {hypothesis.name:<20}{image:>9.2f}{shown:>9}{scores[-1]:>9.2f}")
     bent = max(range(1, len(tried)), key=scores.__getitem__)
     best = tried[bent if scores[bent] >= scores[0] + _MIN_GAIN else 0]
     print(f"training continues with: {best.name}")
