@@ -2,7 +2,7 @@
 
 Examples:
     nerfro mask data.root=data/glass 'outlines={img_01.jpg: [120, 80, 400, 460]}'
-    nerfro mask data=colmap data.root=data/glass 'outlines={img_01.jpg: [120, 80, 400, 460]}'
+    nerfro mask data=colmap data.root=data/glass view=true
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ The refractive index is estimated from the photographs unless `medium.ior` is gi
 
 Examples:
     nerfro reconstruct images=photographs masks=masks out=outputs/glass
-    nerfro reconstruct video=glass.mp4 masks=masks out=outputs/glass train='trainer.max_time=10m'
+    nerfro reconstruct video=glass.mp4 mask='view=true' out=outputs/glass train='trainer.max_time=10m'
 """
 
 from __future__ import annotations

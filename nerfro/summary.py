@@ -1,8 +1,8 @@
 """`python -m nerfro.summary runs=[outputs]`: compare many runs in tables and in a report.
 
 Examples:
-    nerfro summary runs=[outputs]
-    nerfro summary runs=[outputs/first,outputs/straight] out=outputs/report report=true
+    nerfro summary 'runs=[outputs]'
+    nerfro summary 'runs=[outputs/first,outputs/straight]' out=outputs/report report=true
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from nerfro.types import Batch, Rendering
 
 
 class Loss(nn.Module, ABC):
-    """A term of the training objective.
+    """Term of the training objective.
 
     Every loss has the settings `loss.NAME.weight`, `start` and `ramp`. The registry sets these attributes after
     construction, and subclasses override the defaults as class attributes.

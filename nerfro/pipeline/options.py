@@ -26,15 +26,17 @@ class ReconstructConfig:
         video: video instead of photographs; the sharpest of its frames are used.
         frames: number of frames to take from the video.
         masks: folder of the masks, PNG or JPEG files named `<photograph>` or `mask_<photograph>`.
-        outlines: outlines of the object in some photographs, as for `python -m nerfro.mask`.
+        outlines: boxes or polygons around the object in some photographs, as for `python -m nerfro.mask`.
         out: output folder.
         trial_steps: number of steps of the training that tries each hypothesis about the object on validation
             photographs (straight rays, solid body, vessel); 0 trains the solid body without a comparison.
         pixels: maximum length of the longer side of the photographs in training; `data.downscale` has precedence.
         calibrate: further options of `python -m nerfro.calibrate`, separated by spaces.
-        mask: further options of `python -m nerfro.mask`; `view=true` opens a page for drawing outlines.
+        mask: further options of `python -m nerfro.mask`: `view=true` opens a page for drawing outlines, and
+            `sam2=FOLDER` follows the outlined object through the photographs by a network.
         preprocess: further options of `python -m nerfro.preprocess`.
-        train: further options of the final `python -m nerfro.train` and of the trials.
+        train: further options of the final `python -m nerfro.train` and of the trials. With an experiment, as in
+            `train='+experiment=glass_room medium=vessel'`, hypotheses are not compared.
     """
 
     data: Any = MISSING

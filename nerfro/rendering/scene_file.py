@@ -58,7 +58,7 @@ class SceneFile:
         medium: `type` of the medium (an option of the group `medium`), and its settings except those of bodies.
         bodies: bodies by name, the outer one first.
         vessel: settings of a fitted vessel, which `medium=vessel` selects instead of the index of the bodies.
-        surroundings: distance of the surroundings; None if unknown.
+        surroundings: whether the surroundings are near or far; None if unknown.
         photograph: width and height of the photographs in pixels; empty if unknown.
         provenance: origin of the file.
     """
