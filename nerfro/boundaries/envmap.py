@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from nerfro.allowed import Count
@@ -21,8 +24,36 @@ from nerfro.types import Exits
 # Softplus of 0 is log 2.
 _GREY = 0.5 / math.log(2)
 _BLACK = 1e-3
+# Smallest radiance that `fit` tells apart from black: the step of 8-bit images.
+_DARKEST = 1 / 255 / 12.92
+# Largest width of a ray, in texels of a level to which it contributes.
+_MOST_TEXELS = 2.0
 # Texels along each side of a face of the levels, if neither a list nor photographs define them.
 _RESOLUTIONS = (4, 8, 16, 32, 64, 128, 256)
+
+
+@dataclass(frozen=True)
+class Observed:
+    """Radiance that was observed from directions.
+
+    Attributes:
+        directions: unit directions of rays.
+        radiance: linear radiance of each ray.
+        weights: weight of each ray.
+        widths: angle in radians over which the radiance of each ray is a mean.
+    """
+
+    directions: Float[Tensor, "P 3"]
+    radiance: Float[Tensor, "P 3"]
+    weights: Float[Tensor, "P"]
+    widths: Float[Tensor, "P"]
+
+    def __getitem__(self, chosen: Bool[Tensor, "P"]) -> Observed:
+        return Observed(*(value[chosen] for value in vars(self).values()))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Observed]) -> Observed:
+        return cls(*(torch.cat(values) for values in zip(*(vars(part).values() for part in parts), strict=True)))
 
 
 @register("boundary", "envmap")
@@ -65,12 +96,53 @@ class EnvironmentMap(Boundary):
 
     def forward(self, exits: Exits) -> Float[Tensor, "*batch 3"]:
         face, coordinates = cube_map.project(exits.directions.float().reshape(-1, 3))
+        raw = self._looked_up(face, coordinates, self.texels, self.padded, self.levels)
+        return _radiance(raw).view(exits.directions.shape)
+
+    @staticmethod
+    def _looked_up(face: Tensor, *arguments: Any) -> Float[Tensor, "P 3"]:
         if face.device.type == "cpu":
             from nerfro.boundaries.cube_map_cpu import lookup  # compiled code, so only where it is used
         else:
             lookup = cube_map.lookup
-        raw = lookup(face, coordinates, self.texels, self.padded, self.levels)
-        return _radiance(raw).view(exits.directions.shape)
+        return lookup(face, *arguments)
+
+    @torch.no_grad()
+    def fit(self, observed: Observed, past: Float[Tensor, "T"]) -> Float[Tensor, "T"]:
+        """Move the texels towards observed radiance, level by level from coarse to fine.
+
+        A texel moves by the weighted mean of the residuals of its rays before the softplus. The mean includes residuals
+        of zero with the weight of past observations plus one. Therefore, texels keep the mean of all observations, and
+        rarely observed texels stay close to the coarser levels.
+
+        Args:
+            observed: radiance from directions.
+            past: weight of past observations of each texel.
+
+        Returns:
+            Weight of these observations of each texel: the sum over rays of bilinear weight times weight of the ray.
+        """
+        face, coordinates = cube_map.project(observed.directions)
+        target = _raw(observed.radiance.clamp(min=_DARKEST))
+        residual = target - self._looked_up(face, coordinates, self.texels, self.padded, self.levels)
+        texels = zip(*(tensor.split(self.levels.sizes) for tensor in (self.texels, past)), strict=True)
+        padded, total = self.padded.split([6 * (n + 2) ** 2 for n in self.levels.resolutions]), []
+        for n, of_level, (values, earlier) in zip(self.levels.resolutions, padded, texels, strict=True):
+            wide = observed.widths > _MOST_TEXELS * 0.5 * math.pi / n
+            weights = observed.weights.masked_fill(wide, 0)[:, None].expand(-1, 3)
+            place, level = (face, coordinates), cube_map.CubeLevels((n,))
+            with torch.enable_grad():
+                change = torch.zeros_like(values, requires_grad=True)
+                changed = self._looked_up(*place, change, of_level, level)
+            sums, counts = (
+                torch.autograd.grad(changed, change, gradient, retain_graph=True)[0]
+                for gradient in (weights * residual, weights)
+            )
+            change = sums / (counts + earlier[:, None] + 1)
+            values += change
+            residual -= self._looked_up(*place, change, of_level, level)
+            total.append(counts[:, 0])
+        return torch.cat(total)
 
     @torch.no_grad()
     def to_lat_long(self, height: int) -> Float[Tensor, "H 2*H 3"]:

@@ -45,6 +45,20 @@ class Exposure(PerView):
         """Return the gains of all views."""
         return torch.exp(self.log_gain - self.log_gain.mean(0))
 
+    @torch.no_grad()
+    def fit(self, view: Int[Tensor, "R"], radiance: Float[Tensor, "R 3"], photographed: Float[Tensor, "R 3"]) -> None:
+        """Set the gain of each view to the least-squares ratio of photographed to predicted linear radiance.
+
+        Args:
+            view: view of each pixel.
+            radiance: predicted linear radiance without gain.
+            photographed: linear radiance in the photograph; saturated values are ignored.
+        """
+        unsaturated = photographed < 1
+        products = torch.stack([photographed * radiance, radiance * radiance]) * unsaturated
+        sums = products.new_zeros(2, *self.log_gain.shape).index_add(1, view, products)
+        self.log_gain.copy_(torch.where(sums[1] > 0, (sums[0] / sums[1]).log(), self.log_gain))
+
     @property
     def spread(self) -> float:
         """Standard deviation of the logarithmic gains over views."""

@@ -32,6 +32,10 @@ class ColourSpace(Enum):
         """Encode radiance, multiplied by the gains, as sRGB in [0, 1], like a photograph."""
         return self.to_srgb(radiance, gains).clamp(0, 1)
 
+    def to_radiance(self, rgb: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """Decode sRGB values in [0, 1], the inverse of `to_srgb` without gains."""
+        return rgb if self is ColourSpace.SRGB else to_linear(rgb)
+
     def to_linear(self, radiance: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         """Convert radiance of this colour space to linear radiance."""
         return to_linear(radiance.clamp(min=0)) if self is ColourSpace.SRGB else radiance

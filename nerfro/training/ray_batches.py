@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Annotated, Literal
 
@@ -20,9 +20,7 @@ from nerfro.data.pixel_store import PixelStore
 from nerfro.distributed import share_of
 from nerfro.draws import Draws
 from nerfro.errors import NerfroError, warn
-from nerfro.geometry.interpolation import misses
-from nerfro.rays import Rays
-from nerfro.subdivision import PixelRays, Subdivision, Trace, TraceExits, contrast, pixel_rays, subdivide
+from nerfro.subdivision import PixelRays, Subdivision, Trace, TraceExits, contrast, subdivide
 from nerfro.types import Batch
 
 Batching = Literal["single_image", "all_images"]
@@ -170,34 +168,26 @@ class RayBatches:
         """Number of pixels of all views."""
         return len(self._cameras) * self._cameras.height * self._cameras.width
 
-    def missing(
-        self,
-        box: Float[Tensor, "2 3"],
-        num_pixels: int,
-        step: int,
-        estimated: Callable[[Rays, Tensor], Rays] = lambda rays, view: rays,
-    ) -> tuple[Rays, Int[Tensor, "R"], Float[Tensor, "R 3"]]:
-        """Draw random pixels whose rays miss a box; returns rays, views and colours, equal in all processes.
+    def rows(self, part: int, num_parts: int) -> Int[Tensor, "P"]:
+        """Return the usable pixels of every `num_parts`-th row by number (view, row, column), equal in all processes.
 
-        Args:
-            box: corners of the box, world units.
-            num_pixels: number of pixels to draw; pixels whose rays meet the box are dropped.
-            step: number that selects the random pixels.
-            estimated: function from rays of the data set to rays of the estimated cameras, given the views.
+        Rows are counted through all views. If masks exclude pixels, a row has the next usable pixels.
         """
         cameras = self._cameras
-        generator = np.random.default_rng([self.seed, step, num_pixels])
-        size = cameras.height * cameras.width
-        if self._usable is None:
-            drawn = generator.integers(self.num_pixels, size=num_pixels)
-        else:
-            usable = self._usable[central_window(cameras.height, cameras.width, 1.0)]
-            view, pixel = usable.find(generator.integers(usable.starts[-1], size=num_pixels))
-            drawn = view * size + pixel
-        index = self._to_device(drawn)
-        rays = estimated(pixel_rays(cameras, index), index // size)
-        beside = misses(box, rays)
-        return rays[beside], index[beside] // size, self._pixels[index[beside]]
+        width, window = cameras.width, central_window(cameras.height, cameras.width, 1.0)
+        usable = None if self._usable is None else self._usable[window]
+        total = self.num_pixels if usable is None else int(usable.starts[-1])
+        first = np.arange(part * width, total, num_parts * width)
+        numbers = (first[:, None] + np.arange(width)).ravel()
+        numbers = numbers[numbers < total]
+        if usable is not None:
+            view, pixel = usable.find(numbers)
+            numbers = view * window.height * window.width + pixel
+        return self._to_device(numbers)
+
+    def view(self, pixels: Int[Tensor, "P"]) -> Int[Tensor, "P"]:
+        """Return the view of each pixel by number (view, row, column)."""
+        return pixels // (self._cameras.height * self._cameras.width)
 
     def of_each_view(self, num_pixels: int, step: int) -> Int[Tensor, "V P"]:
         """Draw random usable pixels of every view; for a view without usable pixels, the first pixel is returned."""

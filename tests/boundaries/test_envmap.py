@@ -9,7 +9,7 @@ import torch.nn.functional as F
 
 from nerfro.boundaries import cube_map
 from nerfro.boundaries import cube_map_cpu as kernels
-from nerfro.boundaries.envmap import EnvironmentMap
+from nerfro.boundaries.envmap import EnvironmentMap, Observed
 from nerfro.errors import NerfroError
 from nerfro.files import lat_long
 from nerfro.files.images import save_png
@@ -40,6 +40,36 @@ def test_compiled_and_plain_colours_agree() -> None:
     torch.testing.assert_close(
         boundary(Exits(directions)), (0.5 * F.softplus(raw) / math.log(2)).square(), rtol=1e-5, atol=1e-6
     )
+
+
+def test_texels_take_the_mean_of_all_rays_and_of_one_residual_of_zero() -> None:
+    boundary, generator = EnvironmentMap([4]), torch.Generator().manual_seed(0)
+    directions = cube_map.texel_directions(4)
+    radiance, weights = torch.rand(3, 96, 3, generator=generator), torch.rand(3, 96, generator=generator)
+    past = torch.zeros(96)
+    for values, of_ray in zip(radiance, weights, strict=True):
+        past += boundary.fit(Observed(directions, values, of_ray, torch.zeros(96)), past)
+    torch.testing.assert_close(past, weights.sum(0))
+    raw = torch.log(torch.expm1(radiance.sqrt() * 2 * math.log(2)))  # of a texel that one ray has seen
+    expected = (weights[..., None] * raw).sum(0) / (weights.sum(0) + 1)[:, None]
+    torch.testing.assert_close(boundary.texels.detach(), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_wide_rays_leave_fine_levels_alone() -> None:
+    boundary, directions = EnvironmentMap([4, 8]), random_directions(50)
+    width = torch.full((50,), 1.1 * math.radians(90 / 4))  # two texels of the fine level are 90 / 4 degrees wide
+    boundary.fit(Observed(directions, smooth_sky(directions), torch.ones(50), width), torch.zeros(480))
+    coarse, fine = boundary.texels.split(boundary.levels.sizes)
+    assert coarse.any()
+    assert not fine.any()
+
+
+def test_fit_learns_a_sky_from_few_rays() -> None:
+    boundary, directions, others = EnvironmentMap([4, 8, 16, 32]), random_directions(2000), random_directions(2000, 9)
+    observed = Observed(directions, smooth_sky(directions), torch.ones(2000), torch.zeros(2000))
+    boundary.fit(observed, torch.zeros(boundary.levels.num_texels))
+    error = (boundary(Exits(others)) - smooth_sky(others)).detach().square().mean().sqrt()
+    assert error < 0.02  # the standard deviation of the sky is 0.15
 
 
 def test_sum_of_levels_learns_a_sky_from_few_rays() -> None:

@@ -30,6 +30,14 @@ def test_gains_are_learned_and_bend_no_ray() -> None:
     assert not model.paths_learn
 
 
+def test_gains_are_fitted_to_unsaturated_pixels() -> None:
+    exposure, gains = Exposure(), torch.tensor([[0.5, 1.0, 2.0], [2.0, 1.0, 0.5], [1.0, 1.0, 1.0]])
+    exposure.begin(3)
+    view, radiance = torch.arange(300) % 2, 0.9 * torch.rand(300, 3)  # no pixel of the third view
+    exposure.fit(view, radiance, (gains[view] * radiance).clamp(max=1))
+    torch.testing.assert_close(exposure.gains(), gains)
+
+
 def test_a_rendering_is_exposed_before_losses_see_it() -> None:
     model, batch = RefractiveModel(example_components()), example_batch()
     gain = torch.rand(NUM_RAYS, 3) + 0.5

@@ -1,4 +1,4 @@
-"""The sky is learned before the first step, from rays that miss the object, and by nothing else."""
+"""The background is fitted before the first step to rays that miss the object, and later to rays through it."""
 
 import itertools
 import os
@@ -13,22 +13,26 @@ import torch
 from lightning.pytorch.callbacks import timer
 from torch import Tensor
 
+from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.data.blender import BlenderData
 from nerfro.evaluation.results import read_metrics_json
+from nerfro.light import to_srgb
+from nerfro.training.build import build
 from nerfro.training.callbacks import steps_by_phase
-from nerfro.training.phases import background
+from nerfro.training.phases.background import Background
+from nerfro.training.phases.base import Run
 from nerfro.training.ray_batches import RayBatches
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
+from nerfro.types import Exits
 
 FOLDER = "hydra.run.dir"
 
 
 @pytest.fixture
 def weights(
-    train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path: Path
 ) -> Callable[..., dict[str, Tensor]]:
     """Weights after a run whose rates are too small to move anything after its first steps."""
-    monkeypatch.setattr(background, "_SHARE", 1.0)
     still = ["trainer.max_steps=1", "evaluation.every=0", "optimizer.warmup_factor=0", "optimizer.warmup_steps=1000"]
 
     def run(name: str, *overrides: str) -> dict[str, Tensor]:
@@ -45,50 +49,51 @@ def test_the_boundary_alone_has_learned_before_the_first_step(weights: Callable[
     assert changed == {"renderer.scene.boundary.texels"}
 
 
+def test_directions_behind_the_object_are_learned_through_it(tiny_scene: Path, tiny_default_run: list[str]) -> None:
+    module, data = build(overrides=[*tiny_default_run, "medium.ior=1.0001", "trainer.max_steps=1"])
+    views = BlenderData(str(tiny_scene), near=2.0, far=6.0).load("train")
+    optimizer = torch.optim.Adam(module.parameters())
+    run, phase = Run(module.renderer, data.batches, views, optimizer, 0.0), Background(steps=4, start=8)
+    state, towards_the_ball = phase.begin(run), -torch.nn.functional.normalize(views.cameras.camera_to_world[:, :, 3])
+    sky, background = 0.5 + 0.4 * towards_the_ball, module.renderer.scene.boundary
+
+    def error() -> float:
+        return float((to_srgb(background(Exits(towards_the_ball))).detach() - sky).abs().max())
+
+    assert error() > 0.1
+    assert all(phase.step(run, number, state) for number in range(4, 8))  # the first pass through the object
+    assert error() < 0.05
+
+
 def test_pretraining_leaves_time_for_the_scene(
     weights: Callable[..., dict[str, Tensor]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    seconds = itertools.count()
+    seconds, fits, fit = itertools.count(), [], EnvironmentMap.fit
     monkeypatch.setattr(timer, "time", SimpleNamespace(monotonic=lambda: float(next(seconds))))
-    weights("run", "phase.background.steps=100000", "trainer.max_time=300s")
+    monkeypatch.setattr(EnvironmentMap, "fit", lambda *given: fits.append(1) or fit(*given))
+    weights("run", "phase.background.steps=100", "trainer.max_time=300s")
     checkpoint = load_checkpoint(tmp_path / "run" / LAST_CHECKPOINT)[0]
     phases = steps_by_phase(checkpoint["callbacks"], checkpoint["global_step"])
     # The clock advances by at least a second in each step, and pretraining takes a fifth of the limit.
-    assert phases["scene"] == 1
-    assert 0 < phases["background"] <= 60
+    assert phases == {"background": 100, "scene": 1}
+    assert 0 < len(fits) <= 60
     assert read_metrics_json(tmp_path / "run" / "metrics.json").steps_by_phase == phases
-
-
-def test_rays_that_miss_a_box_have_their_own_colours(tiny_scene: Path) -> None:
-    views = BlenderData(str(tiny_scene), near=2.0, far=6.0).load("train")
-    batches = RayBatches(views, 16, "all_images")
-    box = torch.tensor([[-0.6] * 3, [0.6] * 3])
-    rays, view, rgb = batches.missing(box, 500, 0)
-    assert 100 < len(rays) < 500
-    assert set(view.tolist()) == {0, 1, 2}
-    # The scene's sky is a linear function of direction, seen wherever the ball is not.
-    assert torch.allclose(rgb, 0.5 + 0.4 * rays.directions, atol=3e-3)
-    nearest = rays.origins - (rays.origins * rays.directions).sum(-1, keepdim=True) * rays.directions
-    assert (nearest.norm(dim=-1) > 0.6).all()
-    again, others = (batches.missing(box, 500, step)[0] for step in (0, 1))
-    assert torch.equal(again.directions, rays.directions)
-    assert len(others) != len(rays) or not torch.equal(others.directions, rays.directions)
 
 
 def test_a_signal_ends_these_steps_and_a_resumed_run_takes_the_others(
     weights: Callable[..., dict[str, Tensor]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    options, drawn, missing = ("phase.background.steps=20", "trainer.max_steps=2"), [], RayBatches.missing
+    options, drawn, rows = ("phase.background.steps=20", "trainer.max_steps=2"), [], RayBatches.rows
 
     def signalled(self: RayBatches, *given: Any) -> Any:
-        drawn.append(given[2])
+        drawn.append(given[0])
         if drawn[-1] == 7:
             os.kill(os.getpid(), signal.SIGINT)
-        return missing(self, *given)
+        return rows(self, *given)
 
     undisturbed = weights("undisturbed", *options)
     with monkeypatch.context() as context:
-        context.setattr(RayBatches, "missing", signalled)
+        context.setattr(RayBatches, "rows", signalled)
         with pytest.raises(AssertionError, match="interrupted after step 0 and saved"):
             weights("run", *options)
     assert drawn == list(range(8))

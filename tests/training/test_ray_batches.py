@@ -81,6 +81,18 @@ def test_masked_pixels_are_never_drawn_and_all_others_equally_often(given, batch
     assert (counts[usable] - mean).abs().max() < 6 * mean**0.5
 
 
+@pytest.mark.parametrize("kind", ["views", "masked"])
+def test_rows_share_all_usable_pixels(kind, request):
+    given = request.getfixturevalue(kind)
+    batches = RayBatches(given, 8, "all_images")
+    parts = [batches.rows(part, 7) for part in range(7)]
+    assert torch.equal(batches.view(parts[0]), place(parts[0])[:, 0])
+    expected = torch.arange(NUM_VIEWS * HEIGHT * WIDTH)
+    expected = expected if given.usable is None else expected[given.usable.flatten()]
+    assert torch.equal(torch.cat(parts).sort().values, expected)
+    assert min(map(len, parts)) > len(expected) / 7 - 2 * WIDTH
+
+
 def test_masked_batch_of_one_image_is_different_usable_pixels_of_it(masked):
     seen = set()
     for step in range(200):

@@ -1,74 +1,143 @@
-"""Pretraining of the background from rays that miss the object."""
+"""Least squares of the background, from pixels that show it."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from nerfro.allowed import Count, Natural, Share
+from nerfro.boundaries.envmap import EnvironmentMap, Observed
 from nerfro.fields.base import Field
+from nerfro.geometry.interpolation import misses
+from nerfro.rays import Rays
 from nerfro.registry import register
 from nerfro.rendering import Renderer
+from nerfro.subdivision import divergence, main_exits, neighbour_rays, pixel_rays
 from nerfro.training.phases.base import Phase, Run
 from nerfro.types import Exits
 
-# Fraction of all pixels that is drawn in a step, and largest number, which bounds the memory.
-_SHARE, _MOST_PIXELS = 0.01, 2**16
-# The phase ends if fewer of the drawn pixels miss the object.
-_MIN_PIXELS = 64
-# Factor of the learning rate of the background in the first and in the last step.
-_RATES = 25.0, 1.0
+# Largest number of pixels of a pass beside the object, relative to the texels of the finest level.
+_MOST_PIXELS = 8
+# Largest number of rays of a pass through the object: relative to the pixels of all training steps so far, which bounds
+# the share of the time, and absolute, which bounds the duration of a step.
+_SHARE, _MOST_RAYS = 0.15, 2**19
+# Rays through the object count if at least this fraction of their light is background, and if neighbouring rays diverge
+# by at most so many pixel widths.
+_BACKGROUND, _MOST_DIVERGENCE = 0.7, 8.0
 
 
 @register("phase", "background")
 class Background(Phase):
-    """Pretrain the background from pixels whose rays miss the boxes of content and object.
+    """Fit the environment map to pixels that show only the background, without gradient descent.
 
-    Such pixels need one evaluation of the background and no tracing. With a known background, the first gradients of
-    the field depend on the object. A volume that covers all of space has no such pixels, and skips the phase.
+    A pass before training uses pixels whose rays miss the boxes of content and object, which need no tracing. With a
+    known background, the first gradients of the field depend on the object. Later passes also use pixels whose rays
+    cross a box, but hardly any content. They subtract the rendered light of the field, and the rest is the background
+    in the exit direction. Directions that no photograph shows beside the object are learned in this way. These passes
+    are made before the training steps `start`, 2 `start`, 4 `start` and so on, because the field becomes more accurate.
+
+    A step of Adam changes each texel by about the learning rate, however many rays it has. The mean of all rays, which
+    `EnvironmentMap.fit` computes, is more accurate. Other backgrounds, and backgrounds behind a volume that covers all
+    of space, skip the phase.
 
     Args:
-        steps: number of steps; 0 for no pretraining.
-        time_share: largest fraction of `trainer.max_time`, so that short runs train the scene, too.
-        num_pixels: number of pixels that are drawn in a step; None for 1 % of all pixels, so that 600 steps draw each
-            pixel several times, but at most 65536.
-        learn: patterns of the names of the learned parameters. Exposures are learned as well, because a background that
-            averages photographs of different exposures would slow them down.
+        steps: number of steps of a pass, which share the rows of the photographs; 0 for no pass.
+        time_share: largest fraction of `trainer.max_time` for the pass before training, so that short runs train the
+            scene, too.
+        start: training step of the first pass that also uses rays through the object; None for no such pass.
     """
 
-    def __init__(
-        self,
-        steps: Natural = 600,
-        time_share: Share = 0.2,
-        num_pixels: Count | None = None,
-        learn: list[str] = ["background.*", "cameras.*"],  # noqa: B006 (the registry reads and copies it)
-    ) -> None:
-        self.steps, self.time_share, self.num_pixels, self.learn = steps, time_share, num_pixels, learn
+    def __init__(self, steps: Natural = 10, time_share: Share = 0.2, start: Count | None = 250) -> None:
+        self.steps, self.time_share, self.start = steps, time_share, start
+
+    def begin(self, run: Run) -> dict[str, Any]:
+        """Return the weights of the observations of each texel in the current pass."""
+        background = run.renderer.scene.boundary
+        if not isinstance(background, EnvironmentMap) or occupied_box(run.renderer) is None:
+            return {}
+        return {"weights": torch.zeros(background.levels.num_texels, device=run.renderer.scene.device)}
 
     def steps_before(self, training_step: int) -> int:
-        return self.steps
+        later_passes = 0 if self.start is None else (training_step // self.start).bit_length()
+        return self.steps * (1 + later_passes)
 
+    @torch.no_grad()
     def step(self, run: Run, number: int, state: dict[str, Any]) -> bool:
-        scene, box = run.renderer.scene, occupied_box(run.renderer)
-        of_background, learned = run.parameters(["background.*"]), run.parameters(self.learn)
-        if box is None or not of_background:
+        background, box = run.renderer.scene.boundary, occupied_box(run.renderer)
+        if not state or not isinstance(background, EnvironmentMap) or box is None:
             return False
-        num_pixels = self.num_pixels or min(int(_SHARE * run.batches.num_pixels), _MOST_PIXELS)
-        rays, view, rgb = run.batches.missing(box, num_pixels, number, scene.camera)
-        progress = max(number / self.steps, run.spent / self.time_share)
-        if len(rays) < _MIN_PIXELS or progress >= 1:
-            return False
-        first, last = _RATES
-        for group in run.optimizer.param_groups:
-            if any(parameter is own for parameter in group["params"] for own in of_background):
-                group["lr"] = group["initial_lr"] * first * (last / first) ** progress
-        radiance = scene.boundary(Exits.unbent(rays))
-        compared = scene.colour_space.prediction_and_target(radiance, rgb, scene.camera.gains(view))
-        run.descend(torch.nn.functional.mse_loss(*compared), learned)
+        number_of_pass, part = divmod(number, self.steps)
+        if number_of_pass == 0 and run.spent >= self.time_share:
+            return True
+        if part == 0:
+            state["weights"].zero_()
+        most_pixels = min(run.batches.num_pixels, _MOST_PIXELS * background.levels.sizes[-1])
+        num_parts = self.steps * run.batches.num_pixels // most_pixels
+        pixels = run.batches.rows(part * num_parts // self.steps, num_parts)
+        beside = misses(box, _rays(run, pixels))
+        observed = [_beside(run, pixels[beside], number)]
+        if number_of_pass > 0:
+            assert self.start is not None
+            num_trained = self.start * 2 ** (number_of_pass - 1) * run.batches.batch_size
+            num_rays = min(_SHARE * num_trained, _MOST_RAYS)
+            crossing = pixels[~beside]
+            crossing = crossing[:: max(1, math.ceil(len(crossing) * self.steps / num_rays))]
+            observed += [_through(run, chunk) for chunk in crossing.split(run.renderer.chunk_size)]
+        state["weights"] += background.fit(Observed.joined(observed), state["weights"])
         return True
+
+
+def _through(run: Run, pixels: Int[Tensor, "P"]) -> Observed:
+    """Observe the background along those rays of pixels that cross hardly any content."""
+    batches, renderer, scene = run.batches, run.renderer, run.renderer.scene
+    view = batches.view(pixels)
+    path = renderer.trace(_rays(run, pixels))
+    neighbours = renderer.exit_directions(scene.camera(neighbour_rays(batches.cameras, pixels), view))
+    widths = divergence(batches.cameras, pixels, main_exits(path), neighbours)
+    steady = (widths < _MOST_DIVERGENCE).nonzero()[:, 0]
+    path, pixels, view, widths = path.of_rays(steady), pixels[steady], view[steady], widths[steady]
+    rendering = renderer.render_path(path)[-1]
+    # The fraction of the background's radiance that reaches the camera along the main polyline.
+    fraction = rendering.transmittance[:, None] * path.throughput
+    if path.absorbs:
+        fraction = fraction * path.transmitted(path.far[:, None])[:, 0]
+    fraction, exits = path.first_of_ray(fraction), main_exits(path)
+    photographed = _photographed(run, batches.photographed(pixels), view, rendering.rgb)
+    radiance = scene.boundary(Exits(exits)) + (photographed - rendering.rgb) / fraction.clamp(min=_BACKGROUND)
+    observed = Observed(exits, radiance, fraction.square().mean(-1), widths / batches.cameras.fx[view])
+    return observed[fraction.amin(-1) >= _BACKGROUND]
+
+
+def _beside(run: Run, pixels: Int[Tensor, "P"], number: int) -> Observed:
+    """Observe the background along rays of pixels beside the object."""
+    batches, scene = run.batches, run.renderer.scene
+    rays, view, rgb = _rays(run, pixels), batches.view(pixels), batches.photographed(pixels)
+    radiance, exposure = scene.boundary(Exits.unbent(rays)), scene.camera.exposure
+    if exposure is not None and number > 0:  # the first step observes the background with equal gains
+        exposure.fit(view, radiance, scene.colour_space.to_radiance(rgb))
+    widths = 1 / batches.cameras.fx[view]
+    return Observed(rays.directions, _photographed(run, rgb, view, radiance), torch.ones_like(widths), widths)
+
+
+def _rays(run: Run, pixels: Int[Tensor, "P"]) -> Rays:
+    """Make the rays of the estimated cameras through the centres of pixels."""
+    batches = run.batches
+    return run.renderer.scene.camera(pixel_rays(batches.cameras, pixels), batches.view(pixels))
+
+
+def _photographed(
+    run: Run, rgb: Float[Tensor, "R 3"], view: Int[Tensor, "R"], predicted: Float[Tensor, "R 3"]
+) -> Float[Tensor, "R 3"]:
+    """Decode the colours of photographs and divide by their gains; saturated pixels show at least what is predicted."""
+    scene = run.renderer.scene
+    radiance = scene.colour_space.to_radiance(rgb)
+    if (gains := scene.camera.gains(view)) is not None:
+        radiance = radiance / gains
+    return torch.where(rgb >= 1, radiance.maximum(predicted), radiance)
 
 
 def occupied_box(renderer: Renderer) -> Float[Tensor, "2 3"] | None:
