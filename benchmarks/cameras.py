@@ -14,6 +14,7 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -21,13 +22,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.camera.pixel_units import even_weights, object_distances, pixel_motions, without_world, world_motions
-from nerfro.camera.refined import rotations
 from nerfro.camera.similarity import motion_between
 from nerfro.cameras import Cameras
 from nerfro.data.blender import BlenderData
 from nerfro.evaluation.results import read_metrics_json
 from nerfro.paths import resolve_path
+from nerfro.registry import discover
+
+discover()
+pixel_units = import_module("nerfro_plugins.refined_cameras.pixel_units")
+rotations = import_module("nerfro_plugins.refined_cameras.refined").rotations
 
 
 def main() -> None:
@@ -75,12 +79,12 @@ def main() -> None:
 def disturbed(cameras: Cameras, angle: float, share: float, seed: int) -> Float[Tensor, "V 3 4"]:
     """Rotate poses by an angle (radians) and shift them by a fraction of the distance, without common motion."""
     generator = torch.Generator().manual_seed(seed)
-    poses, distances = cameras.camera_to_world.double(), object_distances(cameras)
+    poses, distances = cameras.camera_to_world.double(), pixel_units.object_distances(cameras)
     units = torch.stack([torch.full_like(distances, angle), share * distances], -1).repeat_interleave(3, -1)
     axes = torch.randn(len(cameras), 2, 3, generator=generator, dtype=torch.float64)
-    weights = even_weights(pixel_motions(cameras, distances))
+    weights = pixel_units.even_weights(pixel_units.pixel_motions(cameras, distances))
     motion = torch.nn.functional.normalize(axes, dim=-1).flatten(1) * units
-    motion = without_world(motion, world_motions(poses, weights), weights)
+    motion = pixel_units.without_world(motion, pixel_units.world_motions(poses, weights), weights)
     axes = poses[..., :3]
     return torch.cat([axes @ rotations(motion[:, :3]), poses[..., 3:] + axes @ motion[:, 3:, None]], -1)
 
@@ -130,7 +134,7 @@ def line(row: str, run: Path, true: Cameras, initial: Cameras) -> str:
 def errors(poses: Float[Tensor, "V 3 4"], true: Cameras) -> tuple[Float[Tensor, "V"], Float[Tensor, "V"]]:
     """Return each camera's rotation error in degrees and position error in percent of the distance."""
     turn, shift = motion_between(true.camera_to_world, poses)
-    return turn, 100 * shift / object_distances(true)
+    return turn, 100 * shift / pixel_units.object_distances(true)
 
 
 if __name__ == "__main__":

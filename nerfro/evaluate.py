@@ -30,8 +30,6 @@ from nerfro.training.config import build_data, check_trained
 from nerfro.training.load import checkpoint_of, scene_of
 from nerfro.training.run_folder import CONFIG_FILE, load_checkpoint
 
-_ADOPTED = ("chunk_size", "refine_steps")  # options that replace the options of the run, if given
-
 
 @entry_point("evaluate", EvaluateConfig)
 def main(config: DictConfig) -> None:
@@ -46,9 +44,8 @@ def _evaluate_checkpoint(config: DictConfig) -> None:
     checkpoint, trained = load_checkpoint(path)
     if config.root is not None:
         trained.data.root = config.root
-    for name in _ADOPTED:
-        if config[name] is not None:
-            trained.evaluation[name] = config[name]
+    if config.chunk_size is not None:
+        trained.evaluation.chunk_size = config.chunk_size
     trained.evaluation.subdivision.update({k: v for k, v in config.subdivision.items() if v is not None})
     device = find_device(config.device)
     with own_folder(config, path.parent.parent / f"evaluate_{config.split}") as folder:
@@ -57,9 +54,7 @@ def _evaluate_checkpoint(config: DictConfig) -> None:
         lpips = find_lpips_network()
         metrics = ImageMetrics(lpips)
         record(folder, config)
-        result, treated = score_split(
-            scene.renderer, views, metrics, folder, scene.subdivision, config.split, trained.evaluation.refine_steps
-        )
+        result, treated = score_split(scene.renderer, views, metrics, folder, scene.subdivision, config.split)
         for index, view in enumerate(result.views):
             prediction = load_png(folder / "images" / f"{view.name}.png")
             write_error_sheet(folder, view.name, prediction, views.images[index], lpips)

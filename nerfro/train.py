@@ -93,8 +93,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetr
     scored, scores = None, {}
     try:
         if split is not None:
-            metrics, refine_steps = ImageMetrics(lpips), config.evaluation.refine_steps
-            result, treated = score_split(renderer, test, metrics, folder, subdivision, split, refine_steps)
+            result, treated = score_split(renderer, test, ImageMetrics(lpips), folder, subdivision, split)
             scores = {f"{split}/{name}": mean for name, mean in result.means().items()}
             states = {each.state_key: each.state_dict() for each in trainer.callbacks}  # type: ignore[attr-defined]
             scored = RunMetrics(result, *spent, treated, steps_by_phase(states, spent[0]))

@@ -34,8 +34,6 @@ class EvaluateConfig:
     chunk_size: Optional[NumRays] = None  # rays rendered at once, which limits memory; by default as in training
     # Which pixels get several rays (see docs/concepts/background.md); by default as in training.
     subdivision: SubdivisionChanges = dataclasses.field(default_factory=SubdivisionChanges)
-    # Steps that refine test cameras on left image halves, to score right halves; by default as in training.
-    refine_steps: Optional[Natural] = None
     predictions: Optional[str] = None  # folder of images to score, instead of a checkpoint
     references: Optional[str] = None  # folder of reference images with the same names as `predictions`
     # Folder of masks with the same names; by default the masks beside the references, or their transparency.

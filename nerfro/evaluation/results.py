@@ -22,9 +22,9 @@ Score = float | None  # None if not available; the notes contain the reason
 
 Region = Literal["full", "mask", "crop"]  # see nerfro/evaluation/regions.py
 FULL: Region = "full"
-# Scores with the given cameras and exposure, with fitted exposures, and with fitted cameras; docs/reference/metrics.md.
-AS_GIVEN, EXPOSED, REFINED = "as given", "exposed", "refined"
-FITTED = (EXPOSED, REFINED)  # to the left halves of the photographs; the scores belong to the right halves
+# Scores with the given cameras and exposure, and with exposures that are fitted to the left halves of the photographs,
+# which belong to the right halves; docs/reference/metrics.md.
+AS_GIVEN, EXPOSED = "as given", "exposed"
 OBJECT_REGIONS: tuple[Region, ...] = ("mask", "crop")  # regions that require a mask of the object
 
 

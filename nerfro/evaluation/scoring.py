@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from nerfro.camera.exposure import fit_gain
 from nerfro.data.base import Views
@@ -31,8 +29,8 @@ class Images:
 
     Attributes:
         subfolder: name of their folder.
-        right_halves: score only the right half of each view. If the model estimates exposures, the gain of each view
-            is fitted on the left half of the photograph.
+        right_halves: score only the right half of each view, with the gain that is fitted on the left half of the
+            photograph.
     """
 
     subfolder: str
@@ -47,7 +45,7 @@ def score_views(
     subdivision: Subdivision,
     prefix: str,
     images: Sequence[Images],
-) -> tuple[list[EvaluationResult], Float[Tensor, "V 3"]]:
+) -> list[EvaluationResult]:
     """Render all views, write 8-bit sRGB images to `folder/<subfolder>/<prefix>_NNN.png`, and compute their scores.
 
     The memory holds the rays and images of one view and the samples of `renderer.chunk_size` rays.
@@ -62,27 +60,26 @@ def score_views(
         images: images that are made of each rendering.
 
     Returns:
-        Scores of each of the images, and the gain of each view and channel, which is 1 if no gains are fitted.
+        Scores of each of the images.
     """
     scene, height, width = renderer.scene, views.cameras.height, views.cameras.width
     cameras, left = views.cameras.to(scene.device), slice(width // 2)
     scores: list[list[ViewScores]] = [[] for _ in images]
-    gains = torch.ones(len(views), 3)
     for view in track("evaluate", range(len(views))):
         radiance = render_view(renderer, cameras, view, subdivision).radiance.view(height, width, 3).cpu()
         target, mask = views.images[view], None if views.masks is None else views.masks[view]
         name = f"{prefix}_{view:03d}"
         for kind, scored in zip(images, scores, strict=True):
             gain = torch.ones(3)
-            if kind.right_halves and scene.camera.exposure is not None:
+            if kind.right_halves:
                 to_srgb, shown = scene.colour_space.to_srgb, radiance[:, left].flatten(0, 1)
-                gain = gains[view] = fit_gain(to_srgb, shown, target[:, left].flatten(0, 1))
+                gain = fit_gain(to_srgb, shown, target[:, left].flatten(0, 1))
             rgb = scene.colour_space.to_display(radiance, gain)
             save_png(folder / kind.subfolder / f"{name}.png", rgb)
             part = slice(width // 2, None) if kind.right_halves else slice(None)
             coverage = None if mask is None else mask[:, part].contiguous()
             scored.append(metrics.score(name, rgb[:, part].contiguous(), target[:, part].contiguous(), coverage))
-    return [metrics.result(scored) for scored in scores], gains
+    return [metrics.result(scored) for scored in scores]
 
 
 def score_folders(

@@ -20,7 +20,7 @@ from nerfro.errors import NerfroError
 from nerfro.evaluation.image_metrics import image_metrics
 from nerfro.evaluation.results import (
     AS_GIVEN,
-    FITTED,
+    EXPOSED,
     FULL,
     EvaluationResult,
     Region,
@@ -170,7 +170,7 @@ def regions_table(result: EvaluationResult, title: str) -> Table:
 def treatments_table(metrics: RunMetrics, title: str) -> Table:
     """Tabulate the mean scores of the test views under each treatment (see `nerfro.evaluation.treatments`)."""
     treated = {
-        f"{name}, right halves" if name in FITTED else name: result.means()
+        f"{name}, right halves" if name == EXPOSED else name: result.means()
         for name, result in metrics.treatments.items()
     }
     return _scores_table(title, "test views", {AS_GIVEN: metrics.result.means()} | treated, [])

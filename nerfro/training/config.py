@@ -83,8 +83,6 @@ class EvaluationConfig:
     # five times as often. 0 switches validation off.
     every: Natural = 500
     subdivision: Subdivision = dataclasses.field(default_factory=Subdivision)  # which pixels get several rays
-    # Steps that refine test cameras on the left halves of photographs; the right halves are scored separately.
-    refine_steps: Natural = 0
 
 
 @dataclass
@@ -290,7 +288,7 @@ def settle_trainer(config: DictConfig) -> None:
     for phase in config.phase.values():
         if phase and "steps" in phase:
             phase["steps"] = min(phase["steps"], steps)
-    config.evaluation.every, config.evaluation.refine_steps = steps, 0
+    config.evaluation.every = steps
     config.evaluation.subdivision.side = 1
 
 

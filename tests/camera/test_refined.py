@@ -1,17 +1,21 @@
 """Refined cameras: derivatives of rays, what is held, units, files; how far disturbed poses and gains come back."""
 
 from dataclasses import replace
+from importlib import import_module
 
 import pytest
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from nerfro.camera.pixel_units import even_weights, object_distances, pixel_motions, world_motions
-from nerfro.camera.refined import RefinedCamera, rotations
 from nerfro.camera.similarity import Similarity, motion_between, similarity
 from nerfro.cameras import Cameras
 from nerfro.lens import coefficients
+from nerfro.registry import discover
+
+discover()
+pixel_units = import_module("nerfro_plugins.refined_cameras.pixel_units")
+refined = import_module("nerfro_plugins.refined_cameras.refined")
 
 NUM_VIEWS, SIZE = 8, 20
 
@@ -30,9 +34,9 @@ def cameras(distortion: tuple[float, ...] | None = None) -> Cameras:
     return Cameras(poses, *focal, middle, middle, SIZE, SIZE, 0.5, 8.0, lens)
 
 
-def part(given: Cameras, lens: bool = True, seed: int = 0) -> RefinedCamera:
+def part(given: Cameras, lens: bool = True, seed: int = 0) -> refined.RefinedCamera:
     """A camera part that has moved by about a pixel."""
-    made = RefinedCamera(lens=lens).double()
+    made = refined.RefinedCamera(lens=lens).double()
     made.begin(given)
     generator = torch.Generator().manual_seed(seed)
     made.move(*(torch.randn(shape, generator=generator, dtype=torch.float64) for shape in ((len(given), 6), (3,))))
@@ -77,7 +81,7 @@ def test_slopes_are_those_of_central_differences(distortion: tuple[float, ...] |
 @pytest.mark.parametrize("distortion", LENSES)
 def test_rays_are_those_of_the_estimated_cameras(distortion: tuple[float, ...] | None) -> None:
     given = cameras(distortion)
-    moved, unmoved, (view, row, column) = part(given), RefinedCamera(lens=True).double(), pixels(given)
+    moved, unmoved, (view, row, column) = part(given), refined.RefinedCamera(lens=True).double(), pixels(given)
     unmoved.begin(given)
     for made, estimated in ((moved, moved.estimated(given)), (unmoved, given)):
         found, expected = made(given.rays(view, row, column), view), estimated.rays(view, row, column)
@@ -87,7 +91,7 @@ def test_rays_are_those_of_the_estimated_cameras(distortion: tuple[float, ...] |
 
 @pytest.mark.parametrize("lens", [False, True])
 def test_parameters_of_a_prior_stay_when_cameras_move(lens: bool) -> None:
-    made = RefinedCamera(lens=lens).double()
+    made = refined.RefinedCamera(lens=lens).double()
     made.begin(cameras())
     before = made.numbers()
     made.move(torch.ones(NUM_VIEWS, 6, dtype=torch.float64), torch.ones(3, dtype=torch.float64))
@@ -101,7 +105,7 @@ def test_a_motion_that_all_cameras_share_is_taken_out() -> None:
     given = cameras()
     made, small = part(given), 1e-4
     poses = given.camera_to_world
-    turn = rotations(small * torch.tensor([[0.3, -0.7, 0.5]], dtype=torch.float64))[0]
+    turn = refined.rotations(small * torch.tensor([[0.3, -0.7, 0.5]], dtype=torch.float64))[0]
     world = Similarity(torch.tensor(1 + small).double(), turn, small * torch.tensor([1.0, 2.0, -1.0]).double())
     shared = world.apply(poses)
     turns, shifts = poses[..., :3].mT @ shared[..., :3], poses[..., :3].mT @ (shared[..., 3:] - poses[..., 3:])
@@ -109,7 +113,7 @@ def test_a_motion_that_all_cameras_share_is_taken_out() -> None:
     before = made.motions.moved()
     with torch.no_grad():
         made.motions.motion += torch.cat([vector, shifts[..., 0]], -1) / made.motions.units
-    free = RefinedCamera(fix_gauge=False).double()
+    free = refined.RefinedCamera(fix_gauge=False).double()
     free.begin(given)
     free.motions.motion = torch.cat([vector, shifts[..., 0]], -1) / free.motions.units
     torch.testing.assert_close(free.aligned(given).camera_to_world, shared, rtol=0, atol=1e-6)  # to first order
@@ -121,9 +125,9 @@ def test_a_motion_that_all_cameras_share_is_taken_out() -> None:
 
 def test_a_unit_of_each_parameter_moves_points_by_a_pixel() -> None:
     given = cameras()
-    distances, h = object_distances(given), 1e-5
+    distances, h = pixel_units.object_distances(given), 1e-5
     axis = (torch.arange(90) + 0.5).double() * SIZE / 90
-    motions = pixel_motions(given, distances)
+    motions = pixel_units.pixel_motions(given, distances)
     for view in range(len(given)):
         one = given.select([view])
         u, v = (place.flatten() for place in torch.meshgrid(axis, axis, indexing="xy"))
@@ -133,7 +137,9 @@ def test_a_unit_of_each_parameter_moves_points_by_a_pixel() -> None:
         for k in range(6):
             turn, shift = torch.zeros(2, 1, 3, dtype=torch.float64)
             (turn if k < 3 else shift)[0, k % 3] = h
-            pose = torch.cat([axes @ rotations(turn), one.camera_to_world[..., 3:] + axes @ shift[..., None]], -1)
+            pose = torch.cat(
+                [axes @ refined.rotations(turn), one.camera_to_world[..., 3:] + axes @ shift[..., None]], -1
+            )
             seen, _ = replace(one, camera_to_world=pose).project(points)
             moved = (seen[0] - torch.stack([u, v], -1)).square().sum(-1).mean().sqrt() / h
             assert float(motions[view, k]) == pytest.approx(float(moved), rel=0.02)
@@ -144,26 +150,26 @@ def test_a_unit_of_each_parameter_moves_points_by_a_pixel() -> None:
 
 def test_cameras_in_a_world_that_is_known_may_move_together() -> None:
     given = cameras()
-    made = RefinedCamera(fix_gauge=False).double()
+    made = refined.RefinedCamera(fix_gauge=False).double()
     made.begin(given)
     with torch.no_grad():
         made.motions.motion.normal_()
     physical = made.motions.motion * made.motions.units
     turns = given.camera_to_world[..., :3].mT @ made.motions.moved()[..., :3]
-    torch.testing.assert_close(turns, rotations(physical[:, :3]))
+    torch.testing.assert_close(turns, refined.rotations(physical[:, :3]))
 
 
 @pytest.mark.parametrize(("num", "rank"), [(1, 6), (2, 7), (8, 7)])
 def test_motions_of_the_world_are_orthonormal_and_as_many_as_there_are(num: int, rank: int) -> None:
     given = cameras().select(list(range(num)))
-    weights = even_weights(pixel_motions(given, object_distances(given)))
-    flat = world_motions(given.camera_to_world, weights).flatten(1)
+    weights = pixel_units.even_weights(pixel_units.pixel_motions(given, pixel_units.object_distances(given)))
+    flat = pixel_units.world_motions(given.camera_to_world, weights).flatten(1)
     torch.testing.assert_close(flat @ flat.T, torch.eye(rank, dtype=torch.float64))
 
 
 def test_a_similarity_is_found_again() -> None:
     poses = cameras().camera_to_world
-    turn = rotations(torch.tensor([[0.5, -1.0, 2.0]], dtype=torch.float64))[0]
+    turn = refined.rotations(torch.tensor([[0.5, -1.0, 2.0]], dtype=torch.float64))[0]
     made = Similarity(torch.tensor(1.7).double(), turn, torch.tensor([3.0, -1.0, 0.5]).double())
     for some in (poses, poses[:2], poses[:1]):
         found = similarity(some, made.apply(some), *torch.rand(2, len(some), dtype=torch.float64) + 0.5)

@@ -2,20 +2,24 @@
 
 import math
 from dataclasses import replace
+from importlib import import_module
 
 import pytest
 import torch
 import trimesh
 
 from benchmarks.cameras import disturbed
-from nerfro.camera.least_squares import PriorInformation
-from nerfro.camera.refined import RefinedCamera
 from nerfro.cameras import Cameras
 from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.silhouettes.outlines import align_to_outlines
+from nerfro.registry import discover
 from nerfro.silhouettes.visual_hull import Silhouettes
 from tests.ball_photographs import NUM_VIEWS, RADIUS, SIZE, cameras, soft_masks
+
+discover()
+PriorInformation = import_module("nerfro_plugins.refined_cameras.least_squares").PriorInformation
+RefinedCamera = import_module("nerfro_plugins.refined_cameras.refined").RefinedCamera
+align_to_outlines = import_module("nerfro_plugins.refined_cameras.outlines").align_to_outlines
 
 TRUE = cameras()
 

@@ -18,13 +18,14 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 from torch.nn import functional as F
 
-from nerfro.camera.least_squares import PriorInformation, axes_across, robust_weights
-from nerfro.camera.refined import RefinedCamera
 from nerfro.cameras import Cameras
 from nerfro.light import to_linear
 from nerfro.progress import track
 from nerfro.rays import Rays
 from nerfro.subdivision import pixel_rays
+
+from .least_squares import PriorInformation, axes_across, robust_weights
+from .refined import RefinedCamera
 
 # Photographs are downscaled to this width in pixels; the alignment is accurate to a few hundredths of a pixel.
 _WIDTH = 256

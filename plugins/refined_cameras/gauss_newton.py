@@ -16,12 +16,13 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from nerfro.camera.least_squares import PriorInformation, axes_across, normal_equations, robust_weights, with_priors
-from nerfro.camera.pixel_units import object_distances
-from nerfro.camera.refined import RefinedCamera
 from nerfro.cameras import Cameras
 from nerfro.rays import Rays
 from nerfro.subdivision import contrast, pixel_rays
+
+from .least_squares import PriorInformation, axes_across, normal_equations, robust_weights, with_priors
+from .pixel_units import object_distances
+from .refined import RefinedCamera
 
 # Rendered colours of rays, sRGB in [0, 1], with the exposure of the views.
 Render = Callable[[Rays, Int[Tensor, "R"]], Float[Tensor, "R 3"]]
@@ -44,14 +45,12 @@ class Step:
         scale: scale of the robust error, sRGB.
         max_pixels: maximum motion of a camera, and maximum change of the lens, in pixels.
         fraction: fraction of the step that is applied.
-        keep_improvements: whether to revert the motion of a camera if the error of its pixels does not decrease.
     """
 
     difference_pixels: float
     scale: float
     max_pixels: float
     fraction: float = 1.0
-    keep_improvements: bool = True
 
 
 def gauss_newton_step(
@@ -86,28 +85,13 @@ def gauss_newton_step(
     weights = robust_weights(error, step.scale) / (1 + (slopes[..., :6] / _STEEP_SLOPE).square().sum((1, 2)))
     matrix, vector = normal_equations(slopes.double(), error.double(), weights.double(), view, len(cameras))
     variance = (weights[:, None] * error.square()).sum() / (3 * weights.sum()).clamp(min=_TINY)
-    before = camera.numbers()
-    matrix, vector = with_priors(matrix, vector, before, variance, priors)
+    matrix, vector = with_priors(matrix, vector, camera.numbers(), variance, priors)
     motion, lens = camera.split(-torch.linalg.solve(matrix, vector))
     motion, lens = (
         numbers * (step.max_pixels / numbers.norm(dim=-1, keepdim=True).clamp(min=_TINY)).clamp(max=1)
         for numbers in (motion, lens)
     )
     camera.move(step.fraction * motion.to(angle), step.fraction * lens.to(angle))
-    if not step.keep_improvements:
-        return
-
-    new = _robust_error(render(camera(given, view), view) - target, step.scale, view, len(cameras))
-    old = _robust_error(error, step.scale, view, len(cameras))
-    camera.move_back(before, worse=new >= old, lens=bool(new.sum() >= old.sum()))
-
-
-def _robust_error(
-    error: Float[Tensor, "R 3"], scale: float, view: Int[Tensor, "R"], num_views: int
-) -> Float[Tensor, "V"]:
-    """Sum the Geman-McClure error r^2 / (1 + r^2) of the pixels of each view."""
-    squares = (error / scale).square().sum(-1)
-    return squares.new_zeros(num_views).index_add(0, view, squares / (1 + squares))
 
 
 def informative_pixels(

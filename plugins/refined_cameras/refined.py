@@ -11,12 +11,13 @@ from torch.nn.functional import normalize
 
 from nerfro.camera.base import Camera
 from nerfro.camera.exposure import PerView
-from nerfro.camera.pixel_units import even_weights, object_distances, pixel_motions, without_world, world_motions
 from nerfro.camera.similarity import similarity
 from nerfro.cameras import Cameras
 from nerfro.lens import distort, undistort
 from nerfro.rays import Rays
 from nerfro.registry import register
+
+from .pixel_units import even_weights, object_distances, pixel_motions, without_world, world_motions
 
 
 class _Motions(PerView):
@@ -90,7 +91,7 @@ class _Motions(PerView):
 class RefinedCamera(Camera):
     """Refine the pose of each training camera, and optionally the common lens, during training.
 
-    The phase `cameras` of the training moves them (`training.phases.cameras`). The motion that a similarity
+    The phase `cameras` of the training moves them (`phase`). The motion that a similarity
     transformation of the world would cause is removed to first order, so that the world and the surface keep their
     place.
 

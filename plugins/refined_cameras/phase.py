@@ -9,17 +9,18 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from nerfro.allowed import Count, Natural
-from nerfro.camera.gauss_newton import Step, gauss_newton_step, informative_pixels
-from nerfro.camera.least_squares import PriorInformation
-from nerfro.camera.panorama import align
-from nerfro.camera.refined import RefinedCamera
 from nerfro.geometry.interpolation import misses
 from nerfro.rays import Rays
 from nerfro.registry import register
-from nerfro.silhouettes.outlines import align_to_masks
 from nerfro.subdivision import pixel_rays
 from nerfro.training.phases.background import occupied_box
 from nerfro.training.phases.base import Phase, Run
+
+from .gauss_newton import Step, gauss_newton_step, informative_pixels
+from .least_squares import PriorInformation
+from .outlines import align_to_masks
+from .panorama import align
+from .refined import RefinedCamera
 
 # First and least distance of finite differences in pixels, and its factor from one step to the next.
 _FIRST_DIFFERENCE, _LEAST_DIFFERENCE, _DECAY = 2.0, 0.5, 0.85
@@ -35,8 +36,8 @@ _NUM_CANDIDATES = 6
 class CameraSteps(Phase):
     """Align the training cameras of `camera=refined` before training, and refine them between training steps.
 
-    The alignment uses background and outlines (`camera.panorama`, `silhouettes.outlines`), if the data contain these.
-    The steps are Gauss-Newton steps of all cameras (`camera.gauss_newton`) with a fixed scene.
+    The alignment uses background and outlines (`panorama`, `outlines`), if the data contain these.
+    The steps are Gauss-Newton steps of all cameras (`gauss_newton`) with a fixed scene.
 
     Args:
         start: training step of the first Gauss-Newton step. Earlier, the scene is too inaccurate.
@@ -84,7 +85,7 @@ class CameraSteps(Phase):
         difference = max(_LEAST_DIFFERENCE, _FIRST_DIFFERENCE * _DECAY**number)
         fraction = min(1.0, _FULL_STEPS / (number + 1))
         # Errors may increase: the scene fits the current cameras, so they are at a local minimum.
-        settings = Step(difference, _ERROR_SCALE * difference, _MAX_PIXELS, fraction, keep_improvements=False)
+        settings = Step(difference, _ERROR_SCALE * difference, _MAX_PIXELS, fraction)
         priors = [PriorInformation(**prior) for prior in state.values()]
         gauss_newton_step(camera, batches.cameras, pixels, batches.photographed, shown, settings, priors)
         return True

@@ -2,7 +2,7 @@
 
 Antialiased masks give outlines with an accuracy of hundredths of a pixel, and determine the pose of a camera more
 accurately than colours do. However, outlines hardly distinguish a rotation from a translation across the line of sight;
-the distant surroundings do (`nerfro.camera.panorama`).
+the distant surroundings do (`panorama`).
 """
 
 from __future__ import annotations
@@ -13,8 +13,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerfro.camera.least_squares import PriorInformation, normal_equations, with_priors
-from nerfro.camera.refined import RefinedCamera
 from nerfro.cameras import Cameras
 from nerfro.data.base import Views
 from nerfro.geometry.mesh import TriangleMesh
@@ -24,6 +22,9 @@ from nerfro.progress import track
 from nerfro.silhouettes.rims import RimFinder
 from nerfro.silhouettes.silhouettes import PixelBlocks
 from nerfro.silhouettes.visual_hull import Silhouettes
+
+from .least_squares import PriorInformation, normal_equations, with_priors
+from .refined import RefinedCamera
 
 # Largest side of the reduced images in which outlines are compared, pixels.
 _MAX_PIXELS = 256
