@@ -137,7 +137,7 @@ class Training:
         wanted, views = self.config.batches, build(self.config.data).load("train")
         self.renderer: Renderer = build_model(self.config, views)
         self.module = TrainingModule.of(self.renderer, self.config)
-        batches = RayBatches(views, wanted.size, wanted.batching, self.config.seed, jitter=wanted.jitter)
+        batches = RayBatches(views, wanted.size, wanted.batching, self.config.seed)
         self.batches = traced(batches, self.renderer, self.config)
         self.num_rays = wanted.size
 

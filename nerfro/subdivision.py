@@ -16,7 +16,6 @@ from torch import Tensor
 
 from nerfro.allowed import Natural, NotNegative, Positive, Side, checked
 from nerfro.cameras import Cameras
-from nerfro.draws import Draws
 from nerfro.rays import Rays
 from nerfro.types import Path
 
@@ -86,7 +85,6 @@ def subdivide(
     trace: Trace | None,
     trace_exits: TraceExits | None,
     contrasts: Callable[[Int[Tensor, "N"]], Float[Tensor, "N"]] | None,
-    jitter: Draws | None = None,
 ) -> PixelRays:
     """Trace rays through pixels, several for pixels that one ray does not represent.
 
@@ -97,27 +95,22 @@ def subdivide(
         trace: traces rays, given the view of each ray; None disables tracing and division.
         trace_exits: traces the exit direction of each ray's main polyline; None uses `trace`.
         contrasts: contrast of the pixels in given rows of `pixels`; None disables the criterion.
-        jitter: random numbers, with an index for each pixel, for the position of rays within the pixel, or within the
-            part of a pixel; None selects the centres.
     """
     view, num_parts = pixels // (cameras.height * cameras.width), subdivision.side**2
-    place = None if jitter is None else jitter.uniform(jitter.ray, 2, "place in pixel")
-    rays = pixel_rays(cameras, pixels, place)
+    rays = pixel_rays(cameras, pixels)
     path = None if trace is None else trace(rays, view)
     if trace is None or path is None or num_parts == 1:
         every = torch.arange(len(pixels), device=pixels.device)
         return PixelRays(rays, path, every, torch.zeros_like(every), torch.zeros_like(every, dtype=torch.bool))
     trace_exits = trace_exits or (lambda rays, view: main_exits(trace(rays, view)))
-    exits, neighbours = main_exits(path), trace_exits(neighbour_rays(cameras, pixels, place), view)
+    exits, neighbours = main_exits(path), trace_exits(neighbour_rays(cameras, pixels), view)
     diverges = divergence(cameras, pixels, exits, neighbours) >= subdivision.divergence
     divided = diverges
     if contrasts is not None and subdivision.contrast is not None:
         rows = (path.first_of_ray(path.refracted) & ~diverges).nonzero()[:, 0]
         divided = divided.index_put((rows,), contrasts(rows) >= subdivision.contrast)
     whole, parted = (~divided).nonzero()[:, 0], divided.nonzero()[:, 0]
-    if jitter is not None:
-        place = jitter.uniform(jitter.ray[parted], 2 * num_parts, "place in part").view(-1, num_parts, 2)
-    parts, pixel = part_rays(cameras, pixels[parted], subdivision.side, place), parted.repeat_interleave(num_parts)
+    parts, pixel = part_rays(cameras, pixels[parted], subdivision.side), parted.repeat_interleave(num_parts)
     part = torch.arange(num_parts, device=pixels.device).repeat(len(parted))
     return PixelRays(
         rays=rays[whole].followed_by(parts),
@@ -136,20 +129,17 @@ def pixel_rays(
     return cameras.rays(pixels // (height * width), pixels // width % height, pixels % width, place)
 
 
-def part_rays(
-    cameras: Cameras, pixels: Int[Tensor, "Q"], side: int, place: Float[Tensor, "Q K 2"] | None = None
-) -> Rays:
-    """Make rays through the K = side x side equal parts of each pixel, at a position in each part."""
+def part_rays(cameras: Cameras, pixels: Int[Tensor, "Q"], side: int) -> Rays:
+    """Make rays through the centres of the K = side x side equal parts of each pixel."""
     ticks = torch.arange(side, device=pixels.device)
     corners = torch.cartesian_prod(ticks, ticks).view(-1, 2)
-    places = (corners + (0.5 if place is None else place)) / side
-    return pixel_rays(cameras, pixels.repeat_interleave(side**2), places.expand(len(pixels), -1, 2).reshape(-1, 2))
+    places = (corners + 0.5) / side
+    return pixel_rays(cameras, pixels.repeat_interleave(side**2), places.repeat(len(pixels), 1))
 
 
-def neighbour_rays(cameras: Cameras, pixels: Int[Tensor, "R"], place: Float[Tensor, "R 2"] | None = None) -> Rays:
+def neighbour_rays(cameras: Cameras, pixels: Int[Tensor, "R"]) -> Rays:
     """Make the neighbours of the rays of `pixel_rays`, one pixel along the diagonal."""
-    centre = torch.full((2,), 0.5, device=pixels.device)
-    return pixel_rays(cameras, pixels, (centre if place is None else place) + _TO_NEIGHBOUR)
+    return pixel_rays(cameras, pixels, torch.full((2,), 0.5 + _TO_NEIGHBOUR, device=pixels.device))
 
 
 def main_exits(path: Path) -> Float[Tensor, "R 3"]:

@@ -242,7 +242,6 @@ def tiny_run(tiny_scene: Path) -> list[str]:
         "loss.smoothness.weight=1",
         "evaluation.subdivision.side=1",
         "batches.subdivision.side=1",
-        "batches.jitter=false",
         "medium.resolution=32",
         "medium.smoothing_size=3",
         "medium.cache=false",

@@ -139,7 +139,7 @@ def test_open_mesh_is_accepted_when_asked(
         (["field.widht=3"], ["field.widht is not a setting; did you mean width?"]),
         (["+field.widht=3"], ["field.widht is not a setting; did you mean width?"]),
         (["+expriment=mipnerf"], ["expriment is not a setting; did you mean experiment?"]),
-        (["+batches.foo=3"], ["batches.foo is not a setting; known: batching, jitter, num_validation_views"]),
+        (["+batches.foo=3"], ["batches.foo is not a setting; known: batching, num_validation_views"]),
         (["+sampler.point.num_samples=5"], ["sampler.point is not a setting; did you mean points?"]),
         (["+hydra.run.foo=1"], ["hydra.run.foo is not a setting; known: dir"]),
         (["field.width=abc"], ["Value 'abc' of type 'str' could not be converted to Integer", "field.width"]),

@@ -27,7 +27,6 @@ SHORT = [
     "checkpoint.every_steps=3",
     "checkpoint.every_seconds=null",
     "evaluation.every=4",
-    "batches.jitter=true",
     "field.precision=float32",
     "optimizer.adam_epsilon=1e-8",
     "evaluation.subdivision.side=1",

@@ -183,7 +183,7 @@ def test_last_finds_the_newest_run_beside_a_new_folder(tmp_path: Path) -> None:
         ({"field": {"width": 16}}, "was trained with field.width=8, this run has 16; use the same experiment"),
         ({"seed": 1}, "was trained with seed=0, this run has 1"),
         ({"medium": {"ior": 1.3}}, "was trained with medium.ior=1.5, this run has 1.3"),
-        ({"batches": {"jitter": True}}, "was trained with batches.jitter=None, this run has True"),
+        ({"batches": {"batching": "x"}}, "was trained with batches.batching=None, this run has x"),
     ],
 )
 def test_checkpoint_of_another_configuration_is_refused(change: dict, message: str, tmp_path: Path) -> None:

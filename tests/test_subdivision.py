@@ -100,8 +100,8 @@ def test_divergence_behind_a_ball_is_that_of_its_deviation(above: Cameras) -> No
     np.testing.assert_allclose(angles.numpy(), expected, atol=0.01 * FOCAL)
 
 
-def batches_of(views: Views, subdivision: Subdivision, size: int = 64, jitter: bool = False) -> RayBatches:
-    batches = RayBatches(views, size, "all_images", seed=3, jitter=jitter)
+def batches_of(views: Views, subdivision: Subdivision, size: int = 64) -> RayBatches:
+    batches = RayBatches(views, size, "all_images", seed=3)
     return batches.traced(through_cube, subdivision=subdivision)
 
 
@@ -142,33 +142,14 @@ def test_pixels_of_the_object_are_divided_for_their_contrast(views: Views) -> No
     assert torch.equal(of_pixels(before, True), (~before.teaches_background).nonzero()[:, 0])
 
 
-@pytest.mark.parametrize("jitter", [False, True])
-def test_paths_of_a_batch_are_those_of_its_rays(views: Views, jitter: bool) -> None:
-    batch = batches_of(views, Subdivision(2, 4.0), 200, jitter).batch(0)
+def test_paths_of_a_batch_are_those_of_its_rays(views: Views) -> None:
+    batch = batches_of(views, Subdivision(2, 4.0), 200).batch(0)
     traced = Snell()(batch.rays, CUBE)
     s = torch.linspace(2.0, 6.0, 50).expand(len(batch.rays), -1)
     for a, b in zip(batch.path.at(s), traced.at(s), strict=True):
         torch.testing.assert_close(a, b, rtol=0, atol=1e-5)
     torch.testing.assert_close(batch.path.exit_directions, traced.exit_directions, rtol=0, atol=1e-5)
     assert torch.equal(batch.path.refracted, traced.refracted)
-
-
-def test_jittered_parts_stay_inside_their_parts_and_fill_them(views: Views) -> None:
-    batches, offsets = batches_of(views, Subdivision(2, 4.0), 200, jitter=True), []
-    for step in range(4):
-        batch = batches.batch(step)
-        rays = torch.isin(batch.pixel, of_pixels(batch, True))
-        x, y, z = batch.rays.directions[rays].unbind(-1)
-        column, row = SIDE / 2 - FOCAL * x / z, SIDE / 2 + FOCAL * y / z
-        index = batch.index[batch.pixel[rays]]
-        place = torch.stack([column - index % SIDE, row - index // SIDE], -1).view(-1, 2, 2, 2)
-        corners = 0.5 * torch.stack(torch.meshgrid(torch.arange(2), torch.arange(2), indexing="ij"), -1)
-        offsets.append(((place - corners) * 2).view(-1, 2))
-    offset = torch.cat(offsets)
-    assert offset.min() > -1e-3
-    assert offset.max() < 1 + 1e-3
-    assert torch.allclose(offset.mean(0), torch.tensor(0.5), atol=4 * 12**-0.5 * len(offset) ** -0.5)
-    assert torch.allclose(offset.std(0), torch.tensor(12**-0.5), atol=0.02)
 
 
 def test_contrast_is_the_largest_step_to_a_neighbour(cameras: Cameras) -> None:
@@ -187,7 +168,7 @@ def test_contrast_is_the_largest_step_to_a_neighbour(cameras: Cameras) -> None:
 
 def test_batches_and_renderings_do_not_depend_on_the_process_or_the_chunk(views: Views) -> None:
     """Each pixel has the same rays, paths, numbers and samples, whoever traces it and beside whichever others."""
-    batches = batches_of(views, Subdivision(2, 8.0, 0.2), 60, jitter=True)
+    batches = batches_of(views, Subdivision(2, 8.0, 0.2), 60)
     whole = batches.batch(4)
     model = RefractiveModel(replace(example_components(), point_sampler=Hierarchical(8, 8)))
     sampled = model.render_path(whole.path, whole.draws)[-1].samples.s

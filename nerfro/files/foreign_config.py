@@ -20,7 +20,7 @@ _MOVED = {
     "nerfro.training.phases.cameras.": "nerfro_plugins.refined_cameras.phase.",
 }
 # Removed settings of earlier runs, with the values that had no effect.
-_REMOVED: dict[str, Any] = {"evaluation.refine_steps": 0}
+_REMOVED: dict[str, Any] = {"evaluation.refine_steps": 0, "batches.jitter": False}
 
 
 def foreign_config(text: str, origin: Path) -> DictConfig:

@@ -61,7 +61,6 @@ class BatchesConfig:
     size: NumRays = 1024  # number of pixels in a step
     # Whether the pixels of a step come from one image or from all images.
     batching: Annotated[str, Literal["single_image", "all_images"]] = "single_image"
-    jitter: bool = False  # draw each ray anywhere inside its pixel instead of through its centre
     # Fraction of the pixels of a step that is drawn only from the object, according to the masks.
     object_fraction: Annotated[float, Range(at_least=0, at_most=1)] = 0.0
     # Number of training views, spread over the positions of the cameras, that are used for validation instead.

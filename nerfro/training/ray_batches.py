@@ -42,13 +42,12 @@ class RayBatches:
         seed: Natural = 0,
         precrop_steps: Natural = 0,
         precrop_fraction: float = 0.5,
-        jitter: bool = False,
         object_fraction: Annotated[float, Range(at_least=0, at_most=1)] = 0.0,
     ) -> None:
         if len(views) == 0:
             raise NerfroError("there are no training images; give at least one")
         self.batch_size, self.batching, self.seed = batch_size, batching, seed
-        self.precrop_steps, self.jitter = precrop_steps, jitter
+        self.precrop_steps = precrop_steps
         self._share = slice(batch_size)
         self.subdivision = Subdivision()
         self._trace: Trace | None = None
@@ -80,7 +79,7 @@ class RayBatches:
         """Make the batches of a run from its configuration, see `TrainConfig`."""
         options = config.batches
         precrop, fraction = (options.precrop_steps, options.precrop_fraction), options.object_fraction
-        return cls(views, options.size, options.batching, config.seed, *precrop, options.jitter, fraction)
+        return cls(views, options.size, options.batching, config.seed, *precrop, fraction)
 
     def to(self, device: torch.device | str, dtype: torch.dtype | None = None) -> RayBatches:
         """Return the same sequence on another device, with rays in another precision."""
@@ -142,7 +141,7 @@ class RayBatches:
         pixels = self._to_device(((view * height + row) * width + column)[self._share])
         slot = torch.arange(self.batch_size, device=cameras.device)[self._share]
         draws = Draws(self.seed, step, slot)
-        found = self._rays(pixels, draws, step)
+        found = self._rays(pixels, step)
         return Batch(
             rays=found.rays,
             pixel=found.pixel,
@@ -155,13 +154,12 @@ class RayBatches:
             path=found.path,
         )
 
-    def _rays(self, pixels: Int[Tensor, "Q"], draws: Draws, step: int) -> PixelRays:
+    def _rays(self, pixels: Int[Tensor, "Q"], step: int) -> PixelRays:
         """Create rays through pixels, with paths if a trace function is set."""
         contrasts = None
         if step >= self.subdivision.contrast_start:
             contrasts = lambda rows: contrast(self.photographed, self._cameras, pixels[rows])  # noqa: E731
-        jitter = draws if self.jitter else None
-        return subdivide(self._cameras, pixels, self.subdivision, self._trace, self._trace_exits, contrasts, jitter)
+        return subdivide(self._cameras, pixels, self.subdivision, self._trace, self._trace_exits, contrasts)
 
     @property
     def num_pixels(self) -> int:

@@ -55,13 +55,13 @@ def test_rays_and_colours_belong_to_the_index(views, batching):
 
 @pytest.mark.parametrize("batching", ["single_image", "all_images"])
 def test_batch_depends_on_seed_and_step_alone(views, batching):
-    batches = RayBatches(views, 30, batching, seed=3, jitter=True)
+    batches = RayBatches(views, 30, batching, seed=3)
     in_order = [batches.batch(step) for step in range(6)]
-    again = RayBatches(views, 30, batching, seed=3, jitter=True)
+    again = RayBatches(views, 30, batching, seed=3)
     for step in (5, 0, 3):
         assert torch.equal(again.batch(step).index, in_order[step].index)
         assert torch.equal(again.batch(step).rays.directions, in_order[step].rays.directions)
-    other = RayBatches(views, 30, batching, seed=4, jitter=True)
+    other = RayBatches(views, 30, batching, seed=4)
     assert not torch.equal(other.batch(0).index, in_order[0].index)
     assert not torch.equal(in_order[0].index, in_order[1].index)
 
@@ -165,7 +165,7 @@ def test_every_view_has_its_own_usable_pixels(views, masked):
 
 @pytest.mark.parametrize(("batching", "size"), [("single_image", 1), ("all_images", 30)])
 def test_masks_hold_while_precropped_and_in_every_share(masked, batching, size):
-    whole = RayBatches(masked, size, batching, seed=3, precrop_steps=20, jitter=True)
+    whole = RayBatches(masked, size, batching, seed=3, precrop_steps=20)
     for step in (*range(5), *range(20, 25)):
         batch = whole.batch(step)
         shares = [whole.share(rank, size).batch(step) for rank in range(size)]
@@ -211,23 +211,6 @@ def test_batch_carries_the_cameras_of_the_window_it_is_drawn_from(views):
     torch.testing.assert_close(middle.image_rays(2).directions.reshape(6, 8, 3), full[3:9, 4:12])
 
 
-def test_jittered_rays_stay_inside_their_pixels_and_fill_them(views):
-    batches = RayBatches(views, 192, seed=0, jitter=True)
-    offsets = []
-    for step in range(20):
-        batch = batches.batch(step)
-        view, row, column = place(batch.index).unbind(-1)
-        axes = views.cameras.camera_to_world[view, :, :3]
-        x, y, z = torch.einsum("rij,ri->rj", axes, batch.rays.directions).unbind(-1)
-        offsets.append(torch.stack([8 - 20 * x / z - column, 6 + 20 * y / z - row], -1))
-    offset = torch.cat(offsets)
-    assert offset.min() > -1e-4
-    assert offset.max() < 1 + 1e-4
-    # The mean of 3840 uniform numbers is .5 +- .0047.
-    assert torch.allclose(offset.mean(0), torch.tensor(0.5), atol=0.025)
-    assert torch.allclose(offset.std(0), torch.tensor(12**-0.5), atol=0.02)
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -260,11 +243,10 @@ def test_batches_hold_all_polylines_of_their_rays(views):
         torch.testing.assert_close(getattr(batch.path, name), getattr(again, name))
 
 
-@pytest.mark.parametrize("jitter", [False, True])
-def test_batches_made_ahead_do_not_depend_on_the_default_type(views, jitter):
+def test_batches_made_ahead_do_not_depend_on_the_default_type(views):
     """Lightning sets it for each step of `trainer.precision=64-true`, while a thread makes the next batch."""
     medium, sampler = Ball().double(), Snell()
-    batches = RayBatches(views, 60, "all_images", 1, jitter=jitter).to("cpu", torch.float64)
+    batches = RayBatches(views, 60, "all_images", 1).to("cpu", torch.float64)
     batches = batches.traced(lambda rays, _: sampler(rays, medium), subdivision=Subdivision(2, 0.0))
     expected = batches.batch(0)
     torch.set_default_dtype(torch.float64)
