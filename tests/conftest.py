@@ -84,6 +84,7 @@ def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
 def restored_registry(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Forget the plugins that a test discovers."""
     import nerfro.registry
+    import nerfro.training.lightning_callbacks  # registers callbacks, which the restoration would else remove
 
     nerfro.registry.discover()
     monkeypatch.setattr(nerfro.registry, "_plugins", dict(nerfro.registry._plugins))

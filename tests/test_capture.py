@@ -10,7 +10,6 @@ from functools import cache
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from unittest.mock import Mock
 
 import pytest
 import torch
@@ -22,7 +21,6 @@ from nerfro.geometry.mesh import load_mesh
 from nerfro.paths import CONF_DIR
 from nerfro.registry import discover
 from nerfro.synthetic import path_tracer
-from nerfro.synthetic.scene import Scene
 from nerfro.synthetic.synthesis import SynthesizeConfig, synthesize
 from tests.exact_silhouettes import overlaps_of_convex_body
 
@@ -65,16 +63,6 @@ def test_poses_are_only_in_the_truth(few: Path) -> None:
 def test_masks_are_the_true_surface_in_the_true_cameras(few: Path) -> None:
     views = OpenCVData(str(few / "truth")).load("train")
     assert min(overlaps_of_convex_body(views, load_mesh(few / "truth" / "mesh.ply").vertices)) > 0.99
-
-
-def test_only_what_is_not_on_disk_is_rendered_again(few: Path, tmp_path: Path) -> None:
-    settings = OmegaConf.create(json.loads((few / "truth" / "meta.json").read_text())["settings"])
-    shutil.copytree(few, tmp_path / "copy")
-    data = photographs.Photographs(settings, Mock(spec=Scene, aim=dolphin_capture.AIM), tmp_path / "copy")
-    planned = data.planned()
-    assert data.missing(planned) == []
-    (tmp_path / "copy" / planned[1].mask_path).unlink()
-    assert [picture.image_path for picture in data.missing(planned)] == ["images/photo_001.png"]
 
 
 @pytest.mark.slow

@@ -24,7 +24,6 @@ from nerfro.media.shapes import Ball
 from nerfro.registry import discover, find
 from nerfro.rendering import Components, Renderer
 from nerfro.samplers.paths.eikonal import Eikonal
-from nerfro.samplers.paths.straight import straight_path
 from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import example_rays
 from nerfro.training.config import build_model
@@ -33,7 +32,6 @@ from nerfro.training.optimizer import OptimizerConfig
 from nerfro.training.run_folder import load_checkpoint, restore
 from nerfro.types import Radiance, Samples
 from tests.ball_photographs import save
-from tests.closed_forms import Luneburg
 from tests.exact_silhouettes import cameras_around
 
 discover()
@@ -77,43 +75,7 @@ def test_bounds_are_those_of_the_mesh(tiny_scene: Path) -> None:
     assert float(medium.box[1, 0] - medium.content_box[1, 0]) == pytest.approx(0.3, abs=1e-2)
 
 
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"box_min": [0.0, 0.0, 1.0], "box_max": [1.0, 1.0, 0.0]}, "no box from"),
-        ({"margin": 0.0}, "take a positive margin"),
-    ],
-)
-def test_impossible_index_fields_are_refused(fields: dict[str, Any], message: str) -> None:
-    with pytest.raises(NerfroError, match=message):
-        IndexField(**fields)
-
-
 # Paths.
-
-
-def test_paths_through_nothing_are_the_straight_ones() -> None:
-    rays = example_rays()
-    path = BoxMarch(16)(rays, IndexField())
-    straight = straight_path(rays)
-    s = path.near[:, None] + torch.linspace(0, 1, 20) * (path.far - path.near)[:, None]
-    torch.testing.assert_close(path.at(s)[0], straight.at(s)[0])
-    torch.testing.assert_close(path.exit_directions, rays.directions)
-    assert not path.refracted.any()
-
-
-def test_parallel_rays_through_a_luneburg_lens_meet_in_its_focus() -> None:
-    height = torch.linspace(-0.8, 0.8, 9, dtype=torch.float64)
-    origins = torch.stack([torch.full_like(height, -3), height, 0 * height], -1)
-    directions = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64).expand(9, 3)
-    rays = replace(example_rays(9), origins=origins, directions=directions, near=height * 0 + 1, far=height * 0 + 5)
-    errors = []
-    for num_steps in (256, 512):
-        path = BoxMarch(num_steps)(rays, Luneburg().double())
-        to_focus = path.positions - torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
-        errors.append(float(to_focus.norm(dim=-1).amin(-1).max()))
-    assert errors[1] < 0.02
-    assert errors[1] < 0.7 * errors[0]  # of first order, up to where the vertices happen to lie
 
 
 def test_gradients_of_exit_directions_are_those_of_finite_differences() -> None:
@@ -197,25 +159,6 @@ def test_what_the_first_stage_saw_inside_the_box_is_dropped() -> None:
     # Before the box nothing has changed.
     before = (inside.cumsum(-1) == 0) & inside.any(-1, keepdim=True)
     torch.testing.assert_close(first.weights[before], second.weights[before])
-
-
-def test_sharp_grids_show_what_the_field_and_the_boundary_show() -> None:
-    model = make_model(blur=1e-2, resolution=24)
-    model.stage.fill_(INDEX)
-    model.point_sampler.eval()
-    model.sharpen(0)
-    # Past the box: next to it the grid blurs what was dropped over a cell.
-    rays = replace(example_rays(), origins=example_rays().origins + torch.tensor([2.5, 0, 0]))
-    from_grids = model(rays)[-1].rgb
-    from_fields = model.eval()(rays)[-1].rgb
-    past = (model(rays)[-1].samples.positions.abs().amax(-1) > model.scene.medium.box[1, 0] + 0.5).all(-1)
-    assert past.sum() > 5
-    torch.testing.assert_close(from_grids[past], from_fields[past], atol=1e-4, rtol=0)
-
-
-def test_impossible_shares_are_refused() -> None:
-    with pytest.raises(NerfroError, match="leave the rest of 1 to the interior"):
-        make_model(scene_share=0.8, index_share=0.4)
 
 
 def test_several_processes_are_refused_before_training() -> None:

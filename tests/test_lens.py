@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
@@ -75,24 +74,6 @@ def cameras() -> Cameras:
     ideal = (0.0,) * 9
     distortion = torch.tensor([LENSES["barrel"], ideal, LENSES["rational"]])
     return Cameras(poses, fill(40.0), fill(42.0), fill(24.6), fill(17.1), 48, 36, 0.1, 9.0, distortion)
-
-
-def test_points_on_rays_project_onto_their_pixels(cameras):
-    row, column = np.divmod(np.arange(36 * 48), 48)
-    expected = torch.from_numpy(np.stack([column, row], -1) + 0.5).float()
-    for view in range(3):
-        rays = cameras.image_rays(view)
-        assert torch.allclose(rays.directions.norm(dim=-1), torch.ones(len(rays)), atol=1e-6)
-        pixels, depth = cameras.project(rays.origins + 2.5 * rays.directions)
-        assert (depth[view] > 0).all()
-        torch.testing.assert_close(pixels[view], expected, rtol=0, atol=5e-4)
-
-
-def test_lens_without_distortion_is_the_pinhole_camera(cameras):
-    pinhole = replace(cameras, distortion=None)
-    torch.testing.assert_close(cameras.image_rays(1).directions, pinhole.image_rays(1).directions)
-    torch.testing.assert_close(cameras.image_rays(1).radii, pinhole.image_rays(1).radii)
-    assert not torch.allclose(cameras.image_rays(0).directions, pinhole.image_rays(0).directions, atol=1e-3)
 
 
 def test_radii_follow_the_area_of_the_pixel(cameras):

@@ -18,7 +18,6 @@ from omegaconf import DictConfig
 from PIL import Image
 from torch import nn
 
-import nerfro.registry
 from nerfro.data.base import DataSource, Views
 from nerfro.data.blender import BlenderData
 from nerfro.errors import NerfroError
@@ -71,13 +70,6 @@ def write_plugin(tmp_path: Path) -> Callable[[str, str], Path]:
     return write
 
 
-def test_file_in_a_plugin_folder_is_registered(write_plugin: Callable[[str, str], Path]) -> None:
-    discover(write_plugin("grey_a", BOUNDARY.format(name="grey_a")))
-    plugin = find("boundary", "grey_a")
-    assert plugin.target == "nerfro_plugins.grey_a.OneGrey"
-    assert nerfro.registry.build({"_target_": plugin.target, "grey": 0.25}).grey == 0.25
-
-
 def test_package_in_a_plugin_folder_is_registered(tmp_path: Path) -> None:
     (tmp_path / "folder" / "grey_package").mkdir(parents=True)
     (tmp_path / "folder" / "grey_package" / "__init__.py").write_text("from . import inner\n")
@@ -92,14 +84,6 @@ def test_folders_of_the_environment_are_searched_too(
     monkeypatch.setenv("NERFRO_PLUGINS", str(write_plugin("grey_c", BOUNDARY.format(name="grey_c"))))
     discover()
     assert find("boundary", "grey_c").summary == "The same grey in every direction."
-
-
-def test_discovering_twice_changes_nothing(write_plugin: Callable[[str, str], Path]) -> None:
-    folder = write_plugin("grey_d", BOUNDARY.format(name="grey_d"))
-    discover(folder)
-    before = plugins()
-    discover(folder)
-    assert plugins() == before
 
 
 @pytest.mark.parametrize(
@@ -454,15 +438,6 @@ def test_list_shows_every_plugin_with_its_fields_defaults_and_summary(run_here: 
             assert f" {name}=" in words
             assert kind.replace("`", "") in words
     assert {plugin.kind for plugin in plugins()} == set(KINDS)
-
-
-def test_list_of_one_kind_or_one_plugin_shows_no_other(run_here: Callable[..., Finished]) -> None:
-    assert "field=" not in run_here("plugins", "boundary").out
-    shown = run_here("plugins", "boundary=skybox").out
-    assert "boundary=skybox" in shown
-    assert "boundary=constant" not in shown
-    assert "width" in shown
-    assert "128" in shown
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,6 @@ from torch import nn
 
 import nerfro.registry
 import nerfro.training.lightning_callbacks
-from nerfro.boundaries.constant import ConstantBoundary
 from nerfro.cli import entry_point
 from nerfro.errors import NerfroError
 from nerfro.paths import CONF_DIR
@@ -87,13 +86,6 @@ def test_integer_passes_for_a_float_and_a_text_of_digits_for_an_integer() -> Non
     assert configure(plugin, {"weight": 1, "start": "7"})["start"] == 7
 
 
-def test_list_defaults_are_not_shared_between_configurations() -> None:
-    plugin = find("boundary", "constant")
-    first = configure(plugin, {})
-    first["rgb"][0] = 0.7
-    assert configure(plugin, {})["rgb"] == [0.0, 0.0, 0.0]
-
-
 def test_every_plugin_is_an_option_of_hydra_and_has_a_summary() -> None:
     options = {kind: ConfigStore.instance().list(kind) for kind in KINDS}
     for plugin in plugins():
@@ -103,10 +95,6 @@ def test_every_plugin_is_an_option_of_hydra_and_has_a_summary() -> None:
 
 
 # Refusals by the registry.
-
-
-def test_the_same_class_may_register_again() -> None:
-    assert register("boundary", "constant")(ConstantBoundary) is ConstantBoundary
 
 
 def test_constructor_that_takes_anything_is_refused() -> None:

@@ -4,7 +4,6 @@ import contextlib
 import csv
 import itertools
 import os
-import random
 import shutil
 import signal
 from collections import namedtuple
@@ -46,46 +45,10 @@ def start(
     return start
 
 
-def tensors(node: Any, prefix: str = "") -> dict[str, torch.Tensor]:
-    """All tensors of a nested container by their place in it."""
-    if isinstance(node, torch.Tensor):
-        return {prefix: node}
-    items = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, (list, tuple)) else ()
-    return {name: value for key, child in items for name, value in tensors(child, f"{prefix}/{key}").items()}
-
-
 def log_rows(file: Path) -> list[dict[str, str]]:
     """Rows of a CSV log, without empty cells."""
     with file.open(newline="") as stream:
         return [{name: value for name, value in row.items() if value} for row in csv.DictReader(stream)]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("preset", ["paper", "default"])
-def test_killed_and_resumed_run_ends_with_the_weights_of_an_undisturbed_one(
-    preset: str, start: Callable[..., Command], tmp_path: Path
-) -> None:
-    undisturbed = start("undisturbed", preset=preset)
-    killed_at = random.Random(os.urandom(8)).randint(4, 11)  # any step will do; the message names it
-    killed = start("killed", preset=preset)
-    killed.until(f"^at step {killed_at}$")
-    killed.send(signal.SIGKILL)
-    assert killed.wait() == -signal.SIGKILL
-    assert not (tmp_path / "killed" / "metrics.json").exists()
-    start("killed", "ckpt_path=last", preset=preset).finished()
-    undisturbed.finished()
-
-    one, other = (load_checkpoint(tmp_path / name / LAST_CHECKPOINT)[0] for name in ("undisturbed", "killed"))
-    assert one["global_step"] == other["global_step"] == 12
-    for part in ("state_dict", "optimizer_states"):
-        expected, got = tensors(one[part]), tensors(other[part])
-        assert expected.keys() == got.keys()
-        assert expected
-        for name in expected:
-            assert torch.equal(expected[name], got[name]), f"{part}{name} differs after a kill at step {killed_at}"
-    for view in ("test_000.png", "test_001.png"):
-        pictures = [(tmp_path / name / "images" / view).read_bytes() for name in ("undisturbed", "killed")]
-        assert pictures[0] == pictures[1]
 
 
 @pytest.mark.slow

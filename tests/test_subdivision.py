@@ -142,16 +142,6 @@ def test_pixels_of_the_object_are_divided_for_their_contrast(views: Views) -> No
     assert torch.equal(of_pixels(before, True), (~before.teaches_background).nonzero()[:, 0])
 
 
-def test_paths_of_a_batch_are_those_of_its_rays(views: Views) -> None:
-    batch = batches_of(views, Subdivision(2, 4.0), 200).batch(0)
-    traced = Snell()(batch.rays, CUBE)
-    s = torch.linspace(2.0, 6.0, 50).expand(len(batch.rays), -1)
-    for a, b in zip(batch.path.at(s), traced.at(s), strict=True):
-        torch.testing.assert_close(a, b, rtol=0, atol=1e-5)
-    torch.testing.assert_close(batch.path.exit_directions, traced.exit_directions, rtol=0, atol=1e-5)
-    assert torch.equal(batch.path.refracted, traced.refracted)
-
-
 def test_contrast_is_the_largest_step_to_a_neighbour(cameras: Cameras) -> None:
     images = torch.rand(NUM_VIEWS, HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(2))
     pixels = torch.arange(NUM_VIEWS * HEIGHT * WIDTH)

@@ -166,14 +166,6 @@ def test_scores_of_a_region_come_from_the_region(tmp_path: Path) -> None:
     assert to_table(comparison, PAPER, "mask").rows[0].values == (None, None, None)
 
 
-def test_a_difference_of_commits_is_told(tmp_path: Path) -> None:
-    for name, commit in (("a", "1" * 40), ("b", "2" * 40)):
-        file = write_run(tmp_path / name, name, 20.0) / "run.json"
-        file.write_text(json.dumps({**json.loads(file.read_text()), "commit": commit}))
-    (table,) = tables(tmp_path)
-    assert "The runs used different versions of the code: 1111111, 2222222" in table.notes
-
-
 def test_places_are_folders_and_globs_and_runs_without_scores_are_named(tmp_path: Path) -> None:
     for name in ("a", "b", "c"):
         write_run(tmp_path / name, name, 20.0)

@@ -3,7 +3,6 @@
 import importlib
 import json
 import os
-import re
 import shutil
 import signal
 import subprocess
@@ -30,7 +29,6 @@ SWEEPS = sorted(path.stem for path in (CONF_DIR / "sweep").glob("*.yaml"))
 
 # Nobody listens at that proxy: the search for LPIPS weights ends at once.
 _OFFLINE = {"OMP_NUM_THREADS": "1", "https_proxy": "http://127.0.0.1:9"}
-_RAY = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_DEDUP_LOGS": "0"}
 
 
 @pytest.fixture
@@ -45,7 +43,7 @@ def start(tmp_path: Path, waiting_plugins: str, tiny_run: list[str]) -> Callable
     """Start a sweep with a loss that waits in a process, in tmp_path/sweep; what it prints goes to tmp_path/<name>."""
     options = [*tiny_run, "evaluation.every=0", "+loss.waiting.weight=1", f"hydra.sweep.dir={tmp_path / 'sweep'}"]
     options += ["trainer.max_steps=20", "checkpoint.every_steps=4", "checkpoint.every_seconds=null"]
-    environment = {**_OFFLINE, **_RAY, "TORCH_HOME": str(tmp_path), "NERFRO_PLUGINS": waiting_plugins}
+    environment = {**_OFFLINE, "TORCH_HOME": str(tmp_path), "NERFRO_PLUGINS": waiting_plugins}
     return lambda overrides, name: Command("train", ["-m", *options, *overrides], tmp_path / name, **environment)
 
 
@@ -253,21 +251,6 @@ def test_launchers_run_cells_in_other_processes(
     assert f"{tmp_path / 'nowhere.ply'} does not exist" in log
     (run,) = (tmp_path / "sweep").glob("*/run.json")
     assert json.loads(run.read_text())["command"].startswith("python -m nerfro.train data.root=")
-
-
-@pytest.mark.slow
-def test_sweep_on_ray_finishes_although_a_worker_is_killed(
-    start: Callable[[list[str], str], Command], tmp_path: Path
-) -> None:
-    pytest.importorskip("hydra_plugins.hydra_ray_launcher", reason="needs pip install 'nerfro[ray]'")
-    sweep = start(["hydra/launcher=ray", "+hydra.launcher.ray.init.num_cpus=2", "seed=0,1,2,3"], "log")
-    killed = sweep.until(r"pid=(\d+)\S* at step 10$")[1]
-    os.kill(int(killed), signal.SIGKILL)
-    log = sweep.finished()
-    assert len(written(tmp_path / "sweep")) == 4
-    lines = re.findall(r"pid=(\d+)\S* at step (\d+)$", log, re.MULTILINE)
-    assert max(int(step) for pid, step in lines if pid == killed) < 19
-    assert [step for _, step in lines].count("0") == 4, "Ray repeats the cell, which goes on from its checkpoint"
 
 
 def test_damaged_record_costs_its_own_cell_alone(sweep: Callable[..., Any], tmp_path: Path) -> None:

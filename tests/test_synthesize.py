@@ -7,7 +7,6 @@ from omegaconf import OmegaConf
 from PIL import Image
 from torch.nn.functional import max_pool2d
 
-from nerfro.allowed import check_settings
 from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.data.blender import BlenderData
 from nerfro.errors import NerfroError
@@ -108,19 +107,3 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path, name, content):
     with pytest.raises(NerfroError, match="it is no data set of nerfro"):
         synthesize(small(tmp_path, overwrite=True))
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, content)]
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"scene": "tours"}, "choose one of torus, ship, deerglobe, starlamp"),
-        ({"resolution": 0}, "resolution=0 is not allowed; take at least 8"),
-        ({"ior": 0.0}, "ior=0.0 is not allowed"),
-    ],
-)
-def test_options_out_of_range_are_refused_before_anything_is_written(tmp_path, options, message):
-    config = small(tmp_path / "scene", **options)
-    with pytest.raises(NerfroError, match=message):  # noqa: PT012 (options are looked at first, then the rest)
-        check_settings(config, SynthesizeConfig)
-        synthesize(config)
-    assert not (tmp_path / "scene").exists()

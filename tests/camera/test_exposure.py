@@ -1,13 +1,10 @@
 """Gains of photographs: nothing on average, seen by every loss."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 from torch.nn.functional import mse_loss
 
 from nerfro.camera.exposure import Exposure, fit_gain
-from nerfro.camera.given import GivenCamera
 from nerfro.light import to_srgb
 from nerfro.losses.photometric import Photometric
 from nerfro.models.refractive import RefractiveModel
@@ -20,14 +17,6 @@ def test_gains_are_one_on_average_whatever_is_learned() -> None:
     assert torch.equal(exposure.gains(), torch.ones(5, 3))
     torch.nn.init.normal_(exposure.log_gain, mean=3.0)
     torch.testing.assert_close(exposure.gains().log().mean(0), torch.zeros(3), rtol=0, atol=1e-6)
-
-
-def test_gains_are_learned_and_bend_no_ray() -> None:
-    camera = GivenCamera(exposure=True)
-    camera.begin(example_batch().cameras)
-    model = RefractiveModel(replace(example_components(), camera=camera))
-    assert [name for name in model.parameters_by_name() if not name.startswith("fields.")] == ["cameras.exposure"]
-    assert not model.paths_learn
 
 
 def test_gains_are_fitted_to_unsaturated_pixels() -> None:

@@ -63,16 +63,6 @@ def test_the_shared_lens_is_found_with_them() -> None:
     assert float(camera.estimated(given).fx[0]) == pytest.approx(float(TRUE.fx[0]), rel=2e-3)
 
 
-def test_a_turn_of_all_is_not_told() -> None:
-    camera = RefinedCamera()
-    found = panorama(camera, TRUE)
-    assert found is not None
-    together = camera.motions.common_rotations()
-    torch.testing.assert_close(together.mT @ together, torch.eye(3))
-    motions = torch.nn.functional.pad(together.view(-1, 3, 3), (0, 0, 0, 3)).flatten(0, 1)
-    assert float((found.information @ motions).abs().max()) < 1e-5 * float(found.information.diagonal().mean())
-
-
 def test_without_a_sky_nothing_is_known() -> None:
     camera = RefinedCamera()
     assert panorama(camera, TRUE, box=10 * BOX) is None

@@ -78,29 +78,6 @@ def test_slopes_are_those_of_central_differences(distortion: tuple[float, ...] |
         torch.testing.assert_close(found[..., number], expected, rtol=1e-2, atol=1e-3 * float(expected.abs().max()))
 
 
-@pytest.mark.parametrize("distortion", LENSES)
-def test_rays_are_those_of_the_estimated_cameras(distortion: tuple[float, ...] | None) -> None:
-    given = cameras(distortion)
-    moved, unmoved, (view, row, column) = part(given), refined.RefinedCamera(lens=True).double(), pixels(given)
-    unmoved.begin(given)
-    for made, estimated in ((moved, moved.estimated(given)), (unmoved, given)):
-        found, expected = made(given.rays(view, row, column), view), estimated.rays(view, row, column)
-        torch.testing.assert_close(found.origins, expected.origins)
-        torch.testing.assert_close(found.directions, expected.directions, rtol=0, atol=1e-9)
-
-
-@pytest.mark.parametrize("lens", [False, True])
-def test_parameters_of_a_prior_stay_when_cameras_move(lens: bool) -> None:
-    made = refined.RefinedCamera(lens=lens).double()
-    made.begin(cameras())
-    before = made.numbers()
-    made.move(torch.ones(NUM_VIEWS, 6, dtype=torch.float64), torch.ones(3, dtype=torch.float64))
-    assert not before.any()
-    assert bool((made.numbers() == 1).all())
-    made.move_back(before, torch.arange(NUM_VIEWS) > 0, lens=True)
-    assert made.numbers().tolist() == [1.0] * 6 + [0.0] * (len(before) - 6)
-
-
 def test_a_motion_that_all_cameras_share_is_taken_out() -> None:
     given = cameras()
     made, small = part(given), 1e-4
@@ -146,25 +123,6 @@ def test_a_unit_of_each_parameter_moves_points_by_a_pixel() -> None:
         seen, _ = replace(one, fx=one.fx * (1 + h), fy=one.fy * (1 + h)).project(points)
         moved = (seen[0] - torch.stack([u, v], -1)).square().sum(-1).mean().sqrt() / h
         assert float(motions[view, 6]) == pytest.approx(float(moved), rel=0.02)
-
-
-def test_cameras_in_a_world_that_is_known_may_move_together() -> None:
-    given = cameras()
-    made = refined.RefinedCamera(fix_gauge=False).double()
-    made.begin(given)
-    with torch.no_grad():
-        made.motions.motion.normal_()
-    physical = made.motions.motion * made.motions.units
-    turns = given.camera_to_world[..., :3].mT @ made.motions.moved()[..., :3]
-    torch.testing.assert_close(turns, refined.rotations(physical[:, :3]))
-
-
-@pytest.mark.parametrize(("num", "rank"), [(1, 6), (2, 7), (8, 7)])
-def test_motions_of_the_world_are_orthonormal_and_as_many_as_there_are(num: int, rank: int) -> None:
-    given = cameras().select(list(range(num)))
-    weights = pixel_units.even_weights(pixel_units.pixel_motions(given, pixel_units.object_distances(given)))
-    flat = pixel_units.world_motions(given.camera_to_world, weights).flatten(1)
-    torch.testing.assert_close(flat @ flat.T, torch.eye(rank, dtype=torch.float64))
 
 
 def test_a_similarity_is_found_again() -> None:

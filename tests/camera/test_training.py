@@ -129,20 +129,6 @@ def test_a_run_whose_cameras_learn_goes_on_as_if_it_had_not_stopped(
     assert float(states[0]["renderer.scene.camera.exposure.log_gain"].abs().max()) > 0
 
 
-def test_cameras_wait_for_the_scene(
-    train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path: Path
-) -> None:
-    for steps, moves in ((2, False), (3, True)):
-        folder = tmp_path / f"run{steps}"
-        done = train_here(
-            "camera=refined", "phase.cameras.start=2", *tiny_default_run, *LEARNED_SKY, "evaluation=none",
-            f"trainer.max_steps={steps}", f"hydra.run.dir={folder}",
-        )  # fmt: skip
-        assert done.code == 0, done.err
-        state = load_checkpoint(folder / "checkpoints" / "last.ckpt")[0]["state_dict"]
-        assert bool((state["renderer.scene.camera.motions.motion"][:, 3:] != 0).any()) is moves
-
-
 def test_cameras_move_by_sky_and_masks_before_training_and_their_priors_are_kept(
     train_here: Callable[..., Any], tiny_default_run: list[str], tiny_scene: Path, tmp_path: Path
 ) -> None:

@@ -8,23 +8,20 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 
 from nerfro.data.base import Views
 from nerfro.errors import NerfroError
 from nerfro.registry import discover
 
 from .formats import SCALE, SHIFT, write_idr
-from .photographs import CX, CY, FX, FY, POINTS
+from .photographs import POINTS
 
 discover()
 idr = import_module("nerfro_plugins.data_formats.idr")
 IdrData, decompose = idr.IdrData, idr.decompose
 
+
 # Pixel centres are whole numbers in these files.
-K = np.array([[FX, 0, CX - 0.5], [0, FY, CY - 0.5], [0, 0, 1]])
-
-
 @pytest.fixture
 def write(tmp_path: Path) -> Callable[..., Path]:
     return lambda **changes: write_idr(tmp_path, masks=True, **changes)
@@ -47,17 +44,6 @@ def test_the_files_own_world(write):
     torch.testing.assert_close(cameras.project(world)[1], SCALE * inside[1])
     with pytest.raises(NerfroError, match=r"data.world=file needs data.near and data.far"):
         IdrData(str(write()), world="file")
-
-
-@pytest.mark.parametrize("factor", [1.0, -3.0, 1e-3])
-def test_decomposition_does_not_depend_on_the_matrix_factor(factor):
-    rotation = Rotation.random(random_state=3).as_matrix()
-    centre = np.array([0.4, -2.0, 1.0])
-    projection = factor * K @ np.column_stack([rotation, -rotation @ centre])
-    pose, lens = decompose(projection, "here")
-    np.testing.assert_allclose(pose[:, :3], rotation.T, atol=1e-12)
-    np.testing.assert_allclose(pose[:, 3], centre, atol=1e-12)
-    assert (lens.fx, lens.fy, lens.cx, lens.cy) == pytest.approx((FX, FY, CX, CY))
 
 
 @pytest.mark.parametrize(

@@ -43,13 +43,6 @@ def levels(*shape: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, shape, dtype=np.uint8)
 
 
-def test_8bit_levels_are_divided_by_255(save):
-    picture = levels(5, 4, 3)
-    rgb = read_rgb(save(picture), "drop")
-    assert rgb.dtype == np.float32
-    np.testing.assert_allclose(rgb, picture / 255, rtol=1e-6)
-
-
 @pytest.mark.parametrize("suffix", [".png", ".tif"])
 @pytest.mark.parametrize("num_channels", [1, 3, 4])
 def test_16bit_levels_keep_all_their_bits(num_channels: int, suffix: str, tmp_path: Path):
@@ -73,18 +66,6 @@ def test_transparency_is_dropped_or_composited(save):
     np.testing.assert_allclose(read_rgb(path, "drop"), rgb, rtol=1e-6)
     np.testing.assert_allclose(read_rgb(path, "white"), rgb * opacity + 1 - opacity, atol=0.51 / 65535)
     np.testing.assert_allclose(read_rgb(path, "black"), rgb * opacity, atol=0.51 / 65535)
-
-
-def test_transparent_grey_is_composited(save):
-    picture = levels(5, 4, 2)
-    grey, opacity = picture[..., :1] / 255, picture[..., 1:] / 255
-    expected = np.repeat(grey * opacity + 1 - opacity, 3, -1)
-    np.testing.assert_allclose(read_rgb(save(picture), "white"), expected, atol=0.51 / 65535)
-
-
-def test_mask_is_the_share_of_the_pixel(save):
-    mask = np.array([[0, 51, 255]], np.uint8)
-    np.testing.assert_allclose(read_mask(save(mask)), [[0, 0.2, 1]], atol=1e-6)
 
 
 # Object 1 is left and object 2 right, on a background; both are larger than an outline.
@@ -179,12 +160,6 @@ def test_truncated_or_corrupt_image_is_named(save, kept):
         read_rgb(path, "drop")
 
 
-def test_file_that_is_no_image_is_named(tmp_path: Path):
-    (tmp_path / "image.png").write_text("no image")
-    with pytest.raises(NerfroError, match=r"image\.png cannot be read \(it is not an image\)"):
-        read_rgb(tmp_path / "image.png", "drop")
-
-
 @pytest.mark.parametrize("suffix", [".png", ".tif"])
 def test_truncated_16bit_image_is_named(suffix: str, tmp_path: Path):
     path = tmp_path / f"image{suffix}"
@@ -199,12 +174,6 @@ def test_tiff_of_floating_point_is_refused(tmp_path: Path):
     tifffile.imwrite(tmp_path / "image.tif", np.zeros((4, 4), np.float32))
     with pytest.raises(NerfroError, match=r"channels are float32; save it with 8 or 16 bits per channel"):
         read_rgb(tmp_path / "image.tif", "drop")
-
-
-def test_8bit_tiff_is_read(tmp_path: Path):
-    picture = levels(5, 4, 3)
-    tifffile.imwrite(tmp_path / "image.tif", picture, photometric="rgb")
-    np.testing.assert_allclose(read_rgb(tmp_path / "image.tif", "drop"), picture / 255, rtol=1e-6)
 
 
 def test_flipped_bit_in_an_8bit_image_is_found(save):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from nerfro.camera.base import Camera
-from nerfro.data.blender import BlenderData, OpenCVData
+from nerfro.data.blender import BlenderData
 from nerfro.data.lenses import Lens, check_lenses, read_lens
 from nerfro.data.nerfstudio import NerfstudioData
 from nerfro.errors import NerfroError
@@ -26,7 +26,6 @@ from .formats import (
     TRAIN,
     K,
     P,
-    change_json,
     write_colmap,
     write_idr,
     write_llff,
@@ -93,21 +92,13 @@ def test_distortion_is_read_in_the_conventions_of_nerfstudio_and_opencv(file: di
     [
         ({"is_fisheye": True}, "is_fisheye=True is not supported; undistort the images"),
         ({"ortho": True}, "ortho=True is not supported"),
-        ({"orthographic": 1}, "orthographic=1 is not supported"),
-        ({"equirectangular": True}, "equirectangular"),
-        ({"latlong": True}, "latlong"),
-        ({"ftheta_p0": 0.1}, "ftheta_p0"),
         ({"sk_x": 0.5}, "sk_x"),
         ({"K": CAM_MAT}, "K="),
         ({"focal_length": 35}, "focal_length=35 is not supported; .* state a perspective lens by fl_x"),
-        ({"intrinsics": "long"}, "intrinsics='long'"),
-        ({"spherical": True}, "spherical=True"),
         ({"lens": "fisheye"}, "lens='fisheye' is not supported"),
         ({"FL_X": 40}, "FL_X=40"),
-        ({"c_x": 3}, "c_x=3"),
         ({"camera_model": "OPENCV_FISHEYE"}, "camera_model='OPENCV_FISHEYE' is not supported; undistort"),
         ({"camera_type": "equirectangular"}, "camera_type='equirectangular' is not supported"),
-        ({"camera_model": True}, "camera_model=True is not supported"),
         ({"fl_x": True}, "fl_x=True is not allowed"),
         ({"fl_x": "long"}, "fl_x='long' is not allowed"),
         ({"k1": math.nan}, "k1=nan is not allowed; take a finite number"),
@@ -122,14 +113,6 @@ def test_keys_of_other_projections_are_refused(place: str, keys: dict, message: 
     with pytest.raises(NerfroError, match=rf"^it: .*{message}") as caught:
         read_lens(file, frame, SIZE, "it")
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("source", [BlenderData, OpenCVData, NerfstudioData])
-def test_lenses_of_all_frames_are_read_in_every_format(tmp_path: Path, source: Any) -> None:
-    root = write_transforms(tmp_path, {"camera_angle_x": ANGLE})
-    change_json(root / "transforms_train.json", lambda document: document["frames"][2].update(is_fisheye=True))
-    with pytest.raises(NerfroError, match="'train/r_4': is_fisheye=True is not supported"):
-        source(str(root), near=0.5, far=9.0).load("train")
 
 
 def test_blender_files_with_intrinsics_have_their_lens(tmp_path: Path) -> None:

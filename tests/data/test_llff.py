@@ -11,11 +11,10 @@ import torch
 
 from nerfro.data.base import Views
 from nerfro.errors import NerfroError
-from nerfro.files.foreign_config import foreign_config
-from nerfro.registry import build, discover
+from nerfro.registry import discover
 
 from .formats import FAR, IDEAL, NEAR, write_llff
-from .photographs import FX, HEIGHT, POINTS, WIDTH, check_views, project
+from .photographs import FX, HEIGHT, POINTS, WIDTH, project
 
 discover()
 llff = import_module("nerfro_plugins.data_formats.llff")
@@ -111,11 +110,6 @@ def test_video_frames_are_mapped_with_the_training_transformation(write, frame):
         np.testing.assert_allclose(found, project(seed, lens=IDEAL), atol=2e-4)
 
 
-def test_smaller_images_scale_the_focal_length(write):
-    root = write(size=(2 * HEIGHT, 2 * WIDTH, 2 * FX))  # calibrated at twice the size
-    check_views(load(root), [1, 2, 4, 5], lens=IDEAL)
-
-
 def test_wrong_files_are_refused(write):
     root = write()
     path = root / "poses_bounds.npy"
@@ -147,12 +141,3 @@ def test_parallel_cameras_have_no_sphere():
     with pytest.raises(NerfroError, match="all optical axes are parallel"):
         frame_transform(poses, np.array([[1.0, 2.0]] * 4), "eikonal")
     assert np.isfinite(frame_transform(poses, np.array([[1.0, 2.0]] * 4), "llff")).all()
-
-
-def test_configurations_of_earlier_releases_name_the_former_module(write: Callable[..., Path]) -> None:
-    source = build({"_target_": "nerfro.data.llff.LlffData", "root": str(write()), "frame": "file"})
-    assert isinstance(source, LlffData)
-    run = foreign_config("data: {_target_: nerfro.data.llff.LlffData}", Path("config.yaml"))
-    assert run.data._target_ == f"{LlffData.__module__}.LlffData"  # as of a new run, which can resume the old one
-    with pytest.raises(NerfroError, match=r"'other\.data\.LlffData' is not registered"):
-        build({"_target_": "other.data.LlffData", "root": "."})

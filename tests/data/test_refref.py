@@ -31,16 +31,6 @@ def test_splits_are_the_rows_in_turn_across_files_with_equal_bounds(tmp_path):
     assert views.names == ["image_0004.png", "image_0005.png"]
 
 
-def test_one_of_several_scenes(tmp_path):
-    root = write_refref(tmp_path)
-    write_refref(tmp_path, scene="env_mmncvx_jar", files=((5, 4),))
-    with pytest.raises(NerfroError, match=r"several scenes; choose data\.scene=cube_smcvx_ampoule, env_mmncvx_jar"):
-        RefRefData(str(root)).load("train")
-    check_views(RefRefData(str(root), scene="env_mmncvx_jar").load("train"), [5, 4], lens=REFREF_LENS)
-    with pytest.raises(NerfroError, match="holds 2 rows, none from 4 on"):
-        RefRefData(str(root), scene="env_mmncvx_jar").load("test")
-
-
 @pytest.mark.parametrize("image", ["text", 3, [1, 2], b"bytes", {"bytes": "text"}, {"path": "a.png"}])
 def test_rows_without_an_image_are_named(tmp_path, image):
     parquet, pyarrow = pytest.importorskip("pyarrow.parquet"), pytest.importorskip("pyarrow")

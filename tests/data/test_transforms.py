@@ -44,13 +44,6 @@ def edit(root: Path, change: Callable[[dict], Any]) -> Path:
 # Blender and OpenCV
 
 
-def test_frames_keep_the_order_and_the_names_of_the_file(tmp_path: Path) -> None:
-    root = edit(write_blender(tmp_path), lambda d: d["frames"][1].update(file_path="train\\r_2.png"))
-    (root / "train/r_4.png").rename(root / "train/r.004.png")  # the dot is no extension
-    edit(root, lambda d: d["frames"][2].update(file_path="train/r.004"))
-    assert BlenderData(str(root)).load("train").names == ["train/r_1", "train/r_2.png", "train/r.004", "train/r_5"]
-
-
 def test_extensions_are_found_in_lower_and_upper_case(tmp_path: Path) -> None:
     root = write_blender(tmp_path)
     (root / "train/r_1.png").rename(root / "train/r_1.PNG")
@@ -148,14 +141,6 @@ def test_wrong_transforms_files_give_one_clear_line(
     assert "\n" not in str(caught.value)
 
 
-def test_one_image_in_many_frames_is_refused_before_poses_are_read(tmp_path: Path) -> None:
-    root = edit(
-        write_blender(tmp_path), lambda d: d.update(frames=100_000 * [d["frames"][0] | {"transform_matrix": 1}])
-    )
-    with pytest.raises(NerfroError, match="'train/r_1' occurs in several frames; keep one"):
-        BlenderData(str(root)).load("train")
-
-
 def test_files_without_the_expected_content_are_named(tmp_path: Path) -> None:
     for source in (BlenderData, NerfstudioData):
         with pytest.raises(NerfroError, match=r"holds no transforms_<split>\.json"):
@@ -218,15 +203,6 @@ def test_every_tenth_frame_by_name_is_a_test_view(tmp_path: Path) -> None:
     assert load(root, "val").names == load(root, "test").names
 
 
-def test_listed_splits_are_taken_in_their_order(tmp_path: Path) -> None:
-    lists = {f"{s}_filenames": [f"images/f_{i}.png" for i in n] for s, n in (("train", (3, 1)), ("test", (0,)))}
-    root = write_nerfstudio(tmp_path, top=SHARED | lists)
-    check_views(load(root), [3, 1])
-    check_views(load(root, "test"), [0])
-    with pytest.raises(NerfroError, match="no 'val_filenames'"):
-        load(root, "val")
-
-
 def test_a_file_for_each_split_and_a_field_of_view_instead_of_a_focal_length(tmp_path: Path) -> None:
     root = write_nerfstudio(tmp_path, seeds=(1, 0), top={"camera_angle_x": ANGLE}, name="transforms_train.json")
     assert NerfstudioData(str(root), near=0.5, far=9.0).splits == ["train"]
@@ -262,11 +238,6 @@ def test_grey_of_mask_path_counts_as_the_nearer_level_and_labels_are_0_and_1(tmp
     for mask in (levels, levels - 127):
         Image.fromarray(mask).save(root / "mask.png")
         assert np.argwhere(usable(load(root))).tolist() == [[0, 3, 5]]
-
-
-def test_all_pixels_are_usable_without_mask_path(tmp_path: Path) -> None:
-    assert load(write_nerfstudio(tmp_path)).usable is None
-    assert load(write_nerfstudio(tmp_path, frame=lambda i: {"mask_path": None})).usable is None
 
 
 @pytest.mark.parametrize(

@@ -46,17 +46,6 @@ def test_held_back_views_are_val_and_the_others_train(tiny_scene: Path) -> None:
     assert many.load("val").names == train.names
 
 
-def test_views_of_tensors_are_chosen_with_all_they_have(tiny_scene: Path) -> None:
-    views = BlenderData(str(tiny_scene), near=2.0, far=6.0).load("train")
-    images = torch.stack(list(views.images))
-    masks, usable = images[..., 0], images[..., 1] > 0.5
-    chosen = Views(views.cameras, images, masks, views.names, usable).select([2, 0])
-    assert torch.equal(chosen.images, images[[2, 0]])
-    assert torch.equal(chosen.masks, masks[[2, 0]])
-    assert torch.equal(chosen.usable, usable[[2, 0]])
-    assert chosen.names == [views.names[2], views.names[0]]
-
-
 def test_a_run_never_draws_what_it_holds_back(
     train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

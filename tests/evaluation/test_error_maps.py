@@ -13,21 +13,6 @@ from nerfro.files.drawing import magma
 from nerfro.files.images import load_png, round_to_8bit
 
 
-def test_colours_grow_brighter_with_the_value() -> None:
-    ramp = magma(torch.linspace(0, 2, 256)[None], limit=2.0)[0]
-    linear = torch.where(ramp <= 0.04045, ramp / 12.92, ((ramp + 0.055) / 1.055) ** 2.4)
-    luminance = linear @ torch.tensor([0.2126, 0.7152, 0.0722])
-    assert (luminance.diff() > 0).all()
-    assert luminance[0] < 0.01
-    assert luminance[-1] > 0.9
-
-
-def test_scale_is_fixed_and_not_fitted_to_the_values() -> None:
-    small, large = torch.tensor([[0.0, 0.01]]), torch.tensor([[0.0, 0.01, 7.0]])
-    assert torch.equal(magma(small, 0.05)[0], magma(large, 0.05)[0, :2])
-    assert torch.equal(magma(large, 0.05)[0, 2], magma(torch.tensor([[0.05]]), 0.05)[0, 0])
-
-
 class Difference(torch.nn.Module):
     """Stands in for a network of LPIPS."""
 

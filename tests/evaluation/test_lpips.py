@@ -9,10 +9,9 @@ import torchmetrics
 from torch import Tensor
 
 from nerfro.errors import NerfroError
-from nerfro.evaluation import lpips, pretrained
+from nerfro.evaluation import pretrained
 from nerfro.evaluation.lpips import (
     CONVOLUTIONS,
-    MIN_SIZE,
     LpipsNetwork,
     MissingNetwork,
     find_lpips_network,
@@ -95,26 +94,6 @@ def test_distance_on_a_mask_is_the_mean_of_the_map_there(network: LpipsNetwork) 
     inside[5:20, 7:30] = True
     expected = network.distance_map(prediction, target)[5:20, 7:30].mean()
     assert network(prediction, target, inside).item() == pytest.approx(expected.item(), abs=1e-7)
-
-
-def test_smallest_picture_is_the_smallest_that_the_network_takes(
-    network: LpipsNetwork, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    fits, smaller = torch.rand(2, MIN_SIZE, MIN_SIZE, 3), torch.rand(2, MIN_SIZE - 1, 64, 3)
-    assert torch.isfinite(network(*fits))
-    with pytest.raises(NerfroError, match=f"at least {MIN_SIZE} x {MIN_SIZE} pixels"):
-        network(*smaller)
-    monkeypatch.setattr(lpips, "MIN_SIZE", 0)
-    with pytest.raises(RuntimeError):  # the limit is not stricter than it must be
-        network(*smaller)
-
-
-def test_distance_does_not_depend_on_mixed_precision(network: LpipsNetwork) -> None:
-    generator = torch.Generator().manual_seed(0)
-    prediction, target = torch.rand(2, 48, 48, 3, generator=generator)
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        mixed = network(prediction, target)
-    assert mixed.item() == network(prediction, target).item()
 
 
 def test_model_that_holds_the_network_neither_trains_nor_stores_it(network: LpipsNetwork) -> None:

@@ -29,27 +29,7 @@ def test_views_table_has_a_row_for_each_view_and_their_mean() -> None:
     assert table.notes == ("LPIPS n/a: no network",)
 
 
-def test_views_table_of_a_region_has_its_numbers_and_reasons() -> None:
-    table = views_table(REGIONS, "test views", "crop")
-    assert table.rows == (line("r_0", 15.0), line("r_1", 16.0))
-    assert table.notes == ("SSIM n/a: crops too small", "LPIPS n/a: no network")
-
-
 def test_regions_table_has_their_means_and_each_reason_once() -> None:
     table = regions_table(REGIONS, "means")
     assert table.rows == (line("full", 20.5), line("mask", 10.0), line("crop", 15.5))
     assert table.notes == ("SSIM n/a: crops too small", "LPIPS n/a: no network")
-
-
-def test_a_column_with_some_numbers_stays() -> None:
-    views = (ViewScores("a", {**scores(20.0), "ssim": 0.5}), ViewScores("b", scores(21.0)))
-    table = views_table(EvaluationResult(views, {"ssim": "images below 11 pixels"}), "t")
-    assert [column.title for column in table.columns] == ["PSNR", "SSIM", "FLIP"]
-    assert table.summary[0].values == (20.5, None, 0.5)
-
-
-def test_views_without_the_object_are_told_once_for_both_regions() -> None:
-    nothing = {"mask": scores(None), "crop": scores(None)}
-    result = EvaluationResult((ViewScores("r_0", scores(20.0), nothing),), {"mask": "the mask is empty in r_0"})
-    assert [column.title for column in views_table(result, "t", "mask").columns] == ["FLIP"]
-    assert regions_table(result, "t").notes == ("Mask and crop n/a: the mask is empty in r_0",)

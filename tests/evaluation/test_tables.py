@@ -2,17 +2,14 @@ import csv
 import io
 import re
 
-import pytest
 import rich.console
 
-from nerfro.errors import NerfroError
 from nerfro.evaluation.tables import (
     Column,
     Row,
     Table,
     to_csv,
     to_latex,
-    to_markdown,
     to_rich,
 )
 
@@ -58,16 +55,6 @@ def test_csv_reads_back_every_digit() -> None:
         assert numbers[1::2] == (row.spreads or (None,) * 4)
 
 
-def test_markdown_has_as_many_cells_in_every_line() -> None:
-    lines = [line for line in to_markdown(TABLE).splitlines() if line.startswith("|")]
-    cells = [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines]
-    assert {len(row) for row in cells} == {5}
-    assert cells[0] == ["method", "A & co PSNR ↑", "A & co LPIPS ↓", "B PSNR ↑", "B steps"]
-    assert cells[2] == [r"mip_nerf\|sky", "22.08 🥈", "n/a", "1.00", "1500"]
-    assert cells[3] == ["w/o #H", "22.08 ± 0.50 🥈", "0.250 🥈", "2.00 🥉", "1500"]
-    assert cells[6] == ["*mean*", "*22.86*", "*n/a*", "*2.50*", "*1500*"]
-
-
 def test_latex_is_a_booktabs_table_with_special_characters_escaped() -> None:
     latex = to_latex(TABLE)
     assert re.search(r"(?<!\\)[_#%]|±", latex) is None
@@ -101,9 +88,3 @@ def test_console_prints_square_brackets_as_they_are() -> None:
     console = rich.console.Console(file=io.StringIO())
     console.print(to_rich(Table("t", "view", (Column("PSNR"),), (Row("[red]x", (1.0,)),))))
     assert "[red]x" in console.file.getvalue()
-
-
-@pytest.mark.parametrize("row", [Row("a", (1.0,)), Row("a", (1.0, 2.0), (0.1,))])
-def test_values_and_spreads_that_do_not_fit_the_columns_are_refused(row: Row) -> None:
-    with pytest.raises(NerfroError, match="1 values of 'a' for 2 columns"):
-        Table("t", "view", (Column("x"), Column("y")), (row,))

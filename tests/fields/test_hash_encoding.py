@@ -70,16 +70,6 @@ def test_kernels_match_the_reference_forward_and_backward(num_points: int) -> No
         torch.testing.assert_close(ours, reference, rtol=1e-5, atol=1e-5 * float(reference.abs().max()))
 
 
-def test_gradients_are_those_of_differences() -> None:
-    # A dense level of one cell, a dense one of 27 vertices and a hashed one; places outside the cube do not move.
-    levels = hash_encoding.grid_levels(num_levels=3, base_resolution=1, finest_resolution=6, log2_table_size=5)
-    assert levels.dense == (True, True, False)
-    generator = torch.Generator().manual_seed(5)
-    positions = (1.4 * torch.rand(12, 3, generator=generator, dtype=torch.float64) - 0.2).requires_grad_()
-    table = torch.randn(levels.num_entries, 2, generator=generator, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda p, t: hash_encoding.hash_encode(p, t, levels), (positions, table))
-
-
 def test_positions_learn_after_a_picture_was_rendered() -> None:
     # Tensors made in inference mode, as pictures are, cannot be saved for a gradient, and constants are kept.
     constant.cache_clear()

@@ -5,7 +5,6 @@ from itertools import pairwise
 import pytest
 import torch
 from torch import Tensor, nn
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from nerfro.fields.relu_mlp import relu_mlp
 
@@ -47,36 +46,3 @@ def test_inputs_side_by_side_of_which_one_learns() -> None:
     torch.testing.assert_close(result, expected)
     (mine,), (theirs,) = (torch.autograd.grad(x.square().sum(), first) for x in (result, expected))
     torch.testing.assert_close(mine, theirs)
-
-
-def test_points_of_several_blocks_equal_a_sequential() -> None:
-    mlp = layers(6, 8, 3)
-    inputs = torch.randn(2 * 16384 + 700, 6, requires_grad=True)
-    result, expected = relu_mlp(inputs, weights(mlp), torch.float32), mlp(inputs)
-    torch.testing.assert_close(result, expected)
-    for mine, theirs in zip(
-        *(torch.autograd.grad(x.sin().sum(), [inputs, *weights(mlp)]) for x in (result, expected)), strict=True
-    ):
-        torch.testing.assert_close(mine, theirs, rtol=1e-4, atol=1e-4)
-
-
-class _Products(TorchDispatchMode):
-    """Collects the shapes of matrix products."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.shapes: set[tuple[torch.Size, torch.Size]] = set()
-
-    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
-        if function.overloadpacket is torch.ops.aten.mm:
-            self.shapes.add((args[0].shape, args[1].shape))
-        return function(*args, **kwargs or {})
-
-
-def test_ever_different_numbers_of_points_make_few_shapes_of_products() -> None:
-    """oneDNN keeps a program for each: 5 MB a step were left behind."""
-    mlp, generator = layers(4, 8, 3), torch.Generator().manual_seed(0)
-    with _Products() as products:
-        for count in torch.randint(1, 50000, (40,), generator=generator).tolist():
-            relu_mlp(torch.randn(count, 4, requires_grad=True), weights(mlp), torch.float32).sum().backward()
-    assert len(products.shapes) <= 6 * 8  # two products forward and four backward, of eight numbers of rows each

@@ -5,7 +5,6 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from nerfro.errors import NerfroError
 from nerfro.fields import relu_mlp
 from nerfro.fields.hash_grid import HashGridField
 from nerfro.training.trainer import lightning_precision
@@ -29,11 +28,6 @@ def test_a_field_multiplies_in_what_the_machine_does_fast(has_units: bool, monke
     for precision in (None, "bfloat16", "float32"):
         HashGridField(num_levels=2, log2_table_size=6, precision=precision).density(positions)
     assert used == [torch.bfloat16 if has_units else torch.float32, torch.bfloat16, torch.float32]
-
-
-def test_other_kinds_of_number_are_refused() -> None:
-    with pytest.raises(NerfroError, match="choose 'bfloat16', 'float32'"):
-        HashGridField(precision="int8")  # type: ignore[arg-type]
 
 
 def test_the_trainer_takes_the_fastest_where_it_is_told_to(has_units: bool) -> None:

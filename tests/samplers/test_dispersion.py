@@ -110,13 +110,6 @@ def test_bands_bring_their_gradients_to_the_one_index() -> None:
     assert found.shape == (21, 3)
 
 
-def test_an_index_that_learns_keeps_its_abbe_number() -> None:
-    index = torch.tensor([1.5], dtype=torch.float64, requires_grad=True)
-    medium = Ball(abbe=[30.0]).with_indices(index)
-    (gradient,) = torch.autograd.grad(medium.at_wavelength(450).iors.sum(), index)
-    assert float(gradient) == pytest.approx((cauchy(1.6, 30, 450) - cauchy(1.5, 30, 450)) / 0.1)
-
-
 def test_what_cannot_be_dispersed_is_refused() -> None:
     with pytest.raises(NerfroError, match="one for each body"):
         Ball(abbe=[30.0, 40.0])

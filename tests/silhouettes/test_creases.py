@@ -60,18 +60,3 @@ def test_only_sharp_bodies_have_creases() -> None:
     ball, sharp = trimesh.creation.icosphere(3), box().subdivide_to_size(0.1)
     for made, expected in ((ball, False), (sharp, True)):
         assert has_creases(MovingMesh(np.asarray(made.faces)).surface(np.asarray(made.vertices))) is expected
-
-
-def test_a_vertex_that_is_off_makes_no_crease() -> None:
-    made = trimesh.creation.icosphere(4)
-    vertices = np.asarray(made.vertices).copy()
-    vertices[1000] *= 1.05  # eleven edges around it are sharp by their triangles alone
-    assert len(MovingMesh(np.asarray(made.faces)).surface(vertices).creases) == 0
-
-
-def test_an_open_mesh_has_no_crease_where_it_ends() -> None:
-    """Its border is no sharp edge, and one triangle alone has no other side."""
-    vertices, faces = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.9]]), np.array([[0, 1, 2], [0, 2, 3]])
-    surface = MovingMesh(faces).surface(vertices)
-    assert surface.creases.tolist() == [[0, 2]]
-    assert surface.beside.shape == (1, 2, 3)

@@ -5,7 +5,6 @@ import pytest
 import torch
 import trimesh
 
-from nerfro.silhouettes import silhouette_fit
 from nerfro.silhouettes.moving_mesh import MovingMesh
 from nerfro.silhouettes.pixel_sides import by_pixel_sides
 from nerfro.silhouettes.rims import Rims, find_rims, outlines_of
@@ -72,22 +71,6 @@ def test_a_fit_is_as_large_as_the_body() -> None:
     fitted = fit_surface(hull(silhouettes, 24), silhouettes)
     beyond = axes.mean() * (np.linalg.norm((fitted.vertices - MIDDLE) / axes, axis=1) - 1)
     assert abs(beyond.mean()) < 0.05 * pixel(size)
-
-
-def test_masks_that_are_wrong_are_not_looked_at_by_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
-    cameras = cameras_around(12, 32)
-    masks = photographed(ball(), cameras).masks
-    wrong = Silhouettes.of(cameras, torch.stack([mask.roll(view % 3, 0) for view, mask in enumerate(masks)]))
-    monkeypatch.setattr(silhouette_fit, "by_pixel_sides", None)
-    fit_surface(hull(wrong, 16), wrong)
-
-
-def test_rims_at_the_frame_know_only_the_pixels_in_it() -> None:
-    cameras = cameras_around(4, 24, focal=3.0)  # the ball is cut by all four sides
-    silhouettes = photographed(ball(), cameras)
-    rims = seen(RADIUS, silhouettes)[1]
-    assert np.isfinite(rims.misfit).all()
-    assert np.isfinite(rims.weight).all()
 
 
 def test_masks_in_black_and_white_are_told_from_those_of_shares(silhouettes: Silhouettes) -> None:

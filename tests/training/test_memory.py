@@ -69,15 +69,6 @@ def test_what_does_not_fit_is_refused_before_it_is_begun(monkeypatch: pytest.Mon
         require_bytes(3e9, "medium.resolution=900")
 
 
-def test_share_of_a_steps_rays_stands_for_all(monkeypatch: pytest.MonkeyPatch) -> None:
-    model, rays, device = model_of(64), example_rays(), torch.device("cpu")
-    monkeypatch.setattr(memory, "available_bytes", lambda: 1e12)
-    line = require_memory(model, rays, device, share=0.01)
-    assert f"each of {100 * len(rays)} rays a step" in line
-    with pytest.raises(NerfroError, match="needs about"):
-        require_memory(model, rays, device, share=1e-9)
-
-
 def needed_gigabytes(model: Renderer, monkeypatch: pytest.MonkeyPatch) -> float:
     monkeypatch.setattr(memory, "available_bytes", lambda: -1e12)
     with pytest.raises(NerfroError) as refused:
@@ -101,10 +92,3 @@ def test_memory_of_a_gpu_is_estimated_there_and_holds_the_pixels(monkeypatch: py
         with pytest.raises(NerfroError, match=r"needs about 2\.\d GB of cuda memory and 1\.0 GB are free"):
             require_memory(model, example_rays(), GPU, pixel_bytes=int(2e9))
     assert all(isinstance(parameter, OnGpu) for parameter in model.parameters())
-
-
-def test_gpu_training_needs_main_memory_for_the_checkpoint(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (1e12, 1e12))
-    monkeypatch.setattr(memory, "available_bytes", lambda: 1e8)
-    with PretendedGpu(), pytest.raises(NerfroError, match="GB of main memory"):
-        require_memory(model_of(16), example_rays(), GPU)

@@ -88,9 +88,3 @@ def test_the_last_matching_pattern_decides_and_a_misspelt_one_is_refused() -> No
     assert grouped("bodies.*.material.absorption") == {"common": names}, "a group of an experiment may be absent"
     with pytest.raises(NerfroError, match=r"bodies\.glas\.\* matches no .*choose from .*bodies\.glass\.material\.ior"):
         grouped("bodies.glas.*")
-
-
-@pytest.mark.parametrize("wrong", [{"learning_rate": 0.0}, {"final_learning_rate": -1.0}, {"warmup_steps": -1}])
-def test_impossible_settings_are_refused(wrong: dict[str, Any]) -> None:
-    with pytest.raises(NerfroError, match=r"optimizer: .* is not allowed; take"):
-        OptimizerConfig(**wrong)

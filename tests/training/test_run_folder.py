@@ -5,9 +5,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from importlib.machinery import ModuleSpec
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -16,9 +14,7 @@ from omegaconf import OmegaConf
 
 from nerfro.cli import entry_point
 from nerfro.errors import NerfroError
-from nerfro.files.atomic import write_atomically
-from nerfro.files.folder_lock import hold, lock_folder
-from nerfro.training import run_folder
+from nerfro.files.folder_lock import hold
 from nerfro.training.config import TrainConfig
 from nerfro.training.data_module import RayDataModule
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
@@ -166,14 +162,6 @@ def test_file_in_place_of_the_run_folder_is_told(below: str, train: Callable[...
     assert (tmp_path / "file").read_text() == "mine"
 
 
-def test_folder_is_locked_several_times_over_by_one_process(tmp_path: Path) -> None:
-    with lock_folder(tmp_path, "out"):
-        with lock_folder(tmp_path, "out"):
-            pass
-        write_atomically(tmp_path / "a", "b")
-    assert (tmp_path / "a").is_file()
-
-
 def test_what_killed_processes_were_writing_goes_and_what_others_write_stays(
     train: Callable[..., Any], begun: Path
 ) -> None:
@@ -293,12 +281,3 @@ def test_checkpoints_that_cannot_be_resumed_are_refused_in_one_line(
     assert resumed.code == 1
     assert message in resumed.err
     assert len([line for line in resumed.err.splitlines() if line.startswith("nerfro: error: ")]) == 1
-
-
-@pytest.mark.parametrize(("spec", "program"), [(ModuleSpec("nerfro.train", None), "-m nerfro.train"), (None, "own.py")])
-def test_the_recorded_command_starts_the_same_program(
-    spec: ModuleSpec | None, program: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "__main__", SimpleNamespace(__spec__=spec))
-    monkeypatch.setattr(sys, "argv", ["own.py", "seed=1"])
-    assert run_folder._command() == f"{Path(sys.executable).name} {program} seed=1"

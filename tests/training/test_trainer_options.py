@@ -202,12 +202,6 @@ def test_a_run_is_profiled_and_has_neither_bar_nor_checkpoints_on_its_way(
     assert "run_training_batch" in finished.out
 
 
-@pytest.mark.parametrize("name", get_args(get_args(get_type_hints(TrainerConfig, include_extras=True)["profiler"])[1]))
-def test_every_profiler_exists_in_lightning(name: str, tmp_path: Path) -> None:
-    profiler = nerfro.training.trainer._profiler(name, tmp_path)
-    assert type(profiler).__name__.lower() == f"{name}profiler"
-
-
 @pytest.mark.usefixtures("restored_registry")
 def test_callbacks_are_chosen_by_name(
     train: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch

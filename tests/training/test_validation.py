@@ -11,7 +11,6 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import torch
-from lightning.pytorch import Trainer
 from PIL import Image
 
 from nerfro.camera.given import GivenCamera
@@ -23,10 +22,9 @@ from nerfro.rendering import ColourSpace, Renderer, Scene
 from nerfro.samplers.paths.snell import Snell
 from nerfro.subdivision import Subdivision
 from nerfro.training.data_module import NO_IMAGE, RayDataModule, RotatingView, validation_interval
-from nerfro.training.module import TrainingModule
 from nerfro.training.ray_batches import RayBatches
 from nerfro.training.validation import OverfittingWarning, ValidationPixels
-from nerfro.types import Batch, Rays, mean_per_pixel
+from nerfro.types import Rays, mean_per_pixel
 
 LINE = "the model overfits"
 
@@ -86,18 +84,6 @@ def test_photographs_known_by_heart_are_told_once(learn: Callable[..., Any], noi
 def test_a_gap_in_two_successive_validations_is_overfitting(looks: list[tuple[float, float]], told: list[int]) -> None:
     warning = OverfittingWarning()
     assert [step for step, look in enumerate(looks) if warning.judge(step, *look) is not None] == told
-
-
-@pytest.mark.parametrize("moves", [True, False])
-def test_where_cameras_are_refined_training_and_validation_are_not_compared(
-    moves: bool, capsys: pytest.CaptureFixture[str]
-) -> None:
-    warning, module = OverfittingWarning(), Mock(spec=TrainingModule, scene=Mock(camera=Mock(moves=moves)))
-    trainer = Mock(spec=Trainer, global_step=9, callback_metrics={"val/psnr": 20.0}, is_global_zero=True)
-    for _ in range(2):
-        warning.on_train_batch_end(trainer, module, {"squared_error": 1e-3}, Mock(spec=Batch), 0)
-        warning.on_validation_end(trainer, module)
-    assert (LINE in "".join(capsys.readouterr())) != moves
 
 
 def test_a_resumed_run_remembers_and_says_nothing_twice() -> None:

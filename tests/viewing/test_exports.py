@@ -5,7 +5,6 @@ import math
 import shutil
 import subprocess
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 from xml.etree import ElementTree
@@ -20,7 +19,6 @@ from omegaconf import OmegaConf
 from PIL import Image
 
 from nerfro.errors import NerfroError
-from nerfro.geometry.mesh import TriangleMesh
 from nerfro.light import to_linear, to_srgb
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.subdivision import Subdivision
@@ -132,16 +130,6 @@ def test_glb_passes_khronos_validator(scene: TrainedScene, tmp_path: Path) -> No
     # The validator sees what is wrong.
     (tmp_path / "bad.glb").write_bytes((tmp_path / "ball.glb").read_bytes().replace(b'"SCALAR"', b'"VECTOR"'))
     assert validated(tmp_path / "bad.glb")["issues"]["numErrors"] > 0
-
-
-def test_small_components_are_left_out() -> None:
-    large, small = trimesh.creation.icosphere(4, 1.0), trimesh.creation.icosphere(0, 0.1).apply_translation([3, 0, 0])
-    both = trimesh.util.concatenate([small, large])
-    largest_components = import_module("nerfro_plugins.mesh_exports.meshes").largest_components
-    kept = largest_components(TriangleMesh(np.asarray(both.vertices), np.asarray(both.faces)))
-    assert len(kept.faces) == len(large.faces)
-    assert np.linalg.norm(kept.vertices, axis=1).max() < 1.01
-    assert trimesh.Trimesh(kept.vertices, kept.faces).volume == pytest.approx(large.volume)
 
 
 @pytest.mark.parametrize("suffix", [".hdr", ".exr", ".png"])

@@ -8,7 +8,6 @@ import torch
 from nerfro.errors import NerfroError
 from nerfro.files import lat_long
 from nerfro.samplers.paths.snell import Snell
-from nerfro.subdivision import Subdivision
 from nerfro.variants import variant
 from nerfro.viewing.changes import with_changed_scene
 from nerfro.viewing.trained_scene import TrainedScene
@@ -97,17 +96,6 @@ def test_the_sky_is_read_and_replaced_as_linear_radiance(scene: TrainedScene, tm
     assert (rendered.radiance[up > 0.1] - 3).abs().max() < 0.05
     assert (rendered.radiance[up < -0.1] - 0.25).abs().max() < 0.01
     assert rendered.rgb.max() == 1
-
-
-def test_pictures_do_not_depend_on_chunks_and_carry_their_subdivision(scene: TrainedScene) -> None:
-    camera = scene.cameras().select([2])
-    whole, pieces = scene.render(camera), scene.render(camera, chunk_size=100)
-    for one, other in zip(whole, pieces, strict=True):
-        torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-5)
-    fine = scene.render(camera.resized(96, 96)).radiance
-    mean = fine.view(1, 32, 3, 32, 3, 3).mean((2, 4))
-    parts = scene.render(camera, Subdivision(3)).radiance
-    torch.testing.assert_close(parts, mean, atol=1e-5, rtol=1e-5)
 
 
 class Bounded(SolidBall):

@@ -34,15 +34,6 @@ def test_page_and_its_news(server: PageServer) -> None:
     assert json.loads(get(server, "/state?after=1")[1])["news"] is None
 
 
-def test_a_long_curve_is_thinned_and_keeps_its_end(server: PageServer) -> None:
-    for step in range(0, 12350, 10):
-        server.add_loss(step, 0.5)
-    losses = json.loads(server.state(0))["losses"]
-    assert 300 < len(losses) <= 500
-    assert losses[-1] == [12340, 0.5]
-    assert [step for step, _ in losses] == sorted(step for step, _ in losses)
-
-
 @pytest.mark.parametrize("path", ["/../pyproject.toml", "/etc/passwd", "/%2e%2e/pyproject.toml", "/index.html"])
 def test_nothing_else_is_served(server: PageServer, path: str) -> None:
     assert get(server, path)[0] == 404
