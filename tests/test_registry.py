@@ -229,9 +229,3 @@ def test_mistake_in_an_experiment_file_is_told_in_one_line(
     for word in words:
         assert word in line
     assert not list((tmp_path / "run").rglob("*")), "nothing is written"
-
-
-def test_an_integer_of_hundreds_of_digits_is_refused_in_one_line() -> None:
-    with pytest.raises(NerfroError, match=r"medium=ball: .*too large") as refused:
-        configure(find("medium", "ball"), {"ior": 10**400})
-    assert "\n" not in str(refused.value)

@@ -170,12 +170,6 @@ def test_truncated_16bit_image_is_named(suffix: str, tmp_path: Path):
     assert len(str(raised.value).splitlines()) == 1
 
 
-def test_tiff_of_floating_point_is_refused(tmp_path: Path):
-    tifffile.imwrite(tmp_path / "image.tif", np.zeros((4, 4), np.float32))
-    with pytest.raises(NerfroError, match=r"channels are float32; save it with 8 or 16 bits per channel"):
-        read_rgb(tmp_path / "image.tif", "drop")
-
-
 def test_flipped_bit_in_an_8bit_image_is_found(save):
     path = save(levels(20, 20, 3))
     content = bytearray(path.read_bytes())

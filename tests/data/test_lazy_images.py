@@ -34,16 +34,6 @@ def test_pictures_are_in_the_order_of_their_files_and_means_of_blocks(tmp_path: 
     torch.testing.assert_close(torch.stack(list(half)), mean, rtol=0, atol=0.51 / 65535)
 
 
-def test_8_bits_among_16_keep_their_values(tmp_path: Path) -> None:
-    paths, levels = save(tmp_path, 2)
-    deep = np.random.default_rng(1).integers(0, 65536, (4, 6), dtype=np.uint16)
-    Image.fromarray(deep).save(paths[1])
-    pictures = LazyImages.of(paths, read)
-    assert torch.equal(pictures[0], torch.from_numpy(levels[0].astype(np.float32) / 255))
-    assert torch.equal(pictures[1], torch.from_numpy(deep.astype(np.float32) / 65535)[..., None].expand(-1, -1, 3))
-    assert {picture.dtype for picture in pictures.all_levels()} == {np.dtype(np.uint16)}
-
-
 def test_only_a_few_pictures_are_decoded_ahead(tmp_path: Path) -> None:
     paths, _ = save(tmp_path, 60)
     decoded: list[Path] = []

@@ -58,12 +58,6 @@ def test_read_returns_what_was_written(tmp_path: Path, budget: tuple) -> None:
     assert read_metrics_json(tmp_path / "metrics.json") == RunMetrics(result(), *budget)
 
 
-def test_mean_over_some_of_the_views_is_not_given() -> None:
-    views = (ViewScores("a", scores(psnr=20.0)), ViewScores("b", scores(psnr=30.0, ssim=0.9)))
-    assert EvaluationResult(views).means() == scores(psnr=25.0)
-    assert EvaluationResult(()).mean("psnr") is None
-
-
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 def test_numbers_that_json_lacks_are_refused_and_the_old_file_stays(tmp_path: Path, bad: float) -> None:
     path = tmp_path / "metrics.json"

@@ -60,8 +60,3 @@ def test_world_length_is_its_inverse() -> None:
     for impact_parameter in IMPACT_PARAMETERS:
         length = contracted_length(t, impact_parameter, RADIUS)
         torch.testing.assert_close(world_length(length, impact_parameter, RADIUS), t, rtol=1e-6, atol=1e-9)
-
-
-def test_places_pass_gradients() -> None:
-    x = (CENTRE + torch.tensor([[0.3, 0.2, -0.4], [3.0, -1.0, 2.0], [0.0, 0.0, -90.0]])).requires_grad_()
-    assert torch.autograd.gradcheck(lambda x: (contract(x, CENTRE, RADIUS), contraction_scale(x, CENTRE, RADIUS)), x)

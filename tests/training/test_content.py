@@ -5,9 +5,7 @@ import pytest
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from nerfro.allowed import check_settings
 from nerfro.cameras import Cameras
-from nerfro.errors import NerfroError
 from nerfro.media.analytic import Vacuum
 from nerfro.training.config import TrainConfig
 from nerfro.training.content import common_target, describe, settle_content
@@ -66,10 +64,3 @@ def test_a_box_covers_nothing_else_and_needs_no_cameras() -> None:
     settle_content(config, Vacuum())
     assert config.content.radius is None
     assert describe(config.content) == ""
-
-
-def test_unknown_spaces_are_refused() -> None:
-    config = OmegaConf.structured(TrainConfig)
-    config.content.space = "some"
-    with pytest.raises(NerfroError, match=r"content\.space='some' is not allowed; choose 'box', 'all'"):
-        check_settings(config, TrainConfig)
