@@ -22,9 +22,11 @@ from torch.autograd.function import once_differentiable
 from nerfro.fields.hash_encoding import HASH_Y, HASH_Z, NUM_FEATURES, GridLevels
 from nerfro.kernels.arrays import arrays
 from nerfro.kernels.compilation import compiled, compiled_parallel
-from nerfro.kernels.threads import num_threads
+from nerfro.kernels.threads import num_threads, share
 
 _BLOCK = 512
+# Parts that threads of Python share: a number of points in the forward pass, and of levels in the backward pass.
+_PART, _LEVEL_PARTS = 16 * _BLOCK, 4
 _ONE = np.float32(1)
 # Hashes have 32 bits.
 _UINT, _Y, _Z = np.uint32, np.uint32(HASH_Y), np.uint32(HASH_Z)
@@ -45,8 +47,13 @@ class _HashEncode(torch.autograd.Function):
         ctx.save_for_backward(positions, table)
         ctx.levels = levels
         features = positions.new_empty(positions.shape[1], NUM_FEATURES * len(levels))
-        places, entries = arrays(positions, table)
-        _forward(places, entries, *_layout(levels), features.numpy())
+        (places, entries), layout, num_points = arrays(positions, table), _layout(levels), positions.shape[1]
+
+        def encode(part: int) -> None:
+            first, end = part * _PART, min((part + 1) * _PART, num_points)
+            _forward(places, entries, *layout, first, end, features.numpy())
+
+        share(encode, -(-num_points // _PART))
         return features
 
     @staticmethod
@@ -61,7 +68,7 @@ class _HashEncode(torch.autograd.Function):
             _backward_to_positions(places, entries, upstream, *layout, of_positions.numpy())
         if ctx.needs_input_grad[1]:
             of_table = torch.zeros(table.shape)
-            _backward(places, upstream, *layout, min(threads, len(ctx.levels)), of_table.numpy())
+            share(lambda part: _backward(places, upstream, *layout, part, threads, of_table.numpy()), _LEVEL_PARTS)
         return of_positions, of_table, None
 
 
@@ -139,11 +146,10 @@ def _interpolate(cells, fractions, edges, entries, dense, mask, features, first)
 
 
 @compiled_parallel
-def _forward(positions, table, resolutions, sizes, offsets, dense, features):
-    num_points = positions.shape[1]
-    for block in prange((num_points + _BLOCK - 1) // _BLOCK):
-        start = block * _BLOCK
-        size = min(num_points - start, _BLOCK)
+def _forward(positions, table, resolutions, sizes, offsets, dense, first, end, features):
+    for block in prange((end - first + _BLOCK - 1) // _BLOCK):
+        start = first + block * _BLOCK
+        size = min(end - start, _BLOCK)
         cells, fractions = np.empty((3, size), _UINT), np.empty((3, size), np.float32)
         edges = np.empty((4, size), _UINT)
         for level in range(resolutions.shape[0]):
@@ -202,15 +208,15 @@ def _backward_to_positions(positions, table, gradient, resolutions, sizes, offse
 
 
 @compiled_parallel
-def _backward(positions, gradient, resolutions, sizes, offsets, dense, threads, table):
-    num_points = positions.shape[1]
+def _backward(positions, gradient, resolutions, sizes, offsets, dense, part, threads, table):
+    num_points, step = positions.shape[1], _LEVEL_PARTS * threads
     # Levels are distributed in turn, because fine levels cost more than coarse levels.
     for thread in prange(threads):
         cells, fractions = np.empty((3, _BLOCK), _UINT), np.empty((3, _BLOCK), np.float32)
         edges = np.empty((4, _BLOCK), _UINT)
         for start in range(0, num_points, _BLOCK):
             size = min(num_points - start, _BLOCK)
-            for level in range(thread, resolutions.shape[0], threads):
+            for level in range(part + _LEVEL_PARTS * thread, resolutions.shape[0], step):
                 is_dense, mask = dense[level], _UINT(sizes[level] - 1)
                 entries = table[offsets[level] : offsets[level] + sizes[level]]
                 _locate(positions, start, size, resolutions[level], is_dense, cells, fractions, edges)

@@ -14,9 +14,11 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from nerfro.kernels.threads import share
+
 # Rows of a product. oneDNN compiles and caches a program for each shape. Batches differ in the number of points, so
 # each step would add 5 MB of programs. Rows of zeros therefore pad the number of points to a multiple of _STEP.
-_BLOCK, _STEP = 16384, 2048
+_BLOCK, _STEP = 8192, 2048
 
 
 def relu_mlp(
@@ -46,7 +48,9 @@ class _ReluMLP(torch.autograd.Function):
         activations = [parts[0].new_zeros(kept, sum(part.shape[1] for part in parts), dtype=dtype)]
         activations += [parts[0].new_empty(kept, len(layer), dtype=dtype) for layer in layers[:-1]]
         result = parts[0].new_empty(num_rows, len(layers[-1]), dtype=dtype)
-        for first in range(0, num_rows, _BLOCK):
+
+        def evaluate(number: int) -> None:
+            first = number * _BLOCK
             of_block = result[first : first + _BLOCK]
             joined, *hidden = (a.narrow(0, first if learns else 0, len(of_block)) for a in activations)
             start, size = 0, min(num_points - first, _BLOCK)
@@ -57,8 +61,14 @@ class _ReluMLP(torch.autograd.Function):
                 torch.mm(rows, layer.t(), out=product)
                 if product is not of_block:
                     _comparable(product).relu_()
+
+        num_blocks = -(-num_rows // _BLOCK)
         if learns:
+            share(evaluate, num_blocks)
             ctx.save_for_backward(*activations, *layers)
+        else:
+            for number in range(num_blocks):
+                evaluate(number)
         ctx.parts, ctx.weight_dtype = [(part.shape[1], part.dtype) for part in parts], weights[0].dtype
         return result[:num_points]
 
@@ -67,24 +77,35 @@ class _ReluMLP(torch.autograd.Function):
     def backward(ctx: Any, gradient: Float[Tensor, "P O"]) -> tuple[Tensor | None, ...]:
         num_layers = len(ctx.saved_tensors) // 2
         activations, layers = ctx.saved_tensors[:num_layers], ctx.saved_tensors[num_layers:]
-        of_weights: list[Tensor | None] = []
-        num_points = len(gradient)
-        gradient = F.pad(gradient, (0, 0, 0, len(activations[0]) - num_points))
-        wanted = ctx.needs_input_grad[2:]
-        for i in reversed(range(num_layers)):
-            learns = wanted[len(ctx.parts) + i]
-            of_weights.append(_product_of_columns(gradient, activations[i]).to(ctx.weight_dtype) if learns else None)
-            if i > 0:
-                gradient = _product(gradient, layers[i])
-                bits = _comparable(gradient)
-                torch.ops.aten.threshold_backward.grad_input(bits, _comparable(activations[i]), 0, grad_input=bits)
-        of_parts: list[Tensor | None] = []
-        start = 0
-        for i, (width, dtype) in enumerate(ctx.parts):
-            columns = layers[0][:, start : start + width]
-            of_parts.append(_product(gradient, columns)[:num_points].to(dtype) if wanted[i] else None)
-            start += width
-        return None, None, *of_parts, *reversed(of_weights)
+        num_points, wanted, num_blocks = len(gradient), ctx.needs_input_grad[2:], -(-len(activations[0]) // _BLOCK)
+        weights_learn = any(wanted[len(ctx.parts) :])
+        inputs = layers[0].split([width for width, _ in ctx.parts], 1)
+        of_parts = [
+            gradient.new_empty(num_points, width, dtype=dtype) if wanted[i] else None
+            for i, (width, dtype) in enumerate(ctx.parts)
+        ]
+
+        def differentiate(number: int) -> list[Tensor]:
+            rows = [values[number * _BLOCK : (number + 1) * _BLOCK] for values in activations]
+            points = slice(number * _BLOCK, min((number + 1) * _BLOCK, num_points))
+            of_block = F.pad(gradient[points], (0, 0, 0, len(rows[0]) - (points.stop - points.start)))
+            of_weights = []
+            for i in reversed(range(num_layers)):
+                if weights_learn:
+                    of_weights.append(_product_of_columns(of_block, rows[i]).to(ctx.weight_dtype))
+                if i > 0:
+                    of_block = of_block @ layers[i]
+                    bits = _comparable(of_block)
+                    torch.ops.aten.threshold_backward.grad_input(bits, _comparable(rows[i]), 0, grad_input=bits)
+            for of_part, columns in zip(of_parts, inputs, strict=True):
+                if of_part is not None:
+                    of_part[points] = (of_block @ columns)[: points.stop - points.start]
+            return of_weights[::-1]
+
+        of_blocks = share(differentiate, max(1, num_blocks))
+        if not weights_learn:
+            return None, None, *of_parts, *[None] * num_layers
+        return None, None, *of_parts, *(torch.stack(of_layer).sum(0) for of_layer in zip(*of_blocks, strict=True))
 
 
 def _comparable(values: Tensor) -> Tensor:
@@ -95,19 +116,6 @@ def _comparable(values: Tensor) -> Tensor:
     return values.view(torch.int16) if values.dtype == torch.bfloat16 else values
 
 
-def _product(rows: Float[Tensor, "Q I"], matrix: Float[Tensor, "I O"]) -> Float[Tensor, "Q O"]:
-    """Return rows @ matrix, computed in blocks."""
-    product = rows.new_empty(len(rows), matrix.shape[1])
-    for block, of_block in zip(rows.split(_BLOCK), product.split(_BLOCK), strict=True):
-        torch.mm(block, matrix, out=of_block)
-    return product
-
-
 def _product_of_columns(left: Float[Tensor, "Q O"], right: Float[Tensor, "Q I"]) -> Float[Tensor, "O I"]:
-    """Return left^T @ right, computed in blocks with the narrower matrix on the left, which is faster."""
-    if left.shape[1] > right.shape[1]:
-        return _product_of_columns(right, left).t()
-    total = left.new_zeros(left.shape[1], right.shape[1], dtype=torch.promote_types(left.dtype, torch.float32))
-    for ours, theirs in zip(left.split(_BLOCK), right.split(_BLOCK), strict=True):
-        total += ours.t() @ theirs
-    return total
+    """Return left^T @ right with the narrower matrix on the left, which is faster."""
+    return left.t() @ right if left.shape[1] <= right.shape[1] else (right.t() @ left).t()

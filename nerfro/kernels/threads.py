@@ -5,13 +5,47 @@ from __future__ import annotations
 import contextlib
 import functools
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor
+from typing import TypeVar
 
 import numba
 import torch
 
 # Numba's work queue aborts the process if two threads launch parallel loops at the same time.
 _ONE_CALLER = threading.Lock()
+# Threads that help with `share` while they are idle.
+HELPERS: list[Executor] = []
+Result = TypeVar("Result")
+
+
+def share(task: Callable[[int], Result], number: int) -> list[Result]:
+    """Call a function for all numbers from 0, without gradients, in this thread and in helping threads that are idle.
+
+    The thread of a call depends on the speed of the threads, so the results must not depend on the thread.
+
+    Args:
+        task: function of a number.
+        number: number of calls.
+
+    Returns:
+        Results in the order of the numbers.
+    """
+    results: dict[int, Result] = {}
+    numbers = iter(range(number))
+
+    @torch.no_grad()
+    def work() -> None:
+        for i in numbers:
+            results[i] = task(i)
+
+    begun = [thread.submit(work) for thread in HELPERS]
+    work()
+    for help in begun:
+        # The work of a busy thread has not begun and is cancelled, because nothing is left to do.
+        if not help.cancel():
+            help.result()
+    return [results[i] for i in range(number)]
 
 
 def num_threads() -> int:

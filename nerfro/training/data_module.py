@@ -16,6 +16,7 @@ from omegaconf import DictConfig
 from torch import Tensor, nn
 
 from nerfro.data.base import Views
+from nerfro.kernels.threads import HELPERS
 from nerfro.rendering import Renderer
 from nerfro.subdivision import Subdivision
 from nerfro.training.module import TrainingModule
@@ -114,7 +115,8 @@ Made = TypeVar("Made")
 class Prefetcher(Generic[Made]):
     """Make the batch of the next step in a thread. The batches do not depend on the thread.
 
-    The thread uses one core, and kernels release Python and the threads of Numba (`kernels.compilation`).
+    The thread uses one core, and kernels release Python and the threads of Numba (`kernels.compilation`). When idle,
+    the thread helps with the current step (`kernels.threads.share`).
 
     Args:
         make: function that makes the batch of a step.
@@ -129,6 +131,7 @@ class Prefetcher(Generic[Made]):
         self._num_threads = torch.get_num_threads()
         self._thread = ThreadPoolExecutor(1, "paths", lambda: torch.set_num_threads(1))
         self._thread.submit(torch.get_num_threads).result()
+        HELPERS.append(self._thread)
         torch.set_num_threads(max(1, self._num_threads - spare_core))
 
     def __call__(self, step: int) -> Made:
@@ -146,6 +149,7 @@ class Prefetcher(Generic[Made]):
 
     def close(self) -> None:
         """End the thread, and return its core to PyTorch."""
+        HELPERS.remove(self._thread)
         self._thread.shutdown(cancel_futures=True)
         torch.set_num_threads(self._num_threads)
 

@@ -1,5 +1,7 @@
 """The MLP with its gradient written out, against torch.nn.Sequential."""
 
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 
 import pytest
@@ -7,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from nerfro.fields.relu_mlp import relu_mlp
+from nerfro.kernels import threads
 
 
 def layers(*widths: int) -> nn.Sequential:
@@ -46,3 +49,20 @@ def test_inputs_side_by_side_of_which_one_learns() -> None:
     torch.testing.assert_close(result, expected)
     (mine,), (theirs,) = (torch.autograd.grad(x.square().sum(), first) for x in (result, expected))
     torch.testing.assert_close(mine, theirs)
+
+
+def test_points_of_several_blocks_equal_a_sequential_in_one_thread_and_in_two(monkeypatch: pytest.MonkeyPatch) -> None:
+    mlp = layers(6, 8, 3)
+    inputs = torch.randn(2 * 16384 + 700, 6, requires_grad=True)
+
+    def evaluated(model: Callable[[Tensor], Tensor]) -> list[Tensor]:
+        result = model(inputs)
+        return [result, *torch.autograd.grad(result.sin().sum(), [inputs, *weights(mlp)])]
+
+    alone = evaluated(lambda x: relu_mlp(x, weights(mlp), torch.float32))
+    for mine, theirs in zip(alone, evaluated(mlp), strict=True):
+        torch.testing.assert_close(mine, theirs, rtol=1e-4, atol=1e-4)
+    with ThreadPoolExecutor(1) as helper:
+        monkeypatch.setattr(threads, "HELPERS", [helper])
+        helped = evaluated(lambda x: relu_mlp(x, weights(mlp), torch.float32))
+    assert all(torch.equal(mine, theirs) for mine, theirs in zip(alone, helped, strict=True))

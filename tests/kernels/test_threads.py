@@ -3,8 +3,12 @@
 import os
 import subprocess
 import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
+
+from nerfro.kernels import threads
 
 IMPORTS_ONLY = """
 import numba
@@ -60,3 +64,36 @@ def test_importing_kernels_changes_nothing_for_other_users_of_numba() -> None:
 @pytest.mark.parametrize(("chosen", "used"), [("default", "workqueue"), ("omp", "omp")])
 def test_two_threads_may_trace_at_once_on_the_threading_layer_that_is_chosen(chosen: str, used: str) -> None:
     assert run(TWO_THREADS, NUMBA_THREADING_LAYER=chosen) == [f"400 True {used} {chosen}"]
+
+
+@pytest.mark.parametrize("busy", [True, False])
+def test_a_thread_helps_if_it_is_idle(busy: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    met, end = threading.Barrier(2), threading.Event()
+
+    def name(number: int) -> str:
+        if not busy:
+            met.wait(10)  # passes only if two threads call the function at the same time
+        return f"{number} {threading.current_thread() is threading.main_thread()}"
+
+    with ThreadPoolExecutor(1) as helper:
+        monkeypatch.setattr(threads, "HELPERS", [helper])
+        if busy:
+            helper.submit(end.wait, 10)
+        names = threads.share(name, 6)
+        end.set()
+    assert [called.split()[0] for called in names] == [*"012345"]
+    assert {called.split()[1] for called in names} == {"True"} | ({"False"} if not busy else set())
+
+
+def test_an_error_of_a_helping_thread_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
+    met = threading.Barrier(2)
+
+    def fail(number: int) -> None:
+        met.wait(10)
+        if threading.current_thread() is not threading.main_thread():
+            raise ValueError("no helper")
+
+    with ThreadPoolExecutor(1) as helper:
+        monkeypatch.setattr(threads, "HELPERS", [helper])
+        with pytest.raises(ValueError, match="no helper"):
+            threads.share(fail, 2)
