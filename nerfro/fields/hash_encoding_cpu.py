@@ -68,7 +68,9 @@ class _HashEncode(torch.autograd.Function):
             _backward_to_positions(places, entries, upstream, *layout, of_positions.numpy())
         if ctx.needs_input_grad[1]:
             of_table = torch.zeros(table.shape)
-            share(lambda part: _backward(places, upstream, *layout, part, threads, of_table.numpy()), _LEVEL_PARTS)
+            # Threads of Numba share the levels themselves.
+            parts = _LEVEL_PARTS if threads == 1 else 1
+            share(lambda part: _backward(places, upstream, *layout, part, parts, threads, of_table.numpy()), parts)
         return of_positions, of_table, None
 
 
@@ -208,15 +210,15 @@ def _backward_to_positions(positions, table, gradient, resolutions, sizes, offse
 
 
 @compiled_parallel
-def _backward(positions, gradient, resolutions, sizes, offsets, dense, part, threads, table):
-    num_points, step = positions.shape[1], _LEVEL_PARTS * threads
+def _backward(positions, gradient, resolutions, sizes, offsets, dense, part, parts, threads, table):
+    num_points = positions.shape[1]
     # Levels are distributed in turn, because fine levels cost more than coarse levels.
     for thread in prange(threads):
         cells, fractions = np.empty((3, _BLOCK), _UINT), np.empty((3, _BLOCK), np.float32)
         edges = np.empty((4, _BLOCK), _UINT)
         for start in range(0, num_points, _BLOCK):
             size = min(num_points - start, _BLOCK)
-            for level in range(part + _LEVEL_PARTS * thread, resolutions.shape[0], step):
+            for level in range(part + parts * thread, resolutions.shape[0], parts * threads):
                 is_dense, mask = dense[level], _UINT(sizes[level] - 1)
                 entries = table[offsets[level] : offsets[level] + sizes[level]]
                 _locate(positions, start, size, resolutions[level], is_dense, cells, fractions, edges)

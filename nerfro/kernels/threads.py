@@ -39,7 +39,7 @@ def share(task: Callable[[int], Result], number: int) -> list[Result]:
         for i in numbers:
             results[i] = task(i)
 
-    begun = [thread.submit(work) for thread in HELPERS]
+    begun = [thread.submit(work) for thread in HELPERS if number > 1]
     work()
     for help in begun:
         # The work of a busy thread has not begun and is cancelled, because nothing is left to do.
