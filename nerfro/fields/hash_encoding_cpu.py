@@ -50,8 +50,8 @@ class _HashEncode(torch.autograd.Function):
         (places, entries), layout, num_points = arrays(positions, table), _layout(levels), positions.shape[1]
 
         def encode(part: int) -> None:
-            first, end = part * _PART, min((part + 1) * _PART, num_points)
-            _forward(places, entries, *layout, first, end, features.numpy())
+            span = part * _PART, min((part + 1) * _PART, num_points)
+            _forward(places, entries, *layout, span, features.numpy())
 
         share(encode, -(-num_points // _PART))
         return features
@@ -70,7 +70,7 @@ class _HashEncode(torch.autograd.Function):
             of_table = torch.zeros(table.shape)
             # Threads of Numba share the levels themselves.
             parts = _LEVEL_PARTS if threads == 1 else 1
-            share(lambda part: _backward(places, upstream, *layout, part, parts, threads, of_table.numpy()), parts)
+            share(lambda part: _backward(places, upstream, *layout, (part, parts, threads), of_table.numpy()), parts)
         return of_positions, of_table, None
 
 
@@ -148,7 +148,8 @@ def _interpolate(cells, fractions, edges, entries, dense, mask, features, first)
 
 
 @compiled_parallel
-def _forward(positions, table, resolutions, sizes, offsets, dense, first, end, features):
+def _forward(positions, table, resolutions, sizes, offsets, dense, span, features):
+    first, end = span
     for block in prange((end - first + _BLOCK - 1) // _BLOCK):
         start = first + block * _BLOCK
         size = min(end - start, _BLOCK)
@@ -210,8 +211,8 @@ def _backward_to_positions(positions, table, gradient, resolutions, sizes, offse
 
 
 @compiled_parallel
-def _backward(positions, gradient, resolutions, sizes, offsets, dense, part, parts, threads, table):
-    num_points = positions.shape[1]
+def _backward(positions, gradient, resolutions, sizes, offsets, dense, division, table):
+    num_points, (part, parts, threads) = positions.shape[1], division
     # Levels are distributed in turn, because fine levels cost more than coarse levels.
     for thread in prange(threads):
         cells, fractions = np.empty((3, _BLOCK), _UINT), np.empty((3, _BLOCK), np.float32)
