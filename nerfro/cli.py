@@ -26,11 +26,16 @@ from omegaconf import DictConfig
 from omegaconf.errors import MissingMandatoryValue
 
 from nerfro.allowed import check_names, check_settings
-from nerfro.composition import BoundedFiles, composed_with
+from nerfro.composition import RenamingFiles, composed_with
 from nerfro.errors import NerfroError
 from nerfro.failures import errors_in_one_line, in_one_line
+from nerfro.old_names import (
+    full_key,
+    is_old_name,
+    renamed_override,
+)
 from nerfro.options import ADDED_GROUPS, Described, describe_command, recall, remember, usage
-from nerfro.overrides import full_key, full_override, is_scene_file
+from nerfro.overrides import is_scene_file
 from nerfro.paths import CONF_DIR
 from nerfro.registry import discover
 from nerfro.trust import leave_current_directory
@@ -90,14 +95,14 @@ def entry_point(
                     sys.argv[1:] = ["--hydra-help"]
                 sys.argv[1:] = _flags_first(sys.argv[1:])
                 ConfigStore.instance().store(name=f"{config_name}_schema", node=schema, provider="nerfro")
-                SourcesRegistry.instance().types["file"] = BoundedFiles
+                SourcesRegistry.instance().types["file"] = RenamingFiles
                 leave_current_directory()
                 discover()
                 if _HELP & set(sys.argv) or (program() == config_name and recall(config_name) is None):
                     described = describe_command(config_name, schema, config_dir)
                     remember(config_name, described)
                     answer(described, sys.argv[1:])
-                sys.argv[1:] = [_quoted(full_override(argument), verbatim) for argument in sys.argv[1:]]
+                sys.argv[1:] = [_quoted(renamed_override(argument), verbatim) for argument in sys.argv[1:]]
                 if expand is not None:
                     sys.argv[1:] = expand(sys.argv[1:], [field.name for field in dataclasses.fields(schema)])
                 if config_name == "train":
@@ -225,8 +230,10 @@ def answer(described: Described, arguments: list[str]) -> None:
         sys.exit()
     unknown = any(argument.startswith(("--config", "-c", "hydra.searchpath")) for argument in arguments)
     if not unknown:  # other folders of configurations may have other groups
-        takes_scenes = bool({"data", "medium"} & {*described.names.get("", ())})
-        described.require_known([full_key(text) for text in arguments if not (takes_scenes and is_scene_file(text))])
+        current = [text for text in arguments if not is_old_name(text)]
+        if {"data", "medium"} & {*described.names.get("", ())}:
+            current = [text for text in current if not is_scene_file(text)]
+        described.require_known([full_key(text) for text in current])
 
 
 def _refuse_flag(message: str) -> NoReturn:

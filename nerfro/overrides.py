@@ -10,9 +10,6 @@ from contextvars import ContextVar
 
 _prints_hints = ContextVar("_prints_hints", default=True)
 
-# Short names of settings, on the command line and in YAML files.
-SHORT_NAMES = {"bodies": "medium.bodies"}
-
 
 @contextmanager
 def without_hints() -> Iterator[None]:
@@ -33,20 +30,6 @@ def print_hint(text: str) -> None:
 def print_next(label: str, command: str, options: Sequence[str]) -> None:
     """Print the next command as a hint."""
     print_hint(f"{label}: {shlex.join(['python', '-m', f'nerfro.{command}', *options])}")
-
-
-def full_key(override: str) -> str:
-    """Replace the short name of a setting by the full one."""
-    return re.sub(r"^([+~]*)(\w+)(?=[.=])", lambda key: key[1] + SHORT_NAMES.get(key[2], key[2]), override)
-
-
-def full_override(override: str) -> str:
-    """Write an override as Hydra requires: with full names, and groups of parameters with a plus sign."""
-    override = full_key(override)
-    if not override.lstrip("+").startswith("optimizer.groups="):
-        return override
-    # Hydra reads names with dots only inside of a mapping and without quotes, and adds them only with a plus sign.
-    return ("" if override.startswith("+") else "+") + override.replace('"', "")
 
 
 def is_given(option: str, overrides: Iterable[str]) -> bool:

@@ -45,6 +45,31 @@ _BUILT_IN = (
     "training.phases",
 )  # fmt: skip
 _LOCAL_PACKAGE = "nerfro_plugins"
+# Former and present places of classes; configurations of earlier releases name the former ones.
+MOVED_CLASSES = (
+    {
+        f"nerfro.data.{module}.{name}": f"{_LOCAL_PACKAGE}.data_formats.{module}.{name}"
+        for module, name in (("idr", "IdrData"), ("llff", "LlffData"), ("refref", "RefRefData"))
+    }
+    | {
+        f"nerfro.samplers.{module}.{name}": f"nerfro.samplers.{group}.{module}.{name}"
+        for group, module, name in (
+            ("paths", "eikonal", "Eikonal"),
+            ("paths", "snell", "Snell"),
+            ("paths", "straight", "Straight"),
+            ("points", "density_grid", "DensityGridSampler"),
+            ("points", "hierarchical", "Hierarchical"),
+            ("points", "stratified", "Stratified"),
+        )
+    }
+    | {
+        "nerfro.camera.refined.RefinedCamera": f"{_LOCAL_PACKAGE}.refined_cameras.refined.RefinedCamera",
+        "nerfro.training.phases.cameras.CameraSteps": f"{_LOCAL_PACKAGE}.refined_cameras.phase.CameraSteps",
+        "nerfro.data.opencv.OpenCVData": "nerfro.data.blender.OpenCVData",
+        "nerfro.fields.mip_nerf.MipNerfField": f"{_LOCAL_PACKAGE}.mip_nerf.MipNerfField",
+        "nerfro.models.mip_nerf.MipNerfModel": f"{_LOCAL_PACKAGE}.mip_nerf.MipNerfModel",
+    }
+)
 ENTRY_POINTS = "nerfro.plugins"
 
 # Objects of Lightning that a configuration may name as Hydra's `_target_`, beside registered classes.
@@ -242,7 +267,8 @@ def plugin_of(node: DictConfig) -> Plugin:
         NerfroError: the class is not registered.
     """
     target = str(node.get("_target_"))
-    plugin = next((plugin for plugin in _plugins.values() if plugin.target == target), None)
+    place = MOVED_CLASSES.get(target, target)
+    plugin = next((plugin for plugin in _plugins.values() if plugin.target == place), None)
     if plugin is None:
         raise NerfroError(
             f"'{target}' is not registered; `python -m nerfro.plugins` lists the registered classes; "

@@ -20,8 +20,9 @@ from omegaconf import DictConfig, OmegaConf
 from nerfro.allowed import check_names, check_settings
 from nerfro.cli import _added, _quoted
 from nerfro.errors import NerfroError
+from nerfro.old_names import full_key, renamed_override
 from nerfro.options import Described, describe_command, usage
-from nerfro.overrides import full_override, is_scene_file
+from nerfro.overrides import is_scene_file
 from nerfro.paths import CONF_DIR, PACKAGE_DIR
 from nerfro.registry import KINDS, discover, plugins
 from nerfro.synthetic import SCENES
@@ -90,7 +91,8 @@ def require_valid(command: str, options: list[str]) -> None:
     """Raise an error unless a command accepts the options. Hydra composes only the choices of groups, to save time."""
     schema, verbatim = entry_points()[command]
     options = [option for option in options if not is_scene_file(option)]
-    options = [full_override(option) for option in options]
+    given, options = [full_key(option) for option in options], [renamed_override(option) for option in options]
+    assert [option.lstrip("+") for option in options] == [option.lstrip("+") for option in given], "an old name"
     # Of a sweep the first value; no patterns, and no options of Hydra, whose launchers may not be installed.
     options = [re.sub(r"^([^=]+=[^,[{]+),[^]}]*$", r"\1", option) for option in options if "(" not in option]
     options = [_quoted(option, verbatim) for option in options if not option.lstrip("+").startswith("hydra")]

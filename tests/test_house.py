@@ -98,7 +98,7 @@ MAX_LINES, MAX_ARGUMENTS = 60, 8
 FOREIGN = {
     "bar", "config", "content", "ctx", "hydra_config", "job", "log_gain", "logger", "loss", "main", "node", "numba",
     "options", "pairing", "parameter", "parent", "parser", "pycolmap", "reader", "sampled", "session", "spec", "sys",
-    "tensor", "trained", "trainer", "hydra", "BoundedFiles",
+    "tensor", "trained", "trainer", "hydra", "RenamingFiles",
 }  # fmt: skip
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
 
 import yaml
 from omegaconf import DictConfig, OmegaConf
@@ -12,15 +11,8 @@ from omegaconf.errors import OmegaConfBaseException
 
 from nerfro.errors import NerfroError
 from nerfro.files.reading import read_text
+from nerfro.old_names import renamed_config
 from nerfro.trust import require_bounded_yaml
-
-# Former places of modules, in the configurations of earlier runs.
-_MOVED = {
-    "nerfro.camera.refined.": "nerfro_plugins.refined_cameras.refined.",
-    "nerfro.training.phases.cameras.": "nerfro_plugins.refined_cameras.phase.",
-}
-# Removed settings of earlier runs, with the values that had no effect.
-_REMOVED: dict[str, Any] = {"evaluation.refine_steps": 0, "batches.jitter": False}
 
 
 def foreign_config(text: str, origin: Path) -> DictConfig:
@@ -28,8 +20,6 @@ def foreign_config(text: str, origin: Path) -> DictConfig:
 
     Interpolations are refused: `${oc.env:...}` would copy the environment of this machine into a shared page.
     """
-    for former, present in _MOVED.items():
-        text = text.replace(former, present)
     require_bounded_yaml(text, origin)
     try:
         config = OmegaConf.create(text)
@@ -41,11 +31,7 @@ def foreign_config(text: str, origin: Path) -> DictConfig:
     interpolation = re.search(r".*\$\{.*", OmegaConf.to_yaml(config))
     if interpolation:
         raise NerfroError(f"{origin} contains an interpolation ({interpolation[0].strip()}); write the value instead")
-    for name, value in _REMOVED.items():
-        node, _, key = name.rpartition(".")
-        if OmegaConf.select(config, name) == value:
-            del OmegaConf.select(config, node)[key]
-    return config
+    return renamed_config(config, origin)
 
 
 def read_foreign_config(path: Path) -> DictConfig:
