@@ -1,8 +1,8 @@
-"""`python -m nerfro.mask data=... data.root=DIR view=true`: make the masks of the object in all views.
+"""`python -m nerfro.mask data=... data.root=DIR outlines={NAME:BOX}`: segment the object in all views.
 
 Examples:
-    nerfro mask data.root=data/glass view=true
-    nerfro mask data=colmap data.root=data/glass outlines=outlines.json
+    nerfro mask data.root=data/glass 'outlines={img_01.jpg: [120, 80, 400, 460]}'
+    nerfro mask data=colmap data.root=data/glass view=true
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from nerfro.masks.mask_files import MaskConfig, MaskTask, read_outlines
 from nerfro.masks.masking import Segmentation
 from nerfro.overrides import is_given, of_groups, print_next
 from nerfro.paths import EMBEDDED_PREFIX
+from nerfro.progress import progress_bar
 from nerfro.registry import build
 from nerfro.rendering.scene_file import with_scene
 from nerfro.viewing.outline_page import OutlinePage
@@ -34,7 +35,7 @@ _OUTLINES = "outlines.json"
 @entry_point("mask", MaskConfig, expand=with_scene)
 @torch.no_grad()
 def main(config: DictConfig) -> None:
-    """Write the missing masks of all views."""
+    """Segment the outlined views, then all other views, and write the missing masks."""
     if str(config.data.root).startswith(EMBEDDED_PREFIX):
         raise NerfroError(f"data.root={config.data.root} is part of nerfro and has masks; set data.root to your folder")
     source = build(config.data)
@@ -61,8 +62,10 @@ def _mask(config: DictConfig, source: DataSource) -> None:
         page.serve(source.root.name, config.host, config.port, config.open)
     else:
         missing = len(task.frames) - len(task.kept) - len(outlines)
-        print(f"{len(task.kept)} existing masks, {len(outlines)} outlines; making {missing} further masks")
-        print(task.save(outlines, task.segment(outlines)))
+        print(f"{len(task.kept)} existing masks, {len(outlines)} outlines; segmenting {missing} further views")
+        with progress_bar("segmenting", missing) as progress:
+            found = task.segment(outlines, progress.update)
+        print(task.save(outlines, found))
         print("correct wrong masks in a paint program; or delete them, outline one of these views, and repeat")
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Optional
@@ -24,13 +24,12 @@ from nerfro.errors import NerfroError, first_of, warn
 from nerfro.files.drawing import sheet
 from nerfro.files.images import save_image
 from nerfro.files.reading import read_json
-from nerfro.masks.masking import Segmentation, check_tracked, polygon_mask, propagate
+from nerfro.masks.masking import Segmentation, box_region, check_tracked, grab, polygon_mask, propagate
 from nerfro.masks.tracking import load_tracker, track_object
 from nerfro.opencv import opencv
 from nerfro.paths import user_path
 from nerfro.poses.reconstruction import numeric_order
-from nerfro.progress import progress_bar
-from nerfro.silhouettes.outline_hull import AGREES
+from nerfro.silhouettes.outline_hull import AGREES, FEWEST_VIEWS
 
 _SHEET = "masks.png"
 _TILE, _COLUMNS = 220, 6  # width of a tile in pixels, tiles per row
@@ -43,10 +42,12 @@ class MaskConfig:
 
     Attributes:
         data: data set (options of the group `data`); the views of all splits get masks.
-        outlines: by image name, a polygon [[column, row], ...], which is the mask, in pixels; or a JSON file with such
-            a mapping. With `sam2` or `view`, a box [left, top, right, bottom] around the object is a start as well.
+        outlines: by image name, a box [left, top, right, bottom] around the object, or a polygon [[column, row], ...],
+            which is the mask, in pixels; or a JSON file with such a mapping.
         sam2: folder of a Segment Anything 2 network in the format of transformers, which follows the object from the
             outlines and existing masks through the photographs in the order of their names; needs the extra `sam2`.
+        hull_only: project the visual hull of at least three existing masks into all other views, without segmentation
+            by colour.
         overwrite: replace existing masks, starting from the outlines alone. Otherwise existing masks are kept and used,
             except projections of a hull, which are made again.
         view: serve a page on which you draw outlines in two to five views and see the projections of the hull in all
@@ -59,6 +60,7 @@ class MaskConfig:
     data: Any = MISSING
     outlines: Any = None
     sam2: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
+    hull_only: bool = False
     overwrite: bool = False
     view: bool = False
     host: str = "localhost"
@@ -75,7 +77,7 @@ def read_outlines(given: object) -> dict[str, list]:
     if given is None:
         return {}
     if not isinstance(given, Mapping):
-        raise NerfroError("outlines= must be {NAME:[[COLUMN,ROW],...]} or a JSON file with such a mapping")
+        raise NerfroError("outlines= must be {NAME:[LEFT,TOP,RIGHT,BOTTOM]} or a JSON file with such a mapping")
     outlines = {}
     for name, outline in given.items():
         try:
@@ -128,12 +130,17 @@ def find_frame(name: str, frames: list[Frame]) -> int:
     return found[0]
 
 
-def check_start(frames: list[Frame], outlined: Collection[int], kept: Collection[int]) -> None:
+def check_start(frames: list[Frame], outlined: Collection[int], kept: Collection[int], hull_only: bool) -> None:
     """Refuse data without any mask or outline, without a missing mask, or with one file for several masks."""
     if not outlined and not kept:
         raise NerfroError(
-            "there is no mask to start from; draw the outline of the object with view=true, or give "
-            f"outlines={{{frames[0].name}:[[COLUMN,ROW],...],...}}"
+            "there is no mask to start from; give the outline of the object in one image, for example "
+            f"outlines={{{frames[0].name}:[LEFT,TOP,RIGHT,BOTTOM]}}"
+        )
+    if hull_only and len(outlined) + len(kept) < FEWEST_VIEWS:
+        raise NerfroError(
+            f"hull_only=true needs masks or outlines of at least {FEWEST_VIEWS} images from all sides, and there are "
+            f"{len(outlined) + len(kept)}; outline the object in more images"
         )
     if len(kept) == len(frames):
         raise NerfroError("all images have masks; delete the wrong ones, or set overwrite=true")
@@ -192,7 +199,7 @@ def mask_sheet(
         inside, image = (torch.from_numpy(array[::stride, ::stride]) for array in (found.masks[view], images[view]))
         pictures.append(torch.where(inside[..., None], image / 255, image / 1020 + torch.tensor(_OUTSIDE) / 255))
         captions.append(f"{labels.get(view, 'given')}  {frames[view].image.stem}")
-    legend = "overlap of Segment Anything 2 and visual hull; " if found.overlaps else ""
+    legend = f"overlap of {found.segmenter} and visual hull; " if found.overlaps else ""
     legend += f"hull: the mask is the projection of the {found.shape}; dark: outside the mask"
     return sheet(pictures, captions, _TILE, _COLUMNS, legend)
 
@@ -207,14 +214,14 @@ def report_masks(frames: list[Frame], found: Segmentation) -> None:
             f"masks (least: {frames[worst].name})"
         )
     if found.overlaps:
-        print("overlap (intersection over union) of the mask of Segment Anything 2 with the visual hull:")
+        print(f"overlap (intersection over union) of the mask of {found.segmenter} with the visual hull:")
     for view in sorted(found.overlaps, key=lambda view: found.overlaps[view]):
         taken = " (mask from the hull)" if view in found.by_hull else ""
         print(f"  {found.overlaps[view]:.4f}  {frames[view].name}{taken}")
     doubtful = [frames[view].name for view in found.by_hull if view in found.overlaps]
     if doubtful:
         warn(
-            f"{len(doubtful)} of {len(frames)} views: Segment Anything 2 and the visual hull overlap by less than "
+            f"{len(doubtful)} of {len(frames)} views: {found.segmenter} and the visual hull overlap by less than "
             f"{AGREES} ({first_of(doubtful)}); their masks are projections of the hull and slightly "
             "too large: check them first"
         )
@@ -230,7 +237,8 @@ class MaskTask:
         images: 8-bit sRGB images of all views.
         frames: frames of all views.
         kept: existing masks by view, which do not change.
-        tracker: network that follows the object through the photographs; None for projections of a shape.
+        hull_only: do not use GrabCut.
+        tracker: network that follows the object through the photographs, instead of GrabCut.
     """
 
     source: DataSource
@@ -238,6 +246,7 @@ class MaskTask:
     images: list[UInt8[np.ndarray, "H W 3"]]
     frames: list[Frame]
     kept: dict[int, Bool[np.ndarray, "H W"]]
+    hull_only: bool
     tracker: Any = None
 
     @classmethod
@@ -248,8 +257,8 @@ class MaskTask:
             NerfroError: there is nothing to start from, or nothing to do.
         """
         opencv()  # report a missing package before the long work starts
-        if config.sam2 is not None and config.view:
-            raise NerfroError("sam2= segments all photographs, so it excludes view=true; remove one")
+        if config.sam2 is not None and (config.hull_only or config.view):
+            raise NerfroError("sam2= segments all photographs, so it excludes hull_only=true and view=true; remove one")
         tracker = None if config.sam2 is None else load_tracker(user_path(config.sam2))
         cameras, images, frames = load_all(source)
         outlined, kept = {find_frame(name, frames) for name in outlines}, {}
@@ -261,10 +270,10 @@ class MaskTask:
                 if method is None or stays.get(method, False):
                     kept[view] = read_resized(frame.mask, size, source.mask_labels)
         if not config.view:
-            check_start(frames, outlined, kept)
-        return cls(source, cameras, images, frames, kept, tracker)
+            check_start(frames, outlined, kept, config.hull_only)
+        return cls(source, cameras, images, frames, kept, config.hull_only or config.view, tracker)
 
-    def segment(self, outlines: Mapping[str, list]) -> Segmentation:
+    def segment(self, outlines: Mapping[str, list], progress: Callable[[], None] = lambda: None) -> Segmentation:
         """Make the masks of all views from the kept masks and outlines by image name.
 
         Raises:
@@ -285,22 +294,20 @@ class MaskTask:
             elif self.tracker is not None:
                 boxes[view] = scaled.tolist()
             else:
-                raise NerfroError(
-                    f"{name}: a box is a start for sam2=FOLDER or for view=true only; give a polygon [[COLUMN,ROW],...]"
-                )
+                region = box_region(scaled, size)
+                given[view] = grab(self.images[view], region, region)
         for view, mask in given.items():
             if not mask.any():
                 raise NerfroError(f"{self.frames[view].name}: the outline or mask is empty; draw it around the object")
         if self.tracker is None:
-            return propagate(self.cameras, given)
+            return propagate(self.images, self.cameras, given, self.hull_only, progress)
         names = [frame.image.name for frame in self.frames]
         order = numeric_order(names) or sorted(range(len(names)), key=names.__getitem__)
         place = {view: number for number, view in enumerate(order)}
         images = [self.images[view] for view in order]
         prompts = {place[view]: mask for view, mask in given.items()}
         corners = {place[view]: box for view, box in boxes.items()}
-        with progress_bar("segmenting", len(images) - len({*prompts, *corners})) as progress:
-            tracked = track_object(self.tracker, images, prompts, corners, progress.update)
+        tracked = track_object(self.tracker, images, prompts, corners, progress)
         return check_tracked(self.cameras, given, {order[number]: mask for number, mask in tracked.items()})
 
     def save(self, outlines: Mapping[str, list], found: Segmentation) -> str:

@@ -26,7 +26,7 @@ class ReconstructConfig:
         video: video instead of photographs; the sharpest of its frames are used.
         frames: number of frames to take from the video.
         masks: folder of the masks, PNG or JPEG files named `<photograph>` or `mask_<photograph>`.
-        outlines: polygons around the object in some photographs, as for `python -m nerfro.mask`.
+        outlines: boxes or polygons around the object in some photographs, as for `python -m nerfro.mask`.
         out: output folder.
         trial_steps: number of steps of the training that tries each hypothesis about the object on validation
             photographs (straight rays, solid body, vessel); 0 trains the solid body without a comparison.

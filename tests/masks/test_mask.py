@@ -76,6 +76,12 @@ def capture(tmp_path: Path, photographs: list[tuple[np.ndarray, np.ndarray, np.n
     return write_capture(tmp_path / "capture", photographs)
 
 
+def box_around(mask: np.ndarray, margin: int) -> list[int]:
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    numbers = columns[0] - margin, rows[0] - margin, columns[-1] + 1 + margin, rows[-1] + 1 + margin
+    return [int(number) for number in numbers]
+
+
 def overlap(one: np.ndarray, other: np.ndarray) -> float:
     return float((one & other).sum() / (one | other).sum())
 
@@ -85,6 +91,20 @@ def read(root: Path, view: int) -> np.ndarray:
         levels = np.asarray(image)
     assert set(np.unique(levels)) == {0, 255}
     return levels > 127
+
+
+def test_one_box_leads_to_all_masks(capture: Path, photographs: list, command: Callable[..., str]) -> None:
+    box = str(box_around(photographs[1][1], 3)).replace(" ", "")
+    printed = command("mask", f"data.root={capture}", f"outlines={{p_1:{box}}}")
+    overlaps = [overlap(read(capture, view), mask) for view, (_, mask, _) in enumerate(photographs)]
+    assert min(overlaps) > 0.9, overlaps
+    assert np.mean(overlaps) > 0.95
+    assert "next: python -m nerfro.preprocess data=opencv" in printed
+    # The loader finds them, for all splits.
+    for split in ("train", "val", "test"):
+        assert OpenCVData(str(capture)).load(split).masks is not None
+    with Image.open(capture / "masks.png") as sheet:
+        assert sheet.size[0] > 6 * 220
 
 
 def test_masks_that_exist_are_kept_and_show_the_way(
@@ -107,7 +127,7 @@ def test_masks_that_exist_are_kept_and_show_the_way(
     assert "5 existing masks" in command("mask", f"data.root={capture}")  # projections are made again
 
 
-def test_two_outlines_of_a_body_of_revolution_give_all_masks() -> None:
+def test_two_outlines_of_a_body_of_revolution_give_all_masks_whatever_the_colours() -> None:
     width, height, num_views, focal = 288, 216, 8, 345.0
     azimuth = torch.arange(num_views) * 2 * torch.pi / num_views
     towards = [np.array([np.cos(turn) * 0.8, np.sin(turn) * 0.8, 0.6]) for turn in azimuth.tolist()]
@@ -121,7 +141,8 @@ def test_two_outlines_of_a_body_of_revolution_give_all_masks() -> None:
     along = (rays.directions * offset).sum(-1)
     inside = along.square() - offset.square().sum(-1) + RADIUS**2 > 0
     masks = inside.view(num_views, height, width).numpy()
-    found = propagate(cameras, {view: masks[view] for view in (0, 3)})
+    noise = np.random.default_rng(0).integers(0, 256, (num_views, height, width, 3), np.uint8)
+    found = propagate(list(noise), cameras, {view: masks[view] for view in (0, 3)})
     assert found.shape == "body of revolution"
     assert len(found.by_hull) == num_views - 2
     assert min(overlap(found.masks[view], masks[view]) for view in found.by_hull) > 0.95
@@ -154,19 +175,14 @@ def test_masks_of_a_network_are_marked_and_compared_with_their_hull(
     assert methods == ["polygon", "sam2", "visual hull", "sam2"]
     assert np.array_equal(read(capture, 2), photographs[2][1])
     assert overlap(read(capture, lost), photographs[lost][1]) > 0.8
-    assert "wrote 1 masks" in command("mask", f"data.root={capture}"), "the others are kept"
+    assert "wrote 1 masks" in command("mask", f"data.root={capture}", "hull_only=true"), "the others are kept"
     assert "sam2= segments all photographs" in command("mask", f"data.root={capture}", "sam2=folder", "view=true")
 
 
 def test_polygons_are_the_masks_of_their_views(capture: Path, photographs: list, command: Callable[..., str]) -> None:
     polygons = {f"p_{view}": polygon_around(photographs[view][1]) for view in (1, 5, 9)}
     (capture / "outlines.json").write_text(json.dumps(polygons))
-    printed = command("mask", f"data.root={capture}", f"outlines={capture / 'outlines.json'}")
-    assert "next: python -m nerfro.preprocess data=opencv" in printed
-    for split in ("train", "val", "test"):
-        assert OpenCVData(str(capture)).load(split).masks is not None
-    with Image.open(capture / "masks.png") as sheet:
-        assert sheet.size[0] > 6 * 220
+    command("mask", f"data.root={capture}", f"outlines={capture / 'outlines.json'}", "hull_only=true")
     for name, polygon in polygons.items():
         assert np.array_equal(read(capture, int(name[2:])), polygon_mask(polygon, (WIDTH, HEIGHT)))
     assert min(overlap(read(capture, view), mask) for view, (_, mask, _) in enumerate(photographs)) > 0.7
@@ -177,7 +193,7 @@ def test_projections_are_made_again_and_edited_masks_are_kept(
 ) -> None:
     for view in (1, 5, 9):
         Image.fromarray(np.uint8(255 * photographs[view][1])).save(capture / "photos" / f"mask_p_{view}.png")
-    assert "wrote 11 masks" in command("mask", f"data.root={capture}")
+    assert "wrote 11 masks" in command("mask", f"data.root={capture}", "hull_only=true")
     file = capture / "photos" / "mask_p_3.png"
     assert method_of(file) == "body of revolution"
     assert method_of(capture / "photos" / "mask_p_1.png") is None
@@ -189,7 +205,7 @@ def test_projections_are_made_again_and_edited_masks_are_kept(
     edited.paste(0, (46, 34, 48, 36))
     edited.save(file, pnginfo=text)
     content = file.read_bytes()
-    assert "wrote 10 masks" in command("mask", f"data.root={capture}")
+    assert "wrote 10 masks" in command("mask", f"data.root={capture}", "hull_only=true")
     assert file.read_bytes() == content
 
 
@@ -201,10 +217,8 @@ def test_a_polygon_covers_the_pixels_whose_centres_it_contains() -> None:
 
 
 def test_mistakes_are_reported_in_one_line(capture: Path, command: Callable[..., str]) -> None:
-    root = f"data.root={capture}"
-    assert "p_0: a box is a start for sam2=FOLDER" in command("mask", root, "outlines={p_0:[1,1,9,9]}")
-    one = f"outlines={{p_0:{polygon_around(np.ones((40, 40), bool))}}}"
-    assert "1 masks or outlines do not determine the shape" in command("mask", root, one)
+    root, two_boxes = f"data.root={capture}", "outlines={p_0:[1,1,9,9],p_5:[1,1,9,9]}"
+    assert "hull_only=true needs masks or outlines of at least 3" in command("mask", root, two_boxes, "hull_only=true")
     assert "no mask to start from" in command("mask", root)
     assert torch.is_grad_enabled()
     assert "q_1 is not an image of the data set; names of the data set look like photos/p_" in command(
@@ -214,6 +228,39 @@ def test_mistakes_are_reported_in_one_line(capture: Path, command: Callable[...,
     assert "nothing.json does not exist" in command("mask", root, "outlines=nothing.json")
     assert "is part of nerfro" in command("mask", "data=blender", "data.root=embedded:torus")
     assert not list((capture / "photos").glob("mask_*"))
+
+
+def test_a_neighbour_that_looks_from_the_same_place_does_not_lead(
+    photographs: list, tmp_path: Path, command: Callable[..., str]
+) -> None:
+    """Lines through the centres of two such masks meet anywhere, behind the cameras too."""
+    picture, mask, pose = photographs[1]
+    beside = np.roll(picture, -2, 1), np.roll(mask, -2, 1), pose.copy()
+    beside[2][:, 3] += 0.004 * pose[:, 0]  # as if the ball were behind the cameras
+    root = write_capture(tmp_path, [*photographs, beside])
+    box = str(box_around(mask, 3)).replace(" ", "")
+    printed = command("mask", f"data.root={root}", f"outlines={{p_1:{box}}}")
+    assert "wrote 15 masks" in printed
+    overlaps = [overlap(read(root, view), mask) for view, (_, mask, _) in enumerate([*photographs, beside])]
+    assert np.mean(overlaps) > 0.9, overlaps
+
+
+def scrambled(photographs: list, generator: np.random.Generator) -> list:
+    """The same views, whose colours say nothing about the object."""
+    return [(np.uint8(generator.integers(0, 256, (HEIGHT, WIDTH, 3))), mask, pose) for _, mask, pose in photographs]
+
+
+@pytest.mark.parametrize("hull_only", [False, True])
+def test_the_hull_is_taken_where_colours_say_something_else(
+    hull_only: bool, photographs: list, tmp_path: Path, command: Callable[..., str]
+) -> None:
+    root = write_capture(tmp_path, scrambled(photographs, np.random.default_rng(0)))
+    for view in range(0, NUM_VIEWS, 2):
+        Image.fromarray(np.uint8(255 * photographs[view][1])).save(root / "photos" / f"mask_p_{view}.png")
+    printed = command("mask", f"data.root={root}", f"hull_only={str(hull_only).lower()}")
+    overlaps = [overlap(read(root, view), photographs[view][1]) for view in range(1, NUM_VIEWS, 2)]
+    assert min(overlaps) > 0.85, overlaps
+    assert "7 masks are projections of the body of revolution" in printed
 
 
 def circle(mask: np.ndarray) -> list[tuple[float, float]]:
@@ -289,7 +336,9 @@ def test_drawn_outlines_lead_to_the_masks_of_the_command(
     assert served.wait() == 0, served.errors
     assert len(shown) == NUM_VIEWS
     other = shutil.copytree(capture, tmp_path / "other", ignore=shutil.ignore_patterns("mask*"))
-    printed = command("mask", f"data.root={other}", f"outlines={capture / 'outlines.json'}", "overwrite=true")
+    printed = command(
+        "mask", f"data.root={other}", f"outlines={capture / 'outlines.json'}", "hull_only=true", "overwrite=true"
+    )
     assert "wrote 14 masks" in printed
     assert json.loads((capture / "outlines.json").read_text()).keys() == {f"photos/p_{view}.png" for view in (1, 5, 9)}
     for view in range(NUM_VIEWS):
