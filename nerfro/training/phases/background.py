@@ -36,13 +36,13 @@ class Background(Phase):
 
     A pass before training uses pixels whose rays miss the boxes of content and object, which need no tracing. With a
     known background, the first gradients of the field depend on the object. Later passes also use pixels whose rays
-    cross a box, but hardly any content. They subtract the rendered light of the field, and the rest is the background
-    in the exit direction. Directions that no photograph shows beside the object are learned in this way. These passes
-    are made before the training steps `start`, 2 `start`, 4 `start` and so on, because the field becomes more accurate.
+    cross a box, but hardly any content: the pixel minus the rendered light of the field is the background in the exit
+    direction. Some directions are visible only through the object. The later passes precede the training steps `start`,
+    2 `start`, 4 `start` and so on, because the field becomes more accurate.
 
-    A step of Adam changes each texel by about the learning rate, however many rays it has. The mean of all rays, which
-    `EnvironmentMap.fit` computes, is more accurate. Other backgrounds, and backgrounds behind a volume that covers all
-    of space, skip the phase.
+    A step of Adam changes each texel by about the learning rate, for any number of rays. The mean of all rays, see
+    `EnvironmentMap.fit`, is more accurate. Other backgrounds, and backgrounds behind a volume that covers all of space,
+    skip the phase.
 
     Args:
         steps: number of steps of a pass, which share the rows of the photographs; 0 for no pass.
