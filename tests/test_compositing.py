@@ -10,7 +10,7 @@ from nerfro.media.shapes import Ball
 from nerfro.rendering import composite
 from nerfro.samplers.paths.eikonal import Eikonal
 from nerfro.samplers.paths.snell import Snell
-from nerfro.samplers.paths.straight import Straight
+from nerfro.samplers.paths.straight import Straight, straight_path
 from nerfro.samplers.points.hierarchical import Hierarchical
 from nerfro.samplers.points.stepfun import volume_weights
 from nerfro.samplers.points.stratified import Stratified
@@ -96,6 +96,19 @@ def test_straight_and_eikonal_render_the_same_image_where_n_is_one(integrator: s
         assert rendering is not None
         images.append(rendering.rgb)
     torch.testing.assert_close(images[0], images[1], atol=2e-4, rtol=0)
+
+
+def test_rendering_converges_with_the_number_of_samples() -> None:
+    path = straight_path(example_rays())
+
+    def transmittance(num_samples: int) -> torch.Tensor:
+        samples = Stratified(num_samples).eval()(path, None)
+        return composite(samples, smooth_radiance(samples), torch.zeros(NUM_RAYS, 3), path).transmittance.double()
+
+    exact = transmittance(8192)
+    errors = [float((transmittance(n) - exact).abs().max()) for n in (32, 128)]
+    # A sample stands for the interval after it: a first-order rule, four times the samples a quarter of the error.
+    assert 3 < errors[0] / errors[1] < 6
 
 
 def corner() -> Path:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.files import lat_long
-from nerfro.light import to_srgb
+from nerfro.light import to_linear, to_srgb
 from nerfro.losses.boundary import BoundaryRegulariser
 from nerfro.losses.distortion import Distortion
 from nerfro.losses.photometric import Photometric
@@ -147,6 +147,12 @@ def test_lamps_of_a_sky_survive_a_file_and_a_texture(tmp_path: FilePath, suffix:
     torch.testing.assert_close(boundary(Exits(lamp[None]))[0], sky[12, 24], rtol=0.03, atol=0)
     boundary.save_lat_long(tmp_path / f"again{suffix}", height=32)
     assert lat_long.load_lat_long(tmp_path / f"again{suffix}").max() > 35
+
+
+def test_a_png_sky_is_decoded_and_encoded_again(tmp_path: FilePath) -> None:
+    levels = torch.linspace(0, 1, 64).expand(32, 64)[..., None].expand(-1, -1, 3)
+    lat_long.save_lat_long(tmp_path / "sky.png", to_linear(levels))
+    torch.testing.assert_close(to_srgb(lat_long.load_lat_long(tmp_path / "sky.png")), levels, rtol=0, atol=1 / 400)
 
 
 # --- what learns ---

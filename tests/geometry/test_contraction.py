@@ -55,8 +55,22 @@ def test_contracted_length_is_the_sum_of_the_shrinkage(impact_parameter: float) 
     torch.testing.assert_close(last - first, added_up, rtol=1e-6, atol=1e-6)
 
 
+def test_lengths_to_infinity() -> None:
+    through = contracted_length(
+        torch.tensor([math.inf], dtype=torch.float64).clamp(max=1e12), IMPACT_PARAMETERS[:1], RADIUS
+    )
+    torch.testing.assert_close(through, torch.tensor([2 * RADIUS], dtype=torch.float64))
+    past = contracted_length(torch.tensor([1e12], dtype=torch.float64), IMPACT_PARAMETERS[-1:], RADIUS)
+    torch.testing.assert_close(past, math.pi / 2 * RADIUS**2 / IMPACT_PARAMETERS[-1:])
+
+
 def test_world_length_is_its_inverse() -> None:
     t = torch.cat([-torch.logspace(-3, math.log10(FAR), 60), torch.logspace(-3, math.log10(FAR), 60)]).double()
     for impact_parameter in IMPACT_PARAMETERS:
         length = contracted_length(t, impact_parameter, RADIUS)
         torch.testing.assert_close(world_length(length, impact_parameter, RADIUS), t, rtol=1e-6, atol=1e-9)
+
+
+def test_places_pass_gradients() -> None:
+    x = (CENTRE + torch.tensor([[0.3, 0.2, -0.4], [3.0, -1.0, 2.0], [0.0, 0.0, -90.0]])).requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: (contract(x, CENTRE, RADIUS), contraction_scale(x, CENTRE, RADIUS)), x)

@@ -41,6 +41,14 @@ def test_spline_reproduces_quadratics_and_their_gradients() -> None:
     torch.testing.assert_close(gradient, torch.stack([2 * x - y, 1 - x, 6 * z], -1))
 
 
+def test_spline_gradient_is_that_of_its_value() -> None:
+    coefficients = torch.rand(6, 7, 8, dtype=torch.float64)
+    points = _inner_points(40).requires_grad_()
+    value, gradient = quadratic_spline(coefficients, BOX, points)
+    (automatic,) = torch.autograd.grad(value.sum(), points)
+    torch.testing.assert_close(gradient, automatic)
+
+
 def test_spline_of_smooth_values_has_order_three() -> None:
     points = _inner_points(200)
 

@@ -74,7 +74,9 @@ def test_grids_are_not_in_checkpoints() -> None:
     [
         ({"box_max": [1.0, 0.8, 1.0]}, r"box_min=.*box_max="),
         ({"box_max": [1.5, -2.0, 1.5]}, "min below max"),
+        ({"resolution": 2}, "resolution=2 is not allowed; take at least 4"),
         ({"smoothing_size": 4}, "must be odd"),
+        ({"ior": -1.0}, "medium=voxel_grid: ior=-1.0 is not allowed"),
     ],
 )
 def test_bad_options_are_named(sphere: str, options: dict, message: str) -> None:

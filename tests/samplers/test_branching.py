@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from nerfro.errors import NerfroError
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball
 from nerfro.media.solid import Solid
@@ -155,6 +156,12 @@ def test_what_is_too_light_is_added_to_the_rest() -> None:
     for least in (0.3, 0.03, 0.003):
         counts = torch.bincount(Snell(branches="all", least_weight=least)(_rays(300), Ball().double()).ray)
         assert counts.max() <= 1 / least
+
+
+@pytest.mark.parametrize("least_weight", [0.0, 1.0])
+def test_least_weights_are_shares(least_weight: float) -> None:
+    with pytest.raises(NerfroError, match="least_weight"):
+        Snell(branches="all", least_weight=least_weight)
 
 
 @pytest.mark.parametrize("what", ["index", "origin"])

@@ -7,6 +7,7 @@ is stated in each test.
 import dataclasses
 import math
 
+import numpy as np
 import pytest
 import torch
 from scipy.integrate import quad, simpson
@@ -56,6 +57,17 @@ def test_layers_refract_as_a_plane_does_however_blurred(before: float, after: fl
     torch.testing.assert_close(path.exit_directions, expected, atol=1e-12, rtol=0)
 
 
+def test_layers_reflect_totally_beyond_the_critical_angle() -> None:
+    angles = torch.tensor([45.0, 60.0, 75.0], dtype=torch.float64).deg2rad()  # the critical angle is 41.8 degrees
+    directions = torch.stack([angles.sin(), 0 * angles, angles.cos()], -1)
+    path = _trace(make_rays(-2 * directions, directions, 0, 5), layered(1.5, 1.0, 0.5))
+    mirrored = directions * torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64)
+    torch.testing.assert_close(path.exit_directions, mirrored, atol=1e-12, rtol=0)
+    # The path turns where n has fallen to its conserved n sin(theta).
+    n, _ = FunctionMedium(layered(1.5, 1.0, 0.5))(path.positions)
+    torch.testing.assert_close(n.amin(-1), 1.5 * angles.sin(), atol=1e-3, rtol=0)
+
+
 # --- radial media ---
 
 
@@ -80,6 +92,18 @@ def test_blurred_ball_deviates_as_its_quadrature(impact: float) -> None:
     path = march_uniform(rays, FunctionMedium(blurred_ball(ior, sigma)), leapfrog, 768)
     measured = math.degrees(math.atan2(-float(path.exit_directions[0, 1]), float(path.exit_directions[0, 0])))
     assert measured == pytest.approx(math.degrees(deviation), abs=0.03)
+
+
+@LEVELS
+def test_luneburg_path_is_an_ellipse(dtype: torch.dtype, level: float) -> None:
+    rays = make_rays([[-0.8, 0.6, 0.0], [-0.6, 0.0, 0.8]], [[1, 0, 0], [1, 0, 0]], 0, 1.8)
+    path = _trace(rays, luneburg, dtype)
+    for row in range(2):
+        basis = torch.stack([rays.origins[row], rays.directions[row]], -1)  # |p0| = n = 1 on the rim
+        cos_sin = torch.linalg.lstsq(basis, path.positions[row].T).solution
+        nearest = basis @ (cos_sin / cos_sin.norm(dim=0))
+        distance = (path.positions[row].T - nearest).norm(dim=0)
+        assert distance.max() < 2 * level  # the lens is 2 wide
 
 
 @LEVELS
@@ -132,6 +156,21 @@ def test_fisheye_rays_are_circles_that_meet_in_the_image(dtype: torch.dtype, lev
         assert torch.linalg.cross(to_image, path.exit_directions[0]).norm() < size * level
 
 
+# --- fibres ---
+
+
+@LEVELS
+def test_skew_rays_of_a_parabolic_fibre_are_ellipses(dtype: torch.dtype, level: float) -> None:
+    length = 6.0
+    rays = make_rays([[0.5, 0.2, 0.0], [0.3, -0.4, 0.0]], [[0.1, 0.2, 1.0], [-0.2, 0.1, 1.0]], 0, length)
+    path = _trace(rays, fibre, dtype)
+    omega = 1.5 * FIBRE_ALPHA
+    p0 = rays.directions * FunctionMedium(fibre)(rays.origins)[0][:, None]
+    sigma = path.positions[..., 2:] / p0[:, None, 2:]
+    expected = rays.origins[:, None] * torch.cos(omega * sigma) + p0[:, None] / omega * torch.sin(omega * sigma)
+    torch.testing.assert_close(path.positions[..., :2], expected[..., :2], atol=length * level, rtol=0)
+
+
 # --- mirages ---
 
 
@@ -147,6 +186,25 @@ def test_leapfrog_follows_the_parabola_of_linear_n_squared_to_rounding(dtype: to
     positions = path.positions[0].double()
     sigma = (positions @ across) / (p0 @ across)
     torch.testing.assert_close(positions, sigma[:, None] * p0 + sigma[:, None] ** 2 / 4 * g, atol=level, rtol=0)
+
+
+@LEVELS
+def test_linear_index_gives_the_catenary(dtype: torch.dtype, level: float) -> None:
+    k, length = 0.5, 3.0
+    direction = [math.cos(-0.4), math.sin(-0.4), 0.0]
+
+    def squared(x: Tensor) -> tuple[Tensor, Tensor]:
+        n = 1.5 + k * x[..., 1]
+        return n**2, 2 * k * n[..., None] * x.new_tensor([0.0, 1.0, 0.0])
+
+    path = _trace(make_rays([[0, 0, 0]], [direction], 0, length), squared, dtype)
+    c = 1.5 * direction[0]
+    x, y = path.positions[0, :, 0].numpy(), path.positions[0, :, 1].numpy()
+    vertex = c / k * math.acosh(1.5 / c)  # where the ray turns: it descends until there
+    expected = c / k * np.cosh(k * (x - vertex) / c) - 1.5 / k
+    np.testing.assert_allclose(y, expected, atol=length * level)
+    # Total reflection in a continuous medium: the ray turns where n = C.
+    assert y.min() == pytest.approx((c - 1.5) / k, abs=1e-4)
 
 
 # --- orders ---

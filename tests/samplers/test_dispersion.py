@@ -8,9 +8,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from nerfro.errors import NerfroError
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball
 from nerfro.media.solid import Solid
+from nerfro.samplers.paths.eikonal import Eikonal
 from nerfro.samplers.paths.snell import Snell
 from tests.closed_forms import RoundedBox, angle, beam, make_rays, random_rays
 from tests.samplers.test_snell import _prism
@@ -106,3 +108,19 @@ def test_bands_bring_their_gradients_to_the_one_index() -> None:
     expected = (exits(zero + 1e-6, False) - exits(zero - 1e-6, False)) / 2e-6
     torch.testing.assert_close(found, expected, atol=1e-8, rtol=1e-6)
     assert found.shape == (21, 3)
+
+
+def test_an_index_that_learns_keeps_its_abbe_number() -> None:
+    index = torch.tensor([1.5], dtype=torch.float64, requires_grad=True)
+    medium = Ball(abbe=[30.0]).with_indices(index)
+    (gradient,) = torch.autograd.grad(medium.at_wavelength(450).iors.sum(), index)
+    assert float(gradient) == pytest.approx((cauchy(1.6, 30, 450) - cauchy(1.5, 30, 450)) / 0.1)
+
+
+def test_what_cannot_be_dispersed_is_refused() -> None:
+    with pytest.raises(NerfroError, match="one for each body"):
+        Ball(abbe=[30.0, 40.0])
+    with pytest.raises(NerfroError, match="wavelengths"):
+        Snell(wavelengths=[500.0, 600.0])
+    with pytest.raises(NerfroError, match="path=snell"):
+        Eikonal()(random_rays(2, 2.0, seed=3, far=6), Ball(abbe=[30.0]))

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from nerfro.errors import NerfroError
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball
@@ -17,6 +18,17 @@ BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
 
 
 # --- adaptive steps ---
+
+
+def test_adaptive_luneburg_lens_focuses_on_its_rim() -> None:
+    heights = torch.linspace(-0.9, 0.9, 13, dtype=torch.float64)
+    origins = torch.stack([torch.full_like(heights, -3), heights, 0 * heights], -1)
+    path = Eikonal(tolerance=1e-6)(make_rays(origins, [[1, 0, 0]] * 13, 0.5, 6), Luneburg().double())
+    assert path.refracted.all()
+    # Behind the focus rays go straight: their line passes through (R, 0, 0).
+    to_focus = torch.tensor([1.0, 0, 0], dtype=torch.float64) - path.exit_positions
+    distance = torch.linalg.cross(to_focus, path.exit_directions).norm(dim=-1)
+    assert distance.max() < 1e-4
 
 
 def test_adaptive_steps_refract_exactly_at_a_flat_shell() -> None:
@@ -127,3 +139,10 @@ def test_paths_of_different_capacity_agree() -> None:
         torch.testing.assert_close(path.positions[i, : alone.s.shape[1]], alone.positions[0])
         assert (path.s[i].diff() >= 0).all()
         torch.testing.assert_close(path.far[i], alone.far[0])
+
+
+def test_bad_options_are_named() -> None:
+    with pytest.raises(NerfroError, match="num_steps=1"):
+        Eikonal("euler", 1)
+    with pytest.raises(NerfroError, match=r"tolerance=0\.0 is not allowed; take more than 0"):
+        Eikonal(tolerance=0.0)

@@ -4,6 +4,7 @@ The samplers themselves trace without gradients; these are properties of the pla
 """
 
 import math
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -13,7 +14,7 @@ from nerfro.media.voxel_grid import VoxelGrid
 from nerfro.samplers.paths.eikonal import march_uniform
 from nerfro.samplers.paths.integrators import Integrator, euler, leapfrog
 from nerfro.samplers.paths.snell_law import refract
-from tests.closed_forms import FunctionMedium, grid_points, make_rays
+from tests.closed_forms import FunctionMedium, Squared, blurred_ball, grid_points, make_rays
 
 ONES = torch.ones(1, dtype=torch.float64)
 
@@ -63,6 +64,47 @@ def test_gradients_are_finite_on_crossing_the_critical_angle() -> None:
 
 
 # --- unrolled steps ---
+
+
+def _of_radius(radius: Tensor) -> Squared:
+    return lambda x: (2 - x.square().sum(-1) / radius**2, -2 * x / radius**2)
+
+
+def _of_alpha(alpha: Tensor) -> Squared:
+    def squared(x: Tensor) -> tuple[Tensor, Tensor]:
+        across = x * x.new_tensor([1.0, 1.0, 0.0])
+        return 2.25 * (1 - alpha**2 * across.square().sum(-1)), -2.25 * 2 * alpha**2 * across
+
+    return squared
+
+
+@pytest.mark.parametrize("integrator", [euler, leapfrog])
+@pytest.mark.parametrize(
+    ("profile", "value"),
+    [
+        (lambda ior: blurred_ball(ior, 0.05), 1.52),
+        (lambda radius: blurred_ball(1.52, 0.05, radius), 1.0),
+        (_of_radius, 1.3),
+        (_of_alpha, 0.5),
+    ],
+    ids=["ball-index", "ball-radius", "luneburg", "fibre"],
+)
+def test_autodiff_agrees_with_central_differences(
+    integrator: Integrator, profile: Callable[[Tensor], Squared], value: float
+) -> None:
+    rays = make_rays([[-1.1, 0.4, 0.1], [-1.1, -0.7, 0.2]], [[1, 0.1, 0.2], [1, 0, 0]], 0, 2)
+
+    def loss(parameter: Tensor) -> Tensor:
+        path = march_uniform(rays, FunctionMedium(profile(parameter)), integrator, 129)
+        return (path.exit_positions * _double(0.3, 0.7, -0.4)).sum() + (path.exit_directions * _double(1, -2, 3)).sum()
+
+    parameter = torch.tensor(value, dtype=torch.float64, requires_grad=True)
+    (gradient,) = torch.autograd.grad(loss(parameter), parameter)
+    step = 1e-6
+    with torch.no_grad():
+        expected = (loss(parameter + step) - loss(parameter - step)) / (2 * step)
+    assert abs(float(expected)) > 0.1
+    torch.testing.assert_close(gradient, expected, rtol=1e-6, atol=0)
 
 
 def test_a_voxel_grid_gets_the_gradient_of_central_differences() -> None:

@@ -1,7 +1,8 @@
-"""What every path conserves: |v| = n, moments, and straightness where n = 1."""
+"""What every path conserves: |v| = n, moments, reversibility, phase-space volume, and straightness where n = 1."""
 
 import pytest
 import torch
+from torch import Tensor
 
 from nerfro.media.analytic import Vacuum
 from nerfro.media.base import Medium
@@ -11,7 +12,7 @@ from nerfro.media.voxel_grid import VoxelGrid
 from nerfro.rendering import composite
 from nerfro.samplers.base import PathSampler, PointSampler
 from nerfro.samplers.paths.eikonal import Eikonal
-from nerfro.samplers.paths.integrators import RayState, leapfrog
+from nerfro.samplers.paths.integrators import RayState, kick_drift_kick, leapfrog
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.paths.straight import Straight
 from nerfro.samplers.points.hierarchical import Hierarchical
@@ -22,10 +23,63 @@ from tests.closed_forms import (
     FunctionMedium,
     Squared,
     blurred_ball,
+    fibre,
     fisheye,
     grid_points,
     luneburg,
 )
+
+SMOOTH = [luneburg, fisheye, fibre]
+
+
+def _launch(num: int = 5) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(4)
+    x = 0.6 * (torch.rand(num, 3, generator=generator, dtype=torch.float64) - 0.5)
+    d = torch.nn.functional.normalize(torch.randn(num, 3, generator=generator, dtype=torch.float64), dim=-1)
+    return x, d
+
+
+def _steps(x: Tensor, v: Tensor, medium: Medium, dsigma: float, num_steps: int) -> tuple[Tensor, Tensor]:
+    state = RayState(x, v, *medium(x))
+    for _ in range(num_steps):
+        state = kick_drift_kick(state, torch.full_like(x[:, 0], dsigma), medium)
+    return state.positions, state.velocities
+
+
+# --- steps of fixed dsigma, the core of the leapfrog ---
+
+
+@pytest.mark.parametrize("squared", SMOOTH)
+def test_steps_of_fixed_dsigma_run_backwards_to_their_start(squared: Squared) -> None:
+    medium = FunctionMedium(squared)
+    x0, d = _launch()
+    v0 = d * medium(x0)[0][:, None]
+    x, v = _steps(x0, v0, medium, 0.004, 256)
+    assert (x - x0).norm(dim=-1).min() > 0.2
+    x, v = _steps(x, -v, medium, 0.004, 256)
+    torch.testing.assert_close(x, x0, atol=1e-12, rtol=0)
+    torch.testing.assert_close(-v, v0, atol=1e-12, rtol=0)
+
+
+@pytest.mark.parametrize("squared", SMOOTH)
+def test_steps_of_fixed_dsigma_keep_the_phase_space_volume(squared: Squared) -> None:
+    medium = FunctionMedium(squared)
+    x0, d = _launch(1)
+    v0 = d * medium(x0)[0][:, None]
+
+    def flow(phase: Tensor) -> Tensor:
+        return torch.cat(_steps(phase[None, :3], phase[None, 3:], medium, 0.05, 20), -1)[0]
+
+    jacobian = torch.autograd.functional.jacobian(flow, torch.cat([x0, v0], -1)[0])
+    # Etendue: far from the identity, and yet of determinant 1. Symplectic maps also keep the form J.
+    assert (jacobian - torch.eye(6)).abs().max() > 0.3
+    assert float(torch.linalg.det(jacobian)) == pytest.approx(1.0, abs=1e-12)
+    form = torch.zeros(6, 6, dtype=torch.float64)
+    form[:3, 3:], form[3:, :3] = torch.eye(3), -torch.eye(3)
+    torch.testing.assert_close(jacobian.T @ form @ jacobian, form, atol=1e-12, rtol=0)
+
+
+# --- whole paths ---
 
 
 @pytest.mark.parametrize("squared", [luneburg, fisheye, blurred_ball(1.52, 0.05)])

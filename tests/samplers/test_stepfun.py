@@ -1,11 +1,13 @@
 """Inverse transform sampling against its analytic distribution and against a slow loop."""
 
 import numpy as np
+import pytest
 import torch
 from torch import Tensor
 
 from nerfro.samplers.paths.straight import straight_path
-from nerfro.samplers.points.stepfun import blur_weights, invert_cdf
+from nerfro.samplers.points.stepfun import blur_weights, invert_cdf, spread_uniform
+from nerfro.testing import example_draws
 from nerfro.types import Path
 from tests.closed_forms import make_rays
 
@@ -66,3 +68,16 @@ def test_blur_equals_a_slow_loop() -> None:
             here, left, right = (weights[ray, j] for j in (i, max(i - 1, 0), min(i + 1, 10)))
             slow[ray, i] = 0.5 * (max(left, here) + max(here, right)) + 0.01
     torch.testing.assert_close(blur_weights(weights, 0.01), slow)
+
+
+@pytest.mark.parametrize("num_samples", [1, 5, 64])
+def test_random_u_has_one_draw_in_each_bin(num_samples: int) -> None:
+    u = spread_uniform(_paths(100), num_samples, example_draws(100))
+    assert ((u * num_samples).floor() == torch.arange(num_samples)).all()
+    assert len(u.unique()) > 0.9 * u.numel()
+
+
+def test_even_u_runs_from_zero_to_just_below_one() -> None:
+    u = spread_uniform(_paths(2), 9, None)
+    torch.testing.assert_close(u, torch.linspace(0, 1, 9, dtype=torch.float64).expand(2, -1))
+    assert (u < 1).all()

@@ -92,6 +92,8 @@ def test_cones_fill_the_path_without_gaps() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        ({"num_samples": 1}, "num_samples=1 is not allowed; take at least 2"),
+        ({"offset": 1.0}, "offset=1.0 is not allowed; take at least 0 and less than 1"),
         ({"cast": "cones", "draw": "vertices"}, "cones have no vertices to draw; set draw=arc_length"),
     ],
 )

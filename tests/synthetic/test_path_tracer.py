@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from nerfro.errors import NerfroError
 from nerfro.synthetic import path_tracer
 from nerfro.synthetic.dataset import CAMERA_ANGLE_X, CAMERA_DISTANCE
 from nerfro.synthetic.path_tracer import PathTracer, Pinhole, load_mitsuba
@@ -131,6 +132,11 @@ def test_a_missing_mitsuba_is_told_with_the_extra_to_install():
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert "NerfroError" in result.stderr
     assert "pip install 'nerfro[synthesize]'" in result.stderr
+
+
+def test_an_unknown_variant_names_the_known_ones():
+    with pytest.raises(NerfroError, match="choose auto, llvm_ad_rgb"):
+        load_mitsuba("llvm")
 
 
 def test_only_edges_of_the_sky_are_averaged_over_texels():

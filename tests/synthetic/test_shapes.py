@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from nerfro.synthetic.scene import lat_long_texture
 from nerfro.synthetic.surface import rounded_box, sphere, torus_angles
-from nerfro.synthetic.viewpoints import look_at_origin
+from nerfro.synthetic.viewpoints import directions_on_sphere, look_at_origin
 
 
 def assert_closed_and_outward(surface, volume, tolerance):
@@ -33,6 +34,17 @@ def test_sphere_and_torus_have_their_volumes():
     assert ((angles >= 0) & (angles < 2 * np.pi)).all()
 
 
+def test_viewpoints_cover_the_whole_sphere_and_differ_between_splits():
+    train, test = (directions_on_sphere(100, 0, split) for split in (0, 2))
+    anywhere = np.random.default_rng(2).normal(size=(5000, 3))
+    anywhere /= np.linalg.norm(anywhere, axis=1, keepdims=True)
+    farthest = np.degrees(np.arccos((anywhere @ train.T).max(1))).max()
+    assert farthest < 25  # 100 discs of 11.5 degrees would cover the sphere if they could be packed without overlap
+    assert np.degrees(np.arccos(np.clip((test @ train.T).max(), -1, 1))) > 0.1
+    assert np.array_equal(train, directions_on_sphere(100, 0, 0))
+    assert not np.allclose(train, directions_on_sphere(100, 1, 0))
+
+
 @pytest.mark.parametrize("position", [(3.0, -2.0, 1.0), (0.0, 0.0, 4.0), (0.0, 0.0, -4.0)])
 def test_cameras_look_at_the_origin_upright(position):
     pose = look_at_origin(np.array(position))
@@ -42,3 +54,10 @@ def test_cameras_look_at_the_origin_upright(position):
     assert -rotation[:, 2] * np.linalg.norm(position) == pytest.approx(-np.array(position))
     assert rotation[2, 0] == pytest.approx(0.0, abs=1e-12)  # the picture's horizontal is horizontal
     assert rotation[2, 1] >= -1e-12
+
+
+def test_lat_long_texture_averages_over_each_pixel():
+    texture = lat_long_texture(lambda directions: np.repeat(directions[..., 2:] > 0, 3, -1).astype(float), 9, 3)
+    assert texture[:4] == pytest.approx(1.0)
+    assert texture[5:] == pytest.approx(0.0)
+    assert texture[4] == pytest.approx(0.5, abs=0.2)  # the horizon runs through the middle of row 4
