@@ -146,7 +146,9 @@ class Agreements:
         num_steps, now = 1, time.perf_counter()
         if self._last is not None:
             step, before = self._last
-            num_steps = int(self._SECONDS * (self._step - step) / max(now - before, 1e-6))
+            since = self._step - step
+            # At most twice as many as before, because the next steps may be slower, as after a fit of the background.
+            num_steps = min(int(self._SECONDS * since / max(now - before, 1e-6)), 2 * since)
         self._last = self._step, now
         wanted = self._step + min(max(num_steps, 1), self._MOST_STEPS)
         self._next = trainer.strategy.broadcast(wanted)
