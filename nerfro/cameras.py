@@ -116,7 +116,7 @@ class Cameras:
         view: Int[Tensor, "R"],
         row: Int[Tensor, "R"] | Float[Tensor, "R"],
         column: Int[Tensor, "R"] | Float[Tensor, "R"],
-        jitter: Float[Tensor, "R 2"] | Float[Tensor, "2"] | None = None,
+        place: Float[Tensor, "R 2"] | Float[Tensor, "2"] | None = None,
     ) -> Rays:
         """Make rays through pixels.
 
@@ -127,14 +127,14 @@ class Cameras:
 
         Args:
             view, row, column: indices of each pixel, on the device of the cameras.
-            jitter: position (x, y) of the ray within each pixel, in [0, 1); the centre (.5, .5) by default.
+            place: position (x, y) of the ray within each pixel, in [0, 1); the centre (.5, .5) by default.
 
         Returns:
             Rays in world space with unit directions.
         """
         fx = self.fx[view]
         # Not in PyTorch's default type, which Lightning changes temporarily while another thread makes rays.
-        offset_x, offset_y = (0.5, 0.5) if jitter is None else jitter.to(fx).unbind(-1)
+        offset_x, offset_y = (0.5, 0.5) if place is None else place.to(fx).unbind(-1)
         row, column = row.to(fx), column.to(fx)
         x = (column + offset_x - self.cx[view]) / fx
         y = (self.cy[view] - row - offset_y) / self.fy[view]

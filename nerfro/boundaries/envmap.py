@@ -122,7 +122,7 @@ class EnvironmentMap(Boundary):
         Returns:
             Weight of these observations of each texel: the sum over rays of bilinear weight times weight of the ray.
         """
-        face, coordinates = cube_map.project(observed.directions)
+        face, coordinates = cube_map.project(observed.directions.float())
         target = _raw(observed.radiance.clamp(min=_DARKEST))
         residual = target - self._looked_up(face, coordinates, self.texels, self.padded, self.levels)
         texels = zip(*(tensor.split(self.levels.sizes) for tensor in (self.texels, past)), strict=True)

@@ -57,7 +57,8 @@ class Exposure(PerView):
         unsaturated = photographed < 1
         products = torch.stack([photographed * radiance, radiance * radiance]) * unsaturated
         sums = products.new_zeros(2, *self.log_gain.shape).index_add(1, view, products)
-        self.log_gain.copy_(torch.where(sums[1] > 0, (sums[0] / sums[1]).log(), self.log_gain))
+        # A black photograph has no gain.
+        self.log_gain.copy_(torch.where((sums > 0).all(0), (sums[0] / sums[1]).log(), self.log_gain))
 
     @property
     def spread(self) -> float:

@@ -40,11 +40,13 @@ def share(task: Callable[[int], Result], number: int) -> list[Result]:
             results[i] = task(i)
 
     begun = [thread.submit(work) for thread in HELPERS if number > 1]
-    work()
-    for help in begun:
-        # The work of a busy thread has not begun and is cancelled, because nothing is left to do.
-        if not help.cancel():
-            help.result()
+    try:
+        work()
+    finally:
+        for help in begun:
+            # The work of a busy thread has not begun and is cancelled, because nothing is left to do.
+            if not help.cancel():
+                help.result()
     return [results[i] for i in range(number)]
 
 

@@ -294,6 +294,6 @@ class _Usable:
         """Return the views, and the pixels of the window by number (row, column), of usable pixels."""
         block = np.searchsorted(self._before, numbers, side="right") - 1
         view, within = np.divmod(block, self._bits.shape[1])
-        counted = np.unpackbits(self._bits[view, within], axis=-1).cumsum(-1, dtype=np.int64)
+        counted = np.unpackbits(self._bits[view, within], axis=-1).cumsum(-1, dtype=np.uint8)  # at most _BLOCK
         place = (counted <= (numbers - self._before[block])[:, None]).sum(-1)
         return view, within * self._BLOCK + place

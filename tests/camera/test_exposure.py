@@ -20,10 +20,13 @@ def test_gains_are_one_on_average_whatever_is_learned() -> None:
 
 
 def test_gains_are_fitted_to_unsaturated_pixels() -> None:
-    exposure, gains = Exposure(), torch.tensor([[0.5, 1.0, 2.0], [2.0, 1.0, 0.5], [1.0, 1.0, 1.0]])
-    exposure.begin(3)
-    view, radiance = torch.arange(300) % 2, 0.9 * torch.rand(300, 3)  # no pixel of the third view
-    exposure.fit(view, radiance, (gains[view] * radiance).clamp(max=1))
+    exposure, gains = Exposure(), torch.ones(5, 3)
+    gains[:2] = torch.tensor([[0.5, 1.0, 2.0], [2.0, 1.0, 0.5]])
+    exposure.begin(5)  # without a pixel of the last view
+    view, radiance = torch.arange(400) % 4, 0.9 * torch.rand(400, 3)
+    photographed = (gains[view] * radiance).clamp(max=1)
+    photographed[view == 2] = 0  # a black photograph has no gain
+    exposure.fit(view, radiance, photographed)
     torch.testing.assert_close(exposure.gains(), gains)
 
 

@@ -63,6 +63,8 @@ def test_directions_behind_the_object_are_learned_through_it(tiny_scene: Path, t
     assert error() > 0.1
     assert all(phase.step(run, number, state) for number in range(4, 8))  # the first pass through the object
     assert error() < 0.05
+    background.requires_grad_(False)
+    assert phase.begin(run) == {}, "a given background stays"
 
 
 def test_pretraining_leaves_time_for_the_scene(

@@ -45,7 +45,8 @@ class Background(Phase):
     skip the phase.
 
     Args:
-        steps: number of steps of a pass, which share the rows of the photographs; 0 for no pass.
+        steps: number of steps of a pass, which share the rows of the photographs; 0 for no pass. From the second step
+            on, the exposures of the photographs are fitted as well.
         time_share: largest fraction of `trainer.max_time` for the pass before training, so that short runs train the
             scene, too.
         start: training step of the first pass that also uses rays through the object; None for no such pass.
@@ -57,9 +58,11 @@ class Background(Phase):
     def begin(self, run: Run) -> dict[str, Any]:
         """Return the weights of the observations of each texel in the current pass."""
         background = run.renderer.scene.boundary
-        if not isinstance(background, EnvironmentMap) or occupied_box(run.renderer) is None:
+        if not isinstance(background, EnvironmentMap) or not background.texels.requires_grad:
             return {}
-        return {"weights": torch.zeros(background.levels.num_texels, device=run.renderer.scene.device)}
+        if occupied_box(run.renderer) is None:
+            return {}
+        return {"weights": torch.zeros(background.levels.num_texels)}
 
     def steps_before(self, training_step: int) -> int:
         later_passes = 0 if self.start is None else (training_step // self.start).bit_length()
@@ -73,6 +76,8 @@ class Background(Phase):
         number_of_pass, part = divmod(number, self.steps)
         if number_of_pass == 0 and run.spent >= self.time_share:
             return True
+        # A checkpoint restores the state on the CPU.
+        state["weights"] = state["weights"].to(background.texels.device)
         if part == 0:
             state["weights"].zero_()
         most_pixels = min(run.batches.num_pixels, _MOST_PIXELS * background.levels.sizes[-1])
