@@ -34,10 +34,12 @@ def share(task: Callable[[int], Result], number: int) -> list[Result]:
     results: dict[int, Result] = {}
     numbers = iter(range(number))
 
-    @torch.no_grad()
+    inference = torch.is_inference_mode_enabled()  # a mode of the thread
+
     def work() -> None:
-        for i in numbers:
-            results[i] = task(i)
+        with torch.inference_mode(inference), torch.no_grad():
+            for i in numbers:
+                results[i] = task(i)
 
     begun = [thread.submit(work) for thread in HELPERS if number > 1]
     try:

@@ -7,6 +7,7 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
+import torch
 
 from nerfro.kernels import threads
 
@@ -97,3 +98,17 @@ def test_an_error_of_a_helping_thread_is_raised(monkeypatch: pytest.MonkeyPatch)
         monkeypatch.setattr(threads, "HELPERS", [helper])
         with pytest.raises(ValueError, match="no helper"):
             threads.share(fail, 2)
+
+
+def test_helping_threads_write_to_tensors_of_evaluation(monkeypatch: pytest.MonkeyPatch) -> None:
+    met = threading.Barrier(2)
+    with ThreadPoolExecutor(1) as helper, torch.inference_mode():
+        monkeypatch.setattr(threads, "HELPERS", [helper])
+        values = torch.zeros(2)
+
+        def write(number: int) -> None:
+            met.wait(10)
+            values[number] = 1.0
+
+        threads.share(write, 2)
+    assert values.tolist() == [1.0, 1.0]

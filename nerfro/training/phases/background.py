@@ -28,6 +28,8 @@ _SHARE, _MOST_RAYS = 0.15, 2**19
 # Rays through the object count if at least this fraction of their light is background, and if neighbouring rays diverge
 # by at most so many pixel widths.
 _BACKGROUND, _MOST_DIVERGENCE = 0.7, 8.0
+# Turns between background and exposures in the first step.
+_TURNS = 10
 
 
 @register("phase", "background")
@@ -45,8 +47,8 @@ class Background(Phase):
     skip the phase.
 
     Args:
-        steps: number of steps of a pass, which share the rows of the photographs; 0 for no pass. From the second step
-            on, the exposures of the photographs are fitted as well.
+        steps: number of steps of a pass, which share the rows of the photographs; 0 for no pass. The exposures of the
+            photographs are fitted as well.
         time_share: largest fraction of `trainer.max_time` for the pass before training, so that short runs train the
             scene, too.
         start: training step of the first pass that also uses rays through the object; None for no such pass.
@@ -84,7 +86,10 @@ class Background(Phase):
         num_parts = self.steps * run.batches.num_pixels // most_pixels
         pixels = run.batches.rows(part * num_parts // self.steps, num_parts)
         beside = misses(box, _rays(run, pixels))
-        observed = [_beside(run, pixels[beside], number)]
+        if number == 0 and run.renderer.scene.camera.exposure is not None:
+            for turn in range(_TURNS):
+                background.fit(_beside(run, pixels[beside], turn > 0), torch.zeros_like(state["weights"]))
+        observed = [_beside(run, pixels[beside])]
         if number_of_pass > 0:
             assert self.start is not None
             num_trained = self.start * 2 ** (number_of_pass - 1) * run.batches.batch_size
@@ -117,12 +122,12 @@ def _through(run: Run, pixels: Int[Tensor, "P"]) -> Observed:
     return observed[fraction.amin(-1) >= _BACKGROUND]
 
 
-def _beside(run: Run, pixels: Int[Tensor, "P"], number: int) -> Observed:
-    """Observe the background along rays of pixels beside the object."""
+def _beside(run: Run, pixels: Int[Tensor, "P"], fits_gains: bool = True) -> Observed:
+    """Observe the background along rays of pixels beside the object, after the exposures are fitted to it."""
     batches, scene = run.batches, run.renderer.scene
     rays, view, rgb = _rays(run, pixels), batches.view(pixels), batches.photographed(pixels)
     radiance, exposure = scene.boundary(Exits.unbent(rays)), scene.camera.exposure
-    if exposure is not None and number > 0:  # the first step observes the background with equal gains
+    if exposure is not None and fits_gains:
         exposure.fit(view, radiance, scene.colour_space.to_radiance(rgb))
     widths = 1 / batches.cameras.fx[view]
     return Observed(rays.directions, _photographed(run, rgb, view, radiance), torch.ones_like(widths), widths)
