@@ -174,6 +174,10 @@ class Cameras:
         rows = self.fy[:, None] * y + self.cy[:, None]
         return torch.stack([columns, rows], -1), -back
 
+    def view_of(self, pixels: Int[Tensor, "*batch"]) -> Int[Tensor, "*batch"]:
+        """Return the view of each pixel, given its number view * H * W + row * W + column."""
+        return pixels // (self.height * self.width)
+
     def image_rays(self, view: int) -> Rays:
         """Make rays through all pixel centres of a view, row by row."""
         return self._window_rays(view, Window(0, 0, self.height, self.width))

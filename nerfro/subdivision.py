@@ -96,7 +96,7 @@ def subdivide(
         trace_exits: traces the exit direction of each ray's main polyline; None uses `trace`.
         contrasts: contrast of the pixels in given rows of `pixels`; None disables the criterion.
     """
-    view, num_parts = pixels // (cameras.height * cameras.width), subdivision.side**2
+    view, num_parts = cameras.view_of(pixels), subdivision.side**2
     rays = pixel_rays(cameras, pixels)
     path = None if trace is None else trace(rays, view)
     if trace is None or path is None or num_parts == 1:
@@ -126,7 +126,7 @@ def pixel_rays(
 ) -> Rays:
     """Make rays through a position (x, y) in [0, 1) of pixels, by default the centres."""
     width, height = cameras.width, cameras.height
-    return cameras.rays(pixels // (height * width), pixels // width % height, pixels % width, place)
+    return cameras.rays(cameras.view_of(pixels), pixels // width % height, pixels % width, place)
 
 
 def part_rays(cameras: Cameras, pixels: Int[Tensor, "Q"], side: int) -> Rays:
@@ -170,5 +170,4 @@ def divergence(
     background with the central ray alone would cause speckle.
     """
     chord = torch.linalg.vector_norm(exits - neighbours, dim=-1)
-    view = pixels // (cameras.height * cameras.width)
-    return 2 * torch.asin((0.5 * chord).clamp(max=1)) * cameras.fx[view]
+    return 2 * torch.asin((0.5 * chord).clamp(max=1)) * cameras.fx[cameras.view_of(pixels)]

@@ -30,6 +30,11 @@ class CubeLevels:
         return tuple(6 * n * n for n in self.resolutions)
 
     @property
+    def padded_sizes(self) -> tuple[int, ...]:
+        """Number of texels of each level with margins, see `padded_texels`."""
+        return tuple(6 * (n + 2) ** 2 for n in self.resolutions)
+
+    @property
     def offsets(self) -> tuple[int, ...]:
         return tuple(sum(self.sizes[:level]) for level in range(len(self.resolutions)))
 
@@ -106,8 +111,7 @@ def lookup(
         padded: `padded_texels` of all levels, flattened, one level after the other.
         levels: layout of the texels.
     """
-    padded_sizes = [6 * (n + 2) ** 2 for n in levels.resolutions]
-    padded_offsets = tuple(sum(padded_sizes[:level]) for level in range(len(levels)))
+    padded_offsets = tuple(sum(levels.padded_sizes[:level]) for level in range(len(levels)))
     resolution, offset, padded_offset = (
         constant(values, texels.device) for values in (levels.resolutions, levels.offsets, padded_offsets)
     )

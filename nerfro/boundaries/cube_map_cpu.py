@@ -76,11 +76,11 @@ def _taps(face, x, y, n, padded, padded_offset):
     y = (y + _ONE) * np.float32(0.5 * n) + np.float32(0.5)
     column, row = max(min(np.int64(x), n), 0), max(min(np.int64(y), n), 0)
     u, v = x - np.float32(column), y - np.float32(row)
-    at_corner = (column == 0 or column == n) and (row == 0 or row == n)
-    missing = (1 if column == n else 0) + (2 if row == n else 0) if at_corner else -1
     if 0 < column < n and 0 < row < n:  # between texels of one face
         inside = (face * n + row - 1) * n + column - 1
-        return (inside, inside + 1, inside + n, inside + n + 1), u, v, missing
+        return (inside, inside + 1, inside + n, inside + n + 1), u, v, -1
+    at_corner = (column == 0 or column == n) and (row == 0 or row == n)
+    missing = (1 if column == n else 0) + (2 if row == n else 0) if at_corner else -1
     width = n + 2
     first = padded_offset + (face * width + row) * width + column
     texels = (padded[first], padded[first + 1], padded[first + width], padded[first + width + 1])

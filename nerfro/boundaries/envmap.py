@@ -39,12 +39,14 @@ class Observed:
     Attributes:
         directions: unit directions of rays.
         radiance: linear radiance of each ray.
+        saturated: channels in which the radiance is a lower bound.
         weights: weight of each ray.
         widths: angle in radians over which the radiance of each ray is a mean.
     """
 
     directions: Float[Tensor, "P 3"]
     radiance: Float[Tensor, "P 3"]
+    saturated: Bool[Tensor, "P 3"]
     weights: Float[Tensor, "P"]
     widths: Float[Tensor, "P"]
 
@@ -125,8 +127,9 @@ class EnvironmentMap(Boundary):
         face, coordinates = cube_map.project(observed.directions.float())
         target = _raw(observed.radiance.clamp(min=_DARKEST))
         residual = target - self._looked_up(face, coordinates, self.texels, self.padded, self.levels)
+        residual = torch.where(observed.saturated, residual.clamp(min=0), residual)
         texels = zip(*(tensor.split(self.levels.sizes) for tensor in (self.texels, past)), strict=True)
-        padded, total = self.padded.split([6 * (n + 2) ** 2 for n in self.levels.resolutions]), []
+        padded, total = self.padded.split(self.levels.padded_sizes), []
         for n, of_level, (values, earlier) in zip(self.levels.resolutions, padded, texels, strict=True):
             wide = observed.widths > _MOST_TEXELS * 0.5 * math.pi / n
             weights = observed.weights.masked_fill(wide, 0)[:, None].expand(-1, 3)

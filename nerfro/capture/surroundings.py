@@ -72,7 +72,7 @@ class Pixels:
 
     @property
     def view(self) -> Int[Tensor, "P"]:
-        return self.index // (self.cameras.height * self.cameras.width)
+        return self.cameras.view_of(self.index)
 
     @cached_property
     def rays(self) -> Rays:

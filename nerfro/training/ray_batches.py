@@ -146,7 +146,7 @@ class RayBatches:
             rays=found.rays,
             pixel=found.pixel,
             index=pixels,
-            view=pixels // (height * width),
+            view=cameras.view_of(pixels),
             rgb=self._pixels[pixels],
             teaches_background=~found.diverges,
             cameras=cameras.crop(window),
@@ -182,10 +182,6 @@ class RayBatches:
             view, pixel = usable.find(numbers)
             numbers = view * window.height * window.width + pixel
         return self._to_device(numbers)
-
-    def view(self, pixels: Int[Tensor, "P"]) -> Int[Tensor, "P"]:
-        """Return the view of each pixel by number (view, row, column)."""
-        return pixels // (self._cameras.height * self._cameras.width)
 
     def of_each_view(self, num_pixels: int, step: int) -> Int[Tensor, "V P"]:
         """Draw random usable pixels of every view; for a view without usable pixels, the first pixel is returned."""

@@ -86,7 +86,7 @@ class ValidationPixels:
         radiance = mean_per_pixel(renderer.radiance(found.rays), found.pixel, len(rgb))
         if renderer.scene.camera.exposure is None:
             return _psnr(renderer.scene.colour_space.to_display(radiance), rgb)
-        views = self.index.to(renderer.scene.device) // (self.cameras.height * self.cameras.width)
+        views = self.cameras.view_of(self.index.to(renderer.scene.device))
         gains, colour_space = torch.ones_like(radiance), renderer.scene.colour_space
         for view in views.unique():
             gains[views == view] = fit_gain(colour_space.to_srgb, radiance[views == view], rgb[views == view])

@@ -73,7 +73,7 @@ def gauss_newton_step(
         step: settings of the step.
         priors: prior information about the cameras.
     """
-    view = pixels // (cameras.height * cameras.width)
+    view = cameras.view_of(pixels)
     given, target = pixel_rays(cameras, pixels), photographed(pixels)
     rays = camera(given, view)
     angle = step.difference_pixels / cameras.fx[view]

@@ -75,8 +75,9 @@ class CameraSteps(Phase):
         candidates = batches.of_each_view(_NUM_CANDIDATES * self.num_pixels, self.start + number * self.every)
         past = None
         if "panorama" in state and box is not None:
-            view = candidates.flatten() // (batches.cameras.height * batches.cameras.width)
-            past = misses(box, camera(pixel_rays(batches.cameras, candidates.flatten()), view)).view(candidates.shape)
+            drawn = candidates.flatten()
+            rays = camera(pixel_rays(batches.cameras, drawn), batches.cameras.view_of(drawn))
+            past = misses(box, rays).view(candidates.shape)
         pixels = informative_pixels(candidates, self.num_pixels, batches.photographed, batches.cameras, past)
 
         def shown(rays: Rays, view: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:

@@ -38,7 +38,7 @@ def test_texels_take_the_mean_of_all_rays_and_of_one_residual_of_zero() -> None:
     radiance, weights = torch.rand(3, 96, 3, generator=generator), torch.rand(3, 96, generator=generator)
     past = torch.zeros(96)
     for values, of_ray in zip(radiance, weights, strict=True):
-        past += boundary.fit(Observed(directions, values, of_ray, torch.zeros(96)), past)
+        past += boundary.fit(Observed(directions, values, values >= 1, of_ray, torch.zeros(96)), past)
     torch.testing.assert_close(past, weights.sum(0))
     raw = torch.log(torch.expm1(radiance.sqrt() * 2 * math.log(2)))  # of a texel that one ray has seen
     expected = (weights[..., None] * raw).sum(0) / (weights.sum(0) + 1)[:, None]
@@ -48,15 +48,25 @@ def test_texels_take_the_mean_of_all_rays_and_of_one_residual_of_zero() -> None:
 def test_wide_rays_leave_fine_levels_alone() -> None:
     boundary, directions = EnvironmentMap([4, 8]), random_directions(50)
     width = torch.full((50,), 1.1 * math.radians(90 / 4))  # two texels of the fine level are 90 / 4 degrees wide
-    boundary.fit(Observed(directions, smooth_sky(directions), torch.ones(50), width), torch.zeros(480))
+    sky = smooth_sky(directions)
+    boundary.fit(Observed(directions, sky, sky >= 1, torch.ones(50), width), torch.zeros(480))
     coarse, fine = boundary.texels.split(boundary.levels.sizes)
     assert coarse.any()
     assert not fine.any()
 
 
+def test_saturated_radiance_is_a_lower_bound() -> None:
+    boundary, directions, none = EnvironmentMap([4]), cube_map.texel_directions(4), torch.zeros(96)
+    for radiance in (4.0, 1.0):  # a lamp, and a photograph in which the lamp is saturated
+        seen = torch.full((96, 3), radiance)
+        boundary.fit(Observed(directions, seen, seen == 1, torch.full((96,), 1e6), none), none)
+    torch.testing.assert_close(boundary(Exits(directions)).detach(), torch.full((96, 3), 4.0), rtol=1e-4, atol=0)
+
+
 def test_fit_learns_a_sky_from_few_rays() -> None:
     boundary, directions, others = EnvironmentMap([4, 8, 16, 32]), random_directions(2000), random_directions(2000, 9)
-    observed = Observed(directions, smooth_sky(directions), torch.ones(2000), torch.zeros(2000))
+    sky = smooth_sky(directions)
+    observed = Observed(directions, sky, sky >= 1, torch.ones(2000), torch.zeros(2000))
     boundary.fit(observed, torch.zeros(boundary.levels.num_texels))
     error = (boundary(Exits(others)) - smooth_sky(others)).detach().square().mean().sqrt()
     assert error < 0.02  # the standard deviation of the sky is 0.15

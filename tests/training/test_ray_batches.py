@@ -86,7 +86,7 @@ def test_rows_share_all_usable_pixels(kind, request):
     given = request.getfixturevalue(kind)
     batches = RayBatches(given, 8, "all_images")
     parts = [batches.rows(part, 7) for part in range(7)]
-    assert torch.equal(batches.view(parts[0]), place(parts[0])[:, 0])
+    assert torch.equal(given.cameras.view_of(parts[0]), place(parts[0])[:, 0])
     expected = torch.arange(NUM_VIEWS * HEIGHT * WIDTH)
     expected = expected if given.usable is None else expected[given.usable.flatten()]
     assert torch.equal(torch.cat(parts).sort().values, expected)

@@ -1,4 +1,4 @@
-"""Least squares of the background, from pixels that show it."""
+"""Fits of the background to pixels without content."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ _TURNS = 10
 class Background(Phase):
     """Fit the environment map to pixels that show only the background, without gradient descent.
 
-    A pass before training uses pixels whose rays miss the boxes of content and object, which need no tracing. With a
-    known background, the first gradients of the field depend on the object. Later passes also use pixels whose rays
-    cross a box, but hardly any content: the pixel minus the rendered light of the field is the background in the exit
+    A pass before training uses pixels whose rays miss the boxes of content and object. Such rays need no tracing. With
+    a known background, the first gradients of the field depend on the object. Later passes also use rays through the
+    object that cross hardly any content: the pixel minus the rendered light of the field is the background in the exit
     direction. Some directions are visible only through the object. The later passes precede the training steps `start`,
     2 `start`, 4 `start` and so on, because the field becomes more accurate.
 
@@ -85,11 +85,13 @@ class Background(Phase):
         most_pixels = min(run.batches.num_pixels, _MOST_PIXELS * background.levels.sizes[-1])
         num_parts = self.steps * run.batches.num_pixels // most_pixels
         pixels = run.batches.rows(part * num_parts // self.steps, num_parts)
-        beside = misses(box, _rays(run, pixels))
+        rays = _rays(run, pixels)
+        beside = misses(box, rays)
         if number == 0 and run.renderer.scene.camera.exposure is not None:
             for turn in range(_TURNS):
-                background.fit(_beside(run, pixels[beside], turn > 0), torch.zeros_like(state["weights"]))
-        observed = [_beside(run, pixels[beside])]
+                seen = _beside(run, pixels[beside], rays[beside], fits_gains=turn > 0)
+                background.fit(seen, torch.zeros_like(state["weights"]))
+        observed = [_beside(run, pixels[beside], rays[beside])]
         if number_of_pass > 0:
             assert self.start is not None
             num_trained = self.start * 2 ** (number_of_pass - 1) * run.batches.batch_size
@@ -104,7 +106,7 @@ class Background(Phase):
 def _through(run: Run, pixels: Int[Tensor, "P"]) -> Observed:
     """Observe the background along those rays of pixels that cross hardly any content."""
     batches, renderer, scene = run.batches, run.renderer, run.renderer.scene
-    view = batches.view(pixels)
+    view = batches.cameras.view_of(pixels)
     path = renderer.trace(_rays(run, pixels))
     neighbours = renderer.exit_directions(scene.camera(neighbour_rays(batches.cameras, pixels), view))
     widths = divergence(batches.cameras, pixels, main_exits(path), neighbours)
@@ -116,38 +118,35 @@ def _through(run: Run, pixels: Int[Tensor, "P"]) -> Observed:
     if path.absorbs:
         fraction = fraction * path.transmitted(path.far[:, None])[:, 0]
     fraction, exits = path.first_of_ray(fraction), main_exits(path)
-    photographed = _photographed(run, batches.photographed(pixels), view, rendering.rgb)
-    radiance = scene.boundary(Exits(exits)) + (photographed - rendering.rgb) / fraction.clamp(min=_BACKGROUND)
-    observed = Observed(exits, radiance, fraction.square().mean(-1), widths / batches.cameras.fx[view])
+    rgb = batches.photographed(pixels)
+    difference = _photographed(run, rgb, view) - rendering.rgb
+    radiance = scene.boundary(Exits(exits)) + difference / fraction.clamp(min=_BACKGROUND)
+    widths = widths / batches.cameras.fx[view]
+    observed = Observed(exits, radiance, rgb >= 1, fraction.square().mean(-1), widths)
     return observed[fraction.amin(-1) >= _BACKGROUND]
 
 
-def _beside(run: Run, pixels: Int[Tensor, "P"], fits_gains: bool = True) -> Observed:
-    """Observe the background along rays of pixels beside the object, after the exposures are fitted to it."""
+def _beside(run: Run, pixels: Int[Tensor, "P"], rays: Rays, fits_gains: bool = True) -> Observed:
+    """Observe the background along the rays of pixels beside the object, after the exposures are fitted to it."""
     batches, scene = run.batches, run.renderer.scene
-    rays, view, rgb = _rays(run, pixels), batches.view(pixels), batches.photographed(pixels)
-    radiance, exposure = scene.boundary(Exits.unbent(rays)), scene.camera.exposure
+    view, rgb, exposure = batches.cameras.view_of(pixels), batches.photographed(pixels), scene.camera.exposure
     if exposure is not None and fits_gains:
-        exposure.fit(view, radiance, scene.colour_space.to_radiance(rgb))
+        exposure.fit(view, scene.boundary(Exits.unbent(rays)), scene.colour_space.to_radiance(rgb))
     widths = 1 / batches.cameras.fx[view]
-    return Observed(rays.directions, _photographed(run, rgb, view, radiance), torch.ones_like(widths), widths)
+    return Observed(rays.directions, _photographed(run, rgb, view), rgb >= 1, torch.ones_like(widths), widths)
 
 
 def _rays(run: Run, pixels: Int[Tensor, "P"]) -> Rays:
     """Make the rays of the estimated cameras through the centres of pixels."""
     batches = run.batches
-    return run.renderer.scene.camera(pixel_rays(batches.cameras, pixels), batches.view(pixels))
+    return run.renderer.scene.camera(pixel_rays(batches.cameras, pixels), batches.cameras.view_of(pixels))
 
 
-def _photographed(
-    run: Run, rgb: Float[Tensor, "R 3"], view: Int[Tensor, "R"], predicted: Float[Tensor, "R 3"]
-) -> Float[Tensor, "R 3"]:
-    """Decode the colours of photographs and divide by their gains; saturated pixels show at least what is predicted."""
+def _photographed(run: Run, rgb: Float[Tensor, "R 3"], view: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
+    """Decode the colours of photographs, and divide by the gains of the photographs."""
     scene = run.renderer.scene
-    radiance = scene.colour_space.to_radiance(rgb)
-    if (gains := scene.camera.gains(view)) is not None:
-        radiance = radiance / gains
-    return torch.where(rgb >= 1, radiance.maximum(predicted), radiance)
+    radiance, gains = scene.colour_space.to_radiance(rgb), scene.camera.gains(view)
+    return radiance if gains is None else radiance / gains
 
 
 def occupied_box(renderer: Renderer) -> Float[Tensor, "2 3"] | None:
