@@ -112,13 +112,10 @@ class ByFootprint(Boundary):
         directions, widths = exits.directions[some].float(), exits.radii[some]
         if self._averaged:
             return finest.index_copy(0, some, self._pyramid(directions, widths))
-        raw, first = torch.zeros_like(directions), 0
-        for n, offset, size in zip(sky.levels.resolutions, sky.levels.offsets, sky.levels.sizes, strict=True):
-            end = first + 6 * (n + 2) ** 2
-            texels, padded = sky.texels[offset : offset + size], sky.padded[first:end]
-            level = cube_map.lookup(*cube_map.project(directions), texels, padded, cube_map.CubeLevels((n,)))
-            raw += level if first == 0 else detail_shown(n, widths)[:, None] * level
-            first = end
+        raw = torch.zeros_like(directions)
+        for level, (n, texels) in enumerate(zip(sky.levels.resolutions, sky.texels_of_levels(), strict=True)):
+            looked_up = cube_map.lookup(*cube_map.project(directions), *texels, cube_map.CubeLevels((n,)))
+            raw += looked_up if level == 0 else detail_shown(n, widths)[:, None] * looked_up
         return finest.index_copy(0, some, radiance_of(raw))
 
 

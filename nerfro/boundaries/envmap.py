@@ -68,23 +68,36 @@ class EnvironmentMap(Boundary):
     Args:
         resolutions: texels along each side of a face (90 degrees) of each level. None derives the finest level from the
             width of a pixel of the photographs.
+        fitted_resolutions: the same of finer levels, which only the fits of `phase=background` change. Gradient descent
+            would visit all their texels in each step. None derives the levels from the photographs, too.
         image: initial equirectangular image with z up (.png, .jpg, .hdr or .exr); None for grey.
+
+    Attributes:
+        levels: layout of all levels.
+        texels: raw values of the levels `resolutions`.
+        fitted_texels: raw values of the levels `fitted_resolutions`.
     """
 
     padded: Int[Tensor, "Q"]
+    fitted_texels: Float[Tensor, "F 3"]
 
     def __init__(
         self,
         resolutions: list[Count] | None = None,
+        fitted_resolutions: list[Count] | None = None,
         image: str | None = None,
     ) -> None:
         super().__init__()
         resolutions = list(_RESOLUTIONS) if resolutions is None else resolutions
         if len(resolutions) == 0:
             raise NerfroError("boundary=envmap: resolutions is empty; give one or more")
-        self.levels = cube_map.CubeLevels(tuple(resolutions))
-        self.texels = nn.Parameter(torch.zeros(self.levels.num_texels, 3))
-        padded = torch.cat([cube_map.padded_texels(n).flatten() for n in resolutions])
+        fitted = [] if fitted_resolutions is None else fitted_resolutions
+        self.levels = cube_map.CubeLevels((*resolutions, *fitted))
+        self._groups = cube_map.CubeLevels(tuple(resolutions)), cube_map.CubeLevels(tuple(fitted))
+        of_descent, of_fits = (torch.zeros(levels.num_texels, 3) for levels in self._groups)
+        self.texels = nn.Parameter(of_descent)
+        self.register_buffer("fitted_texels", of_fits)
+        padded = torch.cat([cube_map.padded_texels(n).flatten() for n in self.levels.resolutions])
         self.register_buffer("padded", padded, persistent=False)
         if image is not None:
             self.set_lat_long(lat_long.load_lat_long(image))
@@ -98,8 +111,21 @@ class EnvironmentMap(Boundary):
 
     def forward(self, exits: Exits) -> Float[Tensor, "*batch 3"]:
         face, coordinates = cube_map.project(exits.directions.float().reshape(-1, 3))
-        raw = self._looked_up(face, coordinates, self.texels, self.padded, self.levels)
-        return _radiance(raw).view(exits.directions.shape)
+        return _radiance(self._raw_at(face, coordinates)).view(exits.directions.shape)
+
+    def _raw_at(self, face: Int[Tensor, "P"], coordinates: Float[Tensor, "P 2"]) -> Float[Tensor, "P 3"]:
+        raw = torch.zeros_like(coordinates[:, :1])
+        padded = self.padded.split([sum(levels.padded_sizes) for levels in self._groups])
+        for texels, of_group, levels in zip((self.texels, self.fitted_texels), padded, self._groups, strict=True):
+            if len(levels) > 0:
+                raw = raw + self._looked_up(face, coordinates, texels, of_group, levels)
+        return raw
+
+    def texels_of_levels(self) -> list[tuple[Float[Tensor, "T 3"], Int[Tensor, "Q"]]]:
+        """Return the raw values of each level, and the texels of the faces with margins (`cube_map.padded_texels`)."""
+        groups = zip((self.texels, self.fitted_texels), self._groups, strict=True)
+        texels = [values for group, levels in groups for values in group.split(levels.sizes)]
+        return list(zip(texels, self.padded.split(self.levels.padded_sizes), strict=True))
 
     @staticmethod
     def _looked_up(face: Tensor, *arguments: Any) -> Float[Tensor, "P 3"]:
@@ -126,11 +152,11 @@ class EnvironmentMap(Boundary):
         """
         face, coordinates = cube_map.project(observed.directions.float())
         target = _raw(observed.radiance.clamp(min=_DARKEST))
-        residual = target - self._looked_up(face, coordinates, self.texels, self.padded, self.levels)
+        residual = target - self._raw_at(face, coordinates)
         residual = torch.where(observed.saturated, residual.clamp(min=0), residual)
-        texels = zip(*(tensor.split(self.levels.sizes) for tensor in (self.texels, past)), strict=True)
-        padded, total = self.padded.split(self.levels.padded_sizes), []
-        for n, of_level, (values, earlier) in zip(self.levels.resolutions, padded, texels, strict=True):
+        total = []
+        levels = zip(self.levels.resolutions, self.texels_of_levels(), past.split(self.levels.sizes), strict=True)
+        for n, (values, of_level), earlier in levels:
             wide = observed.widths > _MOST_TEXELS * 0.5 * math.pi / n
             weights = observed.weights.masked_fill(wide, 0)[:, None].expand(-1, 3)
             place, level = (face, coordinates), cube_map.CubeLevels((n,))
@@ -161,8 +187,9 @@ class EnvironmentMap(Boundary):
         """Set the finest level to the linear radiance of an equirectangular image, and the coarser levels to zero."""
         n = self.levels.resolutions[-1]
         radiance = lat_long.sample(radiance, cube_map.texel_directions(n), width=4 * n)
-        self.texels.zero_()
-        self.texels[self.levels.offsets[-1] :] = _raw(radiance).to(self.texels)
+        for texels in (self.texels, self.fitted_texels):
+            texels.zero_()
+        self.texels_of_levels()[-1][0].copy_(_raw(radiance))
 
 
 def _radiance(raw: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:

@@ -9,10 +9,12 @@ from omegaconf import DictConfig
 from nerfro.cameras import Cameras
 from nerfro.registry import find
 
-# Texels along each side of a face of the coarsest level, and bounds of the finest one. The optimizer visits all texels
-# in each step, so that a level of 1024 would take more time than the rays.
-_COARSEST, _FEWEST, _MOST = 4, 64, 512
-# Angle between two compared directions, in texels of the finest level.
+# Texels along each side of a face of the coarsest level, and bounds of the finest one.
+_COARSEST, _FEWEST, _MOST = 4, 64, 1024
+# Bounds of the finest level of gradient descent, whose optimizer visits all texels in each step: with and without finer
+# levels that `phase=background` fits.
+_MOST_BESIDE_FITS, _MOST_ALONE = 256, 512
+# Angle between two compared directions, in texels of the finest level of gradient descent.
 _COMPARED_TEXELS = 2
 
 
@@ -29,10 +31,14 @@ def settle_angular_resolution(config: DictConfig, cameras: Cameras) -> None:
     if config.content.space == "all" or config.boundary._target_ != find("boundary", "envmap").target:
         return
     if config.boundary.get("resolutions") is None:
+        fits = config.phase.get("background", {}).get("steps", 0) > 0
         finest = 0.5 * math.pi * float(cameras.fx.double().median())
-        finest = min(max(2 ** round(math.log2(finest)), _FEWEST), _MOST)
-        levels = range(int(math.log2(_COARSEST)), int(math.log2(finest)) + 1)
-        config.boundary.resolutions = [2**level for level in levels]
+        finest = min(max(2 ** round(math.log2(finest)), _FEWEST), _MOST if fits else _MOST_ALONE)
+        levels = [2**level for level in range(int(math.log2(_COARSEST)), int(math.log2(finest)) + 1)]
+        descent = [n for n in levels if n <= _MOST_BESIDE_FITS or not fits]
+        config.boundary.resolutions = descent
+        if config.boundary.get("fitted_resolutions") is None:
+            config.boundary.fitted_resolutions = levels[len(descent) :]
     variation = config.loss.get("total_variation")
     if variation and variation.get("angle") is None:
         config.loss.total_variation.angle = _COMPARED_TEXELS * 90 / max(config.boundary.resolutions)

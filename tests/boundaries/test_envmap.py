@@ -63,13 +63,29 @@ def test_saturated_radiance_is_a_lower_bound() -> None:
     torch.testing.assert_close(boundary(Exits(directions)).detach(), torch.full((96, 3), 4.0), rtol=1e-4, atol=0)
 
 
-def test_fit_learns_a_sky_from_few_rays() -> None:
-    boundary, directions, others = EnvironmentMap([4, 8, 16, 32]), random_directions(2000), random_directions(2000, 9)
+@pytest.mark.parametrize("levels", [([4, 8, 16, 32], None), ([4, 8], [16, 32])])
+def test_fit_learns_a_sky_from_few_rays(levels: tuple[list[int], list[int] | None]) -> None:
+    boundary, directions, others = EnvironmentMap(*levels), random_directions(2000), random_directions(2000, 9)
     sky = smooth_sky(directions)
     observed = Observed(directions, sky, sky >= 1, torch.ones(2000), torch.zeros(2000))
     boundary.fit(observed, torch.zeros(boundary.levels.num_texels))
     error = (boundary(Exits(others)) - smooth_sky(others)).detach().square().mean().sqrt()
     assert error < 0.02  # the standard deviation of the sky is 0.15
+
+
+def test_fitted_levels_add_to_the_others_without_gradient() -> None:
+    together, apart, directions = EnvironmentMap([4, 8, 16]), EnvironmentMap([4], [8, 16]), random_directions(50)
+    torch.nn.init.normal_(together.texels)
+    state = together.state_dict()["texels"].split([96, 6 * (64 + 256)])
+    apart.load_state_dict({"texels": state[0], "fitted_texels": state[1]})
+    torch.testing.assert_close(apart(Exits(directions)), together(Exits(directions)))
+    apart(Exits(directions)).sum().backward()
+    together(Exits(directions)).sum().backward()
+    torch.testing.assert_close(apart.texels.grad, together.texels.grad[:96])
+    image = torch.rand(32, 64, 3)
+    for sky in (together, apart):
+        sky.set_lat_long(image)
+    torch.testing.assert_close(apart(Exits(directions)), together(Exits(directions)))
 
 
 def test_sum_of_levels_learns_a_sky_from_few_rays() -> None:
