@@ -146,7 +146,7 @@ class Cameras:
         directions = torch.stack([x, y, -torch.ones_like(x)], -1)
         length = torch.linalg.vector_norm(directions, dim=-1)
         pose = self.camera_to_world[view]
-        directions = (pose[..., :3] @ directions[..., None])[..., 0]
+        directions = (pose[..., :3] * directions[:, None]).sum(-1)  # mixed precision would round a matrix product
         # Normalized in world space, because the rotation in a file is rounded.
         return Rays(
             origins=pose[..., 3],

@@ -25,6 +25,9 @@ TraceExits = Callable[[Rays, Int[Tensor, "R"]], Float[Tensor, "R 3"]]  # traces 
 # Offset to the neighbouring ray along both axes, in pixels: one pixel along the diagonal, so that edges along rows and
 # columns are detected equally.
 _TO_NEIGHBOUR = math.sqrt(0.5)
+# Smallest angle between the exit directions of neighbouring rays, in pixel angles, for which a pixel shows a mean over
+# distant directions.
+DIVERGENT = 8.0
 
 
 @checked("subdivision")
@@ -68,7 +71,7 @@ class PixelRays:
         path: path of each ray; None without tracing.
         pixel: row of the pixel of each ray.
         part: number of the ray within the pixel.
-        diverges: pixels that are divided because of divergence.
+        diverges: pixels whose neighbouring rays diverge by at least `DIVERGENT` pixel angles.
     """
 
     rays: Rays
@@ -104,10 +107,10 @@ def subdivide(
         return PixelRays(rays, path, every, torch.zeros_like(every), torch.zeros_like(every, dtype=torch.bool))
     trace_exits = trace_exits or (lambda rays, view: main_exits(trace(rays, view)))
     exits, neighbours = main_exits(path), trace_exits(neighbour_rays(cameras, pixels), view)
-    diverges = divergence(cameras, pixels, exits, neighbours) >= subdivision.divergence
-    divided = diverges
+    angle = divergence(cameras, pixels, exits, neighbours)
+    divided = angle >= subdivision.divergence
     if contrasts is not None and subdivision.contrast is not None:
-        rows = (path.first_of_ray(path.refracted) & ~diverges).nonzero()[:, 0]
+        rows = (path.first_of_ray(path.refracted) & ~divided).nonzero()[:, 0]
         divided = divided.index_put((rows,), contrasts(rows) >= subdivision.contrast)
     whole, parted = (~divided).nonzero()[:, 0], divided.nonzero()[:, 0]
     parts, pixel = part_rays(cameras, pixels[parted], subdivision.side), parted.repeat_interleave(num_parts)
@@ -117,7 +120,7 @@ def subdivide(
         path=Path.joined([path.of_rays(whole), trace(parts, view[pixel])]),
         pixel=torch.cat([whole, pixel]),
         part=torch.cat([torch.zeros_like(whole), part]),
-        diverges=diverges,
+        diverges=angle >= DIVERGENT,
     )
 
 

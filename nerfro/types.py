@@ -341,6 +341,12 @@ class Rendering:
         return replace(self, rgb=self.rgb * gain, boundary_rgb=self.boundary_rgb * of_path, gain=of_path)
 
     @property
+    def boundary_fraction(self) -> Float[Tensor, "P 3"]:
+        """Fraction of the background radiance that reaches the camera along each polyline."""
+        fraction = self.transmittance[:, None] * self.path.throughput
+        return fraction * self.path.transmitted(self.path.far[:, None])[:, 0] if self.path.absorbs else fraction
+
+    @property
     def opacity(self) -> Float[Tensor, "R"]:
         return self.path.per_ray(self.weights.sum(-1))
 

@@ -139,6 +139,12 @@ def test_making_rays_never_waits_for_the_device(cameras):
     assert there.tile(4, example_draws()).shape == (4, 4, 3)
 
 
+def test_directions_keep_their_precision_in_mixed_precision(cameras):
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        mixed = cameras.image_rays(0).directions
+    assert torch.equal(mixed, cameras.image_rays(0).directions)
+
+
 def test_directions_stay_unit_where_the_rotation_is_rounded(cameras):
     rounded = replace(cameras, camera_to_world=(cameras.camera_to_world * 1000).round() / 1000)
     assert torch.allclose(rounded.image_rays(0).directions.norm(dim=-1), torch.ones(280), atol=1e-6)

@@ -142,6 +142,14 @@ def test_pixels_of_the_object_are_divided_for_their_contrast(views: Views) -> No
     assert torch.equal(of_pixels(before, True), (~before.teaches_background).nonzero()[:, 0])
 
 
+def test_all_pixels_are_divided_and_steady_ones_teach_the_background(views: Views) -> None:
+    batch = batches_of(views, Subdivision(2, 0.0), 1000).batch(1)
+    assert len(of_pixels(batch, False)) == 0
+    angles = diverging(views.cameras, Snell(), CUBE)[batch.index]
+    assert (angles >= 8).any()
+    assert torch.equal(batch.teaches_background, angles < 8)
+
+
 def test_contrast_is_the_largest_step_to_a_neighbour(cameras: Cameras) -> None:
     images = torch.rand(NUM_VIEWS, HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(2))
     pixels = torch.arange(NUM_VIEWS * HEIGHT * WIDTH)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -94,7 +95,9 @@ class TrainingModule(LightningModule):
     def training_step(self, batch: Batch, batch_index: int) -> dict[str, Tensor]:
         """Compute the loss of a batch, and the mean squared error of its pixels (sRGB)."""
         camera, colour_space = self.scene.camera, self.scene.colour_space
-        path = self.renderer.trace(camera(batch.rays, batch.ray_view), batch.path)
+        with self._full_precision():
+            rays = camera(batch.rays, batch.ray_view)
+        path = self.renderer.trace(rays, batch.path)
         renderings = self.renderer.render_path(path, batch.draws, batch.teaches_background[batch.pixel])
         if (gains := camera.gains(batch.ray_view)) is not None:
             renderings = [rendering.exposed(gains) for rendering in renderings]
@@ -116,6 +119,10 @@ class TrainingModule(LightningModule):
             self.log(f"scene/{name}", measurement)
         return {"loss": total, "squared_error": error}
 
+    def _full_precision(self) -> torch.autocast:
+        """Turn mixed precision off for rays, because rounded directions would miss their pixels."""
+        return torch.autocast(self.device.type, enabled=False)
+
     def log(self, *args: Any, **kwargs: Any) -> None:
         """Log a value, but only in training steps with output, because logging takes a tenth of the time of a step."""
         if self._is_logged_step or not self.trainer.training:
@@ -131,7 +138,8 @@ class TrainingModule(LightningModule):
             group["lr"] = 0.0 if waits else group["initial_lr"] * factor
         # At the end of the previous step, the update would follow the checkpoint, and a resumed run would miss it.
         if self.global_step > 0:
-            self.renderer.point_sampler.after_step(list(self.scene.fields), batch.draws)  # type: ignore[arg-type]
+            draws = replace(batch.draws, step=self.global_step)  # a repeated batch repeats its number
+            self.renderer.point_sampler.after_step(list(self.scene.fields), draws)  # type: ignore[arg-type]
         self.trainer.datamodule.prefetch()  # type: ignore[attr-defined]
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
@@ -155,14 +163,14 @@ class TrainingModule(LightningModule):
         if not self.trainer.is_global_zero:
             return None  # one process evaluates, the others wait
         data = self.trainer.datamodule  # type: ignore[attr-defined]
-        with torch.autocast(self.device.type, enabled=False):  # directions in half precision would miss their pixels
+        with self._full_precision():
             psnr = data.validation_psnr()
         self.log("val/psnr", psnr, prog_bar=True, batch_size=1, rank_zero_only=True)
         if view < 0:
             return None  # no image is due
         views = data.validation
         target = views.images[view].to(self.device)
-        with torch.autocast(self.device.type, enabled=False):
+        with self._full_precision():
             rays = views.cameras.to(self.device).image_rays(view)
         rendered = self.renderer.render(rays)
         prediction = self.scene.colour_space.to_display(rendered.radiance).reshape(target.shape)

@@ -109,6 +109,21 @@ def test_grid_remembers_the_field_it_looked_at() -> None:
     torch.testing.assert_close(remembered, DenseBall().density(points)[away])
 
 
+class Fog(Field):
+    """Density 1 everywhere."""
+
+    def forward(self, samples: Samples) -> Radiance:
+        return Radiance(torch.ones_like(samples.s), torch.zeros_like(samples.positions))
+
+
+@pytest.mark.parametrize(("resolution", "fraction"), [(2, 1 / 16), (4, 1e-4)])
+def test_small_updates_reach_all_cells(resolution: int, fraction: float) -> None:
+    sampler = DensityGridSampler(resolution=resolution, update_fraction=fraction, update_every=1)
+    for step in range(12 * resolution**3):
+        sampler.after_step([Fog()], example_draws(step=step))
+    assert (sampler.density > 0).all()
+
+
 def split_in_two(shares: tuple[float, float]) -> Path:
     """Each of 64 rays as two equal polylines with shares of its light."""
     path = example_path(64)

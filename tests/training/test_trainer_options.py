@@ -18,6 +18,7 @@ import nerfro.training.trainer
 from nerfro.allowed import Refused, check_settings
 from nerfro.errors import NerfroError
 from nerfro.registry import build, find, register
+from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.testing import check
 from nerfro.training.config import TrainConfig, TrainerConfig, clock_time, settle_trainer
 from nerfro.training.ray_batches import RayBatches
@@ -176,16 +177,18 @@ def test_training_ends_with_the_table_of_means_and_the_files(train: Callable[...
 
 
 def test_overfitting_repeats_batches(train: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn, batch = [], RayBatches.batch
+    drawn, batch, updated = [], RayBatches.batch, []
 
     def recorded(self: RayBatches, step: int) -> Any:
         drawn.append(step)
         return batch(self, step)
 
     monkeypatch.setattr(RayBatches, "batch", recorded)
+    monkeypatch.setattr(DensityGridSampler, "after_step", lambda self, fields, draws: updated.append(draws.step))
     finished = train("trainer.max_steps=6", "trainer.overfit_batches=2", "evaluation.every=0")
     assert finished.code == 0, finished.err
     assert set(drawn) <= {0, 1, 2}  # the thread that traces ahead draws one more
+    assert updated == [1, 2, 3, 4, 5], "each update of the density grid draws other cells"
     assert re.search(r"100%.*step 6,.*train PSNR", finished.err), "a log ends with the last step"
 
 

@@ -270,7 +270,7 @@ class DensityGridSampler(PointSampler):
             return
         device, inside = self.density.device, self.inside
         num_cells = self.resolution**3 if inside is None else len(inside)
-        words = draws.words(torch.arange(int(num_cells * self.update_fraction), device=device), 4, "density grid")
+        words = draws.words(torch.arange(math.ceil(num_cells * self.update_fraction), device=device), 4, "density grid")
         cells = words[:, 0] * num_cells >> 32
         cells = cells if inside is None else inside[cells]
         corners = torch.stack(

@@ -16,7 +16,7 @@ from nerfro.geometry.interpolation import misses
 from nerfro.rays import Rays
 from nerfro.registry import register
 from nerfro.rendering import Renderer
-from nerfro.subdivision import divergence, main_exits, neighbour_rays, pixel_rays
+from nerfro.subdivision import DIVERGENT, divergence, main_exits, neighbour_rays, pixel_rays
 from nerfro.training.phases.base import Phase, Run
 from nerfro.types import Exits
 
@@ -25,9 +25,8 @@ _MOST_PIXELS = 8
 # Largest number of rays of a pass through the object: relative to the pixels of all training steps so far, which bounds
 # the share of the time, and absolute, which bounds the duration of a step.
 _SHARE, _MOST_RAYS = 0.15, 2**19
-# Rays through the object count if at least this fraction of their light is background, and if neighbouring rays diverge
-# by at most so many pixel widths.
-_BACKGROUND, _MOST_DIVERGENCE = 0.7, 8.0
+# Rays through the object count if at least this fraction of their light is background.
+_BACKGROUND = 0.7
 # Turns between background and exposures in the first step.
 _TURNS = 10
 
@@ -110,14 +109,10 @@ def _through(run: Run, pixels: Int[Tensor, "P"]) -> Observed:
     path = renderer.trace(_rays(run, pixels))
     neighbours = renderer.exit_directions(scene.camera(neighbour_rays(batches.cameras, pixels), view))
     widths = divergence(batches.cameras, pixels, main_exits(path), neighbours)
-    steady = (widths < _MOST_DIVERGENCE).nonzero()[:, 0]
+    steady = (widths < DIVERGENT).nonzero()[:, 0]
     path, pixels, view, widths = path.of_rays(steady), pixels[steady], view[steady], widths[steady]
     rendering = renderer.render_path(path)[-1]
-    # The fraction of the background's radiance that reaches the camera along the main polyline.
-    fraction = rendering.transmittance[:, None] * path.throughput
-    if path.absorbs:
-        fraction = fraction * path.transmitted(path.far[:, None])[:, 0]
-    fraction, exits = path.first_of_ray(fraction), main_exits(path)
+    fraction, exits = path.first_of_ray(rendering.boundary_fraction), main_exits(path)
     rgb = batches.photographed(pixels)
     difference = _photographed(run, rgb, view) - rendering.rgb
     radiance = scene.boundary(Exits(exits)) + difference / fraction.clamp(min=_BACKGROUND)
