@@ -83,8 +83,8 @@ class Silhouettes:
         """Compute an approximate signed distance to the visual hull with an exact zero level.
 
         The value is the maximum over the views of the distance to the cone of the silhouette, or the
-        (wrong_masks + 1)-th largest value if so many views may be wrong about any point. Points that fewer than two
-        views see are outside.
+        (wrong_masks + 1)-th largest value if so many views may be wrong about any point. Points that fewer than two or
+        wrong_masks + 1 views see are outside.
 
         Returns:
             Distances in world units, negative inside.
@@ -98,8 +98,8 @@ class Silhouettes:
             value = torch.where(known, -inside * width, -torch.inf)
             for rank in range(wrong_masks + 1):
                 largest[rank], value = torch.maximum(largest[rank], value), torch.minimum(largest[rank], value)
-        far = torch.where(largest[-1].isfinite(), largest[-1].abs(), 1.0)
-        return torch.where(num_seen < _MIN_VIEWS, far, largest[-1])
+        far = torch.where(largest[0].isfinite(), largest[0].abs(), 1.0)
+        return torch.where(num_seen < max(_MIN_VIEWS, wrong_masks + 1), far, largest[-1])
 
 
 def centre_lines(silhouettes: Silhouettes) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "V 3"]]:

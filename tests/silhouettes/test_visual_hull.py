@@ -80,6 +80,20 @@ def test_nothing_is_known_behind_a_camera_and_beyond_a_frame_that_cuts() -> None
     assert Silhouettes.of(cameras, masks).depth_inside(0, points)[0][2] == torch.inf
 
 
+def test_points_are_outside_unless_more_views_see_them_than_may_be_wrong() -> None:
+    cameras, generator = cameras_around(4, 16), torch.Generator().manual_seed(0)
+    masks = torch.zeros(4, 16, 16)
+    masks[:, 4:12, 4:] = 1  # cut by the frame
+    silhouettes = Silhouettes.of(cameras, masks)
+    points = 3 * (2 * torch.rand(2000, 3, generator=generator) - 1)
+    num_seen = torch.stack([silhouettes.depth_inside(view, points)[0] < torch.inf for view in range(4)]).sum(0)
+    for wrong_masks in (0, 2):
+        distances = silhouettes.carve(points, wrong_masks)
+        assert distances.isfinite().all()
+        assert (distances[num_seen < max(2, wrong_masks + 1)] > 0).all()
+        assert (distances < 0).any()
+
+
 def test_wrong_masks_are_tolerated_when_told(odd_shape: trimesh.Trimesh) -> None:
     right = photographed(odd_shape, cameras_around(20, 48))
     masks = right.masks.clone()
