@@ -5,8 +5,10 @@ from __future__ import annotations
 import itertools
 import re
 import signal
+import sqlite3
 import tempfile
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -194,12 +196,22 @@ def _extract(
 
 
 def _match(pycolmap: Any, database: Path, pairs: Sequence[tuple[str, str]], threads: int) -> None:
-    """Match features of pairs of images."""
+    """Match features of pairs of images.
+
+    COLMAP reads pairs from a text file, which cannot contain names with spaces. Therefore, the images in the database
+    have numbers as names while they are matched.
+    """
     options, pairing = pycolmap.FeatureMatchingOptions(), pycolmap.ImportedPairingOptions()
     options.num_threads, pairing.match_list_path = threads, database.with_name("pairs.txt")
+    with closing(sqlite3.connect(database)) as connection, connection:
+        numbers = dict(connection.execute("SELECT name, image_id FROM images"))
+        connection.execute("UPDATE images SET name = image_id")
     for chunk in _chunks(pairs, _PAIRS_PER_CHUNK, f"matching {len(pairs)} pairs"):
-        pairing.match_list_path.write_text("".join(f"{one} {other}\n" for one, other in chunk), encoding="utf-8")
+        lines = [f"{numbers[one]} {numbers[other]}\n" for one, other in chunk]
+        pairing.match_list_path.write_text("".join(lines), encoding="utf-8")
         pycolmap.match_image_pairs(database, matching_options=options, pairing_options=pairing)
+    with closing(sqlite3.connect(database)) as connection, connection:
+        connection.executemany("UPDATE images SET name = ? WHERE image_id = ?", numbers.items())
 
 
 def _map(pycolmap: Any, database: Path, images: Sequence[Path], threads: int) -> dict[int, Any]:
