@@ -171,11 +171,11 @@ class Path:
         return Exits(directions, start, self.radii)
 
     @property
-    def near(self) -> Float[Tensor, "R"]:
+    def near(self) -> Float[Tensor, "P"]:
         return self.s[:, 0]
 
     @property
-    def far(self) -> Float[Tensor, "R"]:
+    def far(self) -> Float[Tensor, "P"]:
         return self.s[:, -1]
 
     @property
@@ -203,7 +203,7 @@ class Path:
         place = torch.arange(len(ray), device=rows.device) - (num.cumsum(0) - num)[ray]
         return replace(self[first[ray] + place], ray=ray)
 
-    def span(self, box: Float[Tensor, "2 3"]) -> tuple[Float[Tensor, "R"], Float[Tensor, "R"]]:
+    def span(self, box: Float[Tensor, "2 3"]) -> tuple[Float[Tensor, "P"], Float[Tensor, "P"]]:
         """Return the arc lengths of the first entry into a box and of the last exit.
 
         Rows that miss the box have an empty span at far.
@@ -220,7 +220,7 @@ class Path:
         last = torch.where(meets, self.s[:, :-1] + leave, -torch.inf).amax(-1)
         return first, torch.maximum(first, last)
 
-    def at(self, s: Float[Tensor, "R N"]) -> tuple[Float[Tensor, "R N 3"], Float[Tensor, "R N 3"]]:
+    def at(self, s: Float[Tensor, "P N"]) -> tuple[Float[Tensor, "P N 3"], Float[Tensor, "P N 3"]]:
         """Return positions and directions at arc lengths `s`, from the nearest previous vertex (paper, section 2).
 
         As in the authors' code, the previous vertex is strictly before `s`, so a sample on a vertex has the direction
@@ -281,24 +281,24 @@ class Samples:
         measure: bounds of the intervals in contracted length; None without contraction.
     """
 
-    positions: Float[Tensor, "R N 3"]
-    directions: Float[Tensor, "R N 3"]
-    s: Float[Tensor, "R N"]
-    edges: Float[Tensor, "R N+1"]
-    radii: Float[Tensor, "R"]
-    occupied: Bool[Tensor, "R N"] | None = None
-    lengths: Float[Tensor, "R N"] | None = None
-    measure: Float[Tensor, "R N+1"] | None = None
+    positions: Float[Tensor, "P N 3"]
+    directions: Float[Tensor, "P N 3"]
+    s: Float[Tensor, "P N"]
+    edges: Float[Tensor, "P N+1"]
+    radii: Float[Tensor, "P"]
+    occupied: Bool[Tensor, "P N"] | None = None
+    lengths: Float[Tensor, "P N"] | None = None
+    measure: Float[Tensor, "P N+1"] | None = None
 
     @classmethod
-    def along(cls, path: Path, s: Float[Tensor, "R N"], edges: Float[Tensor, "R N+1"]) -> Samples:
+    def along(cls, path: Path, s: Float[Tensor, "P N"], edges: Float[Tensor, "P N+1"]) -> Samples:
         """Create samples at arc lengths of a path; positions and directions have the gradients of the path."""
         s, edges = s.detach(), edges.detach()
         positions, directions = path.at(s)
         return cls(positions, directions, s, edges, path.radii)
 
     @property
-    def deltas(self) -> Float[Tensor, "R N"]:
+    def deltas(self) -> Float[Tensor, "P N"]:
         """Length by which the density of each sample is multiplied, in world units."""
         return self.lengths if self.lengths is not None else self.edges[:, 1:] - self.edges[:, :-1]
 
@@ -307,8 +307,8 @@ class Samples:
 class Radiance:
     """Result of a field: volume density (per world unit, not negative) and linear radiance."""
 
-    density: Float[Tensor, "R N"]
-    rgb: Float[Tensor, "R N 3"]
+    density: Float[Tensor, "P N"]
+    rgb: Float[Tensor, "P N 3"]
 
 
 @dataclass(frozen=True)
@@ -405,7 +405,13 @@ class Batch:
 
 
 def mean_per_pixel(values: Float[Tensor, "R *C"], pixel: Int[Tensor, "R"], num_pixels: int) -> Float[Tensor, "Q *C"]:
-    """Average the values of the rays of each pixel, given the row of the pixel of each ray."""
+    """Average the values of the rays of each pixel.
+
+    Args:
+        values: values of the rays.
+        pixel: row of the pixel of each ray; each pixel has a ray, and single rays are in the order of the pixels.
+        num_pixels: number of pixels.
+    """
     if len(pixel) == num_pixels:  # one ray through each pixel, in their order
         return values
     total = values.new_zeros(num_pixels, *values.shape[1:]).index_add(0, pixel, values)
