@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor
@@ -85,6 +86,12 @@ class Cameras:
     def select(self, views: list[int]) -> Cameras:
         """Select cameras, in the given order."""
         return self._each(lambda tensor: tensor[views])
+
+    def relative_to(self, origin: Float[np.ndarray, "3"]) -> Cameras:
+        """Return the cameras in coordinates with another origin."""
+        poses = self.camera_to_world.double()
+        poses[:, :, 3] -= torch.from_numpy(origin).to(poses)
+        return replace(self, camera_to_world=poses.to(self.camera_to_world))
 
     @classmethod
     def joined(cls, parts: Sequence[Cameras]) -> Cameras:

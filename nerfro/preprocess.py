@@ -17,7 +17,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
-from nerfro.capture.index_search import find_medium
+from nerfro.capture.index_search import find_medium, initial_medium
 from nerfro.capture.object_errors import unsupported_bodies
 from nerfro.capture.preprocess_options import MESH, PreprocessConfig, Request, surface_settings, write_scene
 from nerfro.capture.refinement import refine
@@ -29,10 +29,8 @@ from nerfro.data.masks import EVIDENCE, REVOLUTION, masked_views, method_of, wit
 from nerfro.errors import warn
 from nerfro.files.atomic import refuse_existing
 from nerfro.files.folder_lock import lock_folder
-from nerfro.geometry.mesh import TriangleMesh, load_mesh
+from nerfro.geometry.mesh import TriangleMesh
 from nerfro.media.sdf_grid import SdfGrid
-from nerfro.paths import resolve_path
-from nerfro.registry import build
 from nerfro.rendering.scene_file import SceneFile, with_scene
 from nerfro.silhouettes.overlaps import choose_wrong_masks, report_overlaps
 from nerfro.silhouettes.pose_conventions import require_consistent_poses
@@ -51,30 +49,32 @@ def main(config: DictConfig) -> None:
 
 
 def _preprocess(config: DictConfig, request: Request) -> None:
-    mesh = None if config.mesh is None else load_mesh(resolve_path(config.mesh))
+    source, mesh = request.read()
     refuse_existing(request.files, config.overwrite)
-    source = build(config.data)
     views, silhouettes = masked_views(source.load("train")), None
     outlined = with_other_splits(views, source, "train")
     if mesh is None or outlined.masks is not None:
         mesh, outlined, silhouettes = _reconstruct(request, outlined, mesh)
     location = config.mesh or str(request.folder / MESH)
-    settings = surface_settings(request, views.cameras, mesh)
-    observations = Observations(views, mesh, config.room)
-    found = find_medium(request, observations, location, settings)
+    settings = surface_settings(request, views.cameras, mesh, source.origin)
+    medium = initial_medium(request, location, settings)
+    observations = Observations(views, mesh, config.room, medium.origin - source.origin)
+    found = find_medium(request, observations, medium)
     if config.refine:
         given, location = mesh, str(request.folder / MESH)
         if found.is_doubtful:
             warn("surface unchanged: refine=true needs the index, and the photographs do not determine the index")
         else:
-            medium = cast(SdfGrid, found.medium)  # see Request.check
-            mesh = refine(observations, mesh, medium, silhouettes, request.searches_index, request.folder)
-        mesh.save(request.folder / MESH)
-        settings = surface_settings(request, views.cameras, mesh)
+            mesh = refine(observations, mesh, found.medium, silhouettes, request.searches_index, request.folder)
+        mesh.relative_to(-source.origin).save(request.folder / MESH)
+        settings = surface_settings(request, views.cameras, mesh, source.origin)
         if mesh is not given:
             if silhouettes is not None:
                 report_overlaps(outlined, mesh, silhouettes, None, request.folder, list_all=False)
-            found = find_medium(request, observations, location, settings)
+            medium = initial_medium(request, location, settings)
+            if (medium.origin != found.medium.origin).any():
+                observations = Observations(views, mesh, config.room, medium.origin - source.origin)
+            found = find_medium(request, observations, medium)
     vessel, unsupported = dict[str, object](), list[str]()
     if config.vessel:
         solid = cast(SdfGrid, found.medium)  # see Request.check

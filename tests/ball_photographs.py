@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import torch
 import trimesh
 from torch import Tensor
@@ -85,14 +86,15 @@ def mesh() -> TriangleMesh:
     return TriangleMesh(made.vertices, made.faces)
 
 
-def save(views: Views, root: Path) -> None:
-    """Write a split `train` in Blender format, and the mesh of the larger ball."""
+def save(views: Views, root: Path, place: tuple[float, ...] = (0, 0, 0)) -> None:
+    """Write a split `train` in Blender format, and the mesh of the larger ball, both moved to a place."""
     frames = []
     for view, image in enumerate(views.images):
         save_png(root / "train" / f"r_{view}.png", image)
-        pose = torch.eye(4)
+        pose = torch.eye(4, dtype=torch.float64)
         pose[:3] = views.cameras.camera_to_world[view]
+        pose[:3, 3] += torch.tensor(place, dtype=torch.float64)
         frames.append({"file_path": f"./train/r_{view}", "transform_matrix": pose.tolist()})
     angle = 2 * math.atan(0.5 * views.cameras.width / float(views.cameras.fx[0]))
     (root / "transforms_train.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
-    mesh().save(root / "mesh.ply")
+    mesh().relative_to(-np.array(place, np.float64)).save(root / "mesh.ply")

@@ -1,5 +1,6 @@
 """`python -m nerfro.preprocess`: what it writes, the command that it prints, and what it refuses."""
 
+import functools
 import json
 import re
 import shlex
@@ -11,12 +12,15 @@ import pytest
 import torch
 from PIL import Image
 
+from nerfro.capture import refinement
+from nerfro.capture.refinement import RefinementSettings, Stage
 from nerfro.data.base import Views
 from nerfro.geometry.mesh import load_mesh
 from nerfro.media.bodies import BodySettings
 from nerfro.rendering.scene_file import read_scene_file
 from nerfro.silhouettes.silhouettes import mesh_silhouettes
 from tests.ball_photographs import NUM_VIEWS, RADIUS, SIZE, cameras, mesh, photographs, save
+from tests.conftest import UTM
 
 
 @pytest.fixture
@@ -43,7 +47,7 @@ def preprocess(capture: Path, run_here: Callable) -> Callable[..., str]:
 
     def run(*overrides: str) -> str:
         common = [f"data.root={capture}", "resolution=24", "medium.resolution=32", "medium.cache=false"]
-        common += [] if any(text.startswith("medium.ior=") for text in overrides) else ["medium.ior=1.5"]
+        common += [] if any(text.startswith(("medium.ior=", "refine=")) for text in overrides) else ["medium.ior=1.5"]
         done = run_here("preprocess", *common, *overrides)
         return done.err if done.code else done.out
 
@@ -134,14 +138,29 @@ def test_supplied_mesh_is_compared_and_kept(preprocess: Callable[..., str], capt
 
 
 def test_the_index_of_a_named_body_without_material_is_searched(preprocess: Callable[..., str], capture: Path) -> None:
-    save(photographs([1.45]), capture)
-    mesh().save(capture / "ball.ply")
-    ball = f"bodies={{ball: {{mesh: {capture / 'ball.ply'}, absorption: [0.1]}}}}"
-    printed = preprocess(f"mesh={capture / 'ball.ply'}", ball, "room=false", "data.near=0.5")
+    save(photographs([1.45]), capture, UTM)
+    ball = f"bodies={{ball: {{mesh: {capture / 'mesh.ply'}, absorption: [0.1]}}}}"
+    printed = preprocess(f"mesh={capture / 'mesh.ply'}", ball, "room=false", "data.near=0.5")
     assert "index: 1.4" in printed
     found = read_scene_file(capture / "scene.json").bodies["ball"]
     assert found.ior == pytest.approx(1.45, rel=0.01)
     assert found.absorption == [0.1]
+
+
+def test_a_hull_far_from_the_origin_is_searched_and_refined(
+    preprocess: Callable[..., str], capture: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    quick = RefinementSettings((Stage(25, 5e-4, (3.0, 1.0)),), 1000, (8,))
+    monkeypatch.setattr(refinement, "refine_surface", functools.partial(refinement.refine_surface, settings=quick))
+    place = 200.0, 0.0, 0.0
+    save(photographs([1.45]), capture, place)
+    (capture / "mesh.ply").unlink()
+    preprocess("room=false", "data.near=0.5", "refine=true", "smoothing=0")
+    scene = read_scene_file(capture / "scene.json")
+    assert scene.bodies["object"].ior == pytest.approx(1.45, rel=0.03)  # 1.42 at the origin, too
+    assert json.loads((capture / "refinement.json").read_text())["validation_error"][0] < 0.2
+    for box in (load_mesh(capture / "mesh.ply").bounds, [scene.medium["box_min"], scene.medium["box_max"]]):
+        assert np.mean(box, 0) == pytest.approx(place, abs=0.05)
 
 
 def test_data_without_masks_is_refused(preprocess: Callable[..., str], tiny_scene: Path) -> None:

@@ -317,27 +317,36 @@ class FoundMedium:
         return self.estimate is not None and bool(self.estimate.doubts)
 
 
-def find_medium(
-    request: Request, observations: Observations, location: str, settings: dict[str, object]
-) -> FoundMedium:
-    """Build the medium with a surface, and search the indices if they are not given.
+def initial_medium(request: Request, location: str, settings: dict[str, object]) -> Medium:
+    """Build the medium with a surface; the indices are 1.5 unless they are given.
 
     Args:
         request: options of the command.
-        observations: observations of the object and its surroundings.
         location: file of the surface.
         settings: settings of the medium for the surface (see `surface_settings`).
     """
+    config, settings = request.config.medium, settings | {"mesh": location}
+    if request.searches_index:
+        names = [*(config.get("bodies") or body_names(1 + len(config.get("inner_meshes", []))))]
+        settings |= index_settings(config, names, [1.5] * len(names))
+    return build_medium(request, settings)
+
+
+def find_medium(request: Request, observations: Observations, medium: Medium) -> FoundMedium:
+    """Search the indices of a medium if they are not given.
+
+    Args:
+        request: options of the command.
+        observations: observations of the object and its surroundings, relative to the origin of the medium.
+        medium: see `initial_medium`.
+    """
     if not request.searches_index:
-        return FoundMedium(build_medium(request, settings | {"mesh": location}))
-    config = request.config.medium
-    names = [*(config.get("bodies") or body_names(1 + len(config.get("inner_meshes", []))))]
-    medium = build_medium(request, settings | {"mesh": location} | index_settings(config, names, [1.5] * len(names)))
+        return FoundMedium(medium)
     if not isinstance(medium, Solid):
         raise NerfroError("the index of this type of medium cannot be searched for; set medium.ior=, or medium=object")
     found = _search_index(observations, medium, request.folder)
     searched = medium.with_indices(torch.from_numpy(found.values))
-    return FoundMedium(searched, found, index_settings(config, medium.names, found.values))
+    return FoundMedium(searched, found, index_settings(request.config.medium, medium.names, found.values))
 
 
 def _search_index(observations: Observations, medium: Solid, folder: Path) -> Estimate:

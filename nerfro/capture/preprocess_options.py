@@ -15,9 +15,10 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 
 from nerfro.allowed import Count, Natural, NotNegative, Range, corners_of_box
 from nerfro.cameras import Cameras
+from nerfro.data.base import DataSource
 from nerfro.data.frames import require_root
 from nerfro.errors import NerfroError
-from nerfro.geometry.mesh import TriangleMesh
+from nerfro.geometry.mesh import TriangleMesh, load_mesh, local_origin
 from nerfro.media.base import Medium
 from nerfro.overrides import as_overrides, is_given, print_hint, print_next
 from nerfro.paths import EMBEDDED_PREFIX, resolve_path, user_path
@@ -135,27 +136,39 @@ class Request:
         if config.out is None:
             require_root(self.folder)
 
+    def read(self) -> tuple[DataSource, TriangleMesh | None]:
+        """Build the data set and read the given mesh, if any, with positions relative to `DataSource.origin`."""
+        source: DataSource = build(self.config.data)
+        if self.config.mesh is None:
+            return source, None
+        mesh = load_mesh(resolve_path(self.config.mesh))
+        source = source.with_origin(local_origin(mesh.vertices))
+        return source, mesh.relative_to(source.origin)
 
-def surface_settings(request: Request, cameras: Cameras, mesh: TriangleMesh) -> dict[str, object]:
+
+def surface_settings(
+    request: Request, cameras: Cameras, mesh: TriangleMesh, origin: Float[np.ndarray, "3"]
+) -> dict[str, object]:
     """Determine the settings of the medium that a surface needs beside the given ones.
 
     Args:
         request: options of the command.
         cameras: cameras of the photographs.
         mesh: the surface.
+        origin: world coordinates of the origin of cameras and mesh.
     """
     settings: dict[str, object] = {}
     names = ("medium.box_min", "medium.box_max", "medium.bodies")  # each of several bodies has a box of its own
     if not any(is_given(name, request.overrides) for name in names):
-        centre, half_side = mesh.bounds.mean(0), (0.5 + _MARGIN) * float(np.ptp(mesh.bounds, axis=0).max())
+        centre, half_side = mesh.bounds.mean(0) + origin, (0.5 + _MARGIN) * float(np.ptp(mesh.bounds, axis=0).max())
         digits = max(0, 3 - int(np.floor(np.log10(half_side))))
         for name, corner in (("box_min", centre - half_side), ("box_max", centre + half_side)):
             settings[name] = [round(float(x), digits) for x in corner]
     is_vessel = "wall" in request.config.medium
     if is_vessel and not is_given("medium.up", request.overrides) and (found := find_up(cameras, mesh)) is not None:
-        up, origin = found
+        up, reason = found
         settings["up"] = [round(float(x), 4) for x in up]
-        print(f"up is {settings['up']}, {origin}; set medium.up= to change the direction")
+        print(f"up is {settings['up']}, {reason}; set medium.up= to change the direction")
     return settings
 
 

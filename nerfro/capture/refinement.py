@@ -18,7 +18,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
 
 import numpy as np
@@ -36,6 +36,7 @@ from nerfro.errors import NerfroError, warn
 from nerfro.files.atomic import write_atomically
 from nerfro.geometry.interpolation import bspline_basis, smooth
 from nerfro.geometry.mesh import TriangleMesh
+from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.progress import bar
 from nerfro.samplers.paths.snell import Snell
@@ -170,7 +171,7 @@ def refine_surface(
 def refine(
     observations: Observations,
     mesh: TriangleMesh,
-    medium: SdfGrid,
+    medium: Medium,
     silhouettes: Silhouettes | None,
     learn_index: bool,
     folder: FilePath,
@@ -179,32 +180,38 @@ def refine(
 
     Args:
         observations: observations of the object and its surroundings.
-        mesh, medium, learn_index: see `refine_surface`.
-        silhouettes: silhouettes of the masks; None uses projections of the mesh.
+        mesh: the surface, in the coordinates that `observations.shift` refers to.
+        medium, learn_index: see `refine_surface`.
+        silhouettes: silhouettes of the masks in the coordinates of the mesh; None uses projections of the mesh.
         folder: output folder.
 
     Returns:
         The refined surface; the given one without a significant improvement, or if the refinement is impossible.
     """
     through, surroundings, cameras = observations.through, observations.surroundings, observations.views.cameras
+    assert isinstance(medium, SdfGrid)  # see Request.check
+    start = mesh.relative_to(observations.shift)
     if silhouettes is None:
-        silhouettes = Silhouettes.of(cameras, mesh_silhouettes(mesh, cameras, 1).float())
+        silhouettes = Silhouettes.of(cameras, mesh_silhouettes(start, cameras, 1).float())
+    else:
+        silhouettes = replace(silhouettes, cameras=silhouettes.cameras.relative_to(observations.shift))
     try:
         with bar("surface") as progress:
-            refined = refine_surface(mesh, medium, silhouettes, through, surroundings, learn_index, progress)
+            refined = refine_surface(start, medium, silhouettes, through, surroundings, learn_index, progress)
     except NerfroError as reason:  # keep the results of the other steps
         warn(f"surface unchanged: {reason}")
         return mesh
     before, after = refined.errors[0], min(refined.errors)
     change = f"the validation error changes from {before:.4f} to {after:.4f} (0: exact, 1: unrelated images)"
-    if refined.mesh is mesh:
+    if refined.mesh is start:
         print(f"surface unchanged: {change}, which is not significant")
     else:
-        moved = float(torch.from_numpy(refined.mesh.vertices - mesh.vertices).norm(dim=-1).median())
+        mesh = refined.mesh.relative_to(-observations.shift)
+        moved = float(torch.from_numpy(refined.mesh.vertices - start.vertices).norm(dim=-1).median())
         print(f"surface refined and used: {change}; median displacement {moved:.2g} world units")
     figures = {"steps": refined.steps, "validation_error": [round(error, 5) for error in refined.errors]}
     write_atomically(folder / FIGURES, json.dumps(figures, indent=1) + "\n")
-    return refined.mesh
+    return mesh
 
 
 class Displacement(nn.Module):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -30,7 +30,7 @@ from nerfro.samplers.paths.straight import straight_path
 from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.silhouettes.silhouettes import VALIDATION_EVERY, PixelBlocks, mesh_silhouettes
 from nerfro.subdivision import pixel_rays
-from nerfro.types import Exits
+from nerfro.types import WORLD_ORIGIN, Exits
 
 # Photographs are downscaled to at most so many pixels per side, in linear radiance.
 _MAX_PIXELS = 200
@@ -209,10 +209,17 @@ class Observations:
         views: photographs with poses.
         mesh: surface of the object.
         room: whether the surroundings are near; None decides by validation views.
+        shift: origin of the observations in the coordinates of views and mesh.
+
+    Attributes:
+        views: the photographs, with poses relative to `shift`.
     """
 
-    def __init__(self, views: Views, mesh: TriangleMesh, room: bool | None) -> None:
-        self.views, self._mesh, self._room = views, mesh, room
+    def __init__(
+        self, views: Views, mesh: TriangleMesh, room: bool | None, shift: Float[np.ndarray, "3"] = WORLD_ORIGIN
+    ) -> None:
+        self.views = replace(views, cameras=views.cameras.relative_to(shift))
+        self.shift, self._mesh, self._room = shift, mesh.relative_to(shift), room
 
     @property
     def distance(self) -> str | None:

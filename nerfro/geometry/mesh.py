@@ -53,11 +53,15 @@ class TriangleMesh:
         return bool((uses % 2 == 0).all())
 
     def save(self, path: Path) -> None:
-        """Write vertices and triangles as a binary PLY."""
-        import trimesh
-
-        content = trimesh.exchange.ply.export_ply(trimesh.Trimesh(self.vertices, self.faces, process=False))
-        write_atomically(path, content)
+        """Write vertices and triangles as a binary PLY, in double precision for objects far from the origin."""
+        header = (
+            f"ply\nformat binary_little_endian 1.0\nelement vertex {len(self.vertices)}\n"
+            "property double x\nproperty double y\nproperty double z\n"
+            f"element face {len(self.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+        )
+        faces = np.zeros(len(self.faces), [("count", "u1"), ("corners", "<i4", 3)])
+        faces["count"], faces["corners"] = 3, self.faces
+        write_atomically(path, header.encode() + self.vertices.astype("<f8").tobytes() + faces.tobytes())
 
 
 _THINNEST = 1e-4  # world units; boxes are stored with six decimals
