@@ -40,7 +40,7 @@ class Path:
         directions: unit direction of the segment after each vertex; at the last vertex, the exit direction.
         s: arc length from the camera at each vertex, non-decreasing, world units. `s[:, 0]` is near; `s[:, -1]` is far,
             or more if the ray leaves the object later.
-        refracted: whether the polyline meets the medium (an index other than 1).
+        refracted: whether the polyline meets the medium (an index other than 1, or an absorbing body).
         radii: pixel cone radius at unit distance, from the rays.
         splits: whether rays may have several polylines. If not, `ray` counts from 0 and `throughput` is 1 everywhere.
         ray: ray of each polyline, non-decreasing; every ray has at least one polyline.

@@ -9,7 +9,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int, Int8
+from jaxtyping import Bool, Float, Int, Int8
 
 from nerfro.kernels.compilation import compiled
 from nerfro.kernels.tolerances import BEYOND_BOX, SAFE_SHARE
@@ -52,6 +52,7 @@ class Solids(NamedTuple):
     block_shape: Int[np.ndarray, "K 3"]
     inverse_block: Float[np.ndarray, "K 3"]
     iors: Float[np.ndarray, "K"]
+    absorbs: Bool[np.ndarray, "K"]
     nested: bool  # whether each body is bounded by all previous bodies
     shell: float  # half width of the smooth interfaces, world units
     # Corners of the box of all bodies, world units.
@@ -65,7 +66,7 @@ _corners, _lengths, _counts, _numbers = np.empty((0, 3)), np.empty(0), np.empty(
 _values, _bounds, _bytes = np.empty(0, np.float32), np.empty((0, 3, 2), np.float32), np.empty(0, np.int8)
 NO_SOLIDS = Solids(
     _corners, _corners, _corners, _lengths, _values, _numbers, _counts, _bounds, _bytes, _numbers, _counts, _corners,
-    _lengths, False, 0.0, *np.empty((2, 3)),
+    _lengths, np.empty(0, np.bool_), False, 0.0, *np.empty((2, 3)),
 )  # fmt: skip
 
 

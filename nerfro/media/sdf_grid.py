@@ -181,7 +181,7 @@ class SdfGrid(Solid):
 
         low, high = self.box.double().numpy()
         indices = self.indices.double().numpy()
-        return Solids._make((*self.grids.packed, indices, self.nested, self.shell, low, high))
+        return Solids._make((*self.grids.packed, indices, self.absorbs.numpy(), self.nested, self.shell, low, high))
 
     @cached_property
     def triangles(self) -> Triangles:

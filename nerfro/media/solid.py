@@ -46,8 +46,8 @@ class Solid(Medium):
 
     Attributes:
         nested: whether a body exists only where all bodies before it exist. A nested body may then reach beyond the
-            others and touch them without a gap, and a body of index 1 is air, as outside. Otherwise a point belongs to
-            the last body that contains it.
+            others and touch them without a gap, and a clear body of index 1 is air, as outside. Otherwise a point
+            belongs to the last body that contains it.
         materials: material of each body.
         names: name of each body.
     """
@@ -97,9 +97,14 @@ class Solid(Medium):
             return None
         return torch.stack([material.absorption for material in self.materials])
 
+    @property
+    def absorbs(self) -> Bool[Tensor, "K"]:
+        """Whether each body may absorb light."""
+        return torch.tensor([material.absorbs for material in self.materials], device=self.box.device)
+
     def with_absorption_coefficients(self: Self, absorption: Float[Tensor, "K 3"]) -> Self:
         """Return the same bodies with other coefficients, per world unit."""
-        return self._with_materials([{"_absorption": values} for values in absorption])
+        return self._with_materials([{"_absorption": values if values.any() else None} for values in absorption])
 
     @property
     def disperses(self) -> bool:
@@ -161,7 +166,7 @@ class Solid(Medium):
         numbers = torch.arange(inside.shape[-1] + 1, device=inside.device)
         if self.nested:
             # Air in a vessel is the air outside: a ray passes between them without an event.
-            numbers[1:] *= self.iors != 1
+            numbers[1:] *= (self.iors != 1) | self.absorbs
             return numbers[inside.long().cumprod(-1).sum(-1)]
         return torch.where(inside, numbers[1:], 0).amax(-1)
 

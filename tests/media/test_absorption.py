@@ -1,11 +1,14 @@
 """Tint along paths: Beer-Lambert in closed form, what is seen through it, what learns, and what is refused."""
 
 from dataclasses import replace
+from pathlib import Path as FilePath
 
 import pytest
 import torch
+from torch import Tensor
 
 from nerfro.errors import NerfroError
+from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball
 from nerfro.models.refractive import RefractiveModel
 from nerfro.rendering import composite
@@ -13,8 +16,9 @@ from nerfro.samplers.paths.eikonal import Eikonal
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.points.stratified import point_samples
 from nerfro.testing import example_components, example_rays
-from nerfro.types import Path, Radiance
-from tests.closed_forms import beam
+from nerfro.types import Path, Radiance, Rays
+from tests.closed_forms import beam, grid_points, random_rays
+from tests.samplers.nested import NestedBalls, nested_mesh
 
 SIGMA = [0.3, 1.0, 2.5]
 
@@ -54,6 +58,34 @@ def test_a_reflection_past_the_ball_is_not_tinted() -> None:
     through, reflected = path.transmitted(path.far[:, None])[:, 0]
     assert (through < 0.9).all()
     assert (reflected == 1).all()
+
+
+@pytest.mark.parametrize("tracer", ["closed form", "grid", "mesh"])
+def test_absorption_does_not_depend_on_a_change_of_the_index(tracer: str, tmp_path: FilePath) -> None:
+    sigma = torch.tensor([[0.5, 1.0, 0.0], [2.0, 0.0, 1.0]], dtype=torch.float64)
+    medium = nested_mesh(tmp_path) if tracer == "mesh" else NestedBalls()
+    if tracer == "grid":
+        distances = medium.signed_distances(grid_points(1.2, 33, torch.float64))[0].movedim(-1, 0)
+        medium = SdfGrid.from_distances(distances, medium.box, [1.5, 1.2], 0.02)
+    medium, rays = medium.with_absorption_coefficients(sigma), random_rays(200, 1.0, seed=0, far=6)
+    sampler = Snell("mesh" if tracer == "mesh" else "sdf")
+
+    def left(*iors: float) -> Tensor:
+        path = medium.with_absorption(sampler(rays, medium.with_indices(torch.tensor(iors))))
+        return path.transmitted(path.far[:, None])[:, 0]
+
+    for outer, inner in ((1.0, 1.0), (1.5, 1.5), (1.0, 1.5)):
+        torch.testing.assert_close(left(outer, inner), left(outer + 1e-6, inner + 2e-6), atol=1e-4, rtol=0)
+    chords = torch.stack([_chord(rays, [0.0, 0, 0], 0.8), _chord(rays, [0.2, 0.1, 0], 0.4)], -1)
+    expected = torch.exp(-(chords @ sigma - chords[:, 1:] * sigma[0]))
+    # An icosphere lies inside its ball, which shortens chords near the rim most.
+    assert (left(1.0, 1.0) - expected).abs().quantile(0.9) < (0.02 if tracer == "mesh" else 1e-3)
+
+
+def _chord(rays: Rays, centre: list[float], radius: float) -> Tensor:
+    """Lengths of straight rays in a ball."""
+    distance = torch.linalg.cross(rays.origins - torch.tensor(centre), rays.directions).norm(dim=-1)
+    return 2 * (radius**2 - distance.square()).clamp(min=0).sqrt()
 
 
 def test_absorption_learns_without_tracing_again() -> None:

@@ -166,6 +166,12 @@ def test_tint_and_dispersion_are_those_of_wall_and_liquid(tmp_path: Path) -> Non
     vessel = spherical_vessel(tmp_path, level=0.9, resolution=40, absorption=[1, 2, 3, 4, 5, 6], abbe=[60, 55])
     assert vessel.absorption.tolist() == [[1, 2, 3], [0, 0, 0], [4, 5, 6]]
     assert vessel.at_wavelength(486.13).iors[1] == 1
+    dyed = vessel.with_indices(torch.ones(3))
+    rays = make_rays([[0.1, 0.0, 3.0]], [[0, 0.0, -1]], 0.5, 9.0)
+    for trace in (Snell().trace(rays, dyed), trace_interfaces(rays, dyed, 16)):
+        # The wall, clear air, the liquid, the wall again, and the air outside.
+        assert trace.path.body[0, :6].tolist() == [0, 1, 0, 3, 1, 0]
+        assert not trace.num_events.any()
     learning = spherical_vessel(tmp_path, level=0.9, resolution=40, learn_absorption=True)
     assert (learning.absorption[1] == 0).all()
     assert (learning.absorption[[0, 2]] > 0).all()

@@ -1,8 +1,10 @@
 """Light that splits at surfaces: energy, closed forms, the three tracers against each other, derivatives of shares."""
 
 import functools
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path as FilePath
+from typing import Any
 
 import pytest
 import torch
@@ -24,11 +26,11 @@ BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
 _rays = functools.partial(random_rays, width=1.6, seed=2, far=6)
 
 
-def _nested_grid(size: int = 40) -> SdfGrid:
+def _nested_grid(size: int = 40, iors: Sequence[float] = (1.5, 1.2), **glass: Any) -> SdfGrid:
     p = grid_points(1.5, size)
     centre = torch.tensor([0.2, 0.1, 0])
     return SdfGrid.from_distances(
-        torch.stack([p.norm(dim=-1) - 0.8, (p - centre).norm(dim=-1) - 0.4]), BOX, [1.5, 1.2], 0.02
+        torch.stack([p.norm(dim=-1) - 0.8, (p - centre).norm(dim=-1) - 0.4]), BOX, iors, 0.02, **glass
     )
 
 
@@ -98,8 +100,9 @@ def test_a_slab_transmits_the_sum_over_its_bounces(n: float) -> None:
     assert float(_weights(path)[through].sum()) == pytest.approx(2 * n / (n * n + 1), abs=1e-6)
 
 
-def test_compiled_branches_are_those_of_torch(monkeypatch: pytest.MonkeyPatch) -> None:
-    medium, rays = _nested_grid(), _rays(400)
+@pytest.mark.parametrize("iors", [[1.5, 1.2], [1.8, 1.8], [1.0, 1.8]])
+def test_compiled_branches_are_those_of_torch(iors: list[float], monkeypatch: pytest.MonkeyPatch) -> None:
+    medium, rays = _nested_grid(iors=iors, absorption=[1.0, 0.0, 2.0, 0.0, 3.0, 0.0]), _rays(400)
     sampler = Snell(branches="all", least_weight=0.005)
     fast = sampler.trace(rays, medium)
     # The same with too little room for polylines and vertices at first.
@@ -118,9 +121,30 @@ def test_compiled_branches_are_those_of_torch(monkeypatch: pytest.MonkeyPatch) -
     assert torch.equal(fast.num_events[one], num_events[other])
     assert torch.equal(fast.exceeded[one], exceeded[other])
     torch.testing.assert_close(fast.path.throughput[one], path.throughput[other], atol=1e-5, rtol=0)
-    error = (fast.path.exit_directions[one] - path.exit_directions[other]).norm(dim=-1)
+    assert torch.equal(fast.path.refracted[one], path.refracted[other])
+
+    def values(path: Path) -> Tensor:
+        left = medium.with_absorption(path).transmitted(path.far[:, None])[:, 0]
+        return torch.cat([path.exit_directions, left], -1)
+
+    error = (values(fast.path)[one] - values(path)[other]).norm(dim=-1)
     assert error.median() < 1e-6
     assert error.quantile(0.95) < 1e-4
+
+
+@pytest.mark.parametrize("medium", [_nested_grid(), NestedBalls()], ids=["compiled", "torch"])
+def test_a_dyed_body_of_index_one_is_no_event(medium: Solid) -> None:
+    rays, sampler = _rays(100), Snell(branches="first")
+    iors = torch.tensor([1.0, 1.5]).double().requires_grad_()
+    results = []
+    for outer in (0.0, 1.0):
+        dyed = medium.with_indices(iors).with_absorption_coefficients(torch.tensor([[outer] * 3, [0.0] * 3]))
+        path, num_events, _ = sampler.trace(rays, dyed)
+        refined, steady = sampler.refine(path, rays, dyed), sampler.steady(path, dyed)
+        (gradient,) = torch.autograd.grad((refined.throughput * refined.exit_directions)[steady].sum(), iors)
+        results.append((path.throughput, path.exit_directions, num_events, steady, gradient[1]))
+    for expected, found in zip(*results, strict=True):
+        torch.testing.assert_close(found, expected)
 
 
 def test_the_first_polyline_is_the_one_that_is_transmitted() -> None:

@@ -4,6 +4,7 @@ import functools
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path as FilePath
+from typing import Any
 
 import pytest
 import torch
@@ -50,10 +51,10 @@ def _ball(centre: list[float], radius: float) -> Tensor:
     return (points - torch.tensor(centre, dtype=torch.float64)).norm(dim=-1) - radius
 
 
-def _nested_grid() -> SdfGrid:
-    """A ball of glass with a bubble beside its middle; rays are totally reflected at either."""
+def _nested_grid(inner_ior: float = 1.0, **glass: Any) -> SdfGrid:
+    """A ball of glass with a ball beside its middle, by default a bubble: rays are totally reflected at either."""
     return SdfGrid.from_distances(
-        torch.stack([_ball([0, 0, 0], 0.8), _ball([0.2, 0.1, 0], 0.4)]), BOX, [1.5, 1.0], 0.02
+        torch.stack([_ball([0, 0, 0], 0.8), _ball([0.2, 0.1, 0], 0.4)]), BOX, [1.5, inner_ior], 0.02, **glass
     )
 
 
@@ -66,6 +67,7 @@ SCENES: dict[str, tuple[PathSampler, Callable[[FilePath], Medium]]] = {
     "snell-ball": (Snell(), lambda folder: Ball(0.8, 1.5).double()),
     "snell-rounded-cube": (Snell(), lambda folder: RoundedBox(0.6, 0.15, 1.52).double()),
     "snell-nested-grid": (PlainSnell(), lambda folder: _nested_grid()),
+    "snell-matched-grid": (PlainSnell(), lambda folder: _nested_grid(1.5, absorption=[1.0])),
     "snell-nested-mesh": (Snell("mesh"), nested_mesh),
     "snell-cube-mesh": (Snell("mesh"), _cube_mesh),
     "eikonal-ball": (Eikonal(), lambda folder: Ball(0.8, 1.5, 0.05).double()),
@@ -116,7 +118,8 @@ def _shifted(what: str, rays: Rays, medium: Medium) -> Callable[[Tensor], Rays]:
 # On a grid the cell that a ray is in says where its steps begin; now and then differences see that.
 EVERYWHERE = [name for name in SCENES if name != "eikonal-nested-grid"]
 CASES = [(name, what) for name in EVERYWHERE for what in ("ior", "origin", "direction")]
-CASES += [("snell-nested-grid", "coefficients"), ("eikonal-nested-grid", "coefficients")]
+CASES += [("snell-nested-grid", "coefficients"), ("snell-matched-grid", "coefficients")]
+CASES += [("eikonal-nested-grid", "coefficients")]
 
 
 @pytest.mark.parametrize(("name", "what"), CASES)

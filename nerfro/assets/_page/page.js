@@ -137,7 +137,9 @@ function settings(scene) {
   const colour = [1, 3, 5].map((at) => parseInt($("tint-colour").value.slice(at, at + 2), 16) / 255);
   const strength = Number($("tint").value) / scene.orbit.halfWidth;
   const tint = colour.map((c) => -Math.log(Math.max(c, 0.02) ** 2.2) * strength);
-  const absorption = scene.surface.absorption.map((own) => own.map((value, i) => value + tint[i]));
+  const isAir = (body) => scene.surface.nested && scene.surface.iors[body] === 1;
+  const absorption = scene.surface.absorption.map((own, body) =>
+    own.map((value, i) => value + (isAir(body) ? 0 : tint[i])));
   return { iors, absorption, glass: $("glass").checked, reflection: $("reflection").checked };
 }
 

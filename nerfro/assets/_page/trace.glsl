@@ -26,7 +26,7 @@ uniform usampler3D clearance;  // how far blocks of cells are from the body's su
 uniform float clearanceStep[MAX_BODIES], blockCells;
 uniform float shortestStep;
 uniform int bodies, maxEvents;
-uniform bool nested;  // whether a body is only where all before it are too; one of index 1 is air then
+uniform bool nested;  // whether a body is only where all before it are too; a clear one of index 1 is air then
 uniform int startInside;  // bodies that the eye is in, a bit for each
 uniform float index[MAX_BODIES + 1];  // of air and of each body
 uniform vec3 absorption[MAX_BODIES + 1];  // for each world unit
@@ -110,7 +110,7 @@ int innermost(int inside) {
     if ((inside >> body & 1) == 1) number = body + 1;
     else if (nested) break;
   }
-  return nested && index[number] == 1.0 ? 0 : number;
+  return nested && index[number] == 1.0 && absorption[number] == vec3(0.0) ? 0 : number;
 }
 
 struct Hit {

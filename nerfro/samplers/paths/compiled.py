@@ -46,9 +46,9 @@ def snell_on_grid(rays: Rays, medium: SdfGrid, max_events: int, branching: Branc
         order = np.argsort(np.concatenate([part[0] for part in parts]), kind="stable")
         parts = [tuple(np.concatenate(column)[order] for column in zip(*parts, strict=True))]
     owner, *columns = (torch.from_numpy(column) for column in parts[0])
-    positions, directions, s, body, surface, across, weight, num_events, exceeded = columns
+    positions, directions, s, body, surface, across, weight, num_vertices, num_events, exceeded = columns
     radii = rays.radii[owner] if branching.num_events else rays.radii
-    path = Path.unbranched(positions, directions, s, num_events > 0, radii)
+    path = Path.unbranched(positions, directions, s, num_vertices > 2, radii)
     path = replace(path, body=body, surface=surface, across=across)
     if branching.num_events:
         path = replace(path, splits=True, ray=owner, throughput=weight[:, None].expand(-1, 3))
@@ -56,7 +56,7 @@ def snell_on_grid(rays: Rays, medium: SdfGrid, max_events: int, branching: Branc
 
 
 def _polylines(rows: Polylines, counts: Int[np.ndarray, "R"], width: int) -> tuple[np.ndarray, ...]:
-    """Select polylines; returns their rays, arrays with a column per vertex, weights, numbers of events, and excess.
+    """Select polylines; returns their rays, arrays with a column per vertex, and values per polyline.
 
     Args:
         rows: results of the kernel.
@@ -68,7 +68,7 @@ def _polylines(rows: Polylines, counts: Int[np.ndarray, "R"], width: int) -> tup
     valid = np.arange(rows.weight.shape[1]) < counts[:, None]
     ray, place = (np.ascontiguousarray(indices) for indices in valid.nonzero())
     of_vertices = polylines_of_width(rows, ray, place, width)
-    return ray, *of_vertices, rows.weight[valid], rows.num_events[valid], rows.exceeded[valid]
+    return ray, *of_vertices, *(column[valid] for column in rows[6:])
 
 
 def eikonal_on_grid(

@@ -32,7 +32,8 @@ class SnellTrace(NamedTuple):
     """Result of tracing rays through solids.
 
     Attributes:
-        path: polylines with one vertex for each event, besides near and far.
+        path: polylines with one vertex for each event, besides near and far. Surfaces of absorbing bodies are vertices
+            even if the index does not change there.
         num_events: number of refractions and reflections of each polyline.
         exceeded: whether the polyline met the limit of events, after which it continues straight.
     """

@@ -56,14 +56,14 @@ def smallest_cosine(path: Path, medium: Medium) -> Float[Tensor, "P"]:
     """Compute the least |N . d| of each path just before and just after events at sharp surfaces; 1 without events.
 
     First derivatives of a path are reliable if the cosine is above 0.15. Below, the ray grazes a surface or is near the
-    critical angle, and the derivatives grow without bound.
+    critical angle, and the derivatives grow without bound. Surfaces at which the index does not change do not count.
     """
     with torch.no_grad():
         n = indices_of(medium, path.s)[path.body.long()]
         before, after = path.directions[:, :-1], path.directions[:, 1:]
         normals = turning_normals(before, after, n[:, :-1], n[:, 1:])
         cosines = torch.minimum((normals * before).sum(-1).abs(), (normals * after).sum(-1).abs())
-        return torch.where(path.surface[:, 1:] >= 0, cosines, 1.0).amin(-1)
+        return torch.where((path.surface[:, 1:] >= 0) & normals.any(-1), cosines, 1.0).amin(-1)
 
 
 def indices_of(medium: Medium, like: Tensor) -> Float[Tensor, "M"]:
@@ -89,7 +89,7 @@ def replay(path: Path, rays: Rays, medium: Medium, meet: Meet, branching: Branch
     rows, column = torch.arange(num_paths, device=s.device), torch.zeros_like(path.ray)
     vertices: list[Vertices] = [(rows, column, x, d, s)]
     indices = indices_of(medium, path.s)
-    weight = torch.ones_like(s)
+    weight, num_events = torch.ones_like(s), torch.zeros_like(path.ray)
     for i in range(1, num_vertices - 1):
         rows = (path.surface[:, i] >= 0).nonzero().squeeze(1)
         if not len(rows):
@@ -98,12 +98,14 @@ def replay(path: Path, rays: Rays, medium: Medium, meet: Meet, branching: Branch
             (path.positions, x), (path.directions, d), (path.s, s)))  # fmt: skip
         before, after, across = (numbers[rows].long() for numbers in (
             path.body[:, i - 1], path.body[:, i], path.across[:, i]))  # fmt: skip
-        reflected = before == after
+        reflected = after != across
         length, normal = meet(rows, i, old_x, old_d, path.s[rows, i] - path.s[rows, i - 1])
         turned, _ = refract(old_d, normal, indices[before], indices[across], reflected)
-        if i <= branching.num_events:
-            share = reflectance(old_d, normal, indices[before], indices[across])
-            splits, _ = branching.decide(weight[rows].detach(), share.detach(), torch.full_like(rows, i - 1))
+        if (num_events[rows] < branching.num_events).any():
+            visible = indices[before] != indices[across]
+            share = torch.where(visible, reflectance(old_d, normal, indices[before], indices[across]), 0.0)
+            splits, _ = branching.decide(weight[rows].detach(), share.detach(), num_events[rows])
+            num_events[rows] += visible
             factor = torch.where(splits, torch.where(reflected, share, 1 - share), 1.0)
             weight = weight.index_copy(0, rows, weight[rows] * factor)
         vertex = old_x + length[:, None] * old_d, turned, old_s + length

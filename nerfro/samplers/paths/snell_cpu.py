@@ -60,6 +60,7 @@ class Polylines(NamedTuple):
     surface: Int8[np.ndarray, "B V"]
     across: Int8[np.ndarray, "B V"]
     weight: Float[np.ndarray, "B"]
+    num_vertices: Int[np.ndarray, "B"]
     num_events: Int[np.ndarray, "B"]
     exceeded: Bool[np.ndarray, "B"]  # whether the limit of events was met
 
@@ -94,7 +95,7 @@ def _innermost(inside, solids):
             number = body + 1
         elif solids.nested:
             break
-    if solids.nested and number > 0 and solids.iors[number - 1] == 1.0:
+    if solids.nested and number > 0 and solids.iors[number - 1] == 1.0 and not solids.absorbs[number - 1]:
         return 0
     return number
 
@@ -103,6 +104,12 @@ def _innermost(inside, solids):
 def _index(number, solids):
     """Return the refractive index of a body by number from 1; number 0 is air."""
     return solids.iors[number - 1] if number > 0 else 1.0
+
+
+@compiled
+def _absorbs(number, solids):
+    """Return whether a body absorbs light, by number from 1; number 0 is air."""
+    return number > 0 and solids.absorbs[number - 1]
 
 
 @compiled
@@ -181,11 +188,12 @@ def _put_vertex(rows, row, branch, body, surface, across):
 def _put_end(solids, rows, row, branch, far, exceeded):
     """Append the last vertex of a row at far; bent paths end outside of the box, beyond far if necessary."""
     line, ahead = branch.line, far - branch.s
-    if branch.num_events > 0:
+    if branch.num_vertices > 1:
         x, y, z, dx, dy, dz = line
         ahead = max(ahead, distance_out(solids.box_low, solids.box_high, x, y, z, dx, dy, dz))
     end = Branch(advance(line, ahead), branch.s + ahead, branch.weight, branch.num_vertices, branch.num_events)
     rows.weight[row], rows.num_events[row], rows.exceeded[row] = branch.weight, branch.num_events, exceeded
+    rows.num_vertices[row] = branch.num_vertices + 1
     return _put_vertex(rows, row, end, 0, -1, 0).num_vertices
 
 
@@ -285,6 +293,8 @@ def _follow(solids, settings, scratch, rows, row, branch, num_pending):
         far = advance(here, behind)
         if n_before == n_across:
             branch = Branch(far, branch.s + behind, branch.weight, branch.num_vertices, branch.num_events)
+            if body != across and (_absorbs(body, solids) or _absorbs(across, solids)):
+                branch = _put_vertex(rows, row, branch, across, hit, across)
             continue
         if branch.num_events >= settings.max_events:
             return branch, True, num_pending
@@ -347,8 +357,8 @@ def trace_snell(origins, directions, near, far, solids, settings, capacity, room
         room: largest number of polylines of a ray, B.
 
     Returns:
-        rows: `Polylines` of all rays, with a leading axis R, in the precision of the rays. A polyline has two vertices
-            more than events; the other entries are undefined.
+        rows: `Polylines` of all rays, with a leading axis R, in the precision of the rays. Entries after the last
+            vertex of a polyline are undefined.
         counts [R, 2]: number of polylines of each ray, and largest number of vertices, which may exceed B and V.
     """
     num_rays, num_bodies, num_splits = origins.shape[0], len(solids.iors), settings.num_splits
@@ -357,7 +367,7 @@ def trace_snell(origins, directions, near, far, solids, settings, capacity, room
         np.empty((num_rays, room, capacity), origins.dtype), np.empty((num_rays, room, capacity), np.int8),
         np.empty((num_rays, room, capacity), np.int8), np.empty((num_rays, room, capacity), np.int8),
         np.empty((num_rays, room), origins.dtype), np.empty((num_rays, room), np.int64),
-        np.empty((num_rays, room), np.bool_),
+        np.empty((num_rays, room), np.int64), np.empty((num_rays, room), np.bool_),
     )  # fmt: skip
     counts = np.empty((num_rays, 2), np.int64)
     for block in prange((num_rays + _BLOCK - 1) // _BLOCK):
@@ -375,7 +385,7 @@ def trace_snell(origins, directions, near, far, solids, settings, capacity, room
             )  # fmt: skip
             row = Polylines(
                 rows.positions[ray], rows.directions[ray], rows.s[ray], rows.body[ray], rows.surface[ray],
-                rows.across[ray], rows.weight[ray], rows.num_events[ray], rows.exceeded[ray],
+                rows.across[ray], rows.weight[ray], rows.num_vertices[ray], rows.num_events[ray], rows.exceeded[ray],
             )  # fmt: skip
             start, end = np.float64(near[ray]), np.float64(far[ray])
             counts[ray] = _trace_ray(solids, line, start, end, settings, scratch, row)
@@ -402,7 +412,7 @@ def polylines_of_width(rows, ray, place, width):
     )  # fmt: skip
     for p in prange(number):
         r, b = ray[p], place[p]
-        last = min(rows.num_events[r, b] + 2, capacity, width) - 1
+        last = min(rows.num_vertices[r, b], capacity, width) - 1
         for i in range(width):
             j = min(i, last)
             for axis in range(3):

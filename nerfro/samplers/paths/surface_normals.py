@@ -29,13 +29,12 @@ def _bent_normals(path: Path, medium: Medium) -> Float[Tensor, "P 3"]:
     """Compute the normals of polylines that meet the medium."""
     rows = torch.arange(len(path.s), device=path.s.device)
     before, after = path.directions[:, :-1], path.directions[:, 1:]
-    events = (path.surface[:, 1:] >= 0) | (before != after).any(-1)
+    n = indices_of(medium, path.s).detach()[path.body.long()]
+    changes = turning_normals(before, after, n[:, :-1], n[:, 1:])
+    events = changes.any(-1)
     first = events.byte().argmax(-1)
-    arriving = before[rows, first]
-    if isinstance(medium, Solid):
-        n_before, n_after = (indices_of(medium, path.s)[path.body[rows, first + i].long()] for i in range(2))
-        normals = turning_normals(arriving, after[rows, first], n_before.detach(), n_after.detach())
-    else:
+    normals = changes[rows, first]
+    if not isinstance(medium, Solid):
         _, normals = medium(path.positions[rows, first + 1])
-    towards = -(normals * arriving).sum(-1, keepdim=True).sign()
+    towards = -(normals * before[rows, first]).sum(-1, keepdim=True).sign()
     return torch.where(events.any(-1, keepdim=True), functional.normalize(normals * towards, dim=-1), 0.0)

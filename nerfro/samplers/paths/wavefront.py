@@ -8,6 +8,7 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn import functional
 
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.media.solid import Solid
@@ -34,6 +35,7 @@ class _Crossing(NamedTuple):
     n_before: Float[Tensor, "A"]
     n_after: Float[Tensor, "A"]
     visible: Bool[Tensor, "A"]  # whether the index changes
+    recorded: Bool[Tensor, "A"]  # whether the surface becomes a vertex: the index or the absorption changes
 
     def select(self, index: Tensor) -> _Crossing:
         return _Crossing(*(values[index] for values in self))
@@ -78,6 +80,7 @@ class Wavefront:
     ) -> None:
         self.medium, self.box, self.max_events, self.branching, self.offset = medium, box, max_events, branching, offset
         self.indices, self.far = indices_of(medium, box), rays.far
+        self.absorbs = functional.pad(medium.absorbs.to(box.device), (1, 0))
         self.x, self.d = rays.origins + rays.near[:, None] * rays.directions, rays.directions.clone()
         self.s = rays.near.clone()
         self.enter, leave = intersect_box(box, self.x, self.d)
@@ -140,12 +143,13 @@ class Wavefront:
         num_crossed = rows.new_zeros(len(rows), inside.shape[1] + 1)
         num_crossed.scatter_add_(1, body + 1, torch.ones_like(body))
         flipped = inside ^ (num_crossed[:, 1:] % 2 == 1)
-        across = self.medium.innermost(flipped)
-        n_before, n_after = self.indices[self.medium.innermost(inside)], self.indices[across]
+        number, across = self.medium.innermost(inside), self.medium.innermost(flipped)
+        n_before, n_after = self.indices[number], self.indices[across]
         visible = n_before != n_after
+        recorded = visible | (number != across) & (self.absorbs[number] | self.absorbs[across])
         exceeds = visible & (self.num_events[rows] >= self.max_events)
         self.exceeded[rows], self.moving[rows] = exceeds, ~exceeds
-        met = _Crossing(before, after, body, normal, triangles, flipped, across, n_before, n_after, visible)
+        met = _Crossing(before, after, body, normal, triangles, flipped, across, n_before, n_after, visible, recorded)
         rows, met = rows[~exceeds], met.select(~exceeds)
         turned, reflected = refract(self.d[rows], met.normal, met.n_before, met.n_after)
         reflected &= met.visible
@@ -161,8 +165,8 @@ class Wavefront:
         self.d[rows] = torch.where(met.visible[:, None], turned, self.d[rows])
         self.triangles[rows], self.start[rows] = met.triangles, self.offset
         self.num_events[rows] += met.visible
-        bent = met.select(met.visible)
-        self.add_vertices(rows[met.visible], bent.body[:, 0], bent.across, bent.triangles[:, 0])
+        vertex = met.select(met.recorded)
+        self.add_vertices(rows[met.recorded], vertex.body[:, 0], vertex.across, vertex.triangles[:, 0])
 
     def _split(
         self, rows: Int[Tensor, "A"], share: Float[Tensor, "A"], reflected: Bool[Tensor, "A"]
@@ -195,7 +199,7 @@ class Wavefront:
 
     def finish(self, rays: Rays) -> SnellTrace:
         """Append the last vertices, and return the trace in the precision and on the device of the rays."""
-        refracted, device = self.num_events > 0, rays.origins.device
+        refracted, device = self.lines.counts > 1, rays.origins.device
         self.lines.append_ends(self.far[self.ray], self.box, refracted, self.x, self.d, self.s)
         split = (self.ray, self.weight) if self.branching.num_events else (None, None)
         path = self.lines.path(rays, refracted, *split)
