@@ -59,7 +59,7 @@ def test_masks_are_the_projected_mesh():
 
 def test_sky_picture_is_the_sky_of_the_pictures():
     views = BlenderData(str(EMBEDDED)).load("test")
-    sky = EnvironmentMap([256], str(EMBEDDED / "sky.png"))
+    sky = EnvironmentMap([256], image=str(EMBEDDED / "sky.png"))
     for view in range(3):
         seen = to_srgb(sky(Exits(views.cameras.image_rays(view).directions))).view(128, 128, 3)
         near = max_pool2d(views.masks[view][None], 3, 1, 1)[0] > 0
