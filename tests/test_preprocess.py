@@ -211,6 +211,11 @@ def test_options_out_of_range(preprocess: Callable[..., str]) -> None:
     assert "give both box_min and box_max" in preprocess("box_min=[0,0,0]")
     assert "add out=FOLDER" in preprocess("data.root=embedded:torus")
     assert "set medium=object or medium=vessel" in preprocess("refine=true", "medium=object_voxels")
+    assert "bodies.a=3 is not a set of settings" in preprocess("bodies={a: 3}")
+    stand = "stand: {mesh: stand.ply, ior: 1.5}"
+    for bodies in (f"{{{stand}, ball: {{ior: 1.4}}}}", f"{{ball: {{ior: 1.4, priority: 1}}, {stand}}}"):
+        for option in ("refine=true", "vessel=true"):
+            assert "first body, which must" in preprocess(f"bodies={bodies}", option)
 
 
 def test_a_hull_needs_masks_of_some_views_only(preprocess: Callable[..., str], capture: Path) -> None:

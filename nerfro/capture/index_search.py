@@ -61,7 +61,7 @@ _LOWEST_MATERIAL = 1.25  # ordinary liquids and solids have larger indices; that
 
 @dataclass(frozen=True)
 class Estimate:
-    """Estimated refractive indices of K bodies, the outer one first.
+    """Estimated refractive indices of K bodies in ascending order of priority.
 
     Attributes:
         names: names of the indices for messages.

@@ -20,6 +20,7 @@ from nerfro.data.frames import require_root
 from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import TriangleMesh, load_mesh, local_origin
 from nerfro.media.base import Medium
+from nerfro.media.bodies import ordered_settings
 from nerfro.overrides import as_overrides, is_given, print_hint, print_next
 from nerfro.paths import EMBEDDED_PREFIX, resolve_path, user_path
 from nerfro.registry import build
@@ -103,7 +104,7 @@ class Request:
         """Whether to search the index. The materials of a vessel are known, and those of named bodies if one is."""
         medium = self.config.medium
         if medium.get("bodies") is not None:
-            return not any({"ior", "material"} & set(body) for body in medium.bodies.values())
+            return not any(body.ior or body.material for _, body in ordered_settings(medium.bodies))
         return not (is_given("medium.ior", self.overrides) or "wall" in medium)
 
     @property
@@ -131,6 +132,14 @@ class Request:
             raise NerfroError("refine=true needs a distance grid; set medium=object or medium=vessel")
         if config.vessel and ("shell_voxels" not in config.medium or "wall" in config.medium):
             raise NerfroError("vessel=true estimates the lengths of a vessel; set medium=object, or remove vessel=true")
+        if (config.refine or config.vessel) and config.medium.get("bodies") is not None:
+            name, first = ordered_settings(config.medium.bodies)[0]
+            if first.mesh or first.surface:
+                raise NerfroError(
+                    "refine=true and vessel=true change the first body, which must have the surface that preprocess "
+                    f"makes or takes from mesh=, and bodies.{name} has another one; list the body without mesh and "
+                    "surface first, and without a priority above the others"
+                )
         if config.out is None and str(config.data.root).startswith(EMBEDDED_PREFIX):
             raise NerfroError(f"data.root={config.data.root} is part of nerfro and read-only; add out=FOLDER")
         if config.out is None:

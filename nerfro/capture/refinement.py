@@ -126,7 +126,7 @@ def refine_surface(
     progress: Callable[[float], None] = lambda done: None,
     settings: RefinementSettings = RefinementSettings(),
 ) -> Refined:
-    """Refine the outer surface of a medium by the refractions in photographs.
+    """Refine the surface of the first body of a medium by the refractions in photographs.
 
     Args:
         mesh: the surface.
@@ -335,7 +335,7 @@ class _Descent:
 
     @torch.no_grad()
     def smoothed(self, medium: SdfGrid, error: float) -> tuple[SdfGrid, float]:
-        """Smooth the outer surface as far as the validation error decreases; returns the medium and its error.
+        """Smooth the first body as far as the validation error decreases, and return the medium and its error.
 
         Args:
             medium: the medium.
@@ -396,7 +396,7 @@ def _blurred(panorama: EnvironmentMap | RoomPanorama, degrees: float) -> Boundar
 
 
 def _project_onto(mesh: TriangleMesh, medium: SdfGrid) -> TriangleMesh:
-    """Move the vertices of a mesh onto the zero level of the outer body, by Newton's method."""
+    """Move the vertices of a mesh onto the zero level of the first body, by Newton's method."""
     vertices = torch.from_numpy(mesh.vertices).float()
     grid = medium.grids[0]
     spacing = float(grid.spacing.min())

@@ -62,10 +62,7 @@ class Body:
 
 
 def read_bodies(bodies: Any, mesh: str | None) -> list[Body]:
-    """Read the bodies of a configuration, in ascending order of their priorities.
-
-    The last body at a point decides there. The order therefore expresses priorities (Schmidt and Budge 2002, "Simple
-    Nested Dielectrics in Ray Traced Images").
+    """Read the bodies of a configuration in the order of `ordered_settings`.
 
     Args:
         bodies: settings of each body by name, see `BodySettings`.
@@ -74,13 +71,25 @@ def read_bodies(bodies: Any, mesh: str | None) -> list[Body]:
     Raises:
         NerfroError: a setting is unknown, missing or not allowed.
     """
+    ordered = ordered_settings(bodies)
+    return [Body(name, _surface(name, given, mesh), _material(name, given)) for name, given in ordered]
+
+
+def ordered_settings(bodies: Any) -> list[tuple[str, BodySettings]]:
+    """Read names and settings of bodies, in ascending order of their priorities.
+
+    The last body at a point decides there. The order therefore expresses priorities (Schmidt and Budge 2002, "Simple
+    Nested Dielectrics in Ray Traced Images").
+
+    Raises:
+        NerfroError: a setting is unknown or not allowed.
+    """
     if not isinstance(bodies, Mapping):
         raise NerfroError(f"bodies={bodies} is not a mapping; write bodies={{NAME: {{mesh: FILE, ior: 1.5}}}}")
     settings = {str(name): _settings(str(name), given) for name, given in bodies.items()}
     if not settings:
         raise NerfroError("bodies={} has no body; write bodies={NAME: {mesh: FILE, ior: 1.5}}")
-    ordered = sorted(settings.items(), key=lambda item: item[1].priority)
-    return [Body(name, _surface(name, given, mesh), _material(name, given)) for name, given in ordered]
+    return sorted(settings.items(), key=lambda item: item[1].priority)
 
 
 def surfaces_of(medium: Any) -> list[Mapping[str, Any]]:

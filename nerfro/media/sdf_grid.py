@@ -163,16 +163,16 @@ class SdfGrid(Solid):
         return self.box if self._content_box is None else self._content_box
 
     def grown(self, outwards: Float[Tensor, "X Y Z"]) -> SdfGrid:
-        """Return the same bodies with the outer surface displaced.
+        """Return the same bodies with the surface of the first body displaced.
 
         The displacement is subtracted from the distances, so the distances are exact only for small displacements.
 
         Args:
-            outwards: outward displacement at the vertices of the outer body's grid, world units.
+            outwards: outward displacement at the vertices of the first body's grid, world units.
         """
-        outer, *inner = self.grids
+        first, *others = self.grids
         changed = variant(self, meshes=[], _content_box=None)
-        changed._set_grids([DistanceGrid(outer.distances - outwards, outer.box), *inner])
+        changed._set_grids([DistanceGrid(first.distances - outwards, first.box), *others])
         return changed
 
     def packed(self) -> Solids:

@@ -56,7 +56,7 @@ class SceneFile:
     Attributes:
         data: `type` of the data set (an option of the group `data`), and its settings, such as `root`.
         medium: `type` of the medium (an option of the group `medium`), and its settings except those of bodies.
-        bodies: bodies by name, the outer one first.
+        bodies: bodies by name; where they overlap, the last of the highest priority decides.
         vessel: settings of a fitted vessel, which `medium=vessel` selects instead of the index of the bodies.
         surroundings: whether the surroundings are near or far; None if unknown.
         photograph: width and height of the photographs in pixels; empty if unknown.

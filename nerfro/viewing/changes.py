@@ -41,13 +41,13 @@ def with_sky(renderer: Renderer, radiance: Float[Tensor, "H 2*H 3"]) -> Renderer
 
 
 def with_indices(renderer: Renderer, ior: Float[Tensor, "*K"]) -> Renderer:
-    """Replace the refractive indices: one for each body, or one number for the outer body."""
+    """Replace the refractive indices: one for each body, or one number for the first body."""
     medium = renderer.scene.medium
     return with_changed_scene(renderer, medium=medium.with_indices(_of_bodies(ior, medium.indices, "ior")))
 
 
 def with_absorption(renderer: Renderer, absorption: Float[Tensor, "*K 3"]) -> Renderer:
-    """Replace the absorption coefficients: three for each body, or three for the outer body."""
+    """Replace the absorption coefficients: three for each body, or three for the first body."""
     medium = renderer.scene.medium
     if not (isinstance(medium, Solid) and hasattr(medium, "absorption")):
         raise NerfroError(
@@ -76,7 +76,7 @@ def without_inside(renderer: Renderer) -> Renderer:
 
 
 def _of_bodies(given: Tensor, known: Tensor, name: str) -> Tensor:
-    """Complete values that are given for each body, or for the outer body alone, to values for all bodies."""
+    """Complete values that are given for each body, or for the first body alone, to values for all bodies."""
     given = given.to(known)
     if not len(known):
         raise NerfroError(f"{name} cannot be set: the model has no bodies on which rays bend; leave {name} out")

@@ -136,7 +136,7 @@ class TrainedScene:
 
     @property
     def surface(self) -> list[TriangleMesh]:
-        """Surfaces on which rays bend, starting with the outer body; world units."""
+        """Surfaces on which rays bend, of each body in ascending order of priority; world units."""
         sampler = self.renderer.path_sampler
         return surface_of(self.renderer.scene.medium, isinstance(sampler, Snell) and sampler.interface == "mesh")
 
@@ -148,7 +148,7 @@ class TrainedScene:
 
     @property
     def ior(self) -> Float[Tensor, "K"]:
-        """Refractive index of each body, starting with the outer body; empty without bodies."""
+        """Refractive index of each body in ascending order of priority; empty without bodies."""
         return self.renderer.scene.medium.indices.cpu()
 
     @property
@@ -176,8 +176,8 @@ class TrainedScene:
 
         Args:
             sky: lat-long image of linear radiance, or a file (.hdr, .exr, .png, .jpg), that replaces the background.
-            ior: refractive index of the outer body, or of each body.
-            absorption: absorption of red, green and blue in the outer body [3], or in each body [K, 3], per world unit.
+            ior: refractive index of the first body, or of each body.
+            absorption: absorption of red, green and blue in the first body [3], or in each body [K, 3], per world unit.
             glass: False removes the glass, so that all rays are straight.
             inside: False removes the content of the glass.
 
