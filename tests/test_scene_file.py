@@ -36,7 +36,7 @@ def test_a_scene_survives_moving_its_folder(tmp_path: Path, monkeypatch: pytest.
         bodies={"object": BodySettings(mesh="old capture/surface/mesh.ply", ior=1.5)},
         surroundings="near",
         photograph=[640, 480],
-        provenance=Provenance(standard_error=[0.002]),
+        provenance=Provenance(standard_error=[0.002, None]),
     )
     scene.save(Path("old capture/surface/scene.json"))
     (tmp_path / "old capture").rename("new")

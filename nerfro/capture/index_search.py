@@ -53,6 +53,7 @@ _MAX_ELONGATION, _SLOPE_PIXELS, _DIFFERENCE = 6.0, 6_000, 1 / 300
 # Rays with more events, or more than two per surface, are left out: small errors of the surface turn them far.
 _MAX_EVENTS = 4
 _NUM_BOOTSTRAP = 200
+_MIN_VIEWS = 5  # with pixels, for a standard error: resampling of fewer views underestimates the error
 # Limits of a reliable estimate: depth of the valley relative to the error of unrelated colours, standard error and
 # distance from the ends of the search relative to the range, and fraction of the pixels with known surroundings.
 _MIN_DEPTH, _MAX_STANDARD_ERROR, _MIN_DISTANCE_FROM_END, _MIN_KNOWN = 0.03, 0.02, 1 / 150, 0.1
@@ -66,7 +67,8 @@ class Estimate:
     Attributes:
         names: names of the indices for messages.
         values: the indices.
-        standard_errors: standard errors by resampling of the views; errors of the surface are not included.
+        standard_errors: standard errors by resampling of the views, infinite for too few views; errors of the surface
+            are not included.
         coarse: candidates of the first grid, with their mean robust errors in the last column: 0 for exact colours, 1
             for outliers.
         doubts: reasons why the photographs do not determine the indices; empty for a reliable estimate.
@@ -77,6 +79,11 @@ class Estimate:
     standard_errors: Float[np.ndarray, "K"]
     coarse: Float[np.ndarray, "C N"]
     doubts: list[str]
+
+    @property
+    def written_errors(self) -> list[float | None]:
+        """Standard errors for JSON files, which cannot contain infinite numbers."""
+        return [round(error, 5) if np.isfinite(error) else None for error in self.standard_errors.tolist()]
 
 
 def find_indices(
@@ -123,11 +130,13 @@ def find_indices(
             if converged:
                 break
     progress(1.0)
-    weights = bootstrap_weights(len(counts))
-    standard_errors = _minimum(fine, mean_errors(sums, counts, weights), axes)[0].std(0)
+    weights = bootstrap_weights(counts)
+    standard_errors = standard_error(_minimum(fine, mean_errors(sums, counts, weights), axes)[0], counts)
     names = ["index"] if num_bodies == 1 else [f"index of body {body + 1}" for body in range(num_bodies)]
     depth, known = 1 - errors.min() / search.unrelated, counts.sum() / search.num_pixels
     doubts = _doubts(names, middle, np.where(curvature[0] > 0, standard_errors, np.inf), depth, known)
+    if (num_views := np.count_nonzero(counts)) < _MIN_VIEWS:
+        doubts.append(f"{num_views} views are too few for a standard error; photograph from more sides")
     return Estimate(names, middle, standard_errors, np.column_stack([coarse, coarse_errors.T]), doubts)
 
 
@@ -136,10 +145,16 @@ def _grid(steps: int, num_axes: int) -> Float[np.ndarray, "C K"]:
     return np.array(list(itertools.product(np.linspace(-1, 1, steps), repeat=num_axes)))
 
 
-def bootstrap_weights(num_views: int) -> Float[np.ndarray, "B V"]:
-    """Return how often each view is drawn in random samples of the views."""
-    drawn = np.random.default_rng(0).multinomial(num_views, np.full(num_views, 1 / num_views), _NUM_BOOTSTRAP)
+def bootstrap_weights(counts: Float[np.ndarray, "V"]) -> Float[np.ndarray, "B V"]:
+    """Return how often each view is drawn in random samples of the views with pixels."""
+    num_views = int(np.count_nonzero(counts))
+    drawn = np.random.default_rng(0).multinomial(num_views, (counts > 0) / max(1, num_views), _NUM_BOOTSTRAP)
     return drawn.astype(np.float64)
+
+
+def standard_error(samples: Float[np.ndarray, "B *K"], counts: Float[np.ndarray, "V"]) -> Float[np.ndarray, "*K"]:
+    """Compute the standard deviation of estimates from random samples of the views; infinite for too few views."""
+    return np.where(np.count_nonzero(counts) < _MIN_VIEWS, np.inf, samples.std(0))
 
 
 def mean_errors(
@@ -196,7 +211,7 @@ def _doubts(names: list[str], values: np.ndarray, standard_errors: np.ndarray, d
     for name, value, error in zip(names, values, standard_errors, strict=True):
         if not LOWEST + end < value < HIGHEST - end:
             doubts.append(f"the {name} is at an end of the search range, {LOWEST:.4g} to {HIGHEST:.4g}")
-        elif error > _MAX_STANDARD_ERROR * _RANGE:
+        elif _MAX_STANDARD_ERROR * _RANGE < error < np.inf:
             doubts.append(f"the {name} has a standard error of {error:.2g}: the views do not agree")
     if LOWEST + end < values[0] < _LOWEST_MATERIAL:
         doubts.append(f"no liquid or solid has an index of {values[0]:.3g}: the object may be opaque or hollow")
@@ -308,8 +323,7 @@ class FoundMedium:
         """Accuracy of the indices, for the scene file."""
         if self.estimate is None:
             return Provenance()
-        errors = [round(float(error), 5) for error in self.estimate.standard_errors]
-        return Provenance(standard_error=errors, doubts=self.estimate.doubts)
+        return Provenance(standard_error=self.estimate.written_errors, doubts=self.estimate.doubts)
 
     @property
     def is_doubtful(self) -> bool:
@@ -362,11 +376,11 @@ def _search_index(observations: Observations, medium: Solid, folder: Path) -> Es
         found = find_indices(medium, through, surroundings, progress)
     for name, value, error in zip(found.names, found.values, found.standard_errors, strict=True):
         # At an end of the search range, all samples of the views have the same minimum.
-        spread = f" +- {error:.2g} (standard error by resampling of the views)" if error > 0 else ""
+        spread = f" +- {error:.2g} (standard error by resampling of the views)" if 0 < error < np.inf else ""
         print(f"{name}: {value:.5g}{spread}")
     for doubt in found.doubts:
         warn(f"the photographs do not determine the {' and '.join(found.names)}: {doubt}")
-    values, errors = ([round(float(x), 5) for x in each] for each in (found.values, found.standard_errors))
-    figures = {"ior": values, "standard_error": errors, "doubts": found.doubts}
+    values = [round(value, 5) for value in found.values.tolist()]
+    figures = {"ior": values, "standard_error": found.written_errors, "doubts": found.doubts}
     write_atomically(folder / INDEX, json.dumps(figures, indent=1) + "\n")
     return found

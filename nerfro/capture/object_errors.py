@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from nerfro.capture.index_search import bootstrap_weights, mean_errors
+from nerfro.capture.index_search import bootstrap_weights, mean_errors, standard_error
 from nerfro.capture.surroundings import Observations, half_weight, robust
 from nerfro.media.base import Medium
 from nerfro.media.solid import Solid
@@ -39,8 +39,8 @@ class ObjectErrors:
         self._half_weight = half_weight(self._surroundings)
         self._sampler = Snell(branches="all", least_weight=_LEAST_WEIGHT)
         self._progress, self._num_bodies = progress, 0
-        self.samples = bootstrap_weights(len(self._pixels.cameras))
         self.counts = np.bincount(self._pixels.view, minlength=len(self._pixels.cameras)).astype(np.float64)
+        self.samples = bootstrap_weights(self.counts)
 
     def of(self, body: Medium) -> Float[np.ndarray, "V"]:
         """Sum the robust errors over the pixels of each view."""
@@ -58,7 +58,7 @@ class ObjectErrors:
     def decreases(self, before: Float[np.ndarray, "V"], after: Float[np.ndarray, "V"], num_errors: float) -> bool:
         """Test whether the error decreases by a number of standard errors, by resampling of the views."""
         gains = mean_errors((before - after)[None], self.counts, self.samples)
-        return bool(gains.mean() > num_errors * gains.std())
+        return bool(gains.mean() > num_errors * standard_error(gains, self.counts))
 
 
 def unsupported_bodies(

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from nerfro.capture.index_search import mean_errors
+from nerfro.capture.index_search import mean_errors, standard_error
 from nerfro.capture.object_errors import COMMON_INDICES, ObjectErrors
 from nerfro.capture.surroundings import Observations
 from nerfro.errors import NerfroError, warn
@@ -142,7 +142,8 @@ def fit_vessel(
             values = grid.clip(max=highest) if is_level else np.exp(grid)
             sums = np.stack([search.of(vessel.with_lengths(lengths | {name: value})) for value in values.tolist()])
             found = _minimum(grid, mean_errors(sums, search.counts))[0]
-            spread = float(_minimum(grid, mean_errors(sums, search.counts, search.samples)).std())
+            minima = _minimum(grid, mean_errors(sums, search.counts, search.samples))
+            spread = float(standard_error(minima, search.counts))
             lengths[name] = float(min(found, highest) if is_level else np.exp(found))
             standard_errors[name] = spread if is_level else spread * lengths[name]
     unknown = [name for name in typical if standard_errors[name] > _MAX_STANDARD_ERROR * lengths[name]]

@@ -37,14 +37,14 @@ class Provenance:
     Attributes:
         command: command line of the writer.
         versions: versions of packages.
-        standard_error: standard error of the estimated index of each body; empty if the indices were given.
+        standard_error: standard error of the estimated index of each body, null for few views; empty for given indices.
         doubts: reasons for doubt about the indices; empty for reliable indices.
         unsupported: names of bodies that do not explain the pixels of the object better than straight rays.
     """
 
     command: str = ""
     versions: dict[str, str] = field(default_factory=dict)
-    standard_error: list[float] = field(default_factory=list)
+    standard_error: list[Optional[float]] = field(default_factory=list)  # noqa: UP045 - OmegaConf on Python 3.10
     doubts: list[str] = field(default_factory=list)
     unsupported: list[str] = field(default_factory=list)
 

@@ -27,6 +27,19 @@ def test_index_of_a_ball(ior: float, is_material: bool) -> None:
     assert (not found.doubts) == is_material
 
 
+@pytest.mark.parametrize(("num_views", "num_seen"), [(1, 1), (8, 4)])
+def test_a_few_views_have_no_standard_error(num_views: int, num_seen: int) -> None:
+    """Views without pixels of the object contribute nothing."""
+    views = photographs([1.5]).select(list(range(num_views)))
+    beside, through = divide_pixels(views, mesh())
+    through = through[through.view < num_seen]
+    found = find_indices(solid([1.5]), through, learn_surroundings(beside, mesh(), False))
+    assert found.standard_errors.tolist() == [math.inf]
+    assert found.written_errors == [None]
+    assert any(f"{num_seen} views are too few" in doubt for doubt in found.doubts)
+    assert not any("inf" in doubt for doubt in found.doubts)
+
+
 @pytest.mark.slow
 def test_indices_of_water_in_a_wall_of_glass() -> None:
     found = search(photographs([1.5, 1.33]), 2)

@@ -85,3 +85,5 @@ def test_pixels_support_the_body_that_refracted_their_rays(
     )
     assert found == set(supported)
     assert unsupported_bodies(observations, solid, False, None) == ([] if ior == 1.333 else ["solid body"])
+    observations.__dict__["through"] = observations.through[observations.through.view < 4]
+    assert unsupported_bodies(observations, solid, False, None) == ["solid body"], "no decrease is significant"
