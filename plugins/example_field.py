@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import torch
-from torch import nn
+from jaxtyping import Float
+from torch import Tensor, nn
 
 from nerfro.allowed import Count, Positive
 from nerfro.fields.base import Field
@@ -17,19 +18,25 @@ class Blobs(Field):
 
     Args:
         num_blobs: number of balls.
-        extent: half side of the cube in which the balls begin, world units.
+        extent: half side of the cube around the origin outside of which the field is empty, world units.
     """
 
     def __init__(self, num_blobs: Count = 32, extent: Positive = 1.0) -> None:
         super().__init__()
+        self.extent = extent
         self.centres = nn.Parameter(extent * (2 * torch.rand(num_blobs, 3) - 1))
         self.log_sizes = nn.Parameter(torch.full((num_blobs,), 0.3 * extent).log())
         self.log_densities = nn.Parameter(torch.zeros(num_blobs))
         self.colours = nn.Parameter(torch.randn(num_blobs, 3))
+
+    @property
+    def bounds(self) -> Float[Tensor, "2 3"]:
+        return self.extent * self.centres.new_tensor([[-1.0] * 3, [1.0] * 3])
 
     def forward(self, samples: Samples) -> Radiance:
         offsets = (samples.positions[..., None, :] - self.centres) / self.log_sizes.exp()[:, None]
         densities = torch.exp(self.log_densities - 0.5 * offsets.square().sum(-1))  # [R, N, B], per world unit
         density = densities.sum(-1)
         colour = (densities @ self.colours.sigmoid()) / density.clamp(min=1e-6)[..., None]
-        return Radiance(density, colour)
+        inside = (samples.positions.abs() <= self.extent).all(-1)
+        return Radiance(density * inside, colour)

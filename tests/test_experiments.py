@@ -13,7 +13,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 
 from nerfro.paths import CONF_DIR
-from nerfro.registry import discover
+from nerfro.registry import build, discover
 from nerfro.training.config import TrainConfig, build_model
 from nerfro.training.module import TrainingModule
 
@@ -142,6 +142,14 @@ def test_an_ablation_changes_its_part_alone(experiment: str, ablation: str, chan
         parts = [functools.reduce(dict.__getitem__, groups, config) for config in (one, other)]
         assert parts[0].pop(setting) != parts[1].pop(setting), key
     assert one == other
+
+
+@pytest.mark.parametrize(("experiment", "learned"), [("glass", ["absorption"]), ("unknown", ["ior", "absorption"])])
+def test_experiments_of_glass_learn_all_bodies_without_their_own_settings(experiment: str, learned: list[str]) -> None:
+    ball = "surface: {name: ball, radius: 1}, ior: 1.5"
+    bodies = f"medium.bodies={{own: {{{ball}, learn: [ior]}}, common: {{{ball}}}}}"
+    medium = build(composed(f"+experiment={experiment}", bodies, "medium.resolution=16", "medium.cache=false").medium)
+    assert [list(material.learned()) for material in medium.materials] == [["ior"], learned]
 
 
 def test_papers_recipe_is_the_authors() -> None:

@@ -13,7 +13,6 @@ from torch import Tensor
 from nerfro.data.image_files import IMAGE_SUFFIXES, Alpha, read_rgb, to_unit
 from nerfro.data.masks import find_mask, find_masks, require_used
 from nerfro.errors import NerfroError
-from nerfro.evaluation.regions import object_pixels
 
 
 @dataclass(frozen=True)
@@ -44,7 +43,7 @@ class ImagePair:
             Prediction and reference, sRGB in [0, 1], and the coverage of each pixel by the object in [0, 1], or None.
 
         Raises:
-            NerfroError: a file cannot be read, sizes differ, or the mask is empty.
+            NerfroError: a file cannot be read, or sizes differ.
         """
         prediction, reference = (
             torch.tensor(to_unit(read_rgb(path, alpha))) for path in (self.prediction, self.reference)
@@ -56,13 +55,7 @@ class ImagePair:
             )
         size = reference.shape[1], reference.shape[0]
         masks = find_masks([self.reference], [self.mask], 1, size, self.mask_labels)
-        coverage = None if masks is None else masks[0]
-        if coverage is not None and not object_pixels(coverage).any():
-            raise NerfroError(
-                f"the mask {self.mask or f'(transparency) of {self.reference}'} is empty: it covers half of no pixel; "
-                "correct it, or remove the view"
-            )
-        return prediction, reference, coverage
+        return prediction, reference, None if masks is None else masks[0]
 
 
 def match_folders(

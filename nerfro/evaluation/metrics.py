@@ -47,7 +47,7 @@ class ImageMetrics(nn.Module):
             prediction: rendered image, sRGB.
             target: reference image, sRGB in [0, 1].
             coverage: coverage of each pixel by the object in [0, 1]. Without it, or if the object is not visible, only
-                the full image is scored.
+                the full image has scores.
 
         Raises:
             NerfroError: the sizes differ, or a value is not finite.
@@ -56,7 +56,9 @@ class ImageMetrics(nn.Module):
         prediction = round_to_8bit(prediction)  # raises an error for values that are not finite
         regions: dict[Region, dict[str, Score]] = {}
         inside = None if coverage is None else object_pixels(coverage)
-        if inside is not None and inside.any():
+        if inside is not None and not inside.any():
+            regions = self._missing()
+        elif inside is not None:
             crop = crop_rectangle(inside)
             regions["mask"] = self._scores(prediction, target, inside)
             regions["crop"] = self._scores(prediction[crop], target[crop], None)
@@ -67,9 +69,11 @@ class ImageMetrics(nn.Module):
         if not views:
             raise NerfroError("no view was scored; choose a split that has views")
         if any(view.regions for view in views):
-            missing: dict[Region, dict[str, Score]] = {region: dict.fromkeys(self.metrics) for region in OBJECT_REGIONS}
-            views = [replace(view, regions=view.regions or missing) for view in views]
+            views = [replace(view, regions=view.regions or self._missing()) for view in views]
         return EvaluationResult(tuple(views), self._notes(views))
+
+    def _missing(self) -> dict[Region, dict[str, Score]]:
+        return {region: dict.fromkeys(self.metrics) for region in OBJECT_REGIONS}
 
     def _scores(self, prediction: Tensor, target: Tensor, inside: Tensor | None) -> dict[str, Score]:
         """Compute all scores; None if a metric is not available or the image is too small."""
@@ -80,7 +84,7 @@ class ImageMetrics(nn.Module):
         notes = {}
         unmasked = [view.name for view in views if view.regions and view.score("psnr", "mask") is None]
         if unmasked:
-            notes["mask"] = f"the mask is missing or empty in {', '.join(unmasked)}"
+            notes["mask"] = f"the mask is missing or covers half of no pixel in {', '.join(unmasked)}"
         scored = [
             (view, region)
             for view in views

@@ -43,7 +43,7 @@ class EvaluateConfig:
     alpha: Annotated[str, Literal["drop", "white", "black"]] = "drop"
     # Folder for images and tables; by default beside the folder of checkpoints, or `scores` in `predictions`.
     out: Optional[str] = None
-    device: str = "auto"  # `cpu`, `cuda`, or `auto` for a GPU if available
+    device: str = "auto"  # `cpu`, or `cuda` (untested); `auto` means the CPU
     overwrite: bool = False  # whether to replace an earlier evaluation in `out`
 
 
@@ -84,15 +84,13 @@ def record(folder: Path, config: DictConfig) -> None:
 
 
 def find_device(name: str) -> torch.device:
-    """Return the device of a name; `auto` selects a GPU if available.
+    """Return the device of a name; `auto` means the CPU, as in training.
 
     Raises:
         NerfroError: the device cannot be used.
     """
-    if name == "auto":
-        name = "cuda" if torch.cuda.is_available() else "cpu"
     try:
-        device = torch.device(name)
+        device = torch.device("cpu" if name == "auto" else name)
         torch.zeros(1, device=device)
     except (RuntimeError, AssertionError) as error:
         raise NerfroError(f"device={name} cannot be used; choose cpu, cuda or auto") from error

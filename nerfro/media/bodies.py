@@ -35,7 +35,8 @@ class BodySettings:
         abbe: Abbe number; without one, the index of a body with `ior` is the same for all colours.
         absorption: coefficients of red, green and blue per world unit, or one for all.
         priority: where bodies overlap, the one with the highest priority decides; of equal ones the last.
-        learn: quantities that are learned in training: `ior`, `absorption`.
+        learn: quantities that are learned in training: `ior`, `absorption`; by default those of `medium.learn_ior` and
+            `medium.learn_absorption`.
     """
 
     mesh: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
@@ -61,18 +62,19 @@ class Body:
     material: Material
 
 
-def read_bodies(bodies: Any, mesh: str | None) -> list[Body]:
+def read_bodies(bodies: Any, mesh: str | None, learn: Sequence[str] = ()) -> list[Body]:
     """Read the bodies of a configuration in the order of `ordered_settings`.
 
     Args:
         bodies: settings of each body by name, see `BodySettings`.
         mesh: mesh of bodies without one.
+        learn: learned quantities of bodies without `learn`.
 
     Raises:
         NerfroError: a setting is unknown, missing or not allowed.
     """
     ordered = ordered_settings(bodies)
-    return [Body(name, _surface(name, given, mesh), _material(name, given)) for name, given in ordered]
+    return [Body(name, _surface(name, given, mesh), _material(name, given, learn)) for name, given in ordered]
 
 
 def ordered_settings(bodies: Any) -> list[tuple[str, BodySettings]]:
@@ -152,16 +154,17 @@ def _surface(name: str, given: BodySettings, mesh: str | None) -> Mapping[str, A
     return given.surface
 
 
-def _material(name: str, given: BodySettings) -> Material:
+def _material(name: str, given: BodySettings, learn: Sequence[str]) -> Material:
     if (given.ior is None) == (given.material is None):
         raise NerfroError(f"bodies.{name} needs one of ior and material; write ior: 1.5, or material: water")
+    learn = given.learn or learn
     absorption = given.absorption * 3 if len(given.absorption) == 1 else given.absorption or [0.0] * 3
     if given.material is None:
         dispersion = None if given.abbe is None else Abbe(given.abbe)
-        return Material(typing.cast(float, given.ior), absorption, dispersion, given.learn)
+        return Material(typing.cast(float, given.ior), absorption, dispersion, learn)
     if given.abbe is not None:
         raise NerfroError(
             f"bodies.{name}.abbe={given.abbe} contradicts its material, which has a dispersion; remove it"
         )
     formula = find_material(given.material)
-    return Material(formula.ior, absorption, formula, given.learn)
+    return Material(formula.ior, absorption, formula, learn)

@@ -217,6 +217,11 @@ class Material(nn.Module):
         return 0.0 if self.dispersion is None else self.dispersion(wavelength)
 
 
+def learned_quantities(ior: bool, absorption: bool) -> list[str]:
+    """Return the names of the learned quantities of a material, see `Material`."""
+    return ["ior"] * ior + ["absorption"] * absorption
+
+
 def materials_of(
     iors: Sequence[float],
     absorption: Sequence[float],
@@ -241,7 +246,7 @@ def materials_of(
     coefficients = list(absorption) or [0.0]
     if len(coefficients) == 1:
         coefficients *= 3 * num_bodies
-    learn = [name for name, learns in (("ior", learn_ior), ("absorption", learn_absorption)) if learns]
+    learn = learned_quantities(learn_ior, learn_absorption)
     return [
         Material(ior, coefficients[3 * body : 3 * body + 3], dispersions[body % len(dispersions)], learn)
         for body, ior in enumerate(iors)

@@ -19,7 +19,7 @@ from nerfro.kernels.available import require_bytes
 from nerfro.media.base import Medium, Vectors
 from nerfro.media.bodies import Body, mesh_surface, read_bodies
 from nerfro.media.distance_grid import DistanceGrid, DistanceGrids
-from nerfro.media.material import materials_of
+from nerfro.media.material import learned_quantities, materials_of
 from nerfro.media.solid import Solid, body_names
 from nerfro.media.surface import Grid, make_surface
 from nerfro.media.voxel_grid import BYTES_PER_VERTEX, grid_box
@@ -44,14 +44,14 @@ class SdfGrid(Solid):
         inner_meshes: meshes of inner bodies (a liquid, a bubble). Opaque objects do not belong here, because they do
             not refract.
         inner_iors: refractive index of each inner body.
-        learn_ior: refine all refractive indices in training.
+        learn_ior: refine the refractive indices of all bodies without a setting `learn` in training.
         resolution: vertices along each side of the grid of each body.
         box_min, box_max: corners of all grids, world units; None for the bounds of each mesh and a margin of air.
         shell_voxels: half width of the smooth interface that the Eikonal equation sees, voxels.
         accept_open_mesh: accept meshes with holes. Rays along three axes decide by majority whether a point is inside.
         absorption: absorption coefficients per world unit: red, green and blue of each body, or one number for all;
             only for `sampler/path=snell`.
-        learn_absorption: learn the absorption; only for `sampler/path=snell`.
+        learn_absorption: learn the absorption of the same bodies; only for `sampler/path=snell`.
         abbe: Abbe number of each body, or one for all bodies, for dispersion; only for `sampler/path=snell`.
         cache: keep the distances in the cache folder.
         bodies: bodies by name, with the settings mesh or surface, ior or material, abbe, absorption, priority and learn
@@ -89,12 +89,11 @@ class SdfGrid(Solid):
                 "give one index for each inner mesh"
             )
         if bodies is not None:
-            short = {"inner_meshes": inner_meshes, "absorption": absorption, "learn_absorption": learn_absorption,
-                     "abbe": abbe, "learn_ior": learn_ior}  # fmt: skip
+            short = {"inner_meshes": inner_meshes, "absorption": absorption, "abbe": abbe}
             given = [name for name, value in short.items() if value]
             if given:
                 raise NerfroError(f"medium.{given[0]} has no meaning beside bodies; set it for each body")
-            members = read_bodies(bodies, mesh)
+            members = read_bodies(bodies, mesh, learned_quantities(learn_ior, learn_absorption))
         elif mesh is None:
             raise NerfroError(
                 "medium=sdf_grid needs mesh; add medium.mesh=..., or bodies={NAME: {mesh: FILE, ior: 1.5}}"

@@ -22,7 +22,7 @@ def load(run: str | Path, device: str = "auto", root: str | Path | None = None) 
 
     Args:
         run: folder of the run, or one of its checkpoints.
-        device: `cpu`, `cuda`, or `auto` for a GPU if available.
+        device: `cpu`, or `cuda` (untested); `auto` means the CPU.
         root: folder of the data, if it has moved since training.
 
     Raises:

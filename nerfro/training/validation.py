@@ -104,6 +104,7 @@ class OverfittingWarning(Callback):
         # Sum of the mean squared errors of batches since the last validation, and number of batches.
         self._error, self._steps = 0.0, 0
         self._num_gaps = 0  # number of successive validations with a large difference
+        self._best = -math.inf, 0  # highest validation PSNR in dB, and its step
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Batch, batch_idx: int
@@ -128,21 +129,25 @@ class OverfittingWarning(Callback):
             step: number of completed steps.
             validation, training: PSNR of validation pixels and of training pixels, dB.
         """
+        self._best = max(self._best, (validation, step))
         if self._num_gaps < 2:  # otherwise the warning was printed
             self._num_gaps = self._num_gaps + 1 if training - validation >= _GAP else 0
             if self._num_gaps == 2:
+                best, best_step = self._best
                 return (
-                    f"the model overfits: validation PSNR is {validation:.1f} dB after {step} steps; training PSNR is "
-                    f"{training:.1f} dB. Take more photographs, check the poses and, for glass, surface and index "
-                    "(medium...); see docs/tutorials/photographs.md, Few photographs"
+                    f"the model overfits: validation PSNR is {validation:.1f} dB after {step} steps, and was highest "
+                    f"({best:.1f} dB) after {best_step}; training PSNR is {training:.1f} dB. Take more photographs, "
+                    "check the poses and, for glass, surface and index (medium...); see "
+                    "docs/tutorials/photographs.md, Few photographs"
                 )
         return None
 
     def state_dict(self) -> dict[str, Any]:
-        return {"num_gaps": self._num_gaps}
+        return {"num_gaps": self._num_gaps, "best": self._best}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self._num_gaps = state_dict["num_gaps"]
+        self._best = state_dict.get("best", self._best)  # checkpoints of earlier versions have none
 
 
 def _psnr(prediction: Float[Tensor, "P 3"], target: Float[Tensor, "P 3"]) -> Float[Tensor, ""]:

@@ -108,7 +108,8 @@ def test_views_without_the_object_have_the_full_image_only() -> None:
     assert [view.score("psnr", "mask") is None for view in result.views] == [False, True, True]
     assert [view.score("psnr") is None for view in result.views] == [False, False, False]
     assert result.mean("psnr", "mask") is None
-    assert result.notes["mask"] == "the mask is missing or empty in v1, v2"
+    assert result.notes["mask"] == "the mask is missing or covers half of no pixel in v1, v2"
+    assert scored((*images, 0 * full)).notes["mask"] == "the mask is missing or covers half of no pixel in v0"
 
 
 def test_missing_metrics_are_none_with_a_reason() -> None:

@@ -182,8 +182,8 @@ def test_wrong_bodies_are_refused_by_name(settings: Any, message: str, tmp_path:
 
 def test_short_and_long_form_exclude_each_other(tmp_path: Path) -> None:
     bodies = {"glass": {"mesh": _ball(tmp_path, (0.0, 0.0, 0.0), 2), "ior": 1.5}}
-    with pytest.raises(NerfroError, match=r"medium\.learn_ior has no meaning beside bodies"):
-        SdfGrid(bodies=bodies, learn_ior=True)
+    with pytest.raises(NerfroError, match=r"medium\.abbe has no meaning beside bodies"):
+        SdfGrid(bodies=bodies, abbe=[50])
     with pytest.raises(NerfroError, match="needs mesh"):
         SdfGrid()
 

@@ -16,6 +16,8 @@ from torch import Tensor
 from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.data.blender import BlenderData
 from nerfro.evaluation.results import read_metrics_json
+from nerfro.fields.base import Field
+from nerfro.fields.hash_grid import HashGridField
 from nerfro.light import to_srgb
 from nerfro.training.build import build
 from nerfro.training.callbacks import steps_by_phase
@@ -49,7 +51,9 @@ def test_the_boundary_alone_has_learned_before_the_first_step(weights: Callable[
     assert changed == {"renderer.scene.boundary.texels"}
 
 
-def test_directions_behind_the_object_are_learned_through_it(tiny_scene: Path, tiny_default_run: list[str]) -> None:
+def test_directions_behind_the_object_are_learned_through_it(
+    tiny_scene: Path, tiny_default_run: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     module, data = build(overrides=[*tiny_default_run, "medium.ior=1.0001", "trainer.max_steps=1"])
     views = BlenderData(str(tiny_scene), near=2.0, far=6.0).load("train")
     optimizer = torch.optim.Adam(module.parameters())
@@ -63,6 +67,9 @@ def test_directions_behind_the_object_are_learned_through_it(tiny_scene: Path, t
     assert error() > 0.1
     assert all(phase.step(run, number, state) for number in range(4, 8))  # the first pass through the object
     assert error() < 0.05
+    monkeypatch.setattr(HashGridField, "bounds", Field.bounds)
+    assert phase.begin(run) == {}
+    assert "the field has no bounds" in capsys.readouterr().out
     background.requires_grad_(False)
     assert phase.begin(run) == {}, "a given background stays"
 

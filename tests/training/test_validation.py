@@ -88,9 +88,11 @@ def test_a_gap_in_two_successive_validations_is_overfitting(looks: list[tuple[fl
 
 def test_a_resumed_run_remembers_and_says_nothing_twice() -> None:
     before, later, again = OverfittingWarning(), OverfittingWarning(), OverfittingWarning()
+    assert before.judge(1, 21, 22) is None
     assert before.judge(2, 20, 24) is None
     later.load_state_dict(before.state_dict())
-    assert "20.0 dB after 3 steps; training PSNR is 25.0 dB" in (later.judge(3, 20, 25) or "")
+    expected = "20.0 dB after 3 steps, and was highest (21.0 dB) after 1; training PSNR is 25.0 dB"
+    assert expected in (later.judge(3, 20, 25) or "")
     again.load_state_dict(later.state_dict())
     assert again.judge(4, 20, 26) is None
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from nerfro.allowed import Count, Natural, Share
 from nerfro.boundaries.envmap import EnvironmentMap, Observed
+from nerfro.errors import warn
 from nerfro.fields.base import Field
 from nerfro.geometry.interpolation import misses
 from nerfro.rays import Rays
@@ -62,6 +63,9 @@ class Background(Phase):
         if not isinstance(background, EnvironmentMap) or not background.texels.requires_grad:
             return {}
         if occupied_box(run.renderer) is None:
+            field = run.renderer.scene.fields[0]
+            if self.steps and isinstance(field, Field) and type(field).bounds is Field.bounds:
+                warn("the background is not fitted, because the field has no bounds; define its property `bounds`")
             return {}
         return {"weights": torch.zeros(background.levels.num_texels)}
 
