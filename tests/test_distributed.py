@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -15,9 +16,13 @@ from unittest.mock import Mock
 import pytest
 import torch
 from lightning.pytorch import LightningModule, Trainer
+from omegaconf import OmegaConf
 
-from nerfro.training.callbacks import Checkpoints, SharedTimer, StopOnSignal
+from nerfro.training.build import build
+from nerfro.training.callbacks import Checkpoints, SharedTimer, StopOnSignal, Throughput
+from nerfro.training.config import TrainConfig
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
+from nerfro.training.trainer import make_trainer
 from nerfro.types import Batch
 
 # Gradients are sums in another order, so they differ in their last bits. Adam divides them by their size, and would
@@ -202,6 +207,23 @@ def test_what_two_processes_cannot_do_is_refused_in_one_line(
     assert finished.code == 1
     assert finished.err.splitlines()[-1].endswith(message)
     assert not list(tmp_path.rglob("config.yaml"))
+
+
+def test_every_parameter_has_a_gradient_if_no_ray_meets_the_object(tiny_default_run: list[str]) -> None:
+    module, data = build(overrides=[*tiny_default_run, "medium.learn_ior=true", "trainer.max_steps=1"])
+    batch = data.batches.batch(0)
+    away = replace(batch, path=None, rays=replace(batch.rays, directions=-batch.rays.directions))
+    module.trainer, module._is_logged_step = Mock(spec=Trainer, world_size=2, global_step=0), False
+    module.training_step(away, 0)["loss"].backward()
+    assert [name for name, parameter in module.named_parameters() if parameter.grad is None] == []
+
+
+@pytest.mark.parametrize("strategy", ["ddp", "auto"])
+def test_processes_do_not_exchange_buffers(strategy: str, tmp_path: Path) -> None:
+    two = {"trainer": {"devices": 2, "accelerator": "cpu", "strategy": strategy}}
+    config = OmegaConf.merge(OmegaConf.structured(TrainConfig), two)
+    trainer = make_trainer(config, tmp_path, Throughput(), [])
+    assert trainer.strategy._ddp_kwargs["broadcast_buffers"] is False
 
 
 def test_a_signal_is_not_lost_while_the_processes_agree() -> None:

@@ -111,6 +111,10 @@ class TrainingModule(LightningModule):
                     raise NerfroError(f"loss={name} returned shape {list(value.shape)}; a loss is a scalar")
                 self.log(f"loss/{name}", value)
                 total = total + weight * value
+        if self._trainer is not None and self.trainer.world_size > 1:
+            # Processes wait for each other's gradients of all parameters, also of those that a batch does not use.
+            learned = [parameter.sum().to(total) for parameter in self.parameters() if parameter.requires_grad]
+            total = total + 0 * torch.stack(learned).sum()
         shown = colour_space.to_display(batch.per_pixel(renderings[-1].rgb.detach()))
         error = (shown - batch.rgb).square().mean()
         self.log("train/psnr", -10 * torch.log10(error))

@@ -33,6 +33,7 @@ from nerfro.training.validation import OverfittingWarning
 
 # Arguments of the Trainer with an implementation in nerfro.
 _OWN = ("profiler", "fast_dev_run", "overfit_batches", "limit_test_batches")
+_ONE_PROCESS = [(1, 1), (1, "1"), (1, "auto")]  # numbers of nodes and devices
 _LOST_CONNECTION = re.compile("gloo|NCCL|[Cc]onnection (closed|reset)")  # in errors of torch.distributed
 _PROFILERS = {"simple": SimpleProfiler, "advanced": AdvancedProfiler, "pytorch": PyTorchProfiler}
 
@@ -71,7 +72,8 @@ def make_trainer(config: DictConfig, folder: Path, throughput: Throughput, extra
         "use_distributed_sampler": False,
         "precision": lightning_precision(config),
     }
-    if config.trainer.get("strategy") == "ddp":
+    processes = config.trainer.num_nodes or 1, config.trainer.devices
+    if config.trainer.strategy == "ddp" or (config.trainer.strategy == "auto" and processes not in _ONE_PROCESS):
         # Buffers, such as the index grid, are equal in all processes and need no broadcast in every step.
         ours["strategy"] = DDPStrategy(broadcast_buffers=False, find_unused_parameters=False)
     accelerator = training_accelerator(config.trainer.accelerator)
