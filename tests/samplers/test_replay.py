@@ -21,7 +21,7 @@ from nerfro.samplers.paths.eikonal import Eikonal, march_adaptive
 from nerfro.samplers.paths.replay import smallest_cosine
 from nerfro.samplers.paths.snell import Snell, trace_interfaces
 from nerfro.samplers.paths.straight import Straight
-from nerfro.types import Path, Rays
+from nerfro.types import Path, Rays, Samples
 from tests.closed_forms import RoundedBox, beam, grid_points, make_rays, random_rays
 from tests.samplers.nested import NestedBalls, nested_mesh
 
@@ -165,6 +165,7 @@ REFINED: list[tuple[PathSampler, Callable[[FilePath], Medium]]] = [
     (Eikonal("euler", 64), lambda folder: _voxels()),
     (Snell(), lambda folder: Vacuum()),
     (Straight(), lambda folder: Vacuum()),
+    (Snell(), lambda folder: Ball(0.8, 1.5, abbe=[30.0])),
 ]
 
 
@@ -179,10 +180,12 @@ def test_values_are_the_traced_ones_and_gradients_finite(
     rays, medium = _rays(300).to(torch.float32), make(tmp_path).float()
     rays.origins.requires_grad_()
     path = sampler(rays, medium)
+    path = replace(path, samples=Samples.along(path, path.s[:, 1:], path.s))
     assert not path.positions.requires_grad
     found = sampler.refine(path, rays, medium)
     for name in ("positions", "directions", "s", "exit_directions", "refracted", "body", "ray"):
         assert torch.equal(getattr(found, name), getattr(path, name))
+    assert found.samples is path.samples
     (gradient,) = torch.autograd.grad(found.positions.sum() + found.exit_directions.sum(), rays.origins)
     assert gradient.isfinite().all()
     assert (gradient != 0).any(-1).all()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from jaxtyping import Bool
@@ -25,7 +25,7 @@ from nerfro.samplers.paths.branching import ONE_PATH, Branching
 from nerfro.samplers.paths.compiled import snell_on_grid
 from nerfro.samplers.paths.polylines import SnellTrace
 from nerfro.samplers.paths.replay import meet_solid, meet_triangles, replay, smallest_cosine
-from nerfro.samplers.paths.straight import straight_path
+from nerfro.samplers.paths.straight import refined_straight, straight_path
 from nerfro.samplers.paths.wavefront import Wavefront
 from nerfro.types import Path, Rays
 
@@ -95,7 +95,7 @@ class Snell(PathSampler):
         elif isinstance(medium, Solid):
             meet = meet_solid(medium, path.surface)
         else:
-            return straight_path(rays[path.ray])
+            return refined_straight(path, rays)
         return replay(path, rays, medium, meet, self.branching)
 
     def _at_wavelengths(self, medium: Solid) -> list[Solid]:
@@ -171,7 +171,9 @@ def _refined_in_bands(
     """Refine the polylines of each band in the medium at its wavelength; see `_traced_in_bands` for the arguments."""
     rows = [(path.band == band).nonzero()[:, 0] for band in range(len(media))]
     refined = [refine(path[some], rays[path.ray[some]], medium) for some, medium in zip(rows, media, strict=True)]
-    return replace(Path.joined(refined)[torch.cat(rows).argsort()], ray=path.ray)
+    order, names = torch.cat(rows).argsort(), ("positions", "directions", "s", "throughput")
+    columns: dict[str, Any] = {name: torch.cat([getattr(part, name) for part in refined])[order] for name in names}
+    return replace(path, **columns)
 
 
 def _trace_triangles(rays: Rays, medium: SdfGrid, max_events: int, branching: Branching) -> SnellTrace:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 
 from nerfro.media.base import Medium
@@ -25,7 +27,7 @@ class Straight(PathSampler):
         return True
 
     def refine(self, path: Path, rays: Rays, medium: Medium) -> Path:
-        return straight_path(rays[path.ray])
+        return refined_straight(path, rays)
 
 
 def straight_path(rays: Rays) -> Path:
@@ -35,3 +37,9 @@ def straight_path(rays: Rays) -> Path:
     directions = rays.directions[:, None].expand_as(positions)
     refracted = torch.zeros(len(rays), dtype=torch.bool, device=s.device)
     return Path.unbranched(positions, directions, s, refracted, rays.radii)
+
+
+def refined_straight(path: Path, rays: Rays) -> Path:
+    """Return straight paths with gradients with respect to the rays."""
+    lines = straight_path(rays[path.ray])
+    return replace(path, positions=lines.positions, directions=lines.directions, s=lines.s)
