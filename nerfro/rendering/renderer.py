@@ -202,7 +202,7 @@ class Renderer(nn.Module, ABC):
         was_training = self.training
         self.eval()
         try:
-            chunks = [render(rays[i : i + self.chunk_size]) for i in range(0, len(rays), self.chunk_size)]
+            chunks = [render(rays[i : i + self.chunk_size]) for i in range(0, max(len(rays), 1), self.chunk_size)]
         finally:
             self.train(was_training)
         return [torch.cat(parts) for parts in zip(*chunks, strict=True)]

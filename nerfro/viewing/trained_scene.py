@@ -104,7 +104,12 @@ class TrainedScene:
             subdivision: rays per pixel, by default those of the run's evaluation; `Subdivision()` means one ray.
             chunk_size: rays rendered at once, by default those of the run's evaluation.
             progress: whether to show a progress bar.
+
+        Raises:
+            NerfroError: there are no cameras.
         """
+        if not len(cameras):
+            raise NerfroError("there are no cameras to render; select at least one view")
         scene = self if chunk_size is None else replace(self, renderer=variant(self.renderer, chunk_size=chunk_size))
         views = track("render", range(len(cameras)), disable=not progress)
         rendered = [scene._render_view(cameras, view, subdivision or self.subdivision) for view in views]

@@ -81,6 +81,9 @@ def test_chunks_bound_how_many_rays_are_rendered_at_once(parts: Components, monk
     rendered = model.render(example_rays())
     assert sizes == [7, 7, 7, 3]
     torch.testing.assert_close(rendered.radiance, whole[-1].rgb)
+    none = model.render(example_rays()[:0])
+    for name, values in vars(none).items():
+        assert values.shape == (0, *getattr(rendered, name).shape[1:])
 
 
 def test_optimizer_gives_the_boundary_its_own_rate(parts: Components) -> None:

@@ -126,6 +126,11 @@ def test_rays_that_pass_the_object_are_not_sampled_and_look_the_same(
     assert (skipped.opacity > 0.9).any()
 
 
+def test_images_of_no_camera_are_refused(scene: TrainedScene) -> None:
+    with pytest.raises(NerfroError, match="no cameras to render"):
+        scene.render(scene.cameras().select([]))
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
