@@ -6,11 +6,13 @@ import pytest
 
 from nerfro.evaluation.render_view import render_view
 from nerfro.kernels.constants import constant
+from nerfro.media.sdf_grid import SdfGrid
 from nerfro.registry import build
 from nerfro.subdivision import Subdivision
 from nerfro.training.config import build_model
 from nerfro.training.module import TrainingModule
 from nerfro.training.ray_batches import RayBatches
+from nerfro.viewing.baking import bake_surface
 from tests.pretended_gpu import GPU, OnGpu, PretendedGpu
 from tests.test_experiments import SMALL, composed, shrunk
 
@@ -66,6 +68,8 @@ def test_training_and_rendering_stay_on_the_gpu(
         renderer.point_sampler.after_step(list(renderer.scene.fields), batch.draws)
         assert {wait for wait in gpu.waits if not wait.startswith(TRACING)} == waits
         rendered = render_view(renderer, cameras, 0, Subdivision())
+        if isinstance(renderer.scene.medium, SdfGrid):
+            assert bake_surface(renderer).voxels
     assert isinstance(loss, OnGpu)
     assert isinstance(rendered.radiance, OnGpu)
     assert all(isinstance(tensor, OnGpu) for tensor in (*module.parameters(), *module.buffers()))

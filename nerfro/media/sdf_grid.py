@@ -178,9 +178,9 @@ class SdfGrid(Solid):
         """Return the bodies as kernels take them."""
         from nerfro.kernels.lookup import Solids
 
-        low, high = self.box.double().numpy()
-        indices = self.indices.double().numpy()
-        return Solids._make((*self.grids.packed, indices, self.absorbs.numpy(), self.nested, self.shell, low, high))
+        low, high = self.box.double().cpu().numpy()
+        indices, absorbs = self.indices.double().cpu().numpy(), self.absorbs.cpu().numpy()
+        return Solids._make((*self.grids.packed, indices, absorbs, self.nested, self.shell, low, high))
 
     @cached_property
     def triangles(self) -> Triangles:

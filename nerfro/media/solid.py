@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from nerfro.allowed import NotNegative, Positive, checked
 from nerfro.errors import NerfroError
+from nerfro.kernels.constants import constant
 from nerfro.kernels.tolerances import MIN_COSINE, SAFE_SHARE, STEPS_PER_SHELL
 from nerfro.media.base import Medium, Scalars, Vectors
 from nerfro.media.material import Material, materials_of
@@ -100,7 +101,7 @@ class Solid(Medium):
     @property
     def absorbs(self) -> Bool[Tensor, "K"]:
         """Whether each body may absorb light."""
-        return torch.tensor([material.absorbs for material in self.materials], device=self.box.device)
+        return constant(tuple(material.absorbs for material in self.materials), self.box.device, torch.bool)
 
     def with_absorption_coefficients(self: Self, absorption: Float[Tensor, "K 3"]) -> Self:
         """Return the same bodies with other coefficients, per world unit."""
