@@ -106,6 +106,8 @@ def test_bending_at_a_ball_is_as_in_closed_form(interface: str, tmp_path: Path, 
 def test_rays_that_are_none_are_refused(rays: tuple, message: str, tmp_path: Path) -> None:
     with pytest.raises(NerfroError, match=message):
         nerfro.bend(tmp_path / "ball.ply", 1.5, *rays)
+    with pytest.raises(NerfroError, match="resolution=9 is not allowed; give at least 10"):
+        nerfro.bend(tmp_path / "ball.ply", 1.5, [[0, 0, 0]], [[1, 0, 0]], resolution=9)
 
 
 @pytest.mark.parametrize(

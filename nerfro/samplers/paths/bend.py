@@ -30,7 +30,7 @@ class Bent(NamedTuple):
     """Exit rays at the box around the body, in CPU memory.
 
     Attributes:
-        positions: exit positions in world units, in the precision of the origins.
+        positions: exit positions in world units, in the type of the origins; paths are computed in single precision.
         directions: unit exit directions.
         lengths: lengths of the paths from the origins, world units.
         hit: whether each ray met the body.
@@ -57,14 +57,17 @@ def bend(
         ior: refractive index of the body; the index outside is 1.
         origins, directions: rays [R, 3] in the world of the mesh; directions need not have unit length.
         interface: `mesh` traces the triangles, `sdf` a smooth surface; see `sampler/path=snell`.
-        resolution: number of vertices along each side of the grid of signed distances.
+        resolution: number of vertices along each side of the grid of signed distances, at least 10.
 
     Returns:
         Exit positions, exit directions and path lengths.
 
     Raises:
-        NerfroError: the mesh cannot be read or is open, or the rays are not [R, 3] finite numbers.
+        NerfroError: the mesh cannot be read or is open, the rays are not [R, 3] finite numbers, or the resolution is
+            less than 10.
     """
+    if resolution <= 2 * _MARGIN + 1:
+        raise NerfroError(f"resolution={resolution} is not allowed; give at least {2 * _MARGIN + 2}")
     starts, towards = _checked_rays(origins, directions)
     low, high = load_mesh(resolve_path(mesh)).bounds
     margin = (high - low).max() * _MARGIN / (resolution - 1 - 2 * _MARGIN)
