@@ -14,8 +14,9 @@ from PIL import Image
 
 from nerfro.capture import refinement
 from nerfro.capture.refinement import RefinementSettings, Stage
-from nerfro.data.base import Views
+from nerfro.data.base import Frame, Views
 from nerfro.geometry.mesh import load_mesh
+from nerfro.masks.mask_files import save_mask
 from nerfro.media.bodies import BodySettings
 from nerfro.rendering.scene_file import read_scene_file
 from nerfro.silhouettes.silhouettes import mesh_silhouettes
@@ -221,9 +222,12 @@ def test_options_out_of_range(preprocess: Callable[..., str]) -> None:
 def test_a_hull_needs_masks_of_some_views_only(preprocess: Callable[..., str], capture: Path) -> None:
     for view in range(0, NUM_VIEWS, 2):
         (capture / "masks" / "train" / f"r_{view}.png").unlink()
+    frame = Frame("", capture / "train" / "r_1.png", capture / "masks" / "train" / "r_1.png", np.eye(4)[:3])
+    save_mask(frame, np.zeros((SIZE, SIZE), bool), "visual hull")  # as nerfro.mask does for a camera that looks away
     printed = preprocess("smoothing=0")
     assert "15 of 30 images have no mask (r_0.png, r_2.png, r_4.png and 12 more)" in printed
-    assert len(json.loads((capture / "overlaps.json").read_text())["views"]) == 15
+    assert "views that do not show the object: train/r_1" in printed
+    assert len(json.loads((capture / "overlaps.json").read_text())["views"]) == 14
     assert abs(radii(capture).mean() - RADIUS) < 0.05
 
 

@@ -167,7 +167,10 @@ def masked_views(views: Views) -> Views:
 
 
 def with_other_splits(views: Views, source: DataSource, split: str) -> Views:
-    """Append the views of all other splits that have masks, each image once, if their images have the same size."""
+    """Append the views of all other splits that have masks, each image once, if their images have the same size.
+
+    Views whose mask is an empty projection of a hull are left out, because they do not show the object.
+    """
     for other in source.splits:
         if other == split:
             continue
@@ -175,7 +178,13 @@ def with_other_splits(views: Views, source: DataSource, split: str) -> Views:
         fresh = [i for i, frame in enumerate(more.frames) if frame.image not in known]
         joined = views.joined(more.select(fresh)) if fresh else None
         views = views if joined is None else joined
-    return views
+    if views.masks is None:
+        return views
+    masks = zip(views.frames, views.masks, strict=True) if views.frames else ()
+    without = [i for i, (frame, mask) in enumerate(masks) if not mask.any() and frame.mask and method_of(frame.mask)]
+    if without:
+        print(f"views that do not show the object: {first_of([views.names[i] for i in without])}")
+    return views.select([i for i in range(len(views)) if i not in without])
 
 
 def find_usable(

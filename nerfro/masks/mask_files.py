@@ -207,6 +207,9 @@ def mask_sheet(
 def report_masks(frames: list[Frame], found: Segmentation) -> None:
     """Print how well the masks agree with the shape of the object, the least certain masks first."""
     print(f"{len(found.by_hull)} masks are projections of the {found.shape}")
+    empty = [frames[view].name for view, mask in found.masks.items() if not mask.any()]
+    if empty:
+        print(f"views that do not show the object: {first_of(empty)}")
     if found.agreement:
         worst = min(found.agreement, key=found.agreement.__getitem__)
         print(
@@ -315,7 +318,9 @@ class MaskTask:
         polygons = {find_frame(name, self.frames) for name, outline in outlines.items() if np.ndim(outline) == 2}
         made = [view for view in range(len(self.frames)) if view not in self.kept]
         for view in made:
-            method = POLYGON if view in polygons else found.shape if view in found.by_hull else None
+            # Hull and segmentation agree on an empty mask if a photograph does not show the object.
+            by_hull = view in found.by_hull or not found.masks[view].any()
+            method = POLYGON if view in polygons else found.shape if by_hull else None
             method = TRACKED if method is None and self.tracker is not None else method
             save_mask(self.frames[view], found.masks[view], method)
         path = self.source.root / _SHEET

@@ -57,7 +57,7 @@ def photographs() -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     return views
 
 
-def write_capture(root: Path, photographs: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Path:
+def write_capture(root: Path, photographs: list[tuple[np.ndarray, np.ndarray | None, np.ndarray]]) -> Path:
     """The photographs as a data set in OpenCV's format, without masks, in three splits."""
     splits: dict[str, list[dict]] = {"train": [], "val": [], "test": []}
     (root / "photos").mkdir(parents=True)
@@ -93,12 +93,17 @@ def read(root: Path, view: int) -> np.ndarray:
     return levels > 127
 
 
-def test_one_box_leads_to_all_masks(capture: Path, photographs: list, command: Callable[..., str]) -> None:
+def test_one_box_leads_to_all_masks(tmp_path: Path, photographs: list, command: Callable[..., str]) -> None:
+    picture, _, pose = photographs[0]
+    away = picture, None, pose * [-1, 1, -1, 1]
+    capture = write_capture(tmp_path / "capture", [*photographs, away])
     box = str(box_around(photographs[1][1], 3)).replace(" ", "")
     printed = command("mask", f"data.root={capture}", f"outlines={{p_1:{box}}}")
     overlaps = [overlap(read(capture, view), mask) for view, (_, mask, _) in enumerate(photographs)]
     assert min(overlaps) > 0.9, overlaps
     assert np.mean(overlaps) > 0.95
+    assert f"views that do not show the object: photos/p_{NUM_VIEWS}.png" in printed
+    assert method_of(capture / "photos" / f"mask_p_{NUM_VIEWS}.png") == "visual hull"
     assert "next: python -m nerfro.preprocess data=opencv" in printed
     # The loader finds them, for all splits.
     for split in ("train", "val", "test"):
