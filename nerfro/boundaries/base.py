@@ -1,4 +1,4 @@
-"""Base class of boundary models, which represent the background radiance."""
+"""Base class of background models, which represent the background radiance."""
 
 from __future__ import annotations
 

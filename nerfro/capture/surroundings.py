@@ -143,7 +143,7 @@ class Surroundings:
     """Reconstructed surroundings.
 
     Attributes:
-        boundary: boundary model that returns the background radiance.
+        boundary: background model that returns the background radiance.
         seen: observed directions, by face, row and column of a cube map; None if all directions are known.
         unexplained: fraction of the variance of the validation pixels that is not explained.
         colours: a sample of observed radiances.

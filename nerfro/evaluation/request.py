@@ -15,7 +15,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from nerfro.allowed import Natural, NumRays
-from nerfro.errors import Interrupted, NerfroError
+from nerfro.errors import Interrupted, NerfroError, warn
 from nerfro.files.atomic import refuse_existing, write_atomically
 from nerfro.files.folder_lock import lock_folder, require_only
 from nerfro.paths import user_path
@@ -83,14 +83,30 @@ def record(folder: Path, config: DictConfig) -> None:
     write_atomically(folder / REQUEST_FILE, OmegaConf.to_yaml(config, resolve=True))
 
 
+def report_unused_gpu(option: str) -> None:
+    """Print a line if the machine has a GPU, which `auto` does not use because compiled kernels exist only for CPUs.
+
+    Args:
+        option: option that selects the GPU.
+    """
+    if torch.cuda.is_available() or torch.backends.mps.is_available():
+        warn(
+            "the CPU is used, because nerfro has no GPU kernels and has not been tested on a GPU; "
+            f"set {option} to use the GPU nevertheless"
+        )
+
+
 def find_device(name: str) -> torch.device:
     """Return the device of a name; `auto` means the CPU, as in training.
 
     Raises:
         NerfroError: the device cannot be used.
     """
+    if name == "auto":
+        name = "cpu"
+        report_unused_gpu("device=cuda")
     try:
-        device = torch.device("cpu" if name == "auto" else name)
+        device = torch.device(name)
         torch.zeros(1, device=device)
     except (RuntimeError, AssertionError) as error:
         raise NerfroError(f"device={name} cannot be used; choose cpu, cuda or auto") from error

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as pl
-import torch
 from lightning.pytorch.callbacks import Callback, Timer
 from lightning.pytorch.loggers import CSVLogger, WandbLogger
 from lightning.pytorch.profilers import AdvancedProfiler, Profiler, PyTorchProfiler, SimpleProfiler
@@ -19,7 +18,8 @@ from lightning.pytorch.strategies import DDPStrategy
 from omegaconf import DictConfig
 
 import nerfro.training.lightning_callbacks  # noqa: F401 - registers callbacks
-from nerfro.errors import NerfroError, warn
+from nerfro.errors import NerfroError
+from nerfro.evaluation.request import report_unused_gpu
 from nerfro.kernels.allocator import keep_freed_memory
 from nerfro.kernels.available import fast_bfloat16
 from nerfro.registry import build, create, find
@@ -118,11 +118,7 @@ def training_accelerator(name: str) -> str:
     """
     if name != "auto":
         return name
-    if torch.cuda.is_available() or torch.backends.mps.is_available():
-        warn(
-            "training uses the CPU, because nerfro has no GPU kernels and has not been tested on a GPU; "
-            "set trainer.accelerator=gpu to use the GPU nevertheless"
-        )
+    report_unused_gpu("trainer.accelerator=gpu")
     return "cpu"
 
 

@@ -44,12 +44,12 @@ class Background:
         hidden: Float[Tensor, "2 3"],
         resolution: int,
     ) -> Background:
-        """Evaluate a field and a boundary model at the vertices of grids.
+        """Evaluate a field and a background model at the vertices of grids.
 
         The colour of the field is the mean over the six axis directions.
 
         Args:
-            field, boundary: field and boundary model of the scene.
+            field, boundary: field and background model of the scene.
             box: box of the grid of the field, world units.
             hidden: box inside of which the grid is empty.
             resolution: vertices along each side.

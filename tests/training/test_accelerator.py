@@ -13,5 +13,6 @@ def test_auto_trains_on_the_cpu_and_says_so_where_there_is_a_gpu(
     for there in (False, True):
         monkeypatch.setattr(torch.cuda, "is_available", lambda there=there: there)
         assert training_accelerator("auto") == "cpu"
-        assert find_device("auto").type == "cpu"
         assert capsys.readouterr().out.count("trainer.accelerator=gpu") == int(there)
+        assert find_device("auto").type == "cpu"
+        assert capsys.readouterr().out.count("device=cuda") == int(there)
