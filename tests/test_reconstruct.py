@@ -17,6 +17,7 @@ from PIL import ExifTags, Image
 import nerfro.reconstruct
 import nerfro.train
 from nerfro.capture import refinement
+from nerfro.data.masks import find_mask
 from nerfro.errors import NerfroError
 from nerfro.evaluation.lpips import NO_NETWORK
 from nerfro.files.images import save_png
@@ -61,8 +62,8 @@ def test_links_to_deleted_photographs_are_removed(photos: Path, tmp_path: Path) 
     assert len(list((tmp_path / "out" / "masks").iterdir())) == 3
 
 
-@pytest.mark.parametrize("suffix", [".jpg", ".heic"])
-def test_photographs_of_a_telephone_become_upright(suffix: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("suffix", [".JPG", ".heic"])
+def test_photographs_of_a_telephone_become_upright_and_keep_their_masks(suffix: str, tmp_path: Path) -> None:
     if suffix == ".heic":
         pytest.importorskip("pillow_heif").register_heif_opener()
     lying, exif = Image.new("RGB", (96, 64), (200, 30, 30)), Image.Exif()
@@ -71,7 +72,10 @@ def test_photographs_of_a_telephone_become_upright(suffix: str, tmp_path: Path) 
     exif[ExifTags.Base.Model] = "telephone"
     (tmp_path / "photos").mkdir()
     lying.save(tmp_path / "photos" / f"IMG_1{suffix}", exif=exif.tobytes())
-    stages.link_photographs(tmp_path / "photos", None, tmp_path / "out")
+    (tmp_path / "masks").mkdir()
+    Image.new("L", (64, 96)).save(tmp_path / "masks" / f"IMG_1{suffix}.png")  # as COLMAP names masks
+    stages.link_photographs(tmp_path / "photos", tmp_path / "masks", tmp_path / "out")
+    assert find_mask(tmp_path / "out", tmp_path / "out" / "images" / "IMG_1.jpg") is not None
     with open_image(tmp_path / "out" / "images" / "IMG_1.jpg") as (upright, _):
         assert upright.size == (64, 96)
         assert upright.getexif()[ExifTags.Base.Model] == "telephone"

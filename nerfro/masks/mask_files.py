@@ -28,6 +28,7 @@ from nerfro.masks.masking import Segmentation, box_region, check_tracked, grab, 
 from nerfro.masks.tracking import load_tracker, track_object
 from nerfro.opencv import opencv
 from nerfro.paths import user_path
+from nerfro.poses.photographs import PHOTOGRAPH_SUFFIXES
 from nerfro.poses.reconstruction import numeric_order
 from nerfro.silhouettes.outline_hull import AGREES, FEWEST_VIEWS
 
@@ -121,9 +122,11 @@ def load_all(source: DataSource) -> tuple[Cameras, list[UInt8[np.ndarray, "H W 3
 
 
 def find_frame(name: str, frames: list[Frame]) -> int:
-    """Find a frame by its name in the data set, or by its file name with or without extension."""
+    """Find a frame by its name in the data set, or by its file name with, without or before a change of extension."""
+    stem = Path(name).stem if Path(name).suffix.lower() in PHOTOGRAPH_SUFFIXES else name
     found = [i for i, frame in enumerate(frames) if frame.name == name]
-    found = found or [i for i, frame in enumerate(frames) if name in (frame.image.name, frame.image.stem)]
+    found = found or [i for i, frame in enumerate(frames) if frame.image.name == name]
+    found = found or [i for i, frame in enumerate(frames) if frame.image.stem in (name, stem)]
     if len(found) != 1:
         problem = "is not an image of the data set" if not found else f"matches {len(found)} images of the data set"
         raise NerfroError(f"outlines: {name} {problem}; names of the data set look like {frames[0].name}")

@@ -121,7 +121,7 @@ def link_photographs(photographs: Path, masks: Path | None, out: Path) -> None:
 
     Args:
         photographs: folder of the photographs, which may also contain masks (`mask_*`).
-        masks: folder of the masks, `<photograph>.png` or `mask_<photograph>.png`.
+        masks: folder of the masks, `<name>.png`, `<name>.<extension of the photograph>.png` or `mask_<name>.png`.
         out: folder of the data set.
     """
     list_images(photographs, PHOTOGRAPH_SUFFIXES)  # raises an error for a folder without photographs
@@ -139,5 +139,8 @@ def link_photographs(photographs: Path, masks: Path | None, out: Path) -> None:
             place.mkdir(parents=True, exist_ok=True)
             if folder == photographs:
                 place_photograph(file, place)
-            elif not (place / file.name).exists():
-                (place / file.name).symlink_to(file.resolve())
+                continue
+            # A converted photograph has another extension, so that of the photograph is left out.
+            stem = Path(file.stem).stem if (photographs / file.stem).is_file() else file.stem
+            if not (link := place / f"{stem}{file.suffix}").exists():
+                link.symlink_to(file.resolve())

@@ -186,7 +186,8 @@ def test_masks_of_a_network_are_marked_and_compared_with_their_hull(
 
 def test_polygons_are_the_masks_of_their_views(capture: Path, photographs: list, command: Callable[..., str]) -> None:
     polygons = {f"p_{view}": polygon_around(photographs[view][1]) for view in (1, 5, 9)}
-    (capture / "outlines.json").write_text(json.dumps(polygons))
+    converted = {f"{name}.HEIC": polygon for name, polygon in polygons.items()}  # reconstruct converts photographs
+    (capture / "outlines.json").write_text(json.dumps(converted))
     command("mask", f"data.root={capture}", f"outlines={capture / 'outlines.json'}", "hull_only=true")
     for name, polygon in polygons.items():
         assert np.array_equal(read(capture, int(name[2:])), polygon_mask(polygon, (WIDTH, HEIGHT)))
