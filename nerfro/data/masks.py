@@ -178,12 +178,14 @@ def with_other_splits(views: Views, source: DataSource, split: str) -> Views:
         fresh = [i for i, frame in enumerate(more.frames) if frame.image not in known]
         joined = views.joined(more.select(fresh)) if fresh else None
         views = views if joined is None else joined
-    if views.masks is None:
+    masks = views.masks
+    if masks is None:
         return views
-    masks = zip(views.frames, views.masks, strict=True) if views.frames else ()
-    without = [i for i, (frame, mask) in enumerate(masks) if not mask.any() and frame.mask and method_of(frame.mask)]
-    if without:
-        print(f"views that do not show the object: {first_of([views.names[i] for i in without])}")
+    derived = [i for i, frame in enumerate(views.frames) if frame.mask and method_of(frame.mask) is not None]
+    without = {i for i in derived if not masks[i].any()}
+    if not without:
+        return views
+    print(f"views that do not show the object: {first_of([views.names[i] for i in sorted(without)])}")
     return views.select([i for i in range(len(views)) if i not in without])
 
 
