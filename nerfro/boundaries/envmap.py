@@ -136,7 +136,7 @@ class EnvironmentMap(Boundary):
         return lookup(face, *arguments)
 
     @torch.no_grad()
-    def fit(self, observed: Observed, past: Float[Tensor, "T"]) -> Float[Tensor, "T"]:
+    def fit(self, observed: Observed, past_weights: Float[Tensor, "T"]) -> Float[Tensor, "T"]:
         """Move the texels towards observed radiance, level by level from coarse to fine.
 
         A texel moves by the weighted mean of the residuals of its rays before the softplus. The mean includes residuals
@@ -145,7 +145,7 @@ class EnvironmentMap(Boundary):
 
         Args:
             observed: radiance from directions.
-            past: weight of past observations of each texel.
+            past_weights: weight of past observations of each texel.
 
         Returns:
             Weight of these observations of each texel: the sum over rays of bilinear weight times weight of the ray.
@@ -155,7 +155,9 @@ class EnvironmentMap(Boundary):
         residual = target - self._raw_at(face, coordinates)
         residual = torch.where(observed.saturated, residual.clamp(min=0), residual)
         total = []
-        levels = zip(self.levels.resolutions, self.texels_of_levels(), past.split(self.levels.sizes), strict=True)
+        levels = zip(
+            self.levels.resolutions, self.texels_of_levels(), past_weights.split(self.levels.sizes), strict=True
+        )
         for n, (values, of_level), earlier in levels:
             wide = observed.widths > _MOST_TEXELS * 0.5 * math.pi / n
             weights = observed.weights.masked_fill(wide, 0)[:, None].expand(-1, 3)

@@ -93,14 +93,14 @@ class SceneFile:
         data, own = dict(self.data), dict(self.medium)
         if data_type not in (None, data["type"]):
             data = {"type": data_type, "root": data["root"]}
-        kind = own.pop("type", "object")
+        medium_type = own.pop("type", "object")
         short = self.short
         own |= {"bodies": {name: _given(body) for name, body in self.bodies.items()}} if short is None else short
         if medium == "vessel":
             own |= self.vessel
         chosen: dict[str, object] = {"data": data.pop("type")}
-        if (medium or kind) != "object":  # `object` is the choice of most experiments; others have their own
-            chosen["medium"] = medium or kind
+        if (medium or medium_type) != "object":  # `object` is the choice of most experiments; others have their own
+            chosen["medium"] = medium or medium_type
         for group, values in (("data", data), ("medium", own)):
             chosen |= {f"{group}.{name}": value for name, value in values.items()}
         return chosen

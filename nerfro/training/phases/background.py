@@ -89,24 +89,26 @@ class Background(Phase):
         num_parts = self.steps * run.batches.num_pixels // most_pixels
         pixels = run.batches.rows(part * num_parts // self.steps, num_parts)
         rays = _rays(run, pixels)
-        beside = misses(box, rays)
+        misses_object = misses(box, rays)
         if number == 0 and run.renderer.scene.camera.exposure is not None:
             for turn in range(_TURNS):
-                seen = _beside(run, pixels[beside], rays[beside], fits_gains=turn > 0)
-                background.fit(seen, torch.zeros_like(state["weights"]))
-        observed = [_beside(run, pixels[beside], rays[beside])]
+                observed_pixels = _observe_beside_object(
+                    run, pixels[misses_object], rays[misses_object], fits_gains=turn > 0
+                )
+                background.fit(observed_pixels, torch.zeros_like(state["weights"]))
+        observed = [_observe_beside_object(run, pixels[misses_object], rays[misses_object])]
         if number_of_pass > 0:
             assert self.start is not None
             num_trained = self.start * 2 ** (number_of_pass - 1) * run.batches.batch_size
             num_rays = min(_SHARE * num_trained, _MOST_RAYS)
-            crossing = pixels[~beside]
+            crossing = pixels[~misses_object]
             crossing = crossing[:: max(1, math.ceil(len(crossing) * self.steps / num_rays))]
-            observed += [_through(run, chunk) for chunk in crossing.split(run.renderer.chunk_size)]
+            observed += [_observe_through_object(run, chunk) for chunk in crossing.split(run.renderer.chunk_size)]
         state["weights"] += background.fit(Observed.joined(observed), state["weights"])
         return True
 
 
-def _through(run: Run, pixels: Int[Tensor, "P"]) -> Observed:
+def _observe_through_object(run: Run, pixels: Int[Tensor, "P"]) -> Observed:
     """Observe the background along those rays of pixels that cross hardly any content."""
     batches, renderer, scene = run.batches, run.renderer, run.renderer.scene
     view = batches.cameras.view_of(pixels)
@@ -125,7 +127,7 @@ def _through(run: Run, pixels: Int[Tensor, "P"]) -> Observed:
     return observed[fraction.amin(-1) >= _BACKGROUND]
 
 
-def _beside(run: Run, pixels: Int[Tensor, "P"], rays: Rays, fits_gains: bool = True) -> Observed:
+def _observe_beside_object(run: Run, pixels: Int[Tensor, "P"], rays: Rays, fits_gains: bool = True) -> Observed:
     """Observe the background along the rays of pixels beside the object, after the exposures are fitted to it."""
     batches, scene = run.batches, run.renderer.scene
     view, rgb, exposure = batches.cameras.view_of(pixels), batches.photographed(pixels), scene.camera.exposure
