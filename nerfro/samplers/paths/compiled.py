@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from nerfro.kernels.lookup import Voxels
     from nerfro.media.sdf_grid import SdfGrid
     from nerfro.media.voxel_grid import VoxelGrid
-    from nerfro.samplers.paths.snell_cpu import Polylines
+    from nerfro.samplers.paths.snell_cpu import TracedRows
 
 # Capacity of the first attempt, in vertices of a polyline and polylines of a ray. Rays that need more are traced again;
 # these have many reflections and are slow, so the capacity covers the usual numbers.
@@ -55,7 +55,7 @@ def snell_on_grid(rays: Rays, medium: SdfGrid, max_events: int, branching: Branc
     return SnellTrace(path, num_events, exceeded)
 
 
-def _polylines(rows: Polylines, counts: Int[np.ndarray, "R"], width: int) -> tuple[np.ndarray, ...]:
+def _polylines(rows: TracedRows, counts: Int[np.ndarray, "R"], width: int) -> tuple[np.ndarray, ...]:
     """Select polylines; returns their rays, arrays with a column per vertex, and values per polyline.
 
     Args:

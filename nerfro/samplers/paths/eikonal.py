@@ -20,7 +20,7 @@ from nerfro.registry import register
 from nerfro.samplers.base import PathSampler
 from nerfro.samplers.paths.compiled import eikonal_on_grid, uniform_on_grid
 from nerfro.samplers.paths.integrators import Integrator, RayState, euler, leapfrog
-from nerfro.samplers.paths.polylines import Polylines
+from nerfro.samplers.paths.polylines import PolylineBuilder
 from nerfro.samplers.paths.replay import Vertices, assembled, is_interior, with_gradient
 from nerfro.types import Path, Rays
 
@@ -112,7 +112,7 @@ class _NewVertices:
 
     def __init__(self, rays: Rays, tolerance: float) -> None:
         self.kept = _start(rays)
-        self.lines = Polylines(len(rays), rays.near)
+        self.lines = PolylineBuilder(len(rays), rays.near)
         self.lines.append(torch.arange(len(rays), device=rays.near.device), *self.kept)
         self.tolerance = tolerance
 

@@ -52,7 +52,7 @@ class Crossed(NamedTuple):
     triangle: Int[Tensor, "A"] | int = -1
 
 
-class Polylines:
+class PolylineBuilder:
     """Paths under construction: rows of any number of vertices."""
 
     def __init__(self, num_rays: int, like: Float[Tensor, "..."]) -> None:

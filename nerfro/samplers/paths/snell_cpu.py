@@ -50,7 +50,7 @@ class Event(NamedTuple):
     share: float  # share of the light in the pending branch; 0 if light does not split
 
 
-class Polylines(NamedTuple):
+class TracedRows(NamedTuple):
     """Polylines of one ray, one row each (B rows, V vertices); fields as in `types.Path`."""
 
     positions: Float[np.ndarray, "B V 3"]
@@ -357,12 +357,12 @@ def trace_snell(origins, directions, near, far, solids, settings, capacity, room
         room: largest number of polylines of a ray, B.
 
     Returns:
-        rows: `Polylines` of all rays, with a leading axis R, in the precision of the rays. Entries after the last
+        rows: `TracedRows` of all rays, with a leading axis R, in the precision of the rays. Entries after the last
             vertex of a polyline are undefined.
         counts [R, 2]: number of polylines of each ray, and largest number of vertices, which may exceed B and V.
     """
     num_rays, num_bodies, num_splits = origins.shape[0], len(solids.iors), settings.num_splits
-    rows = Polylines(
+    rows = TracedRows(
         np.empty((num_rays, room, capacity, 3), origins.dtype), np.empty((num_rays, room, capacity, 3), origins.dtype),
         np.empty((num_rays, room, capacity), origins.dtype), np.empty((num_rays, room, capacity), np.int8),
         np.empty((num_rays, room, capacity), np.int8), np.empty((num_rays, room, capacity), np.int8),
@@ -383,7 +383,7 @@ def trace_snell(origins, directions, near, far, solids, settings, capacity, room
                 np.float64(x[0]), np.float64(x[1]), np.float64(x[2]),
                 np.float64(d[0]), np.float64(d[1]), np.float64(d[2]),
             )  # fmt: skip
-            row = Polylines(
+            row = TracedRows(
                 rows.positions[ray], rows.directions[ray], rows.s[ray], rows.body[ray], rows.surface[ray],
                 rows.across[ray], rows.weight[ray], rows.num_vertices[ray], rows.num_events[ray], rows.exceeded[ray],
             )  # fmt: skip

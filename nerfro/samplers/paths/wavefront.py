@@ -13,7 +13,7 @@ from torch.nn import functional
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.media.solid import Solid
 from nerfro.samplers.paths.branching import Branching
-from nerfro.samplers.paths.polylines import Crossed, Polylines, SnellTrace
+from nerfro.samplers.paths.polylines import Crossed, PolylineBuilder, SnellTrace
 from nerfro.samplers.paths.replay import indices_of
 from nerfro.samplers.paths.snell_law import reflectance, refract
 from nerfro.types import Rays
@@ -91,7 +91,7 @@ class Wavefront:
         self.start, self.weight = torch.zeros_like(self.s), torch.ones_like(self.s)
         self.exceeded = torch.zeros_like(self.moving)
         self.inside = self.exceeded[:, None].repeat(1, len(medium.iors))
-        self.lines = Polylines(len(rays), self.x)
+        self.lines = PolylineBuilder(len(rays), self.x)
 
     def begin(self, inside: Callable[[Tensor], Bool[Tensor, "P K"]]) -> None:
         """Record the first vertices, and move the rows that meet the box to the box.
