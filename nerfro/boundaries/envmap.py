@@ -96,7 +96,7 @@ class EnvironmentMap(Boundary):
         self._groups = cube_map.CubeLevels(tuple(resolutions)), cube_map.CubeLevels(tuple(fitted))
         of_descent, of_fits = (torch.zeros(levels.num_texels, 3) for levels in self._groups)
         self.texels = nn.Parameter(of_descent)
-        self.register_buffer("fitted_texels", of_fits)
+        self.register_buffer("fitted_texels", of_fits, persistent=len(fitted) > 0)
         padded = torch.cat([cube_map.padded_texels(n).flatten() for n in self.levels.resolutions])
         self.register_buffer("padded", padded, persistent=False)
         if image is not None:

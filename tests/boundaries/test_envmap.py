@@ -76,6 +76,7 @@ def test_fit_learns_a_sky_from_few_rays(levels: tuple[list[int], list[int] | Non
 def test_fitted_levels_add_to_the_others_without_gradient() -> None:
     together, apart, directions = EnvironmentMap([4, 8, 16]), EnvironmentMap([4], [8, 16]), random_directions(50)
     torch.nn.init.normal_(together.texels)
+    assert set(together.state_dict()) == {"texels"}, "checkpoints of earlier versions have no fitted levels"
     state = together.state_dict()["texels"].split([96, 6 * (64 + 256)])
     apart.load_state_dict({"texels": state[0], "fitted_texels": state[1]})
     torch.testing.assert_close(apart(Exits(directions)), together(Exits(directions)))
