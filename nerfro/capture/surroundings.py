@@ -15,7 +15,7 @@ from torch.nn import functional
 
 from nerfro.boundaries.base import Boundary
 from nerfro.boundaries.cube_map import project
-from nerfro.boundaries.envmap import EnvironmentMap, Observed
+from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.cameras import Cameras
 from nerfro.data.base import Views
 from nerfro.draws import Draws
@@ -34,13 +34,10 @@ from nerfro.types import WORLD_ORIGIN, Exits
 
 # Photographs are downscaled to at most so many pixels per side, in linear radiance.
 _MAX_PIXELS = 200
-# Number of passes over all pixels for distant surroundings.
-_SKY_PASSES = 2
-# Number of steps and pixels per step for near surroundings, and first and last learning rate.
+# Number of steps and pixels per step for distant and near surroundings, and first and last learning rate.
+_SKY_STEPS, _SKY_PIXELS = 300, 16384
 _NEAR_STEPS, _NEAR_PIXELS = 400, 2048
 _RATES = (0.03, 0.0015)
-# Largest number of validation pixels.
-_MAX_VALIDATION = 16384
 # Surroundings are near if a sky leaves more than this fraction of the variance of validation views unexplained.
 _MAX_SKY_RESIDUAL = 0.25
 # Lower bound of the variance of linear radiance.
@@ -181,14 +178,14 @@ def learn_surroundings(
         progress: called with the completed fraction.
     """
     training, validation = beside.split()
-    validation = validation.some(_MAX_VALIDATION)
+    validation = validation.some(_SKY_PIXELS)
     found = None
     if not near:
         # Texels are as wide as pixels, and at most half as many, because unobserved texels would be noise.
         side = min(1.5 * float(beside.cameras.fx.mean()) * math.pi / 2, math.sqrt(len(training) / 12))
         levels = [4 * 2**level for level in range(16) if 4 * 2**level <= max(16, side)]
         boundary = EnvironmentMap(levels)
-        _fit_sky(boundary, training, progress)
+        _learn(boundary, training, _SKY_STEPS, _SKY_PIXELS, progress)
         n = max(1, min(_SEEN_TEXELS, int(math.sqrt(len(training) / (6 * _SEEN_PIXELS)))))
         seen = torch.zeros(6, n, n, dtype=torch.bool)
         seen[_texel(training.rays.directions, n)] = True
@@ -197,7 +194,7 @@ def learn_surroundings(
         middle = torch.from_numpy(mesh.bounds.mean(0)).float()
         distance = (beside.cameras.camera_to_world[:, :, 3] - middle).norm(dim=-1)
         field = Room(mesh.bounds, float(distance.mean()))
-        _train_room(field, training, progress)
+        _learn(field, training, _NEAR_STEPS, _NEAR_PIXELS, progress)
         unexplained = _unexplained(field, validation)
         if found is None or unexplained < found.unexplained:
             found = Surroundings(field, None, unexplained, validation.radiance)
@@ -286,34 +283,27 @@ class Room(Boundary):
         return rendered.rgb, rendered.depth
 
 
-def _fit_sky(sky: EnvironmentMap, pixels: Pixels, progress: Callable[[float], None]) -> None:
-    weights, widths = torch.ones(len(pixels)), 1 / pixels.cameras.fx[pixels.view]
-    # A photograph clips radiance at 1.
-    observed = Observed(pixels.rays.directions, pixels.radiance, pixels.radiance >= 1, weights, widths)
-    for done in range(_SKY_PASSES):
-        sky.fit(observed, torch.zeros(sky.levels.num_texels))
-        progress((done + 1) / _SKY_PASSES)
-    sky.eval().requires_grad_(False)
-
-
-def _train_room(room: Room, pixels: Pixels, progress: Callable[[float], None]) -> None:
-    batch = min(_NEAR_PIXELS, max(1024, len(pixels) // 16))
+def _learn(boundary: Boundary, pixels: Pixels, steps: int, batch: int, progress: Callable[[float], None]) -> None:
+    batch = min(batch, max(1024, len(pixels) // 16))
     generator = torch.Generator().manual_seed(0)
     first, last = _RATES
-    optimizer = torch.optim.Adam(room.parameters(), first, eps=1e-15)
+    optimizer = torch.optim.Adam(boundary.parameters(), first, eps=1e-15)
     with torch.enable_grad():
-        for step in range(_NEAR_STEPS):
-            optimizer.param_groups[0]["lr"] = first * (last / first) ** (step / _NEAR_STEPS)
+        for step in range(steps):
+            optimizer.param_groups[0]["lr"] = first * (last / first) ** (step / steps)
             drawn = pixels[torch.randint(len(pixels), (batch,), generator=generator)]
-            predicted = room(Exits.unbent(drawn.rays), Draws(0, step, torch.arange(batch)))
+            exits = Exits.unbent(drawn.rays)
+            draws = (Draws(0, step, torch.arange(batch)),) if isinstance(boundary, Room) else ()
+            predicted = boundary(exits, *draws)
             # A photograph clips radiance at 1, so brighter predictions of clipped pixels are no error.
             seen = torch.where(drawn.radiance >= 1, predicted.clamp(max=1), predicted)
             optimizer.zero_grad()
             functional.mse_loss(seen, drawn.radiance).backward()
             optimizer.step()
-            room.sampler.after_step([room.field], Draws(0, step + 1, torch.arange(batch)))
-            progress((step + 1) / _NEAR_STEPS)
-    room.eval().requires_grad_(False)
+            if isinstance(boundary, Room):
+                boundary.sampler.after_step([boundary.field], Draws(0, step + 1, torch.arange(batch)))
+            progress((step + 1) / steps)
+    boundary.eval().requires_grad_(False)
 
 
 @torch.no_grad()
