@@ -68,7 +68,8 @@ def _polylines(rows: TracedRows, counts: Int[np.ndarray, "R"], width: int) -> tu
     valid = np.arange(rows.weight.shape[1]) < counts[:, None]
     ray, place = (np.ascontiguousarray(indices) for indices in valid.nonzero())
     of_vertices = polylines_of_width(rows, ray, place, width)
-    return ray, *of_vertices, *(column[valid] for column in rows[6:])
+    of_rows = rows.weight, rows.num_vertices, rows.num_events, rows.exceeded
+    return ray, *of_vertices, *(column[valid] for column in of_rows)
 
 
 def eikonal_on_grid(

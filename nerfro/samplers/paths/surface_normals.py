@@ -30,11 +30,12 @@ def _bent_normals(path: Path, medium: Medium) -> Float[Tensor, "P 3"]:
     rows = torch.arange(len(path.s), device=path.s.device)
     before, after = path.directions[:, :-1], path.directions[:, 1:]
     n = indices_of(medium, path.s).detach()[path.body.long()]
-    changes = turning_normals(before, after, n[:, :-1], n[:, 1:])
-    events = changes.any(-1)
+    events = (before != after).any(-1) | (n[:, :-1] != n[:, 1:])
     first = events.byte().argmax(-1)
-    normals = changes[rows, first]
-    if not isinstance(medium, Solid):
+    arriving = before[rows, first]
+    if isinstance(medium, Solid):
+        normals = turning_normals(arriving, after[rows, first], n[rows, first], n[rows, first + 1])
+    else:
         _, normals = medium(path.positions[rows, first + 1])
-    towards = -(normals * before[rows, first]).sum(-1, keepdim=True).sign()
+    towards = -(normals * arriving).sum(-1, keepdim=True).sign()
     return torch.where(events.any(-1, keepdim=True), functional.normalize(normals * towards, dim=-1), 0.0)

@@ -29,7 +29,7 @@ class Stratified(PointSampler):
         draw: `arc_length` draws any arc length; `vertices` selects one of every S / N_c vertices, as the paper does,
             and needs paths with a multiple of N_c vertices.
         cast: `points`, or `cones`, whose samples fill the bins (mip-NeRF).
-        offset: position in the bin in evaluation, from 0 for the start over 0.5 for the centre to less than 1.
+        offset: position in the bin in evaluation, 0 for the start, 0.5 for the centre, less than 1.
         box_min, box_max: corners of the box to sample, world units; empty to sample the whole path.
     """
 
