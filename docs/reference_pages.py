@@ -8,6 +8,7 @@ from __future__ import annotations
 import ast
 import importlib
 import inspect
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -133,11 +134,13 @@ def _default(value: object) -> str:
     if value is None:
         return "null"
     text = str(value).lower() if isinstance(value, bool) else str(value)
-    return text if value == "required" else f"`{_cell(text)}`" if text else "empty"
+    return text if value == "required" else _cell(f"`{text}`") if text else "empty"
 
 
 def _cell(text: str) -> str:
-    return text.replace("|", "\\|").replace("<", "&lt;").replace("\n", " ")
+    text = text.replace("|", "\\|").replace("\n", " ")
+    # Markdown itself escapes the text of code spans.
+    return "".join(part if part.startswith("`") else part.replace("<", "&lt;") for part in re.split("(`[^`]*`)", text))
 
 
 def _header(file: Path) -> str:

@@ -8,7 +8,7 @@ import sys
 
 from nerfro.cli import print_version
 from nerfro.completion import completions, shell_code
-from nerfro.errors import NerfroError
+from nerfro.errors import NerfroError, nearest_of
 from nerfro.failures import errors_in_one_line
 from nerfro.paths import PACKAGE_DIR
 
@@ -30,7 +30,7 @@ def main() -> None:
         elif name == "--complete":
             print("\n".join(completions(known, arguments)))
         elif name not in known:
-            raise NerfroError(f"there is no command '{name}'; choose one of {', '.join(known)}")
+            raise NerfroError(f"there is no command '{name}'; {nearest_of(name, known)}")
     if name not in known:
         return
     del sys.argv[1]

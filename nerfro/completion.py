@@ -8,12 +8,23 @@ from collections.abc import Iterable, Iterator, Sequence
 from nerfro.errors import NerfroError
 from nerfro.options import Described, recall
 
-_BASH = "complete -o nospace -C 'nerfro --complete' nerfro"
+# Where no option is found, the shells complete the names of files and folders.
 _CODE = {
-    "bash": _BASH,
-    "zsh": f"autoload -U +X bashcompinit && bashcompinit\n{_BASH}",
-    "fish": "complete -c nerfro -f -a "
-    "'(env COMP_LINE=(commandline -cp | string collect) nerfro --complete | string trim)'",
+    "bash": "complete -o nospace -o default -C 'nerfro --complete' nerfro",
+    "zsh": """_nerfro() {
+    local -a found=("${(@f)$(COMP_LINE=$LBUFFER nerfro --complete)}")
+    if [[ -n $found ]]; then compadd -Q -S '' -- $found; else compset -P '*='; _files; fi
+}
+compdef _nerfro nerfro""",
+    "fish": """function __nerfro
+    set -l found (env COMP_LINE=(commandline -cp | string collect) nerfro --complete | string trim)
+    if test -n "$found[1]"
+        printf '%s\\n' $found
+    else if set -l parts (string split -m 1 = (commandline -ct))
+        printf '%s\\n' $parts[1]=(__fish_complete_path $parts[2])
+    end
+end
+complete -c nerfro -f -a '(__nerfro)'""",
 }
 
 
@@ -31,7 +42,7 @@ def shell_code(shell: str) -> str:
 def completions(commands: Iterable[str], arguments: Sequence[str]) -> list[str]:
     """Return the completions of the line that a shell passes in COMP_LINE, up to the cursor at COMP_POINT.
 
-    Options are known once the command has run.
+    Options are known once the command, or its `--help`, has run.
 
     Args:
         commands: names of the commands.
@@ -43,8 +54,9 @@ def completions(commands: Iterable[str], arguments: Sequence[str]) -> list[str]:
     described = recall(words[0]) if words else None
     known = (f"{command} " for command in commands) if not words else () if described is None else _options(described)
     kept = len(last) - len(arguments[1]) if len(arguments) > 1 else 0
-    found = (text for text in known if text.startswith(last) and "." not in text[len(last) : -1])
-    return sorted(text[kept:] for text in found)
+    plus = last[: len(last) - len(last.lstrip("+"))]  # Hydra's sign of an added option
+    found = (plus + text for text in known)
+    return sorted(text[kept:] for text in found if text.startswith(last) and "." not in text[len(last) : -1])
 
 
 def _options(described: Described) -> Iterator[str]:

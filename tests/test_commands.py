@@ -105,6 +105,8 @@ def test_ctrl_c_during_the_imports_ends_in_one_line() -> None:
         ("nerfro train tr", "tr", ["trainer."]),
         ("nerfro train seed=1 trainer.max", "trainer.max", ["trainer.max_steps=", "trainer.max_time="]),
         ("nerfro train field=n", "n", ["nerf "]),
+        ("nerfro train +field=n", "n", ["nerf "]),
+        ("nerfro train +trainer.max_s", "+trainer.max_s", ["+trainer.max_steps="]),
         ("nerfro view che", "che", []),
     ],
 )
@@ -190,7 +192,7 @@ def test_every_command_is_listed_in_one_line() -> None:
 def test_an_unknown_command_is_refused_in_one_line(script: Path) -> None:
     refused = run(script, "trian")
     assert refused.returncode == 1
-    assert refused.stderr.startswith("nerfro: error: there is no command 'trian'; choose one of calibrate, ")
+    assert refused.stderr.startswith("nerfro: error: there is no command 'trian'; did you mean train?")
     assert refused.stderr.count("\n") == 1
 
 

@@ -199,7 +199,7 @@ def report(metrics: RunMetrics, title: str, folder: Path, brief: bool = False) -
     if not brief:
         rich.print(to_rich(views_table(result, title)))
     if brief or len(result.regions) > 1:
-        rich.print(to_rich(regions_table(result, f"mean of {len(result.views)} views")))
+        rich.print(to_rich(regions_table(result, f"mean of {len(result.views)} view{'s' * (len(result.views) > 1)}")))
     if metrics.treatments:
         rich.print(to_rich(treatments_table(metrics, "means; compare only rows of the same pixels")))
 

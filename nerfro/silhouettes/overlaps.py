@@ -76,7 +76,7 @@ def _warn_of_bad(
     advice = "" if better is None else f"; or set wrong_masks={better}, which ignores as many masks and agrees better"
     warn(
         f"overlap below {GOOD_OVERLAP}: {first_of(bad)}; look at {SHEET}, and correct the masks or poses of these "
-        f"views{advice}"
+        f"views, except where another object hides a body of revolution{advice}"
     )
 
 
