@@ -149,18 +149,6 @@ def test_missing_folders_unknown_splits_and_empty_intervals_are_refused(form: Fo
         form.open(tmp_path, far=0.0)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"near": 6.0, "far": 6.0}, r"data.near=6.0 and data.far=6.0 are not an interval; take 0 <= near < far"),
-        ({"near": 7.0}, "data.near=7.0 and data.far=6.0 are not an interval"),
-    ],
-)
-def test_options_out_of_range_are_refused(options: dict[str, float], message: str) -> None:
-    with pytest.raises(NerfroError, match=message):
-        BlenderData("anywhere", **options)
-
-
 def test_alpha_is_dropped_unless_a_background_is_chosen(tmp_path: Path) -> None:
     root = write_blender(tmp_path)
     levels = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 4), dtype=np.uint8)

@@ -166,9 +166,6 @@ def test_evaluation_images_are_cropped_with_their_rays_and_training_images_are_n
     assert torch.equal(test.masks[0], full.masks[0][rows, columns])
     directions = full.cameras.image_rays(0).directions.reshape(HEIGHT, WIDTH, 3)[rows, columns]
     torch.testing.assert_close(test.cameras.image_rays(0).directions.reshape(8, 12, 3), directions)
-    for crop in (0.0, -1.0, 1.2):
-        with pytest.raises(NerfroError, match=f"eval_crop={crop} is not allowed"):
-            OpenCVData("anywhere", eval_crop=crop)
 
 
 @pytest.mark.parametrize(

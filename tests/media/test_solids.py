@@ -152,10 +152,6 @@ def test_bad_solids_are_named(tmp_path: Path) -> None:
     mesh = str(tmp_path / "ball.ply")
     with pytest.raises(NerfroError, match="one index for each inner mesh"):
         SdfGrid(mesh, inner_meshes=[mesh], resolution=16, cache=False)
-    with pytest.raises(NerfroError, match=r"ior=0\.0 is not allowed; take more than 0"):
-        Ball(ior=0.0)
-    with pytest.raises(NerfroError, match=r"shell=0\.0 is not allowed"):
-        Ball(shell=0.0)
     with pytest.raises(NerfroError, match=r"box_min=.*box_max="):
         SdfGrid(mesh, box_min=[-1.5] * 3, box_max=[0.7] * 3, resolution=16, cache=False)
     with pytest.raises(NerfroError, match=r"medium\.box_min and medium\.box_max belong together"):

@@ -325,5 +325,3 @@ def test_media_without_a_surface_are_refused() -> None:
         Snell()(random_rays(2, 1.0, seed=0, far=9), Luneburg())
     with pytest.raises(NerfroError, match="interface=mesh needs a medium made of meshes"):
         Snell("mesh")(random_rays(2, 1.0, seed=0, far=9), Ball())
-    with pytest.raises(NerfroError, match="max_events=0"):
-        Snell(max_events=0)
