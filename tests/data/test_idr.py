@@ -1,7 +1,6 @@
 """Matrices of IDR and NeuS are decomposed into the cameras that they were made of."""
 
 from collections.abc import Callable
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +10,10 @@ import torch
 
 from nerfro.data.base import Views
 from nerfro.errors import NerfroError
-from nerfro.registry import discover
 
-from .formats import SCALE, SHIFT, write_idr
+from .formats import SCALE, SHIFT, idr, write_idr
 from .photographs import POINTS
 
-discover()
-idr = import_module("nerfro_plugins.data_formats.idr")
 IdrData, decompose = idr.IdrData, idr.decompose
 
 

@@ -1,19 +1,15 @@
 """RefRef's parquet files."""
 
 import math
-from importlib import import_module
 
 import numpy as np
 import pytest
 
 from nerfro.errors import NerfroError
-from nerfro.registry import discover
 
-from .formats import REFREF_LENS, few_refref_views, write_refref  # noqa: F401
+from .formats import REFREF_LENS, few_refref_views, refref, write_refref  # noqa: F401
 from .photographs import check_views
 
-discover()
-refref = import_module("nerfro_plugins.data_formats.refref")
 RefRefData = refref.RefRefData
 
 pytestmark = pytest.mark.usefixtures("few_refref_views")

@@ -58,14 +58,8 @@ def test_masks_are_given_or_lie_with_the_references_or_are_their_transparency(
     assert not match_folders(predictions, references, None, [2])[0].load("drop")[2].any()
     for name in ("a", "b"):
         write(tmp_path / "transparent" / f"{name}.png", channels=4, level=153)
-    pairs = match_folders(predictions, tmp_path / "transparent", None)
-    assert pairs[0].load("drop")[2].unique().tolist() == pytest.approx([153 / 255])
-
-
-def test_transparency_is_dropped_or_composited(folders: tuple[Path, Path], tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        write(tmp_path / "transparent" / f"{name}.png", channels=4, level=153)
-    pair = match_folders(folders[0], tmp_path / "transparent", None)[0]
+    pair = match_folders(predictions, tmp_path / "transparent", None)[0]
+    assert pair.load("drop")[2].unique().tolist() == pytest.approx([153 / 255])
     for alpha, expected in (("drop", 0.6), ("black", 0.36), ("white", 0.76)):
         # Pictures are kept in 16 bits.
         assert pair.load(alpha)[1].unique().tolist() == pytest.approx([expected], abs=1 / 2**16)

@@ -47,14 +47,6 @@ def test_psnr_is_that_of_scikit_image(seed: int) -> None:
     assert psnr(prediction, target).item() == pytest.approx(expected, abs=1e-6)
 
 
-def test_psnr_on_a_mask_is_that_of_its_pixels() -> None:
-    prediction, target = pictures()
-    inside = torch.zeros(target.shape[:2], dtype=torch.bool)
-    inside[4:20, 7:30] = True
-    expected = peak_signal_noise_ratio(target[inside].numpy(), prediction[inside].numpy(), data_range=1.0)
-    assert psnr(prediction, target, inside).item() == pytest.approx(expected, abs=1e-5)
-
-
 def test_mean_psnr_is_the_mean_over_views_and_not_over_pixels() -> None:
     target = torch.full((16, 16, 3), 0.4)
     result = scored((target + 0.2, target), (target + 1 / 255, target))

@@ -72,6 +72,13 @@ def one_ray(scene: TrainedScene, cameras: Cameras | None = None) -> Float[torch.
     return scene.render(cameras or scene.cameras("test"), Subdivision()).rgb
 
 
+def in_embedded_scene(scene: TrainedScene, medium: SdfGrid) -> TrainedScene:
+    """The ball inside another medium, under the embedded scene's sky and seen by its cameras."""
+    sky = EnvironmentMap([128], image=str(resolve_path("embedded:torus/sky.png")))
+    renderer = with_changed_scene(scene.renderer, medium=medium, boundary=sky)
+    return TrainedScene(renderer, BlenderData("embedded:torus", downscale=2))
+
+
 @pytest.fixture
 def glass_cube(scene: TrainedScene) -> TrainedScene:
     """The embedded scene's glass, sky and cameras around the ball inside, and a bubble in the glass; both disperse."""
@@ -81,10 +88,7 @@ def glass_cube(scene: TrainedScene) -> TrainedScene:
     axes = torch.stack(torch.meshgrid(*[torch.linspace(-1.5, 1.5, 64)] * 3, indexing="ij"), -1)
     bubble = torch.linalg.vector_norm(axes - torch.tensor([-0.3, -0.3, 0.2]), dim=-1) - 0.15
     medium = SdfGrid.from_distances([outer.grids[0].distances, bubble], box, [1.5, 1.05], outer.shell, abbe=[8.0])
-    sky = EnvironmentMap([128], image=str(resolve_path("embedded:torus/sky.png")))
-    return TrainedScene(
-        with_changed_scene(scene.renderer, medium=medium, boundary=sky), BlenderData("embedded:torus", downscale=2)
-    )
+    return in_embedded_scene(scene, medium)
 
 
 @needs_chromium
@@ -100,10 +104,7 @@ def test_five_cameras_of_a_cube_with_bodies_inside_agree_with_nerfro(glass_cube:
 @needs_chromium
 def test_a_vessel_agrees_with_nerfro(scene: TrainedScene, tmp_path: Path) -> None:
     vessel = spherical_vessel(tmp_path, level=0.9, resolution=64, absorption=[0.3, 1.0, 2.0, 1.0, 0.0, 0.5])
-    sky = EnvironmentMap([128], image=str(resolve_path("embedded:torus/sky.png")))
-    vessel_scene = TrainedScene(
-        with_changed_scene(scene.renderer, medium=vessel, boundary=sky), BlenderData("embedded:torus", downscale=2)
-    )
+    vessel_scene = in_embedded_scene(scene, vessel)
     # Dyed walls of index 1 absorb, another liquid changes the picture, and air has no index to change.
     code = f"""(() => {{ {SHOT}
       const seen = [shot(0, 64), shot(9, 64)];
