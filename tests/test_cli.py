@@ -9,10 +9,9 @@ from pathlib import Path
 import pytest
 import yaml
 from hydra import compose, initialize_config_dir
-from hydra.core.config_store import ConfigStore
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import OverrideParseException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 
 from nerfro.cli import _flags_first
 from nerfro.composition import RenamingFiles
@@ -21,9 +20,9 @@ from nerfro.failures import errors_in_one_line, in_one_line
 from nerfro.files.foreign_config import foreign_config
 from nerfro.old_names import RENAMED, is_old_name, renamed_override
 from nerfro.paths import CONF_DIR, resolve_path, user_path
-from nerfro.registry import discover, plugins
-from nerfro.training.config import TrainConfig
+from nerfro.registry import plugins
 from nerfro.trust import GuardedConfigLoader
+from tests.conftest import composed
 
 
 @pytest.mark.parametrize("num_lines", [1, 10_000])  # less and more than a pipe's buffer
@@ -194,13 +193,6 @@ def test_bodies_are_settings_of_the_medium(tmp_path: Path, capsys: pytest.Captur
     config = RenamingFiles("main", str(tmp_path)).load_config("experiment/mine").config
     assert config == {"medium": {"bodies": {"a": {"ior": 1.5}}}}
     assert not capsys.readouterr().out
-
-
-def composed(*overrides: str) -> DictConfig:
-    discover()
-    ConfigStore.instance().store(name="train_schema", node=TrainConfig, provider="nerfro")
-    with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
-        return compose("train", list(overrides))
 
 
 def test_groups_of_parameters_are_added_to_those_of_the_experiment() -> None:

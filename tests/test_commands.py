@@ -87,7 +87,7 @@ def test_the_cache_ends_when_a_plugin_changes(cache: Path) -> None:
 
 
 def test_a_missing_option_is_told_with_an_example(run_here: Callable, unchecked: None) -> None:
-    done = run_here("view")
+    done = run_here("view", code=1)
     assert done.err == "nerfro: error: checkpoint=... is missing; for example: nerfro view checkpoint=outputs/first\n"
 
 
@@ -135,7 +135,7 @@ def test_demo_opens_the_page_and_ends_with_the_score_in_one_line(
     assert address == "nerfro: the page: http://localhost:1"
     assert last.startswith("PSNR 31.3 dB on 1 photographs that were not trained on; page: ")
     commands["nerfro.train"] = ["raise SystemExit(3)"]
-    assert run_here("demo")[:2] == (3, "")
+    assert run_here("demo", code=3).out == ""
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 

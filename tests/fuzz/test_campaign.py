@@ -1,6 +1,5 @@
 """A short slice of `tests/fuzz/campaign.py`: a few cases of every kind."""
 
-
 import pytest
 
 from tests.fuzz.campaign import run_case
