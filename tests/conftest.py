@@ -12,7 +12,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jaxtyping
 import numpy as np
@@ -25,6 +25,7 @@ from omegaconf import DictConfig
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from nerfro.errors import NerfroError
 from nerfro.evaluation.lpips import NO_NETWORK, MissingNetwork
 from nerfro.paths import CONF_DIR
 from nerfro.synthetic import llvm
@@ -102,6 +103,14 @@ def restored_registry(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     for name in set(sys.modules) - known:
         if name.startswith("nerfro_plugins."):
             del sys.modules[name]
+
+
+def refused(message: str, call: Callable[..., object], /, *arguments: Any, **options: Any) -> str:
+    """Require that a call raises an error of one line in which a pattern is found; returns the line."""
+    with pytest.raises(NerfroError, match=message) as error:
+        call(*arguments, **options)
+    assert "\n" not in str(error.value)
+    return str(error.value)
 
 
 class Bomb:

@@ -8,8 +8,8 @@ import pytest
 from omegaconf import OmegaConf
 
 from nerfro.allowed import AnyNumber, Count, NotNegative, Positive, Range, check_settings, checked, corners_of_box
-from nerfro.errors import NerfroError
 from nerfro.registry import create, discover, find
+from tests.conftest import refused
 
 
 @checked("thing")
@@ -45,8 +45,7 @@ def test_what_is_allowed_passes() -> None:
     ],
 )
 def test_what_is_not_allowed_is_refused(arguments: dict[str, object], message: str) -> None:
-    with pytest.raises(NerfroError, match=message):
-        Thing(**{"count": 1, **arguments})  # type: ignore[arg-type]
+    refused(message, Thing, **{"count": 1, **arguments})
 
 
 @dataclass
@@ -71,8 +70,7 @@ def test_setting_of_a_configuration_is_named_in_full(override: str, message: str
     config = OmegaConf.structured(Outer)
     check_settings(config, Outer)
     config.merge_with_dotlist([override])
-    with pytest.raises(NerfroError, match=message):
-        check_settings(config, Outer)
+    refused(message, check_settings, config, Outer)
 
 
 MESH = "embedded:torus/mesh.ply"
@@ -121,11 +119,9 @@ def test_options_of_plugins_that_are_out_of_range_are_refused(
     kind: str, name: str, options: dict[str, object], message: str
 ) -> None:
     discover()
-    with pytest.raises(NerfroError, match=message):
-        create(find(kind, name), options)
+    refused(message, create, find(kind, name), options)
 
 
 @pytest.mark.parametrize("box_max", [[1.0, 0.0, 1.0], [1.0, 1.0], [1.0, 1.0, math.nan], [1.0, 1.0, math.inf]])
 def test_what_is_no_box_is_refused(box_max: list[float]) -> None:
-    with pytest.raises(NerfroError, match="is not a box; give three numbers each, min below max"):
-        corners_of_box([0.0] * 3, box_max)
+    refused("is not a box; give three numbers each, min below max", corners_of_box, [0.0] * 3, box_max)

@@ -105,6 +105,7 @@ def test_damaged_data_is_refused(
         (["medium.ior=0"], ["ior=0.0 is not allowed; take more than 0"]),
         (["medium.resolution=3000"], ["resolution=3000 is not allowed", "at most 2048"]),
         (["medium.smoothing_size=999999"], ["smoothing_size=999999 is not allowed", "at most 99"]),
+        (["batches.num_validation_views=-1"], ["num_validation_views=-1 is not allowed; take at least 0"]),
         (["batches.size=1e12"], ["batches.size", "could not be converted to Integer"]),
         (["optimizer.learning_rate=nan"], ["optimizer.learning_rate=nan is not allowed"]),
         (["trainer.precision=8"], ["trainer.precision='8' is not allowed; choose '32-true'"]),

@@ -22,7 +22,7 @@ from nerfro.old_names import RENAMED, is_old_name, renamed_override
 from nerfro.paths import CONF_DIR, resolve_path, user_path
 from nerfro.registry import plugins
 from nerfro.trust import GuardedConfigLoader
-from tests.conftest import composed
+from tests.conftest import composed, refused
 
 
 @pytest.mark.parametrize("num_lines", [1, 10_000])  # less and more than a pipe's buffer
@@ -75,8 +75,7 @@ def test_flags_may_stand_anywhere() -> None:
     assert _flags_first(given) == ["--config-dir", "mine", "-m", "seed=1", "seed=2"]
     assert _flags_first(["~seed", "+a=-1"]) == ["~seed", "+a=-1"]
     for flags, message in ((["--sed"], "--sed is not an option; write key=value"), (["-p", "a"], "need --cfg")):
-        with pytest.raises(NerfroError, match=message):
-            _flags_first(flags)
+        refused(message, _flags_first, flags)
 
 
 def test_messages_are_one_line_whatever_files_are_called(capsys: pytest.CaptureFixture[str]) -> None:
@@ -119,14 +118,12 @@ def test_a_file_that_is_no_yaml_is_named_with_the_line(tmp_path: Path) -> None:
 @pytest.mark.parametrize("location", ["~nobody_of_that_name/run", "a\0b"])
 def test_paths_that_cannot_be_are_refused(location: str) -> None:
     for take in (user_path, resolve_path):
-        with pytest.raises(NerfroError, match=r"give the full path|give another"):
-            take(location)
+        refused(r"give the full path|give another", take, location)
 
 
 @pytest.mark.parametrize("location", ["embedded:", "embedded:nothing", "embedded:_lpips", "embedded:.."])
 def test_what_is_not_embedded_is_refused(location: str) -> None:
-    with pytest.raises(NerfroError, match="embedded scenes: torus"):
-        resolve_path(location)
+    refused("embedded scenes: torus", resolve_path, location)
 
 
 OLD_NAMES = {
@@ -160,8 +157,7 @@ def test_old_names_in_overrides_are_replaced_with_a_warning(
     assert renamed_override(old) == new
     printed = capsys.readouterr().out
     assert ("since this release" in printed) == (old != new)
-    with pytest.raises(NerfroError, match=r"medium\.old_depth was removed .* leave it out"):
-        renamed_override("medium.old_depth=3")
+    refused(r"medium\.old_depth was removed .* leave it out", renamed_override, "medium.old_depth=3")
 
 
 def test_old_names_in_files_of_users_and_in_old_runs_are_replaced_with_a_warning(
@@ -176,8 +172,7 @@ def test_old_names_in_files_of_users_and_in_old_runs_are_replaced_with_a_warning
     config = files.load_config("experiment/mine").config
     assert config == {"defaults": ["glass", {"/loss@loss.distortion": "distortion"}, "_self_"], "batches": {"size": 7}}
     (tmp_path / "experiment" / "mine.yaml").write_text("# @package _global_\nmedium: {old_depth: 7}\n")
-    with pytest.raises(NerfroError, match=r"experiment/mine\.yaml: medium\.old_depth was removed"):
-        files.load_config("experiment/mine")
+    refused(r"experiment/mine\.yaml: medium\.old_depth was removed", files.load_config, "experiment/mine")
     assert "experiment/mine.yaml: batches.hidden is called batches.size since this release" in capsys.readouterr().out
 
     run = foreign_config("batches: {hidden: 7}\nmedium: {old_depth: 7, ior: 1.5}\n", tmp_path / "config.yaml")

@@ -13,10 +13,10 @@ import pytest
 
 import nerfro.demo
 from nerfro.completion import completions
-from nerfro.errors import NerfroError
 from nerfro.options import Described, recall, remember
 from nerfro.paths import PACKAGE_DIR
 from nerfro.viewing.server import open_page
+from tests.conftest import refused
 
 DESCRIBED = Described(
     "All options.",
@@ -71,8 +71,7 @@ def test_help_version_and_mistakes_do_not_wait_for_torch(arguments: list[str], p
     ],
 )
 def test_names_that_nothing_knows_are_refused(mistake: str, message: str) -> None:
-    with pytest.raises(NerfroError, match=message):
-        DESCRIBED.require_known(["seed=1", mistake])
+    refused(message, DESCRIBED.require_known, ["seed=1", mistake])
 
 
 def test_the_cache_ends_when_a_plugin_changes(cache: Path) -> None:

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from nerfro.boundaries.constant import ConstantBoundary
 from nerfro.data.base import Views
-from nerfro.errors import NerfroError
 from nerfro.fields.base import Field
 from nerfro.fields.nerf import NerfField
 from nerfro.files import lat_long
@@ -31,7 +30,7 @@ from nerfro.training.optimizer import OptimizerConfig
 from nerfro.training.run_folder import load_checkpoint, restore
 from nerfro.types import Radiance, Samples
 from tests.ball_photographs import save
-from tests.conftest import QUIET
+from tests.conftest import QUIET, refused
 from tests.exact_silhouettes import cameras_around
 
 discover()
@@ -166,8 +165,7 @@ def test_several_processes_are_refused_before_training() -> None:
     module.trainer = SimpleNamespace(world_size=1)  # type: ignore[assignment]
     module.setup("fit")
     module.trainer = SimpleNamespace(world_size=2)  # type: ignore[assignment]
-    with pytest.raises(NerfroError, match="trains in one process"):
-        module.setup("fit")
+    refused("trains in one process", module.setup, "fit")
 
 
 # All of it, from the command line.

@@ -20,7 +20,6 @@ from torch import nn
 
 from nerfro.data.base import DataSource, Views
 from nerfro.data.blender import BlenderData
-from nerfro.errors import NerfroError
 from nerfro.losses.base import Loss
 from nerfro.media.base import Medium
 from nerfro.media.surface import Surface
@@ -32,7 +31,7 @@ from nerfro.training.phases.base import Phase, Run
 from nerfro.viewing import PLUGIN_EXPORTS
 from nerfro.viewing.exports import Export, find_export
 from nerfro.viewing.trained_scene import TrainedScene
-from tests.conftest import Finished
+from tests.conftest import Finished, refused
 
 discover()
 
@@ -82,9 +81,7 @@ def test_plugin_that_fails_is_named_with_the_cause(
     source: str, cause: str, write_plugin: Callable[[str, str], Path]
 ) -> None:
     folder = write_plugin("broken", source)
-    with pytest.raises(NerfroError) as caught:
-        discover(folder)
-    assert str(caught.value).startswith(f"plugin {folder / 'broken.py'} cannot be imported: {cause}")
+    refused(f"^plugin {folder / 'broken.py'} cannot be imported: {cause}", discover, folder)
 
 
 METRIC = """
@@ -112,10 +109,7 @@ def test_metric_that_cannot_be_scored_is_refused_with_its_file(
     part: str, replacement: str, advice: str, write_plugin: Callable[[str, str], Path]
 ) -> None:
     folder = write_plugin("worst_metric", METRIC.replace(part, replacement))
-    with pytest.raises(NerfroError) as caught:
-        discover(folder)
-    assert str(caught.value).startswith(f"plugin {folder / 'worst_metric.py'}: metric=worst: class Worst ")
-    assert advice in str(caught.value)
+    assert advice in refused(f"^plugin {folder / 'worst_metric.py'}: metric=worst: class Worst ", discover, folder)
 
 
 def test_metric_without_a_title_is_called_by_its_name(write_plugin: Callable[[str, str], Path]) -> None:
@@ -209,17 +203,14 @@ def test_check_names_the_broken_contract(kind: str, base: type, members: dict[st
 def test_views_refuse_a_list_of_images() -> None:
     # Without the constructor, whose annotations are checked in tests alone.
     views = SimpleNamespace(images=[torch.zeros(16, 16, 3)], masks=None, usable=None)
-    with pytest.raises(NerfroError, match=r"Views\.images is a list; give one tensor of all views"):
-        Views.__post_init__(views)  # type: ignore[arg-type]
+    refused(r"Views\.images is a list; give one tensor of all views", Views.__post_init__, views)
 
 
 def test_plugin_with_a_taken_name_names_both_modules_and_its_file(write_plugin: Callable[[str, str], Path]) -> None:
     folder = write_plugin("clash", BOUNDARY.format(name="constant"))
-    with pytest.raises(NerfroError) as caught:
-        discover(folder)
-    for word in (str(folder / "clash.py"), "boundary=constant is registered twice", "nerfro.boundaries.constant"):
-        assert word in str(caught.value)
-    assert "nerfro_plugins.clash" in str(caught.value)
+    message = refused("boundary=constant is registered twice", discover, folder)
+    for word in (str(folder / "clash.py"), "nerfro.boundaries.constant", "nerfro_plugins.clash"):
+        assert word in message
 
 
 def test_two_files_of_one_name_are_refused(tmp_path: Path) -> None:
@@ -227,14 +218,12 @@ def test_two_files_of_one_name_are_refused(tmp_path: Path) -> None:
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "same.py").write_text(BOUNDARY.format(name=f"grey_{folder}"))
     discover(tmp_path / "one")
-    with pytest.raises(NerfroError, match=r"two plugin files are called same: .*one.* and .*two"):
-        discover(tmp_path / "two")
+    refused(r"two plugin files are called same: .*one.* and .*two", discover, tmp_path / "two")
 
 
 def test_missing_plugin_folder_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NERFRO_PLUGINS", str(tmp_path / "nowhere"))
-    with pytest.raises(NerfroError, match=r"plugin folder .*nowhere does not exist; correct NERFRO_PLUGINS"):
-        discover()
+    refused(r"plugin folder .*nowhere does not exist; correct NERFRO_PLUGINS", discover)
 
 
 @pytest.mark.parametrize(("variable", "found"), [(None, True), ("", False)])
@@ -356,8 +345,7 @@ def test_exports_keep_their_contract(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_export_without_a_writer_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(PLUGIN_EXPORTS, "broken", __name__)
-    with pytest.raises(NerfroError, match=r"test_plugins\.py of what=broken defines no EXPORT"):
-        find_export("broken", Path("out.csv"))
+    refused(r"test_plugins\.py of what=broken defines no EXPORT", find_export, "broken", Path("out.csv"))
 
 
 def test_loss_that_is_no_scalar_is_refused(train_template: Callable[..., Finished]) -> None:

@@ -13,6 +13,7 @@ import nerfro.training.lightning_callbacks
 from nerfro.errors import NerfroError
 from nerfro.registry import build, configure, discover, find, register
 from nerfro.training.config import build_each
+from tests.conftest import refused
 
 discover()
 
@@ -97,20 +98,17 @@ def test_constructor_that_takes_anything_is_refused() -> None:
     ],
 )
 def test_wrong_fields_are_refused(fields: dict[str, object], message: str) -> None:
-    with pytest.raises(NerfroError, match=message):
-        configure(find("sampler/path", "eikonal"), fields)
+    refused(message, configure, find("sampler/path", "eikonal"), fields)
 
 
 def test_missing_required_field_is_named() -> None:
-    with pytest.raises(NerfroError, match=r"data=opencv needs root; add data\.root=\.\.\."):
-        configure(find("data", "opencv"), {})
+    refused(r"data=opencv needs root; add data\.root=\.\.\.", configure, find("data", "opencv"), {})
 
 
 @pytest.mark.parametrize("target", ["os.system", "nerfro.samplers.paths.eikonal.march_uniform", None])
 def test_target_that_is_not_registered_is_not_built(target: str | None, tmp_path: Path) -> None:
     node = {"_target_": target, "command": f"touch {tmp_path / 'ran'}"}
-    with pytest.raises(NerfroError, match=f"'{target}' is not registered; .*nerfro.plugins"):
-        build(node)
+    refused(f"'{target}' is not registered; .*nerfro.plugins", build, node)
     assert not (tmp_path / "ran").exists()
 
 
@@ -120,8 +118,7 @@ def test_target_inside_a_lightning_object_is_not_built(nested: str, target: str,
     node: dict[str, Any] = {"_target_": target, "command": f"touch {tmp_path / 'ran'}"}
     trainer = {"_target_": "lightning.pytorch.Trainer", nested: node if nested == "strategy" else [node]}
     config = OmegaConf.create({"name": "os.system", "trainer": trainer})
-    with pytest.raises(NerfroError, match=r"'os\.system' inside lightning\.pytorch\.Trainer is not registered"):
-        build(config.trainer)
+    refused(r"'os\.system' inside lightning\.pytorch\.Trainer is not registered", build, config.trainer)
     assert not (tmp_path / "ran").exists()
 
 
@@ -146,8 +143,7 @@ def test_unknown_field_of_a_lightning_object_is_refused() -> None:
     ],
 )
 def test_wrong_losses_are_refused(losses: dict[str, object], message: str) -> None:
-    with pytest.raises(NerfroError, match=message):
-        build_each("loss", OmegaConf.create(losses))
+    refused(message, build_each, "loss", OmegaConf.create(losses))
 
 
 # Refusals in an experiment file.

@@ -25,7 +25,7 @@ from nerfro.training.run_folder import (
     load_checkpoint,
     require_same_configuration,
 )
-from tests.conftest import Bomb
+from tests.conftest import Bomb, refused
 from tests.forked import Command
 
 SCHEDULE = ["checkpoint.every_steps=3", "checkpoint.every_seconds=null", "evaluation.every=5", "trainer.max_steps=12"]
@@ -148,16 +148,14 @@ def test_last_finds_the_newest_run_beside_a_new_folder(tmp_path: Path) -> None:
 def test_checkpoint_of_another_configuration_is_refused(change: dict, message: str, tmp_path: Path) -> None:
     trained = OmegaConf.create({"field": {"width": 8}, "seed": 0, "medium": {"ior": 1.5}, "batches": {"size": 4}})
     require_same_configuration(tmp_path / "a.ckpt", trained, trained)
-    with pytest.raises(NerfroError, match=message):
-        require_same_configuration(tmp_path / "a.ckpt", trained, OmegaConf.merge(trained, change))
+    refused(message, require_same_configuration, tmp_path / "a.ckpt", trained, OmegaConf.merge(trained, change))
 
 
 def test_pickled_code_in_a_checkpoint_is_not_executed(tmp_path: Path) -> None:
     path, traces = tmp_path / "bomb.ckpt", tmp_path / "it_ran"
     torch.save({"nerfro_config": "seed: 0", "state_dict": Bomb(f"touch {traces}")}, path)
-    with pytest.raises(NerfroError, match="is not a readable nerfro checkpoint") as caught:
-        load_checkpoint(path)
-    assert "weights_only" not in str(caught.value), "torch's advice would run it"
+    message = refused("is not a readable nerfro checkpoint", load_checkpoint, path)
+    assert "weights_only" not in message, "torch's advice would run it"
     assert not traces.exists()
 
 

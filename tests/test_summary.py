@@ -10,7 +10,6 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from nerfro.errors import NerfroError
 from nerfro.evaluation.image_metrics import image_metrics
 from nerfro.evaluation.results import EvaluationResult, RunMetrics, ViewScores, write_metrics_json
 from nerfro.evaluation.tables import Table
@@ -18,7 +17,7 @@ from nerfro.files.images import save_png
 from nerfro.report.comparison import compare, find_metrics, to_table
 from nerfro.report.runs import find_runs
 from nerfro.training.run_folder import LAST_CHECKPOINT, record
-from tests.conftest import Finished
+from tests.conftest import Finished, refused
 
 PAPER = find_metrics(["psnr", "ssim", "lpips"])
 FIELD = {"_target_": "nerfro.fields.nerf.NerfField", "width": 64, "scale": 1.0}
@@ -176,17 +175,14 @@ def test_places_are_folders_and_globs_and_runs_without_scores_are_named(tmp_path
     assert [run.folder.name for run in runs] == ["a", "b"]
     assert len(unfinished) == 1
     assert str(tmp_path / "c") in unfinished[0]
-    with pytest.raises(NerfroError, match=r"has not been evaluated$"):
-        find_runs([str(tmp_path / "c")])
+    refused(r"has not been evaluated$", find_runs, [str(tmp_path / "c")])
     (tmp_path / "c" / LAST_CHECKPOINT).parent.mkdir()
     (tmp_path / "c" / LAST_CHECKPOINT).touch()
-    with pytest.raises(NerfroError, match=rf"; run python -m nerfro.evaluate checkpoint={tmp_path / 'c'}$"):
-        find_runs([str(tmp_path / "c")])
+    refused(rf"; run python -m nerfro.evaluate checkpoint={tmp_path / 'c'}$", find_runs, [str(tmp_path / "c")])
     (tmp_path / "d").mkdir()
     (tmp_path / "d" / "cell.json").write_text(json.dumps({"state": "failed", "reason": "no space left"}))
     assert find_runs([str(tmp_path)])[1][1] == f"{tmp_path / 'd'} is omitted: it failed: no space left"
-    with pytest.raises(NerfroError, match="nowhere does not exist"):
-        find_runs([str(tmp_path / "nowhere")])
+    refused("nowhere does not exist", find_runs, [str(tmp_path / "nowhere")])
 
 
 def test_run_without_scores_has_those_of_its_later_evaluation(tmp_path: Path) -> None:

@@ -123,17 +123,10 @@ def test_weights_depend_on_the_seed_and_not_on_validation(
 
 def test_training_learns_the_scene(train_here: Callable[..., Any], tiny_run: list[str], tmp_path: Path) -> None:
     psnr = []
+    quick = ["evaluation.every=0", "optimizer.warmup_steps=0", "optimizer.learning_rate=1e-2", "batches.size=128"]
     for steps in (1, 150):
         folder = tmp_path / str(steps)
-        train_here(
-            *tiny_run,
-            f"hydra.run.dir={folder}",
-            f"trainer.max_steps={steps}",
-            "evaluation.every=0",
-            "optimizer.warmup_steps=0",
-            "optimizer.learning_rate=1e-2",
-            "batches.size=128",
-        )
+        train_here(*tiny_run, *quick, f"trainer.max_steps={steps}", f"hydra.run.dir={folder}")
         psnr.append(json.loads((folder / "metrics.json").read_text())["test"]["psnr"])
     assert psnr[1] > psnr[0] + 3
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from nerfro.data.base import Views
-from nerfro.errors import NerfroError
+from tests.conftest import refused
 
 from .formats import FAR, IDEAL, NEAR, llff, write_llff
 from .photographs import FX, HEIGHT, POINTS, WIDTH, project
@@ -122,19 +122,15 @@ def test_wrong_files_are_refused(write):
         (np.where(np.arange(17) == 16, 1e30, rows), r"data\.far=1.* is not allowed; take at least 0"),
     ):
         np.save(path, content)
-        with pytest.raises(NerfroError, match=message):
-            load(root)
+        refused(message, load, root)
     path.write_bytes(path.read_bytes()[:200])
-    with pytest.raises(NerfroError, match=r"poses_bounds\.npy cannot be read"):
-        load(root)
+    refused(r"poses_bounds\.npy cannot be read", load, root)
     path.unlink()
-    with pytest.raises(NerfroError, match="does not exist; create it with LLFF"):
-        load(root)
+    refused("does not exist; create it with LLFF", load, root)
 
 
 def test_parallel_cameras_have_no_sphere():
     poses = np.tile(np.eye(4)[:3], (4, 1, 1))
     poses[:, 0, 3] = np.arange(4)
-    with pytest.raises(NerfroError, match="all optical axes are parallel"):
-        frame_transform(poses, np.array([[1.0, 2.0]] * 4), "eikonal")
+    refused("all optical axes are parallel", frame_transform, poses, np.array([[1.0, 2.0]] * 4), "eikonal")
     assert np.isfinite(frame_transform(poses, np.array([[1.0, 2.0]] * 4), "llff")).all()

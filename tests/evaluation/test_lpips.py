@@ -7,7 +7,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfro.errors import NerfroError
 from nerfro.evaluation import pretrained
 from nerfro.evaluation.lpips import (
     CONVOLUTIONS,
@@ -16,6 +15,7 @@ from nerfro.evaluation.lpips import (
     find_lpips_network,
     load_lpips_network,
 )
+from tests.conftest import refused
 
 
 class Reference(NamedTuple):
@@ -104,5 +104,4 @@ def test_a_missing_network_is_reported_with_the_reason(tmp_path: Path, monkeypat
 def test_weights_of_another_network_are_refused() -> None:
     other = random_weights()
     other["features.3.weight"] = other["features.3.weight"][:, :3]
-    with pytest.raises(NerfroError, match=r"features\.3\.weight of shape \[192, 64, 5, 5\], found \[192, 3, 5, 5\]"):
-        load_lpips_network(other)
+    refused(r"features\.3\.weight of shape \[192, 64, 5, 5\], found \[192, 3, 5, 5\]", load_lpips_network, other)

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from nerfro.errors import NerfroError
 from nerfro.files.atomic import atomic_file, write_atomically
 from nerfro.training.checkpoint_files import CheckpointFiles
+from tests.conftest import refused
 
 
 def save_checkpoint(path: Path, content: str) -> None:
@@ -28,8 +28,7 @@ def test_full_disk_leaves_the_old_file_whole_and_nothing_beside_it(
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, step, fail)
-    with pytest.raises(NerfroError, match=r"metrics\.json: No space left on device"):
-        write(path, "new")
+    refused(r"metrics\.json: No space left on device", write, path, "new")
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
 
@@ -51,9 +50,7 @@ def test_the_permissions_of_new_files_in_other_threads_are_not_touched(
 
 def test_folder_that_cannot_be_made_is_an_error_of_one_line(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(NerfroError, match="cannot write") as caught:
-        write_atomically(tmp_path / "file" / "metrics.json", "{}")
-    assert "\n" not in str(caught.value)
+    refused("cannot write", write_atomically, tmp_path / "file" / "metrics.json", "{}")
 
 
 @pytest.mark.parametrize("stop", [ValueError, KeyboardInterrupt])

@@ -10,6 +10,7 @@ from nerfro.errors import NerfroError
 from nerfro.geometry.interpolation import gradient
 from nerfro.media.voxel_grid import VoxelGrid
 from tests.closed_forms import grid_points
+from tests.conftest import refused
 
 BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
 
@@ -70,9 +71,9 @@ def test_grids_are_not_in_checkpoints() -> None:
 
 
 def test_the_box_that_the_margin_message_names_is_accepted(sphere: str) -> None:
-    with pytest.raises(NerfroError, match="voxels of air") as error:
-        VoxelGrid(sphere, resolution=64, box_min=[-0.8] * 3, box_max=[0.8] * 3, cache=False)
-    low, high = (part.split("[")[1].split("]")[0] for part in str(error.value).split("medium.box_")[1:])
+    small: dict[str, list[float]] = {"box_min": [-0.8] * 3, "box_max": [0.8] * 3}
+    message = refused("voxels of air", VoxelGrid, sphere, resolution=64, cache=False, **small)
+    low, high = (part.split("[")[1].split("]")[0] for part in message.split("medium.box_")[1:])
     corners = [[float(number) for number in corner.split(",")] for corner in (low, high)]
     VoxelGrid(sphere, resolution=64, box_min=corners[0], box_max=corners[1], cache=False)
     with pytest.raises(NerfroError, match=r"box_min=.*box_max="):
@@ -80,5 +81,4 @@ def test_the_box_that_the_margin_message_names_is_accepted(sphere: str) -> None:
 
 
 def test_a_grid_without_margin_is_refused() -> None:
-    with pytest.raises(NerfroError, match="touches the grid's border"):
-        VoxelGrid.from_occupancy(torch.ones(8, 8, 8), BOX, 1.5, 3, 1.0)
+    refused("touches the grid's border", VoxelGrid.from_occupancy, torch.ones(8, 8, 8), BOX, 1.5, 3, 1.0)

@@ -63,15 +63,8 @@ def test_straight_rays_end_on_the_backdrop(
     train_here: Callable[..., Any], cut_out: Path, tmp_path: Path, options: list[str], told: bool
 ) -> None:
     run = tmp_path / "run"
-    finished = train_here(
-        "+experiment=straight",
-        f"data.root={cut_out}",
-        "trainer.max_steps=2",
-        "batches.size=64",
-        *QUIET,
-        f"hydra.run.dir={run}",
-        *options,
-    )
+    few = ["+experiment=straight", f"data.root={cut_out}", "trainer.max_steps=2", "batches.size=64", *QUIET]
+    finished = train_here(*few, f"hydra.run.dir={run}", *options)
     assert ("plain backdrop (102, 102, 102)" in finished.out) == told
     config = OmegaConf.load(run / "config.yaml")
     if told:

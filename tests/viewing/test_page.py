@@ -16,7 +16,6 @@ from PIL import Image
 from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.cameras import Cameras
 from nerfro.data.blender import BlenderData
-from nerfro.errors import NerfroError
 from nerfro.evaluation.image_metrics import psnr
 from nerfro.fields.base import Field
 from nerfro.files import lat_long
@@ -34,6 +33,7 @@ from nerfro.viewing.changes import with_changed_scene
 from nerfro.viewing.page import make_page
 from nerfro.viewing.trained_scene import TrainedScene
 from tests.closed_forms import Luneburg
+from tests.conftest import refused
 from tests.media.vessels import spherical_vessel
 from tests.viewing.browser import Browser, needs_chromium
 from tests.viewing.conftest import IOR, RADIUS, sky_of
@@ -256,5 +256,4 @@ def test_page_begins_with_the_light_that_the_model_follows(scene: TrainedScene, 
 
 def test_page_of_a_medium_without_surface_is_refused(scene: TrainedScene) -> None:
     lens = replace(scene, renderer=with_changed_scene(scene.renderer, medium=Luneburg()))
-    with pytest.raises(NerfroError, match="bodies with a surface"):
-        make_page(lens, 8)
+    refused("bodies with a surface", make_page, lens, 8)
