@@ -32,6 +32,7 @@ def test_an_index_that_is_off_is_mended_in_training(train_here: Callable[..., An
     save(photographs([1.45]), tmp_path / "ball")
     options = [*TRAINING, f"data.root={tmp_path / 'ball'}", f"medium.ior={1.02 * 1.45}", "medium.learn_ior=true"]
     options += ["optimizer.groups={bodies.*.ior: {learning_rate: 0.006, start: 60}}", "trainer.max_steps=220"]
+    options += ["batches.subdivision.side=2"]
     train_here(*options, f"hydra.run.dir={tmp_path / 'run'}")
     state = load_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")[0]["state_dict"]
     assert state["renderer.scene.medium.materials.0.ior"].item() == pytest.approx(
