@@ -25,6 +25,15 @@ from tests.closed_forms import grid_points
 SIZE, NUM_VIEWS, RADIUS, INNER = 40, 30, 0.7, 0.35
 SHARES = 5  # pixels of masks are divided by so many, each way
 BOX = torch.tensor([[-0.9] * 3, [0.9] * 3])
+# Overrides with which a training on photographs of a ball of index 1.45 takes seconds.
+TRAINING = [
+    "logger=none", "medium.cache=false", "medium.resolution=48", "medium.box_min=[-1,-1,-1]", "medium.box_max=[1,1,1]",
+    "data.near=0.5", "boundary.resolutions=[4,8,16,32]", "batches.size=384", "evaluation.split=train",
+    "sampler.points.num_samples=4", "sampler.points.num_bins=16", "sampler.points.resolution=16",
+    "field.num_levels=2", "field.log2_table_size=8", "field.width=16", "loss.boundary.start=0", "evaluation.every=0",
+    "trainer.accelerator=cpu", "trainer.max_time=null", "evaluation.subdivision.side=1", "batches.subdivision.side=1",
+    "medium.ior=1.45",
+]  # fmt: skip
 
 
 def cameras() -> Cameras:

@@ -5,22 +5,29 @@ import importlib
 import json
 import math
 import os
+import re
+import shutil
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jaxtyping
 import numpy as np
 import pytest
 import torch
 import trimesh
+from hydra import compose, initialize_config_dir
+from hydra.core.config_store import ConfigStore
+from omegaconf import DictConfig
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from nerfro.errors import NerfroError
 from nerfro.evaluation.lpips import NO_NETWORK, MissingNetwork
+from nerfro.paths import CONF_DIR
 from nerfro.synthetic import llvm
 from nerfro.synthetic.path_tracer import load_mitsuba
 
@@ -98,6 +105,35 @@ def restored_registry(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
             del sys.modules[name]
 
 
+def refused(message: str, call: Callable[..., object], /, *arguments: Any, **options: Any) -> str:
+    """Require that a call raises an error of one line in which a pattern is found; returns the line."""
+    with pytest.raises(NerfroError, match=message) as error:
+        call(*arguments, **options)
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+class Bomb:
+    """A value that runs a command when it is unpickled."""
+
+    def __init__(self, command: str) -> None:
+        self.command = command
+
+    def __reduce__(self) -> tuple[Callable[[str], int], tuple[str]]:
+        return os.system, (self.command,)
+
+
+def composed(*overrides: str) -> DictConfig:
+    """The configuration that `nerfro.train` composes of some overrides."""
+    from nerfro.registry import discover
+    from nerfro.training.config import TrainConfig
+
+    discover()
+    ConfigStore.instance().store(name="train_schema", node=TrainConfig, provider="nerfro")
+    with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
+        return compose("train", list(overrides))
+
+
 @pytest.fixture(autouse=True)
 def _seed() -> None:
     torch.manual_seed(0)
@@ -133,22 +169,35 @@ class Finished(NamedTuple):
     out: str
     err: str
 
+    @property
+    def error(self) -> str:
+        """The one line of an error; progress bars of a slow machine may stand before it."""
+        lines = [line for line in self.err.splitlines() if line.strip() and not re.match(r"[\w ]+: +\d+%", line)]
+        assert len(lines) == 1, self.err
+        assert lines[0].startswith("nerfro: error: ")
+        return lines[0]
+
 
 @pytest.fixture
 def run_here(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Finished]:
-    """Run a command's main in this process to its end, as in `run_here("train", "seed=1")`."""
+    """Run a command's main in this process to its end, as in `run_here("train", "seed=1")`.
 
-    def run(name: str, *overrides: str) -> Finished:
+    The command must end with the exit code `code`, by default successfully; None permits any.
+    """
+
+    def run(name: str, *overrides: str, code: int | None = 0) -> Finished:
         main = importlib.import_module(f"nerfro.{name}").main
         monkeypatch.setattr(sys, "argv", [f"nerfro.{name}", *overrides])
         monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
         capsys.readouterr()
-        code = 0
+        ended = 0
         try:
             main()
         except SystemExit as end:
-            code = end.code if isinstance(end.code, int) else 1
-        return Finished(code, *capsys.readouterr())
+            ended = end.code if isinstance(end.code, int) else 1
+        finished = Finished(ended, *capsys.readouterr())
+        assert code in (ended, None), finished.out + finished.err
+        return finished
 
     return run
 
@@ -162,6 +211,12 @@ def train_here(
 
     monkeypatch.setattr(nerfro.train, "find_lpips_network", lambda: NO_NETWORK)
     return functools.partial(run_here, "train")
+
+
+@pytest.fixture
+def train(train_here: Callable[..., Finished], tiny_default_run: list[str], tmp_path: Path) -> Callable[..., Finished]:
+    """Train the default experiment on the tiny scene in tmp_path/run."""
+    return functools.partial(train_here, *tiny_default_run, f"hydra.run.dir={tmp_path / 'run'}")
 
 
 @pytest.fixture
@@ -202,6 +257,16 @@ def tiny_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_tiny_scene(tmp_path_factory.mktemp("scenes") / "tiny_scene")
 
 
+def repaint(scene: Path, root: Path, paint: Callable[[np.ndarray], np.ndarray]) -> Path:
+    """Write the cameras and the mesh of a Blender-format scene with other photographs, painted on those it has."""
+    shutil.copytree(scene, root, dirs_exist_ok=True)
+    for file in sorted(root.glob("*/*.png")):
+        with Image.open(file) as image:
+            levels = np.array(image)
+        Image.fromarray(paint(levels)).save(file)
+    return root
+
+
 def write_tiny_scene(root: Path) -> Path:
     """A Blender-format folder: a ball in front of a sky that is a linear function of direction, 16x16 pixels."""
     root.mkdir()
@@ -223,6 +288,10 @@ def write_tiny_scene(root: Path) -> Path:
         document = {"camera_angle_x": 2 * math.atan(8 / 20), "frames": frames}
         (root / f"transforms_{split}.json").write_text(json.dumps(document))
     return root
+
+
+# Overrides of runs that end after a number of steps and log nothing.
+QUIET = ["trainer.accelerator=cpu", "trainer.max_time=null", "logger=none"]
 
 
 @pytest.fixture(scope="session")
@@ -254,9 +323,7 @@ def tiny_run(tiny_scene: Path) -> list[str]:
         "field.view_width=8",
         "boundary.width=8",
         "loss.smoothness.tile_size=4",
-        "trainer.accelerator=cpu",
-        "trainer.max_time=null",
-        "logger=none",
+        *QUIET,
     ]
 
 
@@ -277,9 +344,7 @@ SMALL = [
     "field.log2_table_size=10",
     "field.width=16",
     "batches.size=32",
-    "trainer.accelerator=cpu",
-    "trainer.max_time=null",
-    "logger=none",
+    *QUIET,
 ]
 
 
@@ -334,14 +399,7 @@ def command(run_here: Callable) -> Callable[..., str]:
     """Run `nerfro.<name>` with overrides; returns what it printed, or its one line of error."""
 
     def run(name: str, *overrides: str) -> str:
-        code, printed, errors = run_here(name, *overrides)
-        if code == 0:
-            return printed
-        assert code == 1
-        # Progress bars start with a carriage return.
-        message = [line for line in errors.split("\n") if line and not line.startswith("\r")]
-        assert len(message) == 1
-        assert message[0].startswith("nerfro: error: ")
-        return f"{message[0]}\n"
+        finished = run_here(name, *overrides, code=None)
+        return finished.error if finished.code else finished.out
 
     return run

@@ -8,7 +8,8 @@ import pytest
 from omegaconf import OmegaConf
 
 from nerfro.allowed import AnyNumber, Count, NotNegative, Positive, Range, check_settings, checked, corners_of_box
-from nerfro.errors import NerfroError
+from nerfro.registry import create, discover, find
+from tests.conftest import refused
 
 
 @checked("thing")
@@ -44,8 +45,7 @@ def test_what_is_allowed_passes() -> None:
     ],
 )
 def test_what_is_not_allowed_is_refused(arguments: dict[str, object], message: str) -> None:
-    with pytest.raises(NerfroError, match=message):
-        Thing(**{"count": 1, **arguments})  # type: ignore[arg-type]
+    refused(message, Thing, **{"count": 1, **arguments})
 
 
 @dataclass
@@ -70,11 +70,58 @@ def test_setting_of_a_configuration_is_named_in_full(override: str, message: str
     config = OmegaConf.structured(Outer)
     check_settings(config, Outer)
     config.merge_with_dotlist([override])
-    with pytest.raises(NerfroError, match=message):
-        check_settings(config, Outer)
+    refused(message, check_settings, config, Outer)
+
+
+MESH = "embedded:torus/mesh.ply"
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "options", "message"),
+    [
+        ("boundary", "constant", {"rgb": [1.0]}, "give three"),
+        ("boundary", "envmap", {"resolutions": []}, "give one or more"),
+        ("boundary", "envmap", {"resolutions": [4, 0]}, r"resolutions=\[4, 0\] is not allowed; take at least 1"),
+        ("data", "opencv", {"root": ".", "eval_crop": 0.0}, "eval_crop=0.0 is not allowed"),
+        ("data", "opencv", {"root": ".", "eval_crop": 1.2}, "eval_crop=1.2 is not allowed"),
+        ("field", "hash_grid", {"box_min": [0.0] * 3, "box_max": [1.0, 0.0, 1.0]}, "min below max"),
+        ("field", "hash_grid", {"box_min": [0.0, 0.0]}, "three numbers"),
+        ("loss", "backdrop", {"colour": [1.0]}, "three numbers in"),
+        ("loss", "backdrop", {"colour": [255.0] * 3}, "three numbers in"),
+        ("loss", "photometric", {"ramp": -1}, "ramp=-1 is not allowed; take at least 0"),
+        ("loss", "photometric", {"start": -1}, "start=-1 is not allowed; take at least 0"),
+        ("loss", "photometric", {"weight": -1}, "weight=-1.0 is not allowed; take at least 0"),
+        ("loss", "smoothness", {"tile_size": 1}, "tile_size=1 is not allowed; take at least 2"),
+        ("loss", "total_variation", {"angle": 0.0}, "more than 0 and less than 90"),
+        ("medium", "ball", {"ior": 0.0}, "ior=0.0 is not allowed; take more than 0"),
+        ("medium", "ball", {"shell": 0.0}, "shell=0.0 is not allowed"),
+        ("medium", "ball", {"abbe": [30.0, 40.0]}, "one for each body"),
+        ("medium", "ball", {"absorption": [0.1, 0.2]}, "red, green and blue of each body"),
+        ("medium", "ball", {"absorption": [-0.1]}, "absorption"),
+        ("medium", "voxel_grid", {"mesh": MESH, "box_max": [1.5, -2.0, 1.5]}, "min below max"),
+        ("medium", "voxel_grid", {"mesh": MESH, "resolution": 2}, "resolution=2 is not allowed; take at least 4"),
+        ("medium", "voxel_grid", {"mesh": MESH, "smoothing_size": 4}, "must be odd"),
+        ("medium", "voxel_grid", {"mesh": MESH, "ior": -1.0}, "medium=voxel_grid: ior=-1.0 is not allowed"),
+        ("sampler/path", "eikonal", {"integrator": "euler", "num_steps": 1}, "num_steps=1"),
+        ("sampler/path", "eikonal", {"tolerance": 0.0}, "tolerance=0.0 is not allowed; take more than 0"),
+        ("sampler/path", "snell", {"max_events": 0}, "max_events=0"),
+        ("sampler/path", "snell", {"least_weight": 0.0}, "least_weight"),
+        ("sampler/path", "snell", {"least_weight": 1.0}, "least_weight"),
+        ("sampler/path", "snell", {"wavelengths": [500.0, 600.0]}, "wavelengths"),
+        ("sampler/points", "hierarchical", {"num_coarse": 3}, "num_coarse=3 is not allowed; take at least 4"),
+        ("sampler/points", "hierarchical", {"num_fine": 0}, "num_fine=0 is not allowed; take at least 1"),
+        ("sampler/points", "stratified", {"num_samples": 1}, "num_samples=1 is not allowed; take at least 2"),
+        ("sampler/points", "stratified", {"offset": 1.0}, "offset=1.0 is not allowed; take at least 0 and less than 1"),
+        ("sampler/points", "stratified", {"cast": "cones", "draw": "vertices"}, "cones have no vertices to draw"),
+    ],
+)
+def test_options_of_plugins_that_are_out_of_range_are_refused(
+    kind: str, name: str, options: dict[str, object], message: str
+) -> None:
+    discover()
+    refused(message, create, find(kind, name), options)
 
 
 @pytest.mark.parametrize("box_max", [[1.0, 0.0, 1.0], [1.0, 1.0], [1.0, 1.0, math.nan], [1.0, 1.0, math.inf]])
 def test_what_is_no_box_is_refused(box_max: list[float]) -> None:
-    with pytest.raises(NerfroError, match="is not a box; give three numbers each, min below max"):
-        corners_of_box([0.0] * 3, box_max)
+    refused("is not a box; give three numbers each, min below max", corners_of_box, [0.0] * 3, box_max)

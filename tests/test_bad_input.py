@@ -1,6 +1,5 @@
 """Input that cannot be trained on is refused in one line, before training starts and with nothing written."""
 
-import json
 import shutil
 from collections.abc import Callable
 from importlib.util import find_spec
@@ -12,11 +11,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-
-def edit(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
-    document = json.loads(path.read_text())
-    change(document)
-    path.write_text(json.dumps(document))
+from tests.data.formats import change_json
 
 
 def put_pose(value: float) -> Callable[[dict[str, Any]], None]:
@@ -54,8 +49,14 @@ DAMAGES: dict[str, tuple[Callable[[Path], object], list[str]]] = {
     "truncated image": (lambda root: truncate(root / "train" / "r_1.png"), ["r_1.png"]),
     "truncated test image": (lambda root: truncate(root / "test" / "r_1.png"), ["test", "r_1.png"]),
     "wrong size": (wrong_size, ["r_1", "12", "16"]),
-    "pose far away": (lambda root: edit(root / "transforms_train.json", put_pose(1e39)), ["r_1", "at least -10000000"]),
-    "pose of 400 digits": (lambda root: edit(root / "transforms_train.json", put_pose(10**400)), ["r_1", "infinite"]),
+    "pose far away": (
+        lambda root: change_json(root / "transforms_train.json", put_pose(1e39)),
+        ["r_1", "at least -10000000"],
+    ),
+    "pose of 400 digits": (
+        lambda root: change_json(root / "transforms_train.json", put_pose(10**400)),
+        ["r_1", "infinite"],
+    ),
     "deep json": (lambda root: (root / "transforms_train.json").write_text("[" * 5000), ["is not valid JSON"]),
     "no mesh": (lambda root: (root / "mesh.ply").unlink(), ["mesh.ply does not exist"]),
     "unreadable mesh": (lambda root: (root / "mesh.ply").write_bytes(b"ply?"), ["mesh.ply"]),
@@ -65,34 +66,29 @@ DAMAGES: dict[str, tuple[Callable[[Path], object], list[str]]] = {
 }
 
 
+@pytest.fixture
+def require_refusal(train_here: Callable[..., Any], tiny_run: list[str], tmp_path: Path) -> Callable[..., None]:
+    """Require that a training is refused with some words, before anything is written."""
+
+    def require(words: list[str], *overrides: str) -> None:
+        options = ["trainer.max_steps=1", f"hydra.run.dir={tmp_path / 'run'}", *overrides]
+        refused = train_here(*tiny_run, *options, code=1).error
+        for word in words:
+            assert word in refused
+        assert not list((tmp_path / "run").rglob("*"))
+
+    return require
+
+
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_damaged_data_is_refused(
-    damage: str, train_here: Callable[..., Any], tiny_scene: Path, tiny_run: list[str], tmp_path: Path
+    damage: str, require_refusal: Callable[..., None], tiny_scene: Path, tmp_path: Path
 ) -> None:
     root = tmp_path / "data"
     shutil.copytree(tiny_scene, root)
     break_it, words = DAMAGES[damage]
     break_it(root)
-    folder = tmp_path / "run"
-    finished = train_here(*tiny_run, f"data.root={root}", "trainer.max_steps=1", f"hydra.run.dir={folder}")
-    assert finished.code == 1
-    lines = finished.err.strip().splitlines()
-    assert len(lines) == 1, finished.err
-    assert lines[0].startswith("nerfro: error: ")
-    for word in words:
-        assert word in lines[0]
-    assert not list(folder.rglob("*")), "nothing is written"
-
-
-def test_open_mesh_is_accepted_when_asked(
-    train_here: Callable[..., Any], tiny_scene: Path, tiny_run: list[str], tmp_path: Path
-) -> None:
-    root = tmp_path / "data"
-    shutil.copytree(tiny_scene, root)
-    open_mesh(root)
-    accepted = ["medium.accept_open_mesh=true", "trainer.max_steps=1", "evaluation.every=0"]
-    finished = train_here(*tiny_run, f"data.root={root}", *accepted, f"hydra.run.dir={tmp_path / 'run'}")
-    assert finished.code == 0, finished.err
+    require_refusal(words, f"data.root={root}")
 
 
 @pytest.mark.parametrize(
@@ -109,6 +105,7 @@ def test_open_mesh_is_accepted_when_asked(
         (["medium.ior=0"], ["ior=0.0 is not allowed; take more than 0"]),
         (["medium.resolution=3000"], ["resolution=3000 is not allowed", "at most 2048"]),
         (["medium.smoothing_size=999999"], ["smoothing_size=999999 is not allowed", "at most 99"]),
+        (["batches.num_validation_views=-1"], ["num_validation_views=-1 is not allowed; take at least 0"]),
         (["batches.size=1e12"], ["batches.size", "could not be converted to Integer"]),
         (["optimizer.learning_rate=nan"], ["optimizer.learning_rate=nan is not allowed"]),
         (["trainer.precision=8"], ["trainer.precision='8' is not allowed; choose '32-true'"]),
@@ -151,15 +148,9 @@ def test_open_mesh_is_accepted_when_asked(
     ids=lambda value: " ".join(value) if isinstance(value, list) and "=" in value[0] else "",
 )
 def test_mistake_on_the_command_line_is_told_in_one_line(
-    overrides: list[str], words: list[str], train_here: Callable[..., Any], tiny_run: list[str], tmp_path: Path
+    overrides: list[str], words: list[str], require_refusal: Callable[..., None]
 ) -> None:
-    finished = train_here(*tiny_run, "trainer.max_steps=1", f"hydra.run.dir={tmp_path / 'run'}", *overrides)
-    assert finished.code == 1
-    lines = finished.err.strip().splitlines()
-    assert len(lines) == 1, finished.err
-    for word in ["nerfro: error: ", *words]:
-        assert word in lines[0]
-    assert not list((tmp_path / "run").rglob("*")), "nothing is written"
+    require_refusal(words, *overrides)
 
 
 def test_a_field_that_rays_miss_is_told_before_training(
@@ -169,29 +160,23 @@ def test_a_field_that_rays_miss_is_told_before_training(
     run = [text for text in tiny_run if text not in sky]
     run += ["trainer.max_steps=1", "evaluation.every=0", "boundary=constant"]
     away = ["field.box_min=[50,50,50]", "field.box_max=[51,51,51]"]
-    finished = train_here(*run, *away, f"hydra.run.dir={tmp_path / 'away'}")
-    assert finished.code == 1
-    assert "no ray of the training views meets the field's box from [50.0, 50.0, 50.0]" in finished.err
-    assert "set content.box_min" in finished.err
+    refused = train_here(*run, *away, f"hydra.run.dir={tmp_path / 'away'}", code=1).error
+    assert "no ray of the training views meets the field's box from [50.0, 50.0, 50.0]" in refused
+    assert "set content.box_min" in refused
     assert not list((tmp_path / "away").rglob("*"))
     small = ["field.box_min=[-0.3,-0.3,-0.3]", "field.box_max=[0.3,0.3,0.3]"]
     finished = train_here(*run, *small, f"hydra.run.dir={tmp_path / 'small'}")
-    assert finished.code == 0
     assert "% of the rays pass the field's box from [-0.3, -0.3, -0.3]" in finished.out
     whole = ["field.box_min=[-9,-9,-9]", "field.box_max=[9,9,9]"]
     assert "pass the field's box" not in train_here(*run, *whole, f"hydra.run.dir={tmp_path / 'whole'}").out
 
 
 def test_straight_rays_without_an_object_ask_for_the_box(
-    train_here: Callable[..., Any], tiny_scene: Path, tiny_default_run: list[str], tmp_path: Path
+    train: Callable[..., Any], tiny_scene: Path, tmp_path: Path
 ) -> None:
     root = tmp_path / "data"
     shutil.copytree(tiny_scene, root)
     (root / "mesh.ply").unlink()
-    own = [f"data.root={root}", "sampler/path=straight", "trainer.max_steps=1", f"hydra.run.dir={tmp_path / 'run'}"]
-    finished = train_here(*tiny_default_run, *own)
-    assert finished.code == 1
-    assert "content.box_min=[X,Y,Z]" in finished.err
-    assert finished.err.count("\n") == 1
-    box = ["content.box_min=[-1,-1,-1]", "content.box_max=[1,1,1]", "evaluation.every=0"]
-    assert train_here(*tiny_default_run, *own, *box).code == 0
+    own = [f"data.root={root}", "sampler/path=straight", "trainer.max_steps=1"]
+    assert "content.box_min=[X,Y,Z]" in train(*own, code=1).error
+    train(*own, "content.box_min=[-1,-1,-1]", "content.box_max=[1,1,1]", "evaluation.every=0")

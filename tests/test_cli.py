@@ -9,10 +9,9 @@ from pathlib import Path
 import pytest
 import yaml
 from hydra import compose, initialize_config_dir
-from hydra.core.config_store import ConfigStore
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import OverrideParseException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 
 from nerfro.cli import _flags_first
 from nerfro.composition import RenamingFiles
@@ -21,9 +20,9 @@ from nerfro.failures import errors_in_one_line, in_one_line
 from nerfro.files.foreign_config import foreign_config
 from nerfro.old_names import RENAMED, is_old_name, renamed_override
 from nerfro.paths import CONF_DIR, resolve_path, user_path
-from nerfro.registry import discover, plugins
-from nerfro.training.config import TrainConfig
+from nerfro.registry import plugins
 from nerfro.trust import GuardedConfigLoader
+from tests.conftest import composed, refused
 
 
 @pytest.mark.parametrize("num_lines", [1, 10_000])  # less and more than a pipe's buffer
@@ -76,8 +75,7 @@ def test_flags_may_stand_anywhere() -> None:
     assert _flags_first(given) == ["--config-dir", "mine", "-m", "seed=1", "seed=2"]
     assert _flags_first(["~seed", "+a=-1"]) == ["~seed", "+a=-1"]
     for flags, message in ((["--sed"], "--sed is not an option; write key=value"), (["-p", "a"], "need --cfg")):
-        with pytest.raises(NerfroError, match=message):
-            _flags_first(flags)
+        refused(message, _flags_first, flags)
 
 
 def test_messages_are_one_line_whatever_files_are_called(capsys: pytest.CaptureFixture[str]) -> None:
@@ -120,14 +118,12 @@ def test_a_file_that_is_no_yaml_is_named_with_the_line(tmp_path: Path) -> None:
 @pytest.mark.parametrize("location", ["~nobody_of_that_name/run", "a\0b"])
 def test_paths_that_cannot_be_are_refused(location: str) -> None:
     for take in (user_path, resolve_path):
-        with pytest.raises(NerfroError, match=r"give the full path|give another"):
-            take(location)
+        refused(r"give the full path|give another", take, location)
 
 
 @pytest.mark.parametrize("location", ["embedded:", "embedded:nothing", "embedded:_lpips", "embedded:.."])
 def test_what_is_not_embedded_is_refused(location: str) -> None:
-    with pytest.raises(NerfroError, match="embedded scenes: torus"):
-        resolve_path(location)
+    refused("embedded scenes: torus", resolve_path, location)
 
 
 OLD_NAMES = {
@@ -161,8 +157,7 @@ def test_old_names_in_overrides_are_replaced_with_a_warning(
     assert renamed_override(old) == new
     printed = capsys.readouterr().out
     assert ("since this release" in printed) == (old != new)
-    with pytest.raises(NerfroError, match=r"medium\.old_depth was removed .* leave it out"):
-        renamed_override("medium.old_depth=3")
+    refused(r"medium\.old_depth was removed .* leave it out", renamed_override, "medium.old_depth=3")
 
 
 def test_old_names_in_files_of_users_and_in_old_runs_are_replaced_with_a_warning(
@@ -177,8 +172,7 @@ def test_old_names_in_files_of_users_and_in_old_runs_are_replaced_with_a_warning
     config = files.load_config("experiment/mine").config
     assert config == {"defaults": ["glass", {"/loss@loss.distortion": "distortion"}, "_self_"], "batches": {"size": 7}}
     (tmp_path / "experiment" / "mine.yaml").write_text("# @package _global_\nmedium: {old_depth: 7}\n")
-    with pytest.raises(NerfroError, match=r"experiment/mine\.yaml: medium\.old_depth was removed"):
-        files.load_config("experiment/mine")
+    refused(r"experiment/mine\.yaml: medium\.old_depth was removed", files.load_config, "experiment/mine")
     assert "experiment/mine.yaml: batches.hidden is called batches.size since this release" in capsys.readouterr().out
 
     run = foreign_config("batches: {hidden: 7}\nmedium: {old_depth: 7, ior: 1.5}\n", tmp_path / "config.yaml")
@@ -194,13 +188,6 @@ def test_bodies_are_settings_of_the_medium(tmp_path: Path, capsys: pytest.Captur
     config = RenamingFiles("main", str(tmp_path)).load_config("experiment/mine").config
     assert config == {"medium": {"bodies": {"a": {"ior": 1.5}}}}
     assert not capsys.readouterr().out
-
-
-def composed(*overrides: str) -> DictConfig:
-    discover()
-    ConfigStore.instance().store(name="train_schema", node=TrainConfig, provider="nerfro")
-    with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
-        return compose("train", list(overrides))
 
 
 def test_groups_of_parameters_are_added_to_those_of_the_experiment() -> None:

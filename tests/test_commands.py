@@ -13,10 +13,10 @@ import pytest
 
 import nerfro.demo
 from nerfro.completion import completions
-from nerfro.errors import NerfroError
 from nerfro.options import Described, recall, remember
 from nerfro.paths import PACKAGE_DIR
 from nerfro.viewing.server import open_page
+from tests.conftest import refused
 
 DESCRIBED = Described(
     "All options.",
@@ -71,8 +71,7 @@ def test_help_version_and_mistakes_do_not_wait_for_torch(arguments: list[str], p
     ],
 )
 def test_names_that_nothing_knows_are_refused(mistake: str, message: str) -> None:
-    with pytest.raises(NerfroError, match=message):
-        DESCRIBED.require_known(["seed=1", mistake])
+    refused(message, DESCRIBED.require_known, ["seed=1", mistake])
 
 
 def test_the_cache_ends_when_a_plugin_changes(cache: Path) -> None:
@@ -87,7 +86,7 @@ def test_the_cache_ends_when_a_plugin_changes(cache: Path) -> None:
 
 
 def test_a_missing_option_is_told_with_an_example(run_here: Callable, unchecked: None) -> None:
-    done = run_here("view")
+    done = run_here("view", code=1)
     assert done.err == "nerfro: error: checkpoint=... is missing; for example: nerfro view checkpoint=outputs/first\n"
 
 
@@ -137,7 +136,7 @@ def test_demo_opens_the_page_and_ends_with_the_score_in_one_line(
     assert address == "nerfro: the page: http://localhost:1"
     assert last.startswith("PSNR 31.3 dB on 1 photographs that were not trained on; page: ")
     commands["nerfro.train"] = ["raise SystemExit(3)"]
-    assert run_here("demo")[:2] == (3, "")
+    assert run_here("demo", code=3).out == ""
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 

@@ -5,13 +5,10 @@ import math
 import pytest
 import torch
 
-from nerfro.media.analytic import Vacuum
 from nerfro.media.shapes import Ball
 from nerfro.rendering import composite
-from nerfro.samplers.paths.eikonal import Eikonal
 from nerfro.samplers.paths.snell import Snell
-from nerfro.samplers.paths.straight import Straight, straight_path
-from nerfro.samplers.points.hierarchical import Hierarchical
+from nerfro.samplers.paths.straight import straight_path
 from nerfro.samplers.points.stepfun import volume_weights
 from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import NUM_RAYS, example_path, example_rays, example_samples
@@ -79,23 +76,6 @@ def test_half_precision_radiance_is_summed_in_single_precision() -> None:
     radiance = smooth_radiance(samples)
     half = Radiance(radiance.density.bfloat16(), radiance.rgb.bfloat16())
     assert composite(samples, half, torch.zeros(NUM_RAYS, 3).bfloat16(), example_path()).rgb.dtype == torch.float32
-
-
-@pytest.mark.parametrize("integrator", ["adaptive", "euler"])
-@pytest.mark.parametrize("levels", ["stratified", "hierarchical"])
-def test_straight_and_eikonal_render_the_same_image_where_n_is_one(integrator: str, levels: str) -> None:
-    rays, vacuum = example_rays(), Vacuum()
-    images = []
-    for path_sampler in (Straight(), Eikonal(integrator, 96)):  # type: ignore[arg-type]
-        path = path_sampler(rays, vacuum)
-        sampler = (Stratified(32) if levels == "stratified" else Hierarchical(16, 32)).eval()
-        rendering = None
-        for _ in range(sampler.num_levels):
-            samples = sampler(path, rendering)
-            rendering = composite(samples, smooth_radiance(samples), 0.5 + 0.5 * path.exit_directions, path)
-        assert rendering is not None
-        images.append(rendering.rgb)
-    torch.testing.assert_close(images[0], images[1], atol=2e-4, rtol=0)
 
 
 def test_rendering_converges_with_the_number_of_samples() -> None:

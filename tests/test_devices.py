@@ -13,8 +13,9 @@ from nerfro.training.config import build_model
 from nerfro.training.module import TrainingModule
 from nerfro.training.ray_batches import RayBatches
 from nerfro.viewing.baking import bake_surface
+from tests.conftest import composed
 from tests.pretended_gpu import GPU, OnGpu, PretendedGpu
-from tests.test_experiments import SMALL, composed, shrunk
+from tests.test_experiments import SMALL, shrunk
 
 # A step at which all losses have begun and densities are looked at.
 STEP = 100_000

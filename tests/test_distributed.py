@@ -159,8 +159,7 @@ def test_signal_to_one_process_stops_both_and_both_resume_to_learn_what_one_lear
         assert f"rank {rank} at step {steps}\n" in out
         assert f"rank {rank} at step {steps - 1}\n" not in out
     assert out.count("nerfro: refractive on") == out.count("8 steps in") == 1, "one process alone speaks"
-    alone = train_here(*small, f"hydra.run.dir={tmp_path / 'one'}")
-    assert alone.code == 0, alone.err
+    train_here(*small, f"hydra.run.dir={tmp_path / 'one'}")
     require_alike(tmp_path / "two", tmp_path / "one")
     assert num_rays(tmp_path / "one") > 8 * 32, "some pixels have several rays there"
 
@@ -203,8 +202,7 @@ def test_what_two_processes_cannot_do_is_refused_in_one_line(
     overrides: list[str], message: str, tiny_run: list[str], train_here: Callable[..., Any], tmp_path: Path
 ) -> None:
     folders = [f"hydra.run.dir={tmp_path / 'run'}", f"hydra.sweep.dir={tmp_path / 'sweep'}"]
-    finished = train_here(*tiny_run, "trainer.max_steps=2", *TWO_PROCESSES, *folders, *overrides)
-    assert finished.code == 1
+    finished = train_here(*tiny_run, "trainer.max_steps=2", *TWO_PROCESSES, *folders, *overrides, code=1)
     assert finished.err.splitlines()[-1].endswith(message)
     assert not list(tmp_path.rglob("config.yaml"))
 
@@ -242,22 +240,10 @@ def test_a_signal_is_not_lost_while_the_processes_agree() -> None:
     assert trainer.should_stop
 
 
-class Others:
-    """A strategy of several processes that counts exchanges."""
-
-    num_exchanges = 0
-
-    def reduce_boolean_decision(self, decision: bool, all: bool) -> bool:
-        self.num_exchanges += 1
-        return decision
-
-    def broadcast(self, value: Any) -> Any:
-        self.num_exchanges += 1
-        return value
-
-
 def test_several_processes_exchange_a_few_times_a_second_and_not_at_each_step(tmp_path: Path) -> None:
-    others, interruption, timer = Others(), StopOnSignal(), SharedTimer(timedelta(seconds=1000))
+    others = Mock(reduce_boolean_decision=Mock(side_effect=lambda decision, all: decision))
+    others.broadcast = Mock(side_effect=lambda value: value)
+    interruption, timer = StopOnSignal(), SharedTimer(timedelta(seconds=1000))
     checkpoints = Checkpoints(dirpath=tmp_path, train_time_interval=timedelta(seconds=1000))
     trainer: Any = Mock(spec=Trainer, strategy=others, should_stop=False, world_size=2, fast_dev_run=False)
     trainer.state, trainer.sanity_checking, trainer.global_step = Mock(fn="fit"), False, 1
@@ -269,7 +255,7 @@ def test_several_processes_exchange_a_few_times_a_second_and_not_at_each_step(tm
         for callback in (interruption, timer, checkpoints):
             callback.on_train_batch_end(trainer, Mock(spec=LightningModule), None, Mock(spec=Batch), step)
     spent = time.perf_counter() - begun
-    assert others.num_exchanges < 60 + 30 * spent
+    assert others.reduce_boolean_decision.call_count + others.broadcast.call_count < 60 + 30 * spent
     assert 0 < elapsed <= spent
     # Within a second of a signal, training ends.
     interruption._signalled, begun = True, time.perf_counter()

@@ -1,6 +1,5 @@
 """The plugin that holds Eikonal Fields: its medium, paths and stages, and the index of a ball learned from images."""
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +13,6 @@ from torch import Tensor
 
 from nerfro.boundaries.constant import ConstantBoundary
 from nerfro.data.base import Views
-from nerfro.errors import NerfroError
 from nerfro.fields.base import Field
 from nerfro.fields.nerf import NerfField
 from nerfro.files import lat_long
@@ -32,6 +30,7 @@ from nerfro.training.optimizer import OptimizerConfig
 from nerfro.training.run_folder import load_checkpoint, restore
 from nerfro.types import Radiance, Samples
 from tests.ball_photographs import save
+from tests.conftest import QUIET, refused
 from tests.exact_silhouettes import cameras_around
 
 discover()
@@ -166,43 +165,10 @@ def test_several_processes_are_refused_before_training() -> None:
     module.trainer = SimpleNamespace(world_size=1)  # type: ignore[assignment]
     module.setup("fit")
     module.trainer = SimpleNamespace(world_size=2)  # type: ignore[assignment]
-    with pytest.raises(NerfroError, match="trains in one process"):
-        module.setup("fit")
+    refused("trains in one process", module.setup, "fit")
 
 
 # All of it, from the command line.
-
-
-def test_the_three_stages_train_from_the_command_line(
-    tiny_scene: Path, train_here: Callable[..., Any], tmp_path: Path
-) -> None:
-    finished = train_here("+experiment=eikonal_fields", *tiny(tiny_scene), f"hydra.run.dir={tmp_path}")
-    assert finished.code == 0, finished.err
-    checkpoint, _ = load_checkpoint(tmp_path / "checkpoints" / "last.ckpt")
-    assert int(checkpoint["state_dict"]["renderer.stage"]) == INTERIOR
-    assert checkpoint["state_dict"]["renderer.scene.medium.last.weight"].abs().max() > 0  # zero before training
-    assert json.loads((tmp_path / "metrics.json").read_text())["steps"] == 9
-
-
-def tiny(root: Path) -> list[str]:
-    """Overrides that make a step take milliseconds."""
-    return [
-        f"data.root={root}",
-        "medium.width=8",
-        "sampler.path.num_steps=16",
-        "sampler.points.num_samples=16",
-        "field.num_levels=4",
-        "field.log2_table_size=10",
-        "boundary.resolutions=[4,8]",
-        "model.resolution=16",
-        "batches.size=64",
-        "evaluation.subdivision.side=1",
-        "evaluation.every=0",
-        "trainer.accelerator=cpu",
-        "trainer.max_time=null",
-        "trainer.max_steps=9",
-        "logger=none",
-    ]
 
 
 # The index of a ball.
@@ -219,9 +185,15 @@ def test_the_index_of_a_homogeneous_ball_is_recovered(train_here: Callable[..., 
     save(ball_scene(), tmp_path / "ball")
     save_png(tmp_path / "sky.png", ball_sky(lat_long.directions(128)))
     side = RADIUS + SHELL
-    finished = train_here(
+    train_here(
         "+experiment=eikonal_fields",
-        *tiny(tmp_path / "ball"),
+        f"data.root={tmp_path / 'ball'}",
+        *QUIET,
+        "sampler.points.num_samples=16",
+        "field.num_levels=4",
+        "field.log2_table_size=10",
+        "evaluation.subdivision.side=1",
+        "evaluation.every=0",
         "medium={mesh: null, width: 24, depth: 3, octaves: 3}",
         f"medium.box_min=[-{side},-{side},-{side}]",
         f"medium.box_max=[{side},{side},{side}]",
@@ -237,7 +209,6 @@ def test_the_index_of_a_homogeneous_ball_is_recovered(train_here: Callable[..., 
         "trainer.max_steps=150",
         f"hydra.run.dir={tmp_path / 'run'}",
     )
-    assert finished.code == 0, finished.err
     checkpoint, config = load_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")
     untrained = build_model(OmegaConf.create(config))
     assert float(untrained.scene.medium.last.weight.detach().abs().max()) == 0  # it begins without a ball

@@ -8,14 +8,13 @@ from typing import Any
 
 import jaxtyping
 import pytest
-from hydra import compose, initialize_config_dir
-from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 
 from nerfro.paths import CONF_DIR
 from nerfro.registry import build, discover
-from nerfro.training.config import TrainConfig, build_model
+from nerfro.training.config import build_model
 from nerfro.training.module import TrainingModule
+from tests.conftest import QUIET, composed
 
 discover()
 
@@ -31,10 +30,8 @@ SMALL = [
     "evaluation.every=1",
     "batches.size=16",
     "trainer.limit_test_batches=2",
-    "trainer.accelerator=cpu",
     "trainer.max_steps=2",
-    "trainer.max_time=null",
-    "logger=none",
+    *QUIET,
 ]
 
 
@@ -42,12 +39,6 @@ SMALL = [
 def _checked(train_here: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
     """Turn on the checks of annotations that other trainings do without."""
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", False)
-
-
-def composed(*overrides: str) -> DictConfig:
-    ConfigStore.instance().store(name="train_schema", node=TrainConfig, provider="nerfro")
-    with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
-        return compose("train", list(overrides), return_hydra_config=False)
 
 
 def shrunk(config: DictConfig) -> list[str]:
@@ -73,8 +64,7 @@ def shrunk(config: DictConfig) -> list[str]:
 @pytest.mark.parametrize("experiment", [name for name in EXPERIMENTS if name not in ABLATIONS])
 def test_experiment_trains_for_two_steps(experiment: str, train_here: Callable[..., Any], tmp_path: Path) -> None:
     small = shrunk(composed(f"+experiment={experiment}"))
-    finished = train_here(f"+experiment={experiment}", *SMALL, *small, f"hydra.run.dir={tmp_path}")
-    assert finished.code == 0, finished.err
+    train_here(f"+experiment={experiment}", *SMALL, *small, f"hydra.run.dir={tmp_path}")
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert metrics["steps"] == 2
     assert len(metrics["views"]) == 2

@@ -16,7 +16,7 @@ from PIL import Image
 import nerfro
 from nerfro.errors import NerfroError
 from nerfro.files.images import load_png
-from tests.conftest import UTM, moved_mesh
+from tests.conftest import UTM, moved_mesh, refused
 
 
 def test_importing_nerfro_imports_nothing_heavy() -> None:
@@ -57,15 +57,14 @@ def test_a_run_is_loaded_rendered_and_exported(trained_run: Path, tmp_path: Path
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
-    with pytest.raises(NerfroError, match=r"checkpoint .* does not exist"):
-        nerfro.load(tmp_path / "gone")
+    refused(r"checkpoint .* does not exist", nerfro.load, tmp_path / "gone")
 
     common = f"checkpoint={trained_run}/checkpoints/last.ckpt", "device=cpu", "resolution=8"
-    assert run_here("render", *common, "path=orbit", "frames=2", f"out={tmp_path / 'O'}").code == 0
-    assert run_here("export", *common, "what=sky", f"out={tmp_path / 'sky.hdr'}").code == 0
+    run_here("render", *common, "path=orbit", "frames=2", f"out={tmp_path / 'O'}")
+    run_here("export", *common, "what=sky", f"out={tmp_path / 'sky.hdr'}")
     for name in ("O/frame_0000.png", "O/frame_0001.png", "O/film.mp4", "sky.hdr"):
         assert (tmp_path / name).stat().st_size > 0
-    assert run_here("export", *common, "what=sky", f"out={tmp_path / 'sky.hdr'}").code == 1, "nothing is overwritten"
+    run_here("export", *common, "what=sky", f"out={tmp_path / 'sky.hdr'}", code=1)  # nothing is overwritten
 
 
 @pytest.mark.parametrize("interface", ["mesh", "sdf"])
@@ -104,8 +103,7 @@ def test_bending_at_a_ball_is_as_in_closed_form(interface: str, tmp_path: Path, 
     ],
 )
 def test_rays_that_are_none_are_refused(rays: tuple, message: str, tmp_path: Path) -> None:
-    with pytest.raises(NerfroError, match=message):
-        nerfro.bend(tmp_path / "ball.ply", 1.5, *rays)
+    refused(message, nerfro.bend, tmp_path / "ball.ply", 1.5, *rays)
     with pytest.raises(NerfroError, match="resolution=9 is not allowed; give at least 10"):
         nerfro.bend(tmp_path / "ball.ply", 1.5, [[0, 0, 0]], [[1, 0, 0]], resolution=9)
 
@@ -118,5 +116,4 @@ def test_rays_that_are_none_are_refused(rays: tuple, message: str, tmp_path: Pat
     ],
 )
 def test_misspelt_names_are_refused_as_on_the_command_line(experiment: str, overrides: list[str], message: str) -> None:
-    with pytest.raises(NerfroError, match=message):
-        nerfro.build(experiment, overrides)
+    refused(message, nerfro.build, experiment, overrides)

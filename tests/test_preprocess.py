@@ -49,7 +49,7 @@ def preprocess(capture: Path, run_here: Callable) -> Callable[..., str]:
     def run(*overrides: str) -> str:
         common = [f"data.root={capture}", "resolution=24", "medium.resolution=32", "medium.cache=false"]
         common += [] if any(text.startswith(("medium.ior=", "refine=")) for text in overrides) else ["medium.ior=1.5"]
-        done = run_here("preprocess", *common, *overrides)
+        done = run_here("preprocess", *common, *overrides, code=None)
         return done.err if done.code else done.out
 
     return run
@@ -89,8 +89,7 @@ def test_printed_command_trains(
 ) -> None:
     command = shlex.split(preprocess("smoothing=0").split("train on it: ")[1])[3:]
     small = [text for text in tiny_default_run if not text.startswith(("data.root=", "medium."))]
-    finished = train_here(*small, *command, "trainer.max_steps=1", "evaluation.split=train", "evaluation.every=0")
-    assert finished.code == 0, finished.err
+    train_here(*small, *command, "trainer.max_steps=1", "evaluation.split=train", "evaluation.every=0")
 
 
 def test_a_vessel_stands_upright_in_a_world_whose_z_points_elsewhere(

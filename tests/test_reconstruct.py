@@ -44,16 +44,6 @@ def photos(tmp_path: Path) -> Path:
     return tmp_path / "photos"
 
 
-def given(photos: Path) -> tuple[str, str]:
-    """Options of the photographs and of their masks."""
-    return f"images={photos}", f"masks={photos.parent / 'silhouettes'}"
-
-
-@pytest.fixture
-def reconstruct(run_here: Reconstruct) -> Reconstruct:
-    return functools.partial(run_here, "reconstruct")
-
-
 def test_links_to_deleted_photographs_are_removed(photos: Path, tmp_path: Path) -> None:
     stages.link_photographs(photos, photos.parent / "silhouettes", tmp_path / "out")
     (photos / "IMG_1.png").unlink()
@@ -153,14 +143,20 @@ def pretended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pretended:
     return made
 
 
+@pytest.fixture
+def reconstruct(run_here: Reconstruct, pretended: Pretended, photos: Path) -> Reconstruct:
+    """Reconstruct the photographs and their masks by pretended commands."""
+    given = f"images={photos}", f"masks={photos.parent / 'silhouettes'}", f"out={pretended.out}"
+    return functools.partial(run_here, "reconstruct", *given)
+
+
 TRIALS = ["train"] * 3  # straight rays, solid body, vessel
 ALL = ["calibrate", "preprocess", *TRIALS, "train", "summary", "export"]
 
 
-def test_photographs_pass_all_stages_once(reconstruct: Reconstruct, pretended: Pretended, photos: Path) -> None:
-    asked = f"images={photos}", f"masks={photos.parent / 'silhouettes'}", f"out={pretended.out}", "data.far=9"
-    done = reconstruct(*asked, "medium.resolution=64", "train=trainer.max_steps=3 logger=none", "preprocess=keep=1")
-    assert done.code == 0, done.err
+def test_photographs_pass_all_stages_once(reconstruct: Reconstruct, pretended: Pretended) -> None:
+    options = "medium.resolution=64", "train=trainer.max_steps=3 logger=none", "preprocess=keep=1"
+    done = reconstruct("data.far=9", *options)
     assert pretended.names == ALL
     links = sorted(path.relative_to(pretended.out).as_posix() for path in pretended.out.glob("*/IMG*"))
     assert links == [f"{folder}/IMG_{i}.png" for folder in ("images", "masks") for i in range(3)]
@@ -180,27 +176,23 @@ def test_photographs_pass_all_stages_once(reconstruct: Reconstruct, pretended: P
     assert straight[:2] == ["+experiment=straight", scene]
     assert solid[: len(train) - 1] == train[:-1]
     assert vessel[:3] == ["+experiment=glass", "medium=vessel", scene]
-    again = reconstruct(*asked)
-    assert again.code == 0, again.err
+    again = reconstruct("data.far=9")
     assert pretended.names == ALL
     assert again.out.count(" is kept (delete the file to repeat the stage)") == len(ALL)
     assert again.out.endswith(f"report: {pretended.out}/report/report.html\npage: {pretended.out}/page.html\n")
 
 
-def test_what_changed_is_followed_by_what_is_made_of_it(
-    reconstruct: Reconstruct, pretended: Pretended, photos: Path
-) -> None:
-    asked = f"images={photos}", f"masks={photos.parent / 'silhouettes'}", f"out={pretended.out}"
-    reconstruct(*asked)
+def test_what_changed_is_followed_by_what_is_made_of_it(reconstruct: Reconstruct, pretended: Pretended) -> None:
+    reconstruct()
     pretended.write("../silhouettes/IMG_1.png")
-    done = reconstruct(*asked)
+    done = reconstruct()
     assert pretended.names == [*ALL, *ALL[1:]]
     # The training that was there is another one's.
     assert (pretended.out / "run_1" / "metrics.json").is_file()
     assert f"which is kept as {pretended.out / 'run_1'}" in done.out
     assert "ckpt_path=last" not in pretended.ran[-3][1]
     (pretended.out / "report" / "report.html").unlink()
-    reconstruct(*asked)
+    reconstruct()
     assert pretended.names == [*ALL, *ALL[1:], "summary"]
 
 
@@ -215,18 +207,11 @@ def test_what_changed_is_followed_by_what_is_made_of_it(
     ],
 )
 def test_training_continues_with_the_hypothesis_that_the_validation_photographs_prefer(
-    reconstruct: Reconstruct,
-    pretended: Pretended,
-    photos: Path,
-    doubts: list[str],
-    psnr: dict[str, float],
-    chosen: str,
-    printed: str,
+    reconstruct: Reconstruct, pretended: Pretended, doubts: list[str], psnr: dict[str, float], chosen: str, printed: str
 ) -> None:
     pretended.doubts = doubts
     pretended.psnr |= psnr
-    done = reconstruct(*given(photos), f"out={pretended.out}", "trial_steps=70")
-    assert done.code == 0, done.err
+    done = reconstruct("trial_steps=70")
     assert printed in done.out
     *trials, train = [options for name, options in pretended.ran if name == "train"]
     best = next(trial for trial in trials if Hypothesis(chosen, []).folder in trial[-1])
@@ -241,11 +226,10 @@ def test_training_continues_with_the_hypothesis_that_the_validation_photographs_
     [(["solid body", "vessel"], 0, "straight"), (["solid body"], 2, "glass"), (["vessel"], 2, "unknown")],
 )
 def test_bodies_that_the_pixels_do_not_support_are_not_tried(
-    reconstruct: Reconstruct, pretended: Pretended, photos: Path, unsupported: list[str], trials: int, chosen: str
+    reconstruct: Reconstruct, pretended: Pretended, unsupported: list[str], trials: int, chosen: str
 ) -> None:
     pretended.unsupported = unsupported
-    done = reconstruct(*given(photos), f"out={pretended.out}")
-    assert done.code == 0, done.err
+    reconstruct()
     *tried, train = [options for name, options in pretended.ran if name == "train"]
     assert len(tried) == trials
     assert f"+experiment={chosen}" in train
@@ -259,55 +243,44 @@ def test_stages_print_no_next_command(capsys: pytest.CaptureFixture[str]) -> Non
 
 
 @pytest.mark.parametrize("end", [SystemExit(130), KeyboardInterrupt()])  # from training, and from any other stage
-def test_an_interrupted_training_goes_on(
-    end: BaseException, reconstruct: Reconstruct, pretended: Pretended, photos: Path
-) -> None:
+def test_an_interrupted_training_goes_on(end: BaseException, reconstruct: Reconstruct, pretended: Pretended) -> None:
     pretended.ends["train"] = end
-    asked = *given(photos), f"out={pretended.out}", "trial_steps=0"
-    stopped = reconstruct(*asked)
-    assert stopped.code == 130
+    stopped = reconstruct("trial_steps=0", code=130)
     assert stopped.err == "nerfro: interrupted; train is incomplete; repeat the same command to continue\n"
     pretended.ends.clear()
-    assert reconstruct(*asked).code == 0
+    reconstruct("trial_steps=0")
     assert pretended.names == ["calibrate", "preprocess", "train", "train", "summary", "export"]
     assert "ckpt_path=last" not in pretended.ran[2][1]
     assert pretended.ran[3][1] == [*pretended.ran[2][1], "ckpt_path=last"]
 
 
-def test_a_stage_that_fails_is_named_and_the_others_wait(
-    reconstruct: Reconstruct, pretended: Pretended, photos: Path
-) -> None:
+def test_a_stage_that_fails_is_named_and_the_others_wait(reconstruct: Reconstruct, pretended: Pretended) -> None:
     pretended.ends["preprocess"] = NerfroError("the masks are empty")
-    failed = reconstruct(*given(photos), f"out={pretended.out}")
-    assert failed.code == 1
-    assert failed.err.startswith("nerfro: error: preprocess failed: the masks are empty; correct the input, ")
-    assert "set preprocess='OPTIONS'" in failed.err
-    assert failed.err.count("\n") == 1
+    failed = reconstruct(code=1).error
+    assert failed.startswith("nerfro: error: preprocess failed: the masks are empty; correct the input, ")
+    assert "set preprocess='OPTIONS'" in failed
     assert pretended.names == ["calibrate", "preprocess"]
     pretended.ends["preprocess"] = None
-    assert "scene.json was not written" in reconstruct(*given(photos), f"out={pretended.out}").err
+    assert "scene.json was not written" in reconstruct(code=1).error
     assert pretended.names == ["calibrate", "preprocess", "preprocess"]
 
 
 def test_a_page_that_cannot_be_made_does_not_fail_the_reconstruction(
-    reconstruct: Reconstruct, pretended: Pretended, photos: Path
+    reconstruct: Reconstruct, pretended: Pretended
 ) -> None:
     pretended.ends["export"] = NerfroError("the index varies in space")
-    done = reconstruct(*given(photos), f"out={pretended.out}", "trial_steps=0")
-    assert done.code == 0, done.err
+    done = reconstruct("trial_steps=0")
     assert "nerfro: warning: no page was written: export failed: the index varies in space; " in done.out
     assert done.out.endswith(f"report: {pretended.out}/report/report.html\n")
 
 
-def test_what_was_found_chooses_the_experiment(
-    reconstruct: Reconstruct, pretended: Pretended, tiny_scene: Path
-) -> None:
+def test_what_was_found_chooses_the_experiment(run_here: Reconstruct, pretended: Pretended, tiny_scene: Path) -> None:
     asked = "data=blender", f"data.root={tiny_scene}", "outlines={r_0:[1,2,9,9]}", "medium=vessel", "medium.wall=0.1"
     pretended.surroundings, pretended.doubts, pretended.medium = "near", ["shallow"], {"type": "vessel", "wall": 0.1}
-    done = reconstruct(*asked, f"out={pretended.out}")
+    failed = run_here("reconstruct", *asked, f"out={pretended.out}", code=1).error
     assert pretended.names == ["mask"], "its sheet lies in the data's folder"
-    assert "mask failed" in done.err
-    done = reconstruct(*asked[:2], *asked[3:], f"out={pretended.out}")
+    assert "mask failed" in failed
+    run_here("reconstruct", *asked[:2], *asked[3:], f"out={pretended.out}")
     assert pretended.names[1:] == ["preprocess", "train", "train", "train", "summary", "export"]
     assert pretended.ran[1][1][:4] == ["data=blender", f"data.root={tiny_scene}", "medium=vessel", "medium.wall=0.1"]
     assert pretended.ran[4][1][:2] == ["+experiment=glass_room", f"scene={pretended.out / 'surface' / 'scene.json'}"]
@@ -329,24 +302,16 @@ def test_what_was_found_chooses_the_experiment(
     ],
 )
 def test_what_contradicts_itself_is_refused(
-    reconstruct: Reconstruct, pretended: Pretended, photos: Path, overrides: tuple[str, ...], told: str
+    run_here: Reconstruct, pretended: Pretended, photos: Path, overrides: tuple[str, ...], told: str
 ) -> None:
     (photos / "film").mkdir()
     (photos / "film" / "CLIP.mp4").touch()
     (photos / "two").mkdir()
     for i in range(2):
         shutil.copy(photos / f"IMG_{i}.png", photos / "two")
-    refused = reconstruct(f"out={pretended.out}", *(text.replace("PHOTOS", str(photos)) for text in overrides))
-    assert refused.code == 1
-    assert told in refused.err
+    options = [f"out={pretended.out}", *(text.replace("PHOTOS", str(photos)) for text in overrides)]
+    assert told in run_here("reconstruct", *options, code=1).error
     assert pretended.names == []
-
-
-def test_a_result_that_was_spoilt_is_refused(reconstruct: Reconstruct, pretended: Pretended, photos: Path) -> None:
-    asked = *given(photos), f"out={pretended.out}"
-    reconstruct(*asked)
-    pretended.write("surface/scene.json", {"data": {}})
-    assert "scene.json lacks the text data.type; write" in reconstruct(*asked).err
 
 
 def test_sigterm_ends_a_stage_like_ctrl_c() -> None:
@@ -356,18 +321,16 @@ def test_sigterm_ends_a_stage_like_ctrl_c() -> None:
     assert signal.getsignal(signal.SIGTERM) == before
 
 
-def test_unknown_surroundings_end_before_training(reconstruct: Reconstruct, pretended: Pretended, photos: Path) -> None:
+def test_unknown_surroundings_end_before_training(reconstruct: Reconstruct, pretended: Pretended) -> None:
     pretended.surroundings = None
-    asked = f"images={photos}", f"masks={photos.parent / 'silhouettes'}", f"out={pretended.out}", "trial_steps=0"
-    done = reconstruct(*asked)
-    assert done.code == 1
-    assert "scene.json does not tell whether the surroundings are near" in done.err
+    refused = reconstruct("trial_steps=0", code=1).error
+    assert "scene.json does not tell whether the surroundings are near" in refused
     assert pretended.names == ["calibrate", "preprocess"]
-    assert reconstruct(*asked, "train=+experiment=glass_room").code == 0
+    reconstruct("trial_steps=0", "train=+experiment=glass_room")
 
 
 def test_posed_photographs_of_a_ball_become_a_scene(
-    reconstruct: Reconstruct, run_here: Reconstruct, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run_here: Reconstruct, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """All stages but that of poses; each gives the same result alone, and leaves nothing behind."""
     data, out = tmp_path / "ball", tmp_path / "out"
@@ -387,8 +350,7 @@ def test_posed_photographs_of_a_ball_become_a_scene(
     asked = ["data=blender", f"data.root={data}", "data.near=0.5", f"out={out}", "medium.resolution=32",
              "medium.cache=false", "preprocess=resolution=24", f"train={' '.join(train)}", "trial_steps=2"]  # fmt: skip
     before = torch.initial_seed(), signal.getsignal(signal.SIGTERM)
-    done = reconstruct(*asked)
-    assert done.code == 0, done.err
+    done = run_here("reconstruct", *asked)
     index = json.loads((out / "surface" / "index.json").read_text())
     assert index["ior"] == [pytest.approx(1.45, rel=0.02)]
     assert 0 < index["standard_error"][0] < 0.02
@@ -403,11 +365,10 @@ def test_posed_photographs_of_a_ball_become_a_scene(
     assert "training continues with: " in done.out
     assert (out / "page.html").is_file()
     # Surface, two trials, training, report and page.
-    assert reconstruct(*asked).out.count(" is kept (delete the file to repeat the stage)") == 6
+    assert run_here("reconstruct", *asked).out.count(" is kept (delete the file to repeat the stage)") == 6
     assert (torch.initial_seed(), signal.getsignal(signal.SIGTERM)) == before
     command = next(line for line in done.out.splitlines() if line.endswith(f"hydra.run.dir={out}/run"))
-    alone = run_here("train", *shlex.split(command)[4:], f"hydra.run.dir={tmp_path / 'alone'}")
-    assert alone.code == 0, alone.err
+    run_here("train", *shlex.split(command)[4:], f"hydra.run.dir={tmp_path / 'alone'}")
     runs = out / "run", tmp_path / "alone"
     chained, separate = (load_checkpoint(run / LAST_CHECKPOINT)[0]["state_dict"] for run in runs)
     assert all(torch.equal(chained[name], separate[name]) for name in chained)

@@ -1,22 +1,19 @@
 """The registry and the typed configuration: what they accept, and how they refuse what they do not."""
 
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal, Optional
 
 import pytest
-from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
 from torch import nn
 
 import nerfro.registry
 import nerfro.training.lightning_callbacks
-from nerfro.cli import entry_point
 from nerfro.errors import NerfroError
-from nerfro.paths import CONF_DIR
-from nerfro.registry import KINDS, build, configure, discover, find, plugins, register
-from nerfro.training.config import TrainConfig, build_each, check_run
+from nerfro.registry import build, configure, discover, find, register
+from nerfro.training.config import build_each
+from tests.conftest import refused
 
 discover()
 
@@ -25,17 +22,6 @@ discover()
 def _registry_as_before(monkeypatch: pytest.MonkeyPatch) -> None:
     """Registrations of a test end with it."""
     monkeypatch.setattr(nerfro.registry, "_plugins", dict(nerfro.registry._plugins))
-
-
-def refused(train_here: Callable[..., Any], *overrides: str) -> str:
-    """The one line on standard error with which a run is refused, apart from progress bars of a slow start."""
-    finished = train_here(*overrides)
-    assert finished.code == 1
-    lines = [line for line in finished.err.strip().splitlines() if "%|" not in line]
-    assert len(lines) == 1, finished.err
-    assert lines[0].startswith("nerfro: error: ")
-    assert "nerfro:" not in finished.out, "nothing has started"
-    return lines[0]
 
 
 # What a constructor becomes.
@@ -86,14 +72,6 @@ def test_integer_passes_for_a_float_and_a_text_of_digits_for_an_integer() -> Non
     assert configure(plugin, {"weight": 1, "start": "7"})["start"] == 7
 
 
-def test_every_plugin_is_an_option_of_hydra_and_has_a_summary() -> None:
-    options = {kind: ConfigStore.instance().list(kind) for kind in KINDS}
-    for plugin in plugins():
-        assert f"{plugin.name}.yaml" in options[plugin.kind]
-        assert plugin.summary
-    assert {p.kind for p in plugins()} == set(KINDS)
-
-
 # Refusals by the registry.
 
 
@@ -120,44 +98,27 @@ def test_constructor_that_takes_anything_is_refused() -> None:
     ],
 )
 def test_wrong_fields_are_refused(fields: dict[str, object], message: str) -> None:
-    with pytest.raises(NerfroError, match=message):
-        configure(find("sampler/path", "eikonal"), fields)
+    refused(message, configure, find("sampler/path", "eikonal"), fields)
 
 
 def test_missing_required_field_is_named() -> None:
-    with pytest.raises(NerfroError, match=r"data=opencv needs root; add data\.root=\.\.\."):
-        configure(find("data", "opencv"), {})
+    refused(r"data=opencv needs root; add data\.root=\.\.\.", configure, find("data", "opencv"), {})
 
 
 @pytest.mark.parametrize("target", ["os.system", "nerfro.samplers.paths.eikonal.march_uniform", None])
 def test_target_that_is_not_registered_is_not_built(target: str | None, tmp_path: Path) -> None:
     node = {"_target_": target, "command": f"touch {tmp_path / 'ran'}"}
-    with pytest.raises(NerfroError, match=f"'{target}' is not registered; .*nerfro.plugins"):
-        build(node)
+    refused(f"'{target}' is not registered; .*nerfro.plugins", build, node)
     assert not (tmp_path / "ran").exists()
 
 
+@pytest.mark.parametrize("target", ["os.system", "${name}"])
 @pytest.mark.parametrize("nested", ["strategy", "plugins"])
-def test_target_inside_a_lightning_object_is_not_built(nested: str, tmp_path: Path) -> None:
-    node: dict[str, Any] = {"_target_": "os.system", "command": f"touch {tmp_path / 'ran'}"}
+def test_target_inside_a_lightning_object_is_not_built(nested: str, target: str, tmp_path: Path) -> None:
+    node: dict[str, Any] = {"_target_": target, "command": f"touch {tmp_path / 'ran'}"}
     trainer = {"_target_": "lightning.pytorch.Trainer", nested: node if nested == "strategy" else [node]}
-    with pytest.raises(NerfroError, match=r"'os\.system' inside lightning\.pytorch\.Trainer is not registered"):
-        build(trainer)
-    assert not (tmp_path / "ran").exists()
-
-
-def test_target_behind_an_interpolation_is_not_built(tmp_path: Path) -> None:
-    config = OmegaConf.create(
-        {
-            "name": "os.system",
-            "trainer": {
-                "_target_": "lightning.pytorch.Trainer",
-                "strategy": {"_target_": "${name}", "command": f"touch {tmp_path / 'ran'}"},
-            },
-        }
-    )
-    with pytest.raises(NerfroError, match=r"'os\.system' inside"):
-        build(config.trainer)
+    config = OmegaConf.create({"name": "os.system", "trainer": trainer})
+    refused(r"'os\.system' inside lightning\.pytorch\.Trainer is not registered", build, config.trainer)
     assert not (tmp_path / "ran").exists()
 
 
@@ -182,30 +143,10 @@ def test_unknown_field_of_a_lightning_object_is_refused() -> None:
     ],
 )
 def test_wrong_losses_are_refused(losses: dict[str, object], message: str) -> None:
-    with pytest.raises(NerfroError, match=message):
-        build_each("loss", OmegaConf.create(losses))
+    refused(message, build_each, "loss", OmegaConf.create(losses))
 
 
 # Refusals in an experiment file.
-
-
-@pytest.fixture
-def train_with_conf(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, train_here: Callable[..., Any]
-) -> Callable[..., Any]:
-    """Train with a copy of conf/ to which an experiment file has been added."""
-    import nerfro.train
-
-    conf = tmp_path / "conf"
-    shutil.copytree(CONF_DIR, conf)
-    unwrapped = nerfro.train.main.__wrapped__
-    monkeypatch.setattr(nerfro.train, "main", entry_point("train", TrainConfig, conf, check=check_run)(unwrapped))
-
-    def train(experiment: str, *overrides: str) -> Any:
-        (conf / "experiment" / "of_test.yaml").write_text(f"# @package _global_\n{experiment}\n")
-        return train_here("+experiment=of_test", *overrides)
-
-    return train
 
 
 @pytest.mark.parametrize(
@@ -219,13 +160,12 @@ def train_with_conf(
     ],
 )
 def test_mistake_in_an_experiment_file_is_told_in_one_line(
-    experiment: str,
-    words: list[str],
-    train_with_conf: Callable[..., Any],
-    tiny_run: list[str],
-    tmp_path: Path,
+    experiment: str, words: list[str], train: Callable[..., Any], tmp_path: Path
 ) -> None:
-    line = refused(train_with_conf, experiment, *tiny_run, f"hydra.run.dir={tmp_path / 'run'}")
+    (tmp_path / "experiment").mkdir()
+    (tmp_path / "experiment" / "of_test.yaml").write_text(f"# @package _global_\n{experiment}\n")
+    refused = train("+experiment=of_test", f"hydra.searchpath=[file://{tmp_path}]", code=1)
     for word in words:
-        assert word in line
+        assert word in refused.error
+    assert "nerfro:" not in refused.out, "nothing has started"
     assert not list((tmp_path / "run").rglob("*")), "nothing is written"

@@ -11,7 +11,6 @@ import pytest
 import torch
 from PIL import Image
 
-from nerfro.errors import NerfroError
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.results import RunMetrics, write_metrics_json
 from nerfro.files.images import load_png, save_png
@@ -20,6 +19,7 @@ from nerfro.report.comparison import compare, find_metrics, to_table
 from nerfro.report.page import report_page
 from nerfro.report.runs import find_runs
 from nerfro.report.views import Selection, embed_image, scene_images
+from tests.conftest import refused
 from tests.test_summary import write_run
 from tests.viewing.browser import Browser, needs_chromium
 
@@ -111,8 +111,7 @@ def test_pictures_of_another_data_set_are_refused(runs: Path, tmp_path: Path, ti
     (changed / "transforms_test.json").write_text(json.dumps(manifest))
     for run in comparison.runs:
         run.config["data"]["root"] = str(changed)  # type: ignore[index]
-    with pytest.raises(NerfroError, match="has changed since these views"):
-        scene_images(comparison, scored, Selection())
+    refused("has changed since these views", scene_images, comparison, scored, Selection())
 
 
 def test_each_budget_has_a_table_that_tells_medals_without_colours(tmp_path: Path) -> None:

@@ -25,21 +25,19 @@ from nerfro.training.run_folder import (
     load_checkpoint,
     require_same_configuration,
 )
+from tests.conftest import Bomb, refused
 from tests.forked import Command
 
 SCHEDULE = ["checkpoint.every_steps=3", "checkpoint.every_seconds=null", "evaluation.every=5", "trainer.max_steps=12"]
 
 
 @pytest.fixture
-def start(
-    tmp_path: Path, waiting_plugins: str, tiny_run: list[str], tiny_default_run: list[str]
-) -> Callable[..., Command]:
+def start(tmp_path: Path, waiting_plugins: str, tiny_run: list[str]) -> Callable[..., Command]:
     """Start a training process with a loss that waits; its folder is tmp_path/<name>."""
     number = itertools.count()
 
-    def start(name: str, *overrides: str, preset: str = "paper") -> Command:
-        small = tiny_run if preset == "paper" else tiny_default_run
-        options = [*small, *SCHEDULE, "+loss.waiting.weight=1", f"hydra.run.dir={tmp_path / name}", *overrides]
+    def start(name: str, *overrides: str) -> Command:
+        options = [*tiny_run, *SCHEDULE, "+loss.waiting.weight=1", f"hydra.run.dir={tmp_path / name}", *overrides]
         return Command("train", options, tmp_path / f"log_{next(number)}", NERFRO_PLUGINS=waiting_plugins)
 
     return start
@@ -93,33 +91,31 @@ def test_interrupted_evaluation_says_how_to_go_on(
     run = tmp_path / "run"
     training = [*tiny_run, "trainer.max_steps=2", "evaluation.every=0"]
     with interrupted_at_second_picture():
-        finished = train_here(*training, f"hydra.run.dir={run}")
-    assert finished.code == 130
+        finished = train_here(*training, f"hydra.run.dir={run}", code=130)
     advice = f"hydra.run.dir={run} ckpt_path=last"
     assert finished.err.splitlines()[-1] == f"nerfro: interrupted; to resume, repeat the command with {advice}"
     assert not (run / "metrics.json").exists()
     # What the message says works.
-    assert train_here(*training, *advice.split()).code == 0
+    train_here(*training, *advice.split())
     assert (run / "metrics.json").exists()
 
     scored = [f"checkpoint={run / LAST_CHECKPOINT}", f"out={tmp_path / 'scores'}"]
     with interrupted_at_second_picture():
-        stopped = evaluate_here(*scored)
-    assert stopped.code == 130
+        stopped = evaluate_here(*scored, code=130)
     assert stopped.err.splitlines()[-1] == "nerfro: interrupted; run the same command to start again"
     assert not (tmp_path / "scores" / "metrics.json").exists()
-    assert evaluate_here(*scored).code == 0
+    evaluate_here(*scored)
     assert (tmp_path / "scores" / "metrics.json").exists()
 
 
 def test_resuming_a_finished_run_with_more_steps_trains_the_rest(
-    train_here: Callable[..., Any], tiny_default_run: list[str], trained_run: Path, tmp_path: Path
+    train: Callable[..., Any], trained_run: Path, tmp_path: Path
 ) -> None:
     shutil.copytree(trained_run, tmp_path / "run")
-    options = ["evaluation.every=0", f"hydra.run.dir={tmp_path / 'run'}", "trainer.max_steps=5", "ckpt_path=last"]
+    options = ["evaluation.every=0", "trainer.max_steps=5", "ckpt_path=last"]
     log = tmp_path / "run" / "csv" / "metrics.csv"
     before = log_rows(log)
-    assert train_here(*tiny_default_run, *options, "logger=tensorboard", "trainer.log_every_n_steps=1").code == 0
+    train(*options, "logger=tensorboard", "trainer.log_every_n_steps=1")
     assert before
     assert log_rows(log)[: len(before)] == before, "the log keeps its earlier rows"
     assert len(log_rows(log)) > len(before)
@@ -152,47 +148,21 @@ def test_last_finds_the_newest_run_beside_a_new_folder(tmp_path: Path) -> None:
 def test_checkpoint_of_another_configuration_is_refused(change: dict, message: str, tmp_path: Path) -> None:
     trained = OmegaConf.create({"field": {"width": 8}, "seed": 0, "medium": {"ior": 1.5}, "batches": {"size": 4}})
     require_same_configuration(tmp_path / "a.ckpt", trained, trained)
-    with pytest.raises(NerfroError, match=message):
-        require_same_configuration(tmp_path / "a.ckpt", trained, OmegaConf.merge(trained, change))
-
-
-@pytest.mark.parametrize("lost", ["half", "all", "callbacks"])
-def test_checkpoint_that_lost_something_is_refused_in_one_line(lost: str, trained_run: Path, tmp_path: Path) -> None:
-    content = (trained_run / LAST_CHECKPOINT).read_bytes()
-    path = tmp_path / "damaged.ckpt"
-    path.write_bytes({"half": content[: len(content) // 2], "all": b"", "callbacks": content}[lost])
-    if lost == "callbacks":
-        torch.save({"state_dict": {}}, path)
-    with pytest.raises(NerfroError, match=r"is not a readable nerfro checkpoint \(|lacks callbacks") as caught:
-        load_checkpoint(path)
-    assert "\n" not in str(caught.value)
-
-
-class Bomb:
-    """Runs a command when it is unpickled."""
-
-    def __init__(self, command: str) -> None:
-        self.command = command
-
-    def __reduce__(self) -> tuple[Callable[[str], int], tuple[str]]:
-        return os.system, (self.command,)
+    refused(message, require_same_configuration, tmp_path / "a.ckpt", trained, OmegaConf.merge(trained, change))
 
 
 def test_pickled_code_in_a_checkpoint_is_not_executed(tmp_path: Path) -> None:
     path, traces = tmp_path / "bomb.ckpt", tmp_path / "it_ran"
     torch.save({"nerfro_config": "seed: 0", "state_dict": Bomb(f"touch {traces}")}, path)
-    with pytest.raises(NerfroError, match="is not a readable nerfro checkpoint") as caught:
-        load_checkpoint(path)
-    assert "weights_only" not in str(caught.value), "torch's advice would run it"
+    message = refused("is not a readable nerfro checkpoint", load_checkpoint, path)
+    assert "weights_only" not in message, "torch's advice would run it"
     assert not traces.exists()
 
 
 def test_full_disk_is_refused_before_training(
-    train_here: Callable[..., Any], tiny_run: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    train: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     usage = namedtuple("usage", "total used free")
     monkeypatch.setattr("shutil.disk_usage", lambda path: usage(100 * 2**20, 99 * 2**20, 2**20))
-    finished = train_here(*tiny_run, "trainer.max_steps=2", f"hydra.run.dir={tmp_path / 'run'}")
-    assert finished.code == 1
-    assert "has 1 MiB free and this run needs " in finished.err
+    assert "has 1 MiB free and this run needs " in train("trainer.max_steps=2", code=1).error
     assert not [path for path in (tmp_path / "run").rglob("*") if path.is_file()]

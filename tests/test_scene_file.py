@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from nerfro.errors import NerfroError
 from nerfro.media.bodies import BodySettings
 from nerfro.rendering.scene_file import Provenance, SceneFile, read_scene_file, with_scene
+from tests.conftest import refused
 
 NODES = ["data", "medium", "sampler"]
 DATA = {"type": "opencv", "root": ".."}
@@ -122,7 +122,4 @@ def test_files_of_earlier_releases_are_read(tmp_path: Path) -> None:
 )
 def test_mistakes_get_one_line(content: Any, message: str, tmp_path: Path) -> None:
     (tmp_path / "scene.json").write_text(json.dumps(content))
-    with pytest.raises(NerfroError) as error:
-        with_scene([f"scene={tmp_path}/scene.json"], NODES)
-    assert message in str(error.value)
-    assert "\n" not in str(error.value)
+    assert message in refused("scene", with_scene, [f"scene={tmp_path}/scene.json"], NODES)

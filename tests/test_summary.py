@@ -1,3 +1,4 @@
+import functools
 import json
 import os
 import re
@@ -9,7 +10,6 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from nerfro.errors import NerfroError
 from nerfro.evaluation.image_metrics import image_metrics
 from nerfro.evaluation.results import EvaluationResult, RunMetrics, ViewScores, write_metrics_json
 from nerfro.evaluation.tables import Table
@@ -17,6 +17,7 @@ from nerfro.files.images import save_png
 from nerfro.report.comparison import compare, find_metrics, to_table
 from nerfro.report.runs import find_runs
 from nerfro.training.run_folder import LAST_CHECKPOINT, record
+from tests.conftest import Finished, refused
 
 PAPER = find_metrics(["psnr", "ssim", "lpips"])
 FIELD = {"_target_": "nerfro.fields.nerf.NerfField", "width": 64, "scale": 1.0}
@@ -174,17 +175,14 @@ def test_places_are_folders_and_globs_and_runs_without_scores_are_named(tmp_path
     assert [run.folder.name for run in runs] == ["a", "b"]
     assert len(unfinished) == 1
     assert str(tmp_path / "c") in unfinished[0]
-    with pytest.raises(NerfroError, match=r"has not been evaluated$"):
-        find_runs([str(tmp_path / "c")])
+    refused(r"has not been evaluated$", find_runs, [str(tmp_path / "c")])
     (tmp_path / "c" / LAST_CHECKPOINT).parent.mkdir()
     (tmp_path / "c" / LAST_CHECKPOINT).touch()
-    with pytest.raises(NerfroError, match=rf"; run python -m nerfro.evaluate checkpoint={tmp_path / 'c'}$"):
-        find_runs([str(tmp_path / "c")])
+    refused(rf"; run python -m nerfro.evaluate checkpoint={tmp_path / 'c'}$", find_runs, [str(tmp_path / "c")])
     (tmp_path / "d").mkdir()
     (tmp_path / "d" / "cell.json").write_text(json.dumps({"state": "failed", "reason": "no space left"}))
     assert find_runs([str(tmp_path)])[1][1] == f"{tmp_path / 'd'} is omitted: it failed: no space left"
-    with pytest.raises(NerfroError, match="nowhere does not exist"):
-        find_runs([str(tmp_path / "nowhere")])
+    refused("nowhere does not exist", find_runs, [str(tmp_path / "nowhere")])
 
 
 def test_run_without_scores_has_those_of_its_later_evaluation(tmp_path: Path) -> None:
@@ -197,37 +195,27 @@ def test_run_without_scores_has_those_of_its_later_evaluation(tmp_path: Path) ->
 
 
 @pytest.fixture
-def summarise(run_here: Callable) -> Callable[..., tuple[int, str]]:
-    """Exit code and output of `python -m nerfro.summary`'s main in this process."""
-
-    def run(*overrides: str) -> tuple[int, str]:
-        done = run_here("summary", *overrides)
-        return done.code, done.out + done.err
-
-    return run
+def summarise(run_here: Callable) -> Callable[..., Finished]:
+    """Run `python -m nerfro.summary` in this process."""
+    return functools.partial(run_here, "summary")
 
 
 def test_command_prints_writes_all_forms_and_refuses_to_overwrite(
-    tmp_path: Path, summarise: Callable[..., tuple[int, str]]
+    tmp_path: Path, summarise: Callable[..., Finished]
 ) -> None:
     write_run(tmp_path / "runs" / "a", "refractive", 25.0)
     write_run(tmp_path / "runs" / "b", "mine", 22.0, max_time=None, max_steps=100)
     runs, out = f"runs={tmp_path / 'runs'}", tmp_path / "out"
-    code, printed = summarise(runs, "methods.refractive=Ours", "+methods.mine=My own")
-    assert code == 0
+    printed = summarise(runs, "methods.refractive=Ours", "+methods.mine=My own").out
     assert "Ours" in printed
     assert "My own" in printed
     assert not out.exists()
-    code, printed = summarise(runs, f"out={out}")
-    assert code == 0, printed
+    summarise(runs, f"out={out}")
     assert {path.suffix for path in out.glob("[!.]*")} == {".csv", ".md", ".tex"}
     assert len(list(out.glob("[!.]*"))) == 6
     assert "22.00" in (out / "100_steps_of_512_rays.md").read_text()
-    code, printed = summarise(runs, f"out={out}")
-    assert code == 1
-    assert "overwrite=true" in printed
-    assert len(printed.strip().splitlines()) == 1
-    assert summarise(runs, f"out={out}", "overwrite=true")[0] == 0
+    assert "overwrite=true" in summarise(runs, f"out={out}", code=1).error
+    summarise(runs, f"out={out}", "overwrite=true")
 
 
 @pytest.mark.parametrize(
@@ -239,10 +227,7 @@ def test_command_prints_writes_all_forms_and_refuses_to_overwrite(
     ],
 )
 def test_mistakes_are_told_in_one_line(
-    tmp_path: Path, summarise: Callable[..., tuple[int, str]], override: str, said: str
+    tmp_path: Path, summarise: Callable[..., Finished], override: str, said: str
 ) -> None:
     write_run(tmp_path / "a", "refractive", 25.0)
-    code, printed = summarise(f"runs=[{tmp_path}]", override)
-    assert code == 1
-    assert said in printed
-    assert len(printed.strip().splitlines()) == 1
+    assert said in summarise(f"runs=[{tmp_path}]", override, code=1).error

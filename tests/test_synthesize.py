@@ -9,12 +9,12 @@ from torch.nn.functional import max_pool2d
 
 from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.data.blender import BlenderData
-from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import load_mesh
 from nerfro.light import to_srgb
 from nerfro.paths import ASSETS_DIR, CONF_DIR
 from nerfro.synthetic.synthesis import SynthesizeConfig, synthesize
 from nerfro.types import Exits
+from tests.conftest import refused
 from tests.exact_silhouettes import overlaps_of_convex_body
 
 EMBEDDED = ASSETS_DIR / "torus"
@@ -90,8 +90,7 @@ def test_another_data_set_is_replaced_only_on_request_and_strangers_survive(tmp_
     (folder / "notes.txt").write_text("mine")
     assert (folder / "interior.ply").is_file()
     before = (folder / "train" / "r_000.png").read_bytes()
-    with pytest.raises(NerfroError, match="overwrite=true"):
-        synthesize(small(folder, seed=1))
+    refused("overwrite=true", synthesize, small(folder, seed=1))
     assert (folder / "train" / "r_000.png").read_bytes() == before
     synthesize(small(folder, seed=1, views={"train": 1, "val": 1, "test": 1}, extras=False, overwrite=True))
     assert not (folder / "interior.ply").exists()
@@ -104,6 +103,5 @@ def test_another_data_set_is_replaced_only_on_request_and_strangers_survive(tmp_
 @pytest.mark.usefixtures("mitsuba")
 def test_a_folder_of_something_else_is_left_alone(tmp_path, name, content):
     (tmp_path / name).write_text(content)
-    with pytest.raises(NerfroError, match="it is no data set of nerfro"):
-        synthesize(small(tmp_path, overwrite=True))
+    refused("it is no data set of nerfro", synthesize, small(tmp_path, overwrite=True))
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, content)]

@@ -81,12 +81,12 @@ def test_georeferenced_data_train_as_at_the_origin(
         f"medium.box_{end}={[x + side for x in UTM]}".replace(" ", "") for end, side in (("min", -1.5), ("max", 1.5))
     ]
     far = [f"data.root={root}", f"medium.mesh={mesh}", *box]
-    finished = train_here(*overrides, *far, f"hydra.run.dir={tmp_path / 'far'}")
-    assert finished.code == 0, finished.err
+    train_here(*overrides, *far, f"hydra.run.dir={tmp_path / 'far'}")
     psnr = [json.loads((folder / "metrics.json").read_text())["test"]["psnr"] for folder in (run, tmp_path / "far")]
     assert psnr[1] == pytest.approx(psnr[0], abs=0.01)
-    refused = train_here(*overrides, f"data.root={root}", f"hydra.run.dir={tmp_path / 'apart'}")
-    assert "too far from the origin for single precision; subtract this point" in refused.err
+    apart = [f"data.root={root}", f"hydra.run.dir={tmp_path / 'apart'}"]
+    refused = train_here(*overrides, *apart, code=1).error
+    assert "too far from the origin for single precision; subtract this point" in refused
 
 
 def test_log_holds_every_loss_and_weight_of_every_second_step_and_images(run: Path) -> None:
@@ -115,7 +115,7 @@ def test_weights_depend_on_the_seed_and_not_on_validation(
     weights = [load_checkpoint(run / LAST_CHECKPOINT)[0]["state_dict"]]
     for seed in (0, 1):
         folder = tmp_path / str(seed)
-        assert train_here(*overrides, f"hydra.run.dir={folder}", f"seed={seed}", "evaluation.every=0").code == 0
+        train_here(*overrides, f"hydra.run.dir={folder}", f"seed={seed}", "evaluation.every=0")
         weights.append(load_checkpoint(folder / LAST_CHECKPOINT)[0]["state_dict"])
     assert all(torch.equal(weights[0][key], weights[1][key]) for key in weights[0])
     assert not all(torch.equal(weights[0][key], weights[2][key]) for key in weights[0])
@@ -123,35 +123,16 @@ def test_weights_depend_on_the_seed_and_not_on_validation(
 
 def test_training_learns_the_scene(train_here: Callable[..., Any], tiny_run: list[str], tmp_path: Path) -> None:
     psnr = []
+    quick = ["evaluation.every=0", "optimizer.warmup_steps=0", "optimizer.learning_rate=1e-2", "batches.size=128"]
     for steps in (1, 150):
         folder = tmp_path / str(steps)
-        finished = train_here(
-            *tiny_run,
-            f"hydra.run.dir={folder}",
-            f"trainer.max_steps={steps}",
-            "evaluation.every=0",
-            "optimizer.warmup_steps=0",
-            "optimizer.learning_rate=1e-2",
-            "batches.size=128",
-        )
-        assert finished.code == 0, finished.err
+        train_here(*tiny_run, *quick, f"trainer.max_steps={steps}", f"hydra.run.dir={folder}")
         psnr.append(json.loads((folder / "metrics.json").read_text())["test"]["psnr"])
     assert psnr[1] > psnr[0] + 3
 
 
-def test_time_ends_a_run(train_here: Callable[..., Any], overrides: list[str], tmp_path: Path) -> None:
-    finished = train_here(
-        *overrides, f"hydra.run.dir={tmp_path / 'run'}", "trainer.max_steps=-1", "trainer.max_time=00:00:00:01"
-    )
-    assert finished.code == 0, finished.err
-    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    assert metrics["steps"] > 0
-    assert metrics["train_seconds"] < 30
-
-
 def test_evaluation_of_the_checkpoint_repeats_the_runs_own(run: Path, evaluate_here: Callable[..., Any]) -> None:
-    code, _, errors = evaluate_here(f"checkpoint={run}")
-    assert code == 0, errors
+    evaluate_here(f"checkpoint={run}")
     again = run / "evaluate_test"
     first, second = (json.loads((folder / "metrics.json").read_text()) for folder in (run, again))
     assert first["views"] == second["views"]

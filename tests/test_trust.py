@@ -14,6 +14,7 @@ from nerfro.paths import CONF_DIR
 from nerfro.registry import discover
 from nerfro.training.config import TrainConfig
 from nerfro.trust import GuardedConfigLoader, command_of_module
+from tests.conftest import Bomb
 
 discover()
 
@@ -98,14 +99,7 @@ def write_experiment(folder: Path, hydra: str) -> None:
 
 
 def test_a_pickled_configuration_is_not_read(folder: Path) -> None:
-    (folder / "config.pickle").write_bytes(pickle.dumps(Evil()))
+    (folder / "config.pickle").write_bytes(pickle.dumps(Bomb("touch executed")))
     done = run(folder, sys.executable, "-m", "nerfro.train", "--experimental-rerun", "config.pickle")
     assert done.returncode == 1
     assert "--experimental-rerun executes code" in done.stderr
-
-
-class Evil:
-    """A value that executes code when it is unpickled."""
-
-    def __reduce__(self) -> tuple:
-        return exec, ("open('executed', 'w').close()",)

@@ -62,11 +62,10 @@ def test_offline_run_needs_no_account_and_holds_what_tensorboard_and_the_csv_hol
     monkeypatch.setenv("WANDB_SILENT", "true")
     monkeypatch.delenv("WANDB_API_KEY", raising=False)
     folder = tmp_path / "run"
-    finished = train_here(
+    train_here(
         *tiny_run, "logger=wandb", "logger.wandb.offline=true", "trainer.max_steps=4", "evaluation.every=2",
         "trainer.log_every_n_steps=1", "loss.boundary.start=0", "loss.smoothness.start=0", f"hydra.run.dir={folder}",
     )  # fmt: skip
-    assert finished.code == 0, finished.err
     (log,) = folder.glob("wandb/offline-run-*/run-*.wandb")
     settings, logged = read(log)
     assert (settings["trainer"]["max_steps"], settings["loss"]["boundary"]["start"]) == (4, 0)

@@ -25,14 +25,10 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return Path(next(iter(built)))
 
 
-def names(wheel: Path) -> set[str]:
-    with zipfile.ZipFile(wheel) as archive:
-        return set(archive.namelist())
-
-
 @pytest.mark.slow
 def test_wheel_holds_every_configuration_plugin_and_asset(wheel: Path) -> None:
-    inside = names(wheel)
+    with zipfile.ZipFile(wheel) as archive:
+        inside = set(archive.namelist())
     for folder in ("conf", "plugins"):
         files = [p for p in (PROJECT / folder).rglob("*") if p.suffix in (".yaml", ".py")]
         assert files

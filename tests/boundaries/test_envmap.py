@@ -10,11 +10,11 @@ import torch.nn.functional as F
 from nerfro.boundaries import cube_map
 from nerfro.boundaries import cube_map_cpu as kernels
 from nerfro.boundaries.envmap import EnvironmentMap, Observed
-from nerfro.errors import NerfroError
 from nerfro.files import lat_long
 from nerfro.files.images import save_png
 from nerfro.light import to_srgb
 from nerfro.types import Exits
+from tests.conftest import refused
 
 
 def random_directions(num: int, seed: int = 0) -> torch.Tensor:
@@ -149,23 +149,14 @@ def test_a_finer_picture_is_averaged_not_sampled() -> None:
     torch.testing.assert_close(colours, torch.full_like(colours, 0.4), rtol=0, atol=0.01)
 
 
-def test_bad_settings_and_files_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(NerfroError, match="give one or more"):
-        EnvironmentMap([])
-    with pytest.raises(NerfroError, match=r"resolutions=\[4, 0\] is not allowed; take at least 1"):
-        EnvironmentMap([4, 0])
-    with pytest.raises(NerfroError, match="does not exist"):
-        EnvironmentMap(image=str(tmp_path / "none.hdr"))
-    with pytest.raises(NerfroError, match="allowed are"):
-        EnvironmentMap(image=str(tmp_path / "sky.tiff"))
-    with pytest.raises(NerfroError, match=r"use \.png"):
-        EnvironmentMap([4]).save_lat_long(tmp_path / "sky.jpg", 8)
+def test_bad_files_are_refused(tmp_path: Path) -> None:
+    refused("does not exist", EnvironmentMap, image=str(tmp_path / "none.hdr"))
+    refused("allowed are", EnvironmentMap, image=str(tmp_path / "sky.tiff"))
+    refused(r"use \.png", lambda: EnvironmentMap([4]).save_lat_long(tmp_path / "sky.jpg", 8))
     (tmp_path / "broken.hdr").write_bytes(b"#?RADIANCE\n")
-    with pytest.raises(NerfroError, match="cannot be read"):
-        EnvironmentMap(image=str(tmp_path / "broken.hdr"))
+    refused("cannot be read", EnvironmentMap, image=str(tmp_path / "broken.hdr"))
     save_png(tmp_path / "square.png", torch.zeros(4, 4, 3))
-    with pytest.raises(NerfroError, match="twice as wide"):
-        EnvironmentMap(image=str(tmp_path / "square.png"))
+    refused("twice as wide", EnvironmentMap, image=str(tmp_path / "square.png"))
 
 
 LEVELS = cube_map.CubeLevels((1, 3, 8))

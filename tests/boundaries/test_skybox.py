@@ -1,11 +1,9 @@
 """The paper's boundary, and the constant one."""
 
-import pytest
 import torch
 
 from nerfro.boundaries.constant import ConstantBoundary
 from nerfro.boundaries.skybox import Skybox
-from nerfro.errors import NerfroError
 from nerfro.types import Exits
 
 
@@ -23,8 +21,3 @@ def test_published_skybox_has_its_layers() -> None:
 def test_constant_boundary_is_the_same_in_every_direction() -> None:
     rgb = ConstantBoundary([0.1, 0.2, 0.3])(Exits(torch.randn(4, 5, 3)))
     assert torch.equal(rgb, torch.tensor([0.1, 0.2, 0.3]).expand(4, 5, 3))
-
-
-def test_colour_of_other_than_three_numbers_is_refused() -> None:
-    with pytest.raises(NerfroError, match="give three"):
-        ConstantBoundary([1.0])

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from importlib import import_module
 
 import pytest
 import torch
@@ -12,15 +11,10 @@ from benchmarks.cameras import disturbed
 from nerfro.camera.similarity import motion_between
 from nerfro.light import to_srgb
 from nerfro.rays import Rays
-from nerfro.registry import discover
 from nerfro.samplers.paths.snell import Snell
 from tests.ball_photographs import NUM_VIEWS, SIZE, cameras, sky, solid
+from tests.camera.refined_cameras import PriorInformation, RefinedCamera, gauss_newton
 from tests.pretended_gpu import GPU, PretendedGpu
-
-discover()
-gauss_newton = import_module("nerfro_plugins.refined_cameras.gauss_newton")
-PriorInformation = import_module("nerfro_plugins.refined_cameras.least_squares").PriorInformation
-RefinedCamera = import_module("nerfro_plugins.refined_cameras.refined").RefinedCamera
 
 MEDIUM = solid([1.45])
 

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from importlib import import_module
 
 import pytest
 import torch
@@ -12,13 +11,8 @@ from benchmarks.cameras import disturbed
 from nerfro.cameras import Cameras
 from nerfro.geometry.interpolation import misses
 from nerfro.light import to_linear, to_srgb
-from nerfro.registry import discover
 from tests.ball_photographs import BOX, NUM_VIEWS, cameras, photographs
-
-discover()
-PriorInformation = import_module("nerfro_plugins.refined_cameras.least_squares").PriorInformation
-align = import_module("nerfro_plugins.refined_cameras.panorama").align
-RefinedCamera = import_module("nerfro_plugins.refined_cameras.refined").RefinedCamera
+from tests.camera.refined_cameras import PriorInformation, RefinedCamera, align
 
 TRUE = cameras()
 PHOTOGRAPHS = photographs([1.45]).images.reshape(-1, 3)

@@ -1,7 +1,6 @@
 """Refined cameras: derivatives of rays, what is held, units, files; how far disturbed poses and gains come back."""
 
 from dataclasses import replace
-from importlib import import_module
 
 import pytest
 import torch
@@ -11,11 +10,7 @@ from torch.nn.functional import normalize
 from nerfro.camera.similarity import Similarity, motion_between, similarity
 from nerfro.cameras import Cameras
 from nerfro.lens import coefficients
-from nerfro.registry import discover
-
-discover()
-pixel_units = import_module("nerfro_plugins.refined_cameras.pixel_units")
-refined = import_module("nerfro_plugins.refined_cameras.refined")
+from tests.camera.refined_cameras import pixel_units, refined
 
 NUM_VIEWS, SIZE = 8, 20
 

@@ -16,7 +16,7 @@ from omegaconf import OmegaConf
 from nerfro.data.base import Views
 from nerfro.data.colmap_model import CAMERA_MODELS, read_colmap
 from nerfro.errors import NerfroError
-from tests.conftest import SMALL
+from tests.conftest import SMALL, refused
 
 from .formats import BROWN, FORMATS, OPENCV, TRAIN, write_colmap
 from .photographs import CX, CY, FX, FY, HEIGHT, POINTS, WIDTH, camera_to_world, check_views, save_picture
@@ -43,11 +43,10 @@ def test_text_models_are_read_and_views_are_sorted_by_name(write):
 def test_a_reconstruction_with_a_distorting_lens_trains_in_a_room(write, train_here, tmp_path):
     root, run = write(), tmp_path / "run"
     trimesh.creation.icosphere(2, 0.3).export(root / "mesh.ply")
-    finished = train_here(
+    train_here(
         "+experiment=refractive_room", "data=colmap", f"data.root={root}", "data.test_every=3", *TINY,
         f"hydra.run.dir={run}",
     )  # fmt: skip
-    assert finished.code == 0, finished.err
     rows = json.loads((run / "metrics.json").read_text())["views"]
     assert len(rows) == 2
     config = OmegaConf.load(run / "config.yaml")
@@ -92,13 +91,6 @@ def test_pycolmap_writes_what_is_read_and_reads_what_is_written(write, tmp_path)
         np.testing.assert_allclose(again.cameras.project(TORCH_POINTS)[0].numpy(), pixels, atol=1e-4)
 
 
-def test_cameras_differ_by_image(write):
-    other = ("PINHOLE", (FX + 2, FY, CX, CY))
-    views = load(write(cameras={1: OPENCV, 3: other}, camera=lambda i: 3 if i == 2 else 1))
-    assert views.cameras.fx.tolist() == [FX, FX + 2, FX, FX]
-    assert (views.cameras.distortion[1] == 0).all()
-
-
 def test_bounds_come_from_the_points_unless_they_are_given(write):
     inside = np.array([[0, 0, 0.5], [0.2, 0, 0], [0, -0.1, -0.3]])
     views = load(write(points=inside), near=None, far=None)
@@ -124,8 +116,7 @@ def test_points_and_poses_beyond_all_coordinates_do_not_give_bounds(write):
     rows = [line.split() for line in path.read_text().splitlines()]
     rows[1][5] = "1e30"
     path.write_text("\n".join(" ".join(row) for row in rows) + "\n")
-    with pytest.raises(NerfroError, match=r"position in the pose=.* is not allowed; take at least -1000000"):
-        load(root)
+    refused(r"position in the pose=.* is not allowed; take at least -1000000", load, root)
 
 
 def test_without_points_bounds_come_from_the_cameras(write):
@@ -162,11 +153,9 @@ def test_truncated_and_overlong_binary_files_are_refused(write, file):
     whole = path.read_bytes()
     for cut in (3, 20, len(whole) - 1):
         path.write_bytes(whole[:cut])
-        with pytest.raises(NerfroError, match=rf"{file}\.bin is truncated; copy or export it again"):
-            load(root)
+        refused(rf"{file}\.bin is truncated; copy or export it again", load, root)
     path.write_bytes(whole + b"\0")
-    with pytest.raises(NerfroError, match=rf"{file}\.bin continues after its last item"):
-        load(root)
+    refused(rf"{file}\.bin continues after its last item", load, root)
 
 
 @pytest.mark.parametrize(
@@ -189,19 +178,15 @@ def test_wrong_text_files_are_refused(write, file, old, new, message):
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new, 1))
-    with pytest.raises(NerfroError, match=message):
-        load(root)
+    refused(message, load, root)
 
 
 def test_what_is_missing_is_named(write, tmp_path):
-    with pytest.raises(NerfroError, match="there is no COLMAP model"):
-        load(tmp_path)
-    with pytest.raises(NerfroError, match=r"sparse/7; set data\.model to its folder"):
-        load(tmp_path, model="sparse/7")
+    refused("there is no COLMAP model", load, tmp_path)
+    refused(r"sparse/7; set data\.model to its folder", load, tmp_path, model="sparse/7")
     root = write()
     (root / "sparse/0/images.bin").unlink()
-    with pytest.raises(NerfroError, match="holds no cameras and images"):
-        load(root)
+    refused("holds no cameras and images", load, root)
 
 
 def test_model_without_its_images_is_read(write):

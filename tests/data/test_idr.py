@@ -1,7 +1,6 @@
 """Matrices of IDR and NeuS are decomposed into the cameras that they were made of."""
 
 from collections.abc import Callable
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -10,14 +9,11 @@ import pytest
 import torch
 
 from nerfro.data.base import Views
-from nerfro.errors import NerfroError
-from nerfro.registry import discover
+from tests.conftest import refused
 
-from .formats import SCALE, SHIFT, write_idr
+from .formats import SCALE, SHIFT, idr, write_idr
 from .photographs import POINTS
 
-discover()
-idr = import_module("nerfro_plugins.data_formats.idr")
 IdrData, decompose = idr.IdrData, idr.decompose
 
 
@@ -42,8 +38,7 @@ def test_the_files_own_world(write):
     inside = load(write()).cameras.project(torch.from_numpy(POINTS).float())
     torch.testing.assert_close(cameras.project(world)[0], inside[0], rtol=0, atol=1e-3)
     torch.testing.assert_close(cameras.project(world)[1], SCALE * inside[1])
-    with pytest.raises(NerfroError, match=r"data.world=file needs data.near and data.far"):
-        IdrData(str(write()), world="file")
+    refused(r"data.world=file needs data.near and data.far", IdrData, str(write()), world="file")
 
 
 @pytest.mark.parametrize(
@@ -63,20 +58,15 @@ def test_the_files_own_world(write):
     ],
 )
 def test_wrong_matrices_are_refused(write, changes, message):
-    with pytest.raises(NerfroError, match=message):
-        load(write(**changes))
+    refused(message, load, write(**changes))
 
 
 def test_missing_files_are_named(write, tmp_path):
-    with pytest.raises(NerfroError, match=r"image is not a folder; it should hold the images"):
-        load(tmp_path)
+    refused(r"image is not a folder; it should hold the images", load, tmp_path)
     root = write()
-    with pytest.raises(NerfroError, match=r"cameras_large\.npz does not exist; set data.cameras"):
-        load(root, cameras="cameras_large.npz")
+    refused(r"cameras_large\.npz does not exist; set data.cameras", load, root, cameras="cameras_large.npz")
     (root / "mask/002.png").unlink()
-    with pytest.raises(NerfroError, match="holds 5 masks for 6 images"):
-        load(root)
+    refused("holds 5 masks for 6 images", load, root)
     (root / "cameras_sphere.npz").write_bytes(b"PK\3\4 cut off")
     (root / "mask/002.png").write_bytes(b"")
-    with pytest.raises(NerfroError, match=r"cameras_sphere\.npz is not a readable \.npz"):
-        load(root)
+    refused(r"cameras_sphere\.npz is not a readable \.npz", load, root)

@@ -18,12 +18,24 @@ from nerfro.errors import NerfroError
 read = partial(read_rgb, alpha="drop")
 
 
-def save(folder: Path, count: int, height: int = 4, width: int = 6) -> tuple[list[Path], np.ndarray]:
-    levels = np.random.default_rng(0).integers(0, 256, (count, height, width, 3), dtype=np.uint8)
+def save(folder: Path, count: int, bits: int = 8, seed: int = 0) -> tuple[list[Path], np.ndarray]:
+    shape = (count, 4, 6, 3) if bits == 8 else (count, 4, 6)  # Pillow has no deep colour
+    levels = np.random.default_rng(seed).integers(0, 2**bits, shape).astype(f"uint{bits}")
     paths = [folder / f"{number}.png" for number in range(count)]
     for path, picture in zip(paths, levels, strict=True):
         Image.fromarray(picture).save(path)
     return paths, levels
+
+
+class Reader:
+    """Reads colours, and lists what it has read."""
+
+    def __init__(self) -> None:
+        self.decoded: list[Path] = []
+
+    def __call__(self, path: Path) -> np.ndarray:
+        self.decoded.append(path)
+        return read(path)
 
 
 def test_pictures_are_in_the_order_of_their_files_and_means_of_blocks(tmp_path: Path) -> None:
@@ -36,38 +48,28 @@ def test_pictures_are_in_the_order_of_their_files_and_means_of_blocks(tmp_path: 
 
 def test_only_a_few_pictures_are_decoded_ahead(tmp_path: Path) -> None:
     paths, _ = save(tmp_path, 60)
-    decoded: list[Path] = []
-
-    def counting(path: Path) -> np.ndarray:
-        decoded.append(path)
-        return read(path)
-
-    pictures = LazyImages.of(paths, counting)
-    assert decoded == []
+    reader = Reader()
+    pictures = LazyImages.of(paths, reader)
+    assert reader.decoded == []
     levels = pictures.all_levels()
     next(levels)
-    assert 1 <= len(decoded) <= 10
+    assert 1 <= len(reader.decoded) <= 10
     levels.close()
 
 
 def test_a_program_decodes_a_picture_once_per_size(tmp_path: Path) -> None:
     paths, _ = save(tmp_path, 3)
-    decoded: list[Path] = []
-
-    def counting(path: Path) -> np.ndarray:
-        decoded.append(path)
-        return read(path)
-
+    reader = Reader()
     with decoded_once():
         for downscale in (1, 2, 1, 2):
-            pictures = LazyImages.of(paths, counting, downscale, recipe="drop")
+            pictures = LazyImages.of(paths, reader, downscale, recipe="drop")
             shown = np.stack(list(pictures.all_levels()))
-        assert sorted(decoded) == sorted(paths * 2)
+        assert sorted(reader.decoded) == sorted(paths * 2)
         os.utime(paths[0], (0, 0))
         assert np.array_equal(np.stack(list(pictures.select([0, 1]).all_levels())), shown[:2])
-        assert decoded[6:] == [paths[0]]
-    LazyImages.of(paths, counting, recipe="drop").levels(2)
-    assert decoded[7:] == [paths[2]]
+        assert reader.decoded[6:] == [paths[0]]
+    LazyImages.of(paths, reader, recipe="drop").levels(2)
+    assert reader.decoded[7:] == [paths[2]]
 
 
 def test_picture_that_changes_its_size_is_told(tmp_path: Path) -> None:
@@ -78,33 +80,13 @@ def test_picture_that_changes_its_size_is_told(tmp_path: Path) -> None:
         pictures[1]
 
 
-NUM_VIEWS, HEIGHT, WIDTH = 3, 5, 4
-EVERY = torch.arange(NUM_VIEWS * HEIGHT * WIDTH)
-
-
-class Reader:
-    """Reads colours, and counts how often."""
-
-    def __init__(self) -> None:
-        self.count = 0
-
-    def __call__(self, path: Path) -> np.ndarray:
-        self.count += 1
-        return read_rgb(path, "drop")
-
-
-def save_bits(folder: Path, bits: int, seed: int = 0) -> list[Path]:
-    shape = (NUM_VIEWS, HEIGHT, WIDTH, 3) if bits == 8 else (NUM_VIEWS, HEIGHT, WIDTH)  # Pillow has no deep colour
-    levels = np.random.default_rng(seed).integers(0, 2**bits, shape).astype(f"uint{bits}")
-    paths = [folder / f"{view}.png" for view in range(NUM_VIEWS)]
-    for path, picture in zip(paths, levels, strict=True):
-        Image.fromarray(picture).save(path)
-    return paths
+NUM_VIEWS = 3
+EVERY = torch.arange(NUM_VIEWS * 4 * 6)
 
 
 @pytest.mark.parametrize("bits", [8, 16])
 def test_drawn_colours_are_those_of_the_pictures_to_the_last_bit(bits: int, tmp_path: Path) -> None:
-    pictures = LazyImages.of(save_bits(tmp_path, bits), partial(read_rgb, alpha="drop"))
+    pictures = LazyImages.of(save(tmp_path, NUM_VIEWS, bits)[0], read)
     store = PixelStore(pictures)
     expected = torch.stack(list(pictures)).view(-1, 3)
     order = EVERY.flip(0)
@@ -115,22 +97,22 @@ def test_drawn_colours_are_those_of_the_pictures_to_the_last_bit(bits: int, tmp_
 @pytest.mark.parametrize("bits", [8, 16])
 def test_mapped_pixels_are_made_once_for_a_content(bits: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NERFRO_CACHE", str(tmp_path / "cache"))
-    paths = save_bits(tmp_path, bits)
+    paths, _ = save(tmp_path, NUM_VIEWS, bits)
     resident = PixelStore(LazyImages.of(paths, Reader()))[EVERY]
     monkeypatch.setattr(pixel_store, "_MAPPED_FROM", 0)
     reader = Reader()
     for _ in range(2):
         assert torch.equal(PixelStore(LazyImages.of(paths, reader))[EVERY], resident)
-    assert reader.count == NUM_VIEWS
+    assert len(reader.decoded) == NUM_VIEWS
     mapped = PixelStore(LazyImages.of(paths, reader))
     mapped.forget()
     assert torch.equal(mapped[EVERY], resident)
     half = PixelStore(LazyImages.of(paths, reader, recipe="other"))
-    assert reader.count == 2 * NUM_VIEWS  # another recipe may make other colours of the same files
+    assert len(reader.decoded) == 2 * NUM_VIEWS  # another recipe may make other colours of the same files
     assert torch.equal(half[EVERY], resident)
-    save_bits(tmp_path, bits, seed=1)  # other pictures under the same names
+    save(tmp_path, NUM_VIEWS, bits, seed=1)  # other pictures under the same names
     assert not torch.equal(PixelStore(LazyImages.of(paths, reader))[EVERY], resident)
     for path in (tmp_path / "cache").glob("*.npy"):
         path.write_bytes(path.read_bytes()[:-10])
-    save_bits(tmp_path, bits)
+    save(tmp_path, NUM_VIEWS, bits)
     assert torch.equal(PixelStore(LazyImages.of(paths, reader))[EVERY], resident)

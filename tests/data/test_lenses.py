@@ -13,9 +13,9 @@ from nerfro.camera.base import Camera
 from nerfro.data.blender import BlenderData
 from nerfro.data.lenses import Lens, check_lenses, read_lens
 from nerfro.data.nerfstudio import NerfstudioData
-from nerfro.errors import NerfroError
 from nerfro.lens import coefficients, opencv_coefficients
 from nerfro.viewing.camera_files import write_cameras
+from tests.conftest import refused
 
 from .formats import (
     ANGLE,
@@ -110,9 +110,7 @@ def test_distortion_is_read_in_the_conventions_of_nerfstudio_and_opencv(file: di
 @pytest.mark.parametrize("place", ["file", "frame"])
 def test_keys_of_other_projections_are_refused(place: str, keys: dict, message: str) -> None:
     file, frame = (WIDE | keys, {}) if place == "file" else (WIDE, keys)
-    with pytest.raises(NerfroError, match=rf"^it: .*{message}") as caught:
-        read_lens(file, frame, SIZE, "it")
-    assert "\n" not in str(caught.value)
+    refused(rf"^it: .*{message}", read_lens, file, frame, SIZE, "it")
 
 
 def test_blender_files_with_intrinsics_have_their_lens(tmp_path: Path) -> None:
@@ -139,8 +137,7 @@ def test_blender_files_with_intrinsics_have_their_lens(tmp_path: Path) -> None:
     ],
 )
 def test_lenses_that_no_camera_has_are_refused(lens: Lens, message: str) -> None:
-    with pytest.raises(NerfroError, match=message):
-        check_lenses([Lens(FX, FY, CX, CY), lens], ["b", "a"], SIZE)
+    refused(message, check_lenses, [Lens(FX, FY, CX, CY), lens], ["b", "a"], SIZE)
 
 
 def test_principal_points_outside_the_image_are_reported(capsys: pytest.CaptureFixture[str]) -> None:
@@ -160,8 +157,7 @@ BEYOND: dict[str, Callable[[Path], Path]] = {
 
 @pytest.mark.parametrize("form", BEYOND)
 def test_lenses_beyond_reason_are_refused_in_every_format(tmp_path: Path, form: str) -> None:
-    with pytest.raises(NerfroError, match=r"for an image of 24x18 pixels, has (cx=[1-9]\d|fx=1)"):
-        FORMATS[form].load(BEYOND[form](tmp_path))
+    refused(r"for an image of 24x18 pixels, has (cx=[1-9]\d|fx=1)", FORMATS[form].load, BEYOND[form](tmp_path))
 
 
 @pytest.mark.parametrize("dist", [[0.1, -0.02, 0.001, 0.002, 0.003], [0.4, 0.05, 0.001, -0.002, 0.002, 0.6, 0.1, 0.01]])

@@ -1,7 +1,6 @@
 """LLFF's poses_bounds.npy in its own world and in the frames of LLFF and Eikonal Fields."""
 
 from collections.abc import Callable
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -10,14 +9,11 @@ import pytest
 import torch
 
 from nerfro.data.base import Views
-from nerfro.errors import NerfroError
-from nerfro.registry import discover
+from tests.conftest import refused
 
-from .formats import FAR, IDEAL, NEAR, write_llff
+from .formats import FAR, IDEAL, NEAR, llff, write_llff
 from .photographs import FX, HEIGHT, POINTS, WIDTH, project
 
-discover()
-llff = import_module("nerfro_plugins.data_formats.llff")
 LlffData, frame_transform = llff.LlffData, llff.frame_transform
 map_poses, read_poses_bounds = llff.map_poses, llff.read_poses_bounds
 
@@ -27,6 +23,12 @@ def write(tmp_path: Path) -> Callable[..., Path]:
     return lambda *seeds, folder="", **changes: write_llff(tmp_path / folder, seeds=seeds or range(6), **changes)
 
 
+def transformed(root: Path, frame: str) -> tuple[np.ndarray, np.ndarray]:
+    """The file's poses, and the transformation to a frame."""
+    poses, depths, _ = read_poses_bounds(root / "poses_bounds.npy")
+    return poses, frame_transform(poses, depths, frame)
+
+
 def load(root: Path, split: str = "train", **options: Any) -> Views:
     return LlffData(str(root), **{"frame": "file", "test_every": 3} | options).load(split)
 
@@ -34,8 +36,7 @@ def load(root: Path, split: str = "train", **options: Any) -> Views:
 @pytest.mark.parametrize("frame", ["llff", "eikonal"])
 def test_a_frame_is_a_similarity_that_takes_the_scene_along(write, frame):
     root = write()
-    poses, depths, _ = read_poses_bounds(root / "poses_bounds.npy")
-    transform = frame_transform(poses, depths, frame)
+    _, transform = transformed(root, frame)
     linear = transform[:3, :3]
     scale = np.cbrt(np.linalg.det(linear))
     np.testing.assert_allclose(linear.T @ linear, scale**2 * np.eye(3), atol=1e-12)
@@ -48,8 +49,7 @@ def test_a_frame_is_a_similarity_that_takes_the_scene_along(write, frame):
 
 
 def test_llff_frame_is_scaled_by_the_least_depth_and_centred_on_the_average_camera(write):
-    poses, depths, _ = read_poses_bounds(write() / "poses_bounds.npy")
-    transform = frame_transform(poses, depths, "llff")
+    poses, transform = transformed(write(), "llff")
     assert np.cbrt(np.linalg.det(transform[:3, :3])) == pytest.approx(1 / (0.75 * NEAR))
     mapped = map_poses(poses, transform)
     np.testing.assert_allclose(mapped[:, :, 3].mean(0), 0, atol=1e-12)
@@ -60,8 +60,7 @@ def test_llff_frame_is_scaled_by_the_least_depth_and_centred_on_the_average_came
 
 
 def test_eikonal_frame_is_spherified(write):
-    poses, depths, _ = read_poses_bounds(write() / "poses_bounds.npy")
-    transform = frame_transform(poses, depths, "eikonal")
+    poses, transform = transformed(write(), "eikonal")
     mapped = map_poses(poses, transform)
     centres, axes = mapped[:, :, 3], mapped[:, :, 2]
     assert np.square(centres).sum(-1).mean() == pytest.approx(1)
@@ -85,8 +84,7 @@ def test_bounds_are_the_files_depths_in_the_frames_units(write):
     scaled = load(root, frame="llff").cameras
     assert scaled.near == pytest.approx(0.9 / 0.75)
     assert scaled.far == pytest.approx(FAR / (0.75 * NEAR) * corner)
-    poses, depths, _ = read_poses_bounds(root / "poses_bounds.npy")
-    scale = np.cbrt(np.linalg.det(frame_transform(poses, depths, "eikonal")[:3, :3]))
+    scale = np.cbrt(np.linalg.det(transformed(root, "eikonal")[1][:3, :3]))
     assert load(root, frame="eikonal").cameras.far == pytest.approx(min(FAR * scale, 2.0) * corner)
     given = load(root, near=0.1, far=7.0).cameras
     assert (given.near, given.far) == (0.1, 7.0)
@@ -102,8 +100,7 @@ def test_video_frames_are_mapped_with_the_training_transformation(write, frame):
     test = load(root, "test", frame=frame, video="video")
     assert test.names == ["img_000.png", "img_001.png"]
     assert (test.cameras.near, test.cameras.far) == (train.cameras.near, train.cameras.far)
-    poses, depths, _ = read_poses_bounds(root / "poses_bounds.npy")
-    transform = frame_transform(poses, depths, frame)
+    _, transform = transformed(root, frame)
     moved = torch.from_numpy(POINTS @ transform[:3, :3].T + transform[:3, 3]).float()
     for view, seed in enumerate((9, 7)):
         found = test.cameras.project(moved)[0][view].double().numpy()
@@ -125,19 +122,15 @@ def test_wrong_files_are_refused(write):
         (np.where(np.arange(17) == 16, 1e30, rows), r"data\.far=1.* is not allowed; take at least 0"),
     ):
         np.save(path, content)
-        with pytest.raises(NerfroError, match=message):
-            load(root)
+        refused(message, load, root)
     path.write_bytes(path.read_bytes()[:200])
-    with pytest.raises(NerfroError, match=r"poses_bounds\.npy cannot be read"):
-        load(root)
+    refused(r"poses_bounds\.npy cannot be read", load, root)
     path.unlink()
-    with pytest.raises(NerfroError, match="does not exist; create it with LLFF"):
-        load(root)
+    refused("does not exist; create it with LLFF", load, root)
 
 
 def test_parallel_cameras_have_no_sphere():
     poses = np.tile(np.eye(4)[:3], (4, 1, 1))
     poses[:, 0, 3] = np.arange(4)
-    with pytest.raises(NerfroError, match="all optical axes are parallel"):
-        frame_transform(poses, np.array([[1.0, 2.0]] * 4), "eikonal")
+    refused("all optical axes are parallel", frame_transform, poses, np.array([[1.0, 2.0]] * 4), "eikonal")
     assert np.isfinite(frame_transform(poses, np.array([[1.0, 2.0]] * 4), "llff")).all()

@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 
 from nerfro.data.masks import find_mask, find_masks
-from nerfro.errors import NerfroError
+from tests.conftest import refused
 
 
 def _touch(path: Path) -> Path:
@@ -39,8 +39,7 @@ def test_stated_mask_wins_and_must_exist(tmp_path: Path) -> None:
     image, beside, stated = (_touch(tmp_path / name) for name in ("a.png", "mask_a.png", "other/b.png"))
     assert find_mask(tmp_path, image) == beside
     assert find_mask(tmp_path, image, "other\\b.png") == stated
-    with pytest.raises(NerfroError, match=r"mask .*no\.png of .*a\.png does not exist"):
-        find_mask(tmp_path, image, "no.png")
+    refused(r"mask .*no\.png of .*a\.png does not exist", find_mask, tmp_path, image, "no.png")
 
 
 def test_views_of_different_splits_never_share_a_mask(tmp_path: Path) -> None:

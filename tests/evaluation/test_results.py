@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 
-from nerfro.errors import NerfroError
 from nerfro.evaluation.image_metrics import image_metrics
 from nerfro.evaluation.results import (
     EvaluationResult,
@@ -13,6 +12,7 @@ from nerfro.evaluation.results import (
     read_metrics_json,
     write_metrics_json,
 )
+from tests.conftest import refused
 
 
 def scores(**given: float) -> dict[str, float | None]:
@@ -63,11 +63,9 @@ def test_numbers_that_json_lacks_are_refused_and_the_old_file_stays(tmp_path: Pa
     path = tmp_path / "metrics.json"
     write_metrics_json(path, RunMetrics(result(), 1, 1.0, 1.0))
     before = path.read_text()
-    with pytest.raises(NerfroError, match="is NaN or infinite"):
-        write_metrics_json(path, RunMetrics(result(), 1, 1.0, bad))
+    refused("is NaN or infinite", write_metrics_json, path, RunMetrics(result(), 1, 1.0, bad))
     diverged = EvaluationResult((ViewScores("test_000", {"psnr": 20.0, "ssim": bad, "lpips": None}),))
-    with pytest.raises(NerfroError, match="is NaN or infinite"):
-        write_metrics_json(path, RunMetrics(diverged, 1, 1.0, 1.0))
+    refused("is NaN or infinite", write_metrics_json, path, RunMetrics(diverged, 1, 1.0, 1.0))
     assert path.read_text() == before
 
 
@@ -88,11 +86,8 @@ def test_numbers_that_json_lacks_are_refused_and_the_old_file_stays(tmp_path: Pa
 )
 def test_damaged_files_are_an_error_of_one_line(tmp_path: Path, content: str) -> None:
     (tmp_path / "metrics.json").write_bytes(content.encode("latin-1"))
-    with pytest.raises(NerfroError, match=r"metrics\.json") as caught:
-        read_metrics_json(tmp_path / "metrics.json")
-    assert "\n" not in str(caught.value)
+    refused(r"metrics\.json", read_metrics_json, tmp_path / "metrics.json")
 
 
 def test_missing_file_names_the_next_step(tmp_path: Path) -> None:
-    with pytest.raises(NerfroError, match=r"does not exist.*run nerfro\.evaluate"):
-        read_metrics_json(tmp_path / "metrics.json")
+    refused(r"does not exist.*run nerfro\.evaluate", read_metrics_json, tmp_path / "metrics.json")

@@ -3,7 +3,6 @@
 import pytest
 import torch
 
-from nerfro.errors import NerfroError
 from nerfro.fields import hash_encoding
 from nerfro.fields.hash_grid import HashGridField
 from nerfro.fields.selection import evaluate_selected, inside_box
@@ -129,18 +128,6 @@ def test_untrained_field_is_thin_fog_whatever_the_box() -> None:
         with torch.no_grad():
             density, _ = field.decode(side * torch.rand(100, 3), torch.tensor([[0.0, 0, 1]]).expand(100, 3))
         torch.testing.assert_close(density * side, torch.full((100,), 0.2), rtol=0.02, atol=0)
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"box_min": [0.0, 0, 0], "box_max": [1.0, 0, 1]}, "min below max"),
-        ({"box_min": [0.0, 0]}, "three numbers"),
-    ],
-)
-def test_impossible_fields_are_refused(settings: dict, message: str) -> None:
-    with pytest.raises(NerfroError, match=message):
-        HashGridField(**settings)
 
 
 def test_field_of_all_space_is_asked_where_contraction_leads() -> None:

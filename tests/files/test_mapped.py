@@ -10,6 +10,7 @@ import pytest
 from nerfro.errors import NerfroError
 from nerfro.files import cache as cache_module
 from nerfro.files.mapped import mapped_array
+from tests.conftest import refused
 
 SHAPE, TYPE = (4, 1000), np.dtype(np.uint16)
 
@@ -37,8 +38,7 @@ def test_what_is_written_to_an_array_stays_in_the_process() -> None:
 
 
 def test_nothing_is_left_of_an_array_that_could_not_be_made(cache: Path) -> None:
-    with pytest.raises(NerfroError, match="a picture cannot be read"):
-        mapped_array("a", SHAPE, TYPE, broken)
+    refused("a picture cannot be read", mapped_array, "a", SHAPE, TYPE, broken)
     assert list(cache.iterdir()) == []
 
 

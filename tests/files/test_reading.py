@@ -18,6 +18,7 @@ from nerfro.files.images import load_png
 from nerfro.files.reading import load_array, load_arrays, read_json
 from nerfro.geometry.mesh import load_mesh
 from nerfro.training.run_folder import load_checkpoint
+from tests.conftest import refused
 
 
 def chunk(kind: bytes, content: bytes) -> bytes:
@@ -38,8 +39,7 @@ def test_png_that_is_cut_off_anywhere_is_no_image(tmp_path: Path) -> None:
     for length in range(len(content)):
         path.write_bytes(content[:length])
         for read in (read_levels, load_png):
-            with pytest.raises(NerfroError, match=r"image\.png cannot be read \(.+\); copy or export it again"):
-                read(path)
+            refused(r"image\.png cannot be read \(.+\); copy or export it again", read, path)
     path.write_bytes(content + b"bytes behind the last chunk, as some programs write them")
     assert read_levels(path).shape == (5, 4, 3)
 
@@ -59,8 +59,7 @@ def test_images_without_palette_and_of_enormous_size_are_refused(
 ) -> None:
     content, message = IMAGES[image]
     (tmp_path / "image.png").write_bytes(content)
-    with pytest.raises(NerfroError, match=message):
-        read_levels(tmp_path / "image.png")
+    refused(message, read_levels, tmp_path / "image.png")
     assert len(recwarn) == 0
 
 
@@ -71,8 +70,7 @@ READERS = [read_levels, read_size, load_png, load_array, load_arrays, lambda pat
 @pytest.mark.parametrize("read", READERS)
 def test_pipes_are_refused_instead_of_waited_for(tmp_path: Path, read: Callable[[Path], object]) -> None:
     os.mkfifo(tmp_path / "pipe.png")
-    with pytest.raises(NerfroError, match=r"pipe\.png is not a regular file; give a file on a disk"):
-        read(tmp_path / "pipe.png")
+    refused(r"pipe\.png is not a regular file; give a file on a disk", read, tmp_path / "pipe.png")
 
 
 def test_arrays_that_unpack_to_more_than_the_limit_are_refused(tmp_path: Path) -> None:
@@ -114,5 +112,4 @@ def test_one_transparent_colour_is_composited(tmp_path: Path, bits: int) -> None
     (tmp_path / "image.png").write_bytes(png(2, 1, bits, 2, b"\0" + rows.tobytes(), transparency))
     read = {alpha: read_rgb(tmp_path / "image.png", alpha)[0].tolist() for alpha in ("white", "black")}
     assert read == {"white": [[65535] * 3, [65535, 0, 0]], "black": [[0] * 3, [65535, 0, 0]]}
-    with pytest.raises(NerfroError, match="convert it, with transparency composited first"):
-        load_png(tmp_path / "image.png")
+    refused("convert it, with transparency composited first", load_png, tmp_path / "image.png")

@@ -1,7 +1,5 @@
 """A short slice of `tests/fuzz/campaign.py`: a few cases of every kind."""
 
-from pathlib import Path
-
 import pytest
 
 from tests.fuzz.campaign import run_case
@@ -9,11 +7,6 @@ from tests.fuzz.cases import KINDS
 from tests.fuzz.world import World
 
 _NUM_CASES = {"data_formats": 60, "single_files": 60, "checkpoints": 20}  # the others are commands, of which 8 are run
-
-
-@pytest.fixture(scope="module")
-def world(tmp_path_factory: pytest.TempPathFactory, tiny_scene: Path, tiny_default_run: list[str]) -> World:
-    return World(tmp_path_factory.mktemp("world"), tiny_scene, tiny_default_run)
 
 
 @pytest.mark.parametrize("kind", KINDS)

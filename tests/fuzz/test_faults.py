@@ -29,11 +29,6 @@ PHASES = {
 }
 
 
-@pytest.fixture(scope="module")
-def world(tmp_path_factory: pytest.TempPathFactory, tiny_scene: Path, tiny_default_run: list[str]) -> World:
-    return World(tmp_path_factory.mktemp("world"), tiny_scene, tiny_default_run)
-
-
 def tensors(node: Any) -> list[torch.Tensor]:
     if isinstance(node, torch.Tensor):
         return [node]

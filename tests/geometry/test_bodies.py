@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from nerfro.errors import NerfroError
 from nerfro.geometry.bodies import bodies_of, require_separate
 from nerfro.geometry.mesh import TriangleMesh, load_mesh, merge_vertices
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.voxel_grid import VoxelGrid
+from tests.conftest import refused
 
 BOX = {"box_min": [-1.5] * 3, "box_max": [1.5] * 3, "resolution": 24, "cache": False}
 
@@ -68,8 +68,7 @@ def test_surfaces_apart_inside_each_other_or_touching_pass(parts: list[trimesh.T
 def test_surfaces_that_go_through_each_other_are_refused(parts: list[trimesh.Trimesh]) -> None:
     mesh = mesh_of(*parts)
     assert bodies_of(mesh).max() == len(parts) - 1
-    with pytest.raises(NerfroError, match="closed surfaces of the mesh cross"):
-        require_separate(mesh)
+    refused("closed surfaces of the mesh cross", require_separate, mesh)
 
 
 @pytest.mark.parametrize("medium", [SdfGrid, VoxelGrid])
@@ -94,12 +93,18 @@ def test_mesh_without_an_inside_is_refused(medium: type, shape: str, tmp_path: P
     else:
         mesh = trimesh.creation.box((0.5, 0.5, 0.001)).apply_translation((0, 0, 0.03))
     mesh.export(tmp_path / "mesh.ply")
-    with pytest.raises(NerfroError, match="no vertex of the grid lies inside the mesh"):
-        medium(str(tmp_path / "mesh.ply"), **BOX)
+    refused("no vertex of the grid lies inside the mesh", medium, str(tmp_path / "mesh.ply"), **BOX)
+
+
+@pytest.mark.parametrize("medium", [SdfGrid, VoxelGrid])
+def test_mesh_with_a_hole_is_accepted_when_asked(medium: type, tmp_path: Path) -> None:
+    mesh = ball(0.6)
+    mesh.update_faces(np.arange(len(mesh.faces)) > 0)
+    mesh.export(tmp_path / "mesh.ply")
+    medium(str(tmp_path / "mesh.ply"), accept_open_mesh=True, **BOX)
 
 
 @pytest.mark.parametrize("scale", [1e8, 1e30])
 def test_mesh_that_is_far_too_large_is_refused(scale: float, tmp_path: Path) -> None:
     ball(scale).export(tmp_path / "mesh.ply")
-    with pytest.raises(NerfroError, match="reaches too far; scale it to about one unit"):
-        load_mesh(tmp_path / "mesh.ply")
+    refused("reaches too far; scale it to about one unit", load_mesh, tmp_path / "mesh.ply")

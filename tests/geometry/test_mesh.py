@@ -8,6 +8,7 @@ import trimesh
 
 from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import load_mesh
+from tests.conftest import refused
 
 
 @pytest.mark.parametrize("extension", ["ply", "obj", "stl", "glb"])
@@ -25,23 +26,18 @@ def test_open_meshes_are_refused_unless_accepted(tmp_path: Path) -> None:
     shape = trimesh.creation.icosphere(2)
     shape.update_faces(np.arange(len(shape.faces)) > 3)
     shape.export(tmp_path / "open.ply")
-    with pytest.raises(NerfroError, match=r"not watertight.*medium\.accept_open_mesh=true"):
-        load_mesh(tmp_path / "open.ply")
+    refused(r"not watertight.*medium\.accept_open_mesh=true", load_mesh, tmp_path / "open.ply")
     assert not load_mesh(tmp_path / "open.ply", accept_open_mesh=True).is_closed
 
 
 def test_missing_garbled_and_empty_files_are_named(tmp_path: Path) -> None:
-    with pytest.raises(NerfroError, match=r"none\.ply does not exist"):
-        load_mesh(tmp_path / "none.ply")
+    refused(r"none\.ply does not exist", load_mesh, tmp_path / "none.ply")
     (tmp_path / "bad.ply").write_bytes(b"ply\nformat nonsense")
-    with pytest.raises(NerfroError, match=r"bad\.ply"):
-        load_mesh(tmp_path / "bad.ply")
+    refused(r"bad\.ply", load_mesh, tmp_path / "bad.ply")
     (tmp_path / "points.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n")
-    with pytest.raises(NerfroError, match=r"points\.obj"):
-        load_mesh(tmp_path / "points.obj")
+    refused(r"points\.obj", load_mesh, tmp_path / "points.obj")
     (tmp_path / "nan.obj").write_text("v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    with pytest.raises(NerfroError, match=r"nan\.obj"):
-        load_mesh(tmp_path / "nan.obj")
+    refused(r"nan\.obj", load_mesh, tmp_path / "nan.obj")
 
 
 @pytest.mark.parametrize("index", [-1, 8, 2**31 - 1])
@@ -61,5 +57,4 @@ def test_meshes_without_an_inside_are_refused(extents: tuple[float, float, float
     trimesh.Trimesh(trimesh.creation.box().vertices * extents, trimesh.creation.box().faces, process=False).export(
         tmp_path / "flat.ply"
     )
-    with pytest.raises(NerfroError, match=r"flat\.ply is \S+ world units thin, so it has no inside"):
-        load_mesh(tmp_path / "flat.ply")
+    refused(r"flat\.ply is \S+ world units thin, so it has no inside", load_mesh, tmp_path / "flat.ply")

@@ -4,14 +4,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from nerfro.geometry.mesh import TriangleMesh, merge_vertices
+from nerfro.geometry.mesh import TriangleMesh
 from nerfro.geometry.occupancy import occupancy_fraction
+from tests.geometry.test_bodies import mesh_of
 
 BOX = np.array([[-1.5] * 3, [1.5] * 3])
-
-
-def _mesh(shape: trimesh.Trimesh) -> TriangleMesh:
-    return merge_vertices(np.asarray(shape.vertices, np.float64), np.asarray(shape.faces))
 
 
 def _winding_number(points: np.ndarray, mesh: TriangleMesh) -> np.ndarray:
@@ -24,7 +21,7 @@ def _winding_number(points: np.ndarray, mesh: TriangleMesh) -> np.ndarray:
 
 
 def test_fractions_are_counts_of_sub_samples_inside_by_winding_number() -> None:
-    mesh = _mesh(trimesh.creation.annulus(0.4, 0.9, 0.7))
+    mesh = mesh_of(trimesh.creation.annulus(0.4, 0.9, 0.7))
     size = 12
     axis = np.linspace(-1.5, 1.5, size)
     offsets = np.linspace(-1, 1, 4) * (axis[1] - axis[0])
@@ -39,7 +36,7 @@ def test_fractions_are_counts_of_sub_samples_inside_by_winding_number() -> None:
 
 def test_columns_through_edges_and_vertices_are_counted_once() -> None:
     # All vertices, edges and diagonals of this cube project onto columns of the grid.
-    mesh = _mesh(trimesh.creation.box(extents=[1.0, 1.0, 1.0]))
+    mesh = mesh_of(trimesh.creation.box(extents=[1.0, 1.0, 1.0]))
     box = np.array([[-1.0] * 3, [1.0] * 3])
     occupancy = occupancy_fraction(mesh, box, 17, subsamples=1)
     assert set(np.unique(occupancy)) == {0.0, 1.0}
@@ -52,7 +49,7 @@ def test_a_cavity_with_either_orientation_is_outside() -> None:
     for flip in (False, True):
         if flip:
             inner.invert()
-        mesh = _mesh(trimesh.util.concatenate([outer, inner]))
+        mesh = mesh_of(trimesh.util.concatenate([outer, inner]))
         occupancy = occupancy_fraction(mesh, BOX, 31)
         assert occupancy[15, 15, 15] == 0
         assert occupancy[15, 15, 22] == 1
@@ -62,7 +59,7 @@ def test_a_hole_is_outvoted_by_the_other_axes() -> None:
     sphere = trimesh.creation.icosphere(4, 0.8)
     # The cap around +z is missing: columns along z that pass through it see a single crossing.
     sphere.update_faces(sphere.triangles_center[:, 2] < 0.75)
-    mesh = _mesh(sphere)
+    mesh = mesh_of(sphere)
     assert not mesh.is_closed
     occupancy = occupancy_fraction(mesh, BOX, 33)
     assert occupancy[16, 16, 16] == 1

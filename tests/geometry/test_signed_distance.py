@@ -3,15 +3,11 @@
 import numpy as np
 import trimesh
 
-from nerfro.geometry.mesh import TriangleMesh, merge_vertices
 from nerfro.geometry.signed_distance import distance_to_set, signed_distance_grid
+from tests.geometry.test_bodies import mesh_of
 
 BOX = np.array([[-1.0] * 3, [1.0] * 3])
 SIZE = 41
-
-
-def _mesh(shape: trimesh.Trimesh) -> TriangleMesh:
-    return merge_vertices(np.asarray(shape.vertices, np.float64), np.asarray(shape.faces))
 
 
 def _points() -> np.ndarray:
@@ -21,7 +17,7 @@ def _points() -> np.ndarray:
 
 def test_facets_of_a_sphere_do_not_show() -> None:
     radius = 0.6
-    mesh = _mesh(trimesh.creation.icosphere(3, radius))
+    mesh = mesh_of(trimesh.creation.icosphere(3, radius))
     sagitta = radius - np.linalg.norm(mesh.triangles.mean(1), axis=1).min()
     distance = signed_distance_grid(mesh, BOX, SIZE, band=3.0)
     exact = np.linalg.norm(_points(), axis=-1) - radius
@@ -31,7 +27,7 @@ def test_facets_of_a_sphere_do_not_show() -> None:
 
 def test_sharp_edges_stay_sharp() -> None:
     half = 0.53
-    mesh = _mesh(trimesh.creation.box(extents=[2 * half] * 3))
+    mesh = mesh_of(trimesh.creation.box(extents=[2 * half] * 3))
     distance = signed_distance_grid(mesh, BOX, SIZE, band=3.0)
     q = np.abs(_points()) - half
     exact = np.linalg.norm(q.clip(0), axis=-1) + q.max(-1).clip(max=0)
@@ -40,7 +36,7 @@ def test_sharp_edges_stay_sharp() -> None:
 
 
 def test_far_values_are_lower_bounds_of_the_right_sign() -> None:
-    mesh = _mesh(trimesh.creation.torus(0.6, 0.25, 64, 32))
+    mesh = mesh_of(trimesh.creation.torus(0.6, 0.25, 64, 32))
     distance = signed_distance_grid(mesh, BOX, SIZE, band=2.0)
     p = _points()
     exact = np.hypot(np.hypot(p[..., 0], p[..., 1]) - 0.6, p[..., 2]) - 0.25

@@ -6,7 +6,6 @@ from unittest.mock import Mock
 import pytest
 import torch
 
-from nerfro.errors import NerfroError
 from nerfro.losses.backdrop import Backdrop
 from nerfro.losses.base import Loss
 from nerfro.losses.near_camera import NearCamera
@@ -56,12 +55,6 @@ def test_what_is_as_white_as_the_boundary_becomes_opaque() -> None:
 def test_pixels_of_another_colour_and_photographs_without_a_backdrop_are_not_charged() -> None:
     assert learned_opacity(torch.tensor([1.0, 1.0, 0.98]), Backdrop(WHITE)) > 0.95
     assert learned_opacity(torch.ones(3), Backdrop()) > 0.95
-
-
-@pytest.mark.parametrize("colour", [[1.0], [255.0, 255.0, 255.0]])
-def test_a_colour_has_three_numbers_up_to_one(colour: list[float]) -> None:
-    with pytest.raises(NerfroError, match="three numbers in"):
-        Backdrop(colour)
 
 
 BATCH = example_batch(8)

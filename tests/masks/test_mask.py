@@ -1,5 +1,6 @@
 """`python -m nerfro.mask` on a coloured ball before a textured floor."""
 
+import functools
 import json
 import shutil
 from collections.abc import Callable
@@ -76,6 +77,12 @@ def capture(tmp_path: Path, photographs: list[tuple[np.ndarray, np.ndarray, np.n
     return write_capture(tmp_path / "capture", photographs)
 
 
+@pytest.fixture
+def mask(capture: Path, command: Callable[..., str]) -> Callable[..., str]:
+    """`nerfro.mask` on the capture."""
+    return functools.partial(command, "mask", f"data.root={capture}")
+
+
 def box_around(mask: np.ndarray, margin: int) -> list[int]:
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     numbers = columns[0] - margin, rows[0] - margin, columns[-1] + 1 + margin, rows[-1] + 1 + margin
@@ -112,24 +119,20 @@ def test_one_box_leads_to_all_masks(tmp_path: Path, photographs: list, command: 
         assert sheet.size[0] > 6 * 220
 
 
-def test_masks_that_exist_are_kept_and_show_the_way(
-    capture: Path, photographs: list, command: Callable[..., str]
-) -> None:
+def test_masks_that_exist_are_kept_and_show_the_way(capture: Path, photographs: list, mask: Callable[..., str]) -> None:
     drawn = {view: photographs[view][1].copy() for view in (0, 3, 5, 8, 11)}
     drawn[3][:2, :2] = True  # known again
-    for view, mask in drawn.items():
-        Image.fromarray(np.uint8(200 * mask)).save(capture / "photos" / f"mask_p_{view}.png")
+    for view, silhouette in drawn.items():
+        Image.fromarray(np.uint8(200 * silhouette)).save(capture / "photos" / f"mask_p_{view}.png")
     before = {view: (capture / "photos" / f"mask_p_{view}.png").read_bytes() for view in drawn}
-    assert "delete the mask, or set overwrite=true" in command(
-        "mask", f"data.root={capture}", "outlines={p_0:[1,1,9,9]}"
-    )
-    assert "5 existing masks" in command("mask", f"data.root={capture}")
-    for view, (_, mask, _) in enumerate(photographs):
+    assert "delete the mask, or set overwrite=true" in mask("outlines={p_0:[1,1,9,9]}")
+    assert "5 existing masks" in mask()
+    for view, (_, silhouette, _) in enumerate(photographs):
         if view in drawn:
             assert (capture / "photos" / f"mask_p_{view}.png").read_bytes() == before[view]
         else:
-            assert overlap(read(capture, view), mask) > 0.9
-    assert "5 existing masks" in command("mask", f"data.root={capture}")  # projections are made again
+            assert overlap(read(capture, view), silhouette) > 0.9
+    assert "5 existing masks" in mask()  # projections are made again
 
 
 def test_two_outlines_of_a_body_of_revolution_give_all_masks_whatever_the_colours() -> None:
@@ -153,53 +156,53 @@ def test_two_outlines_of_a_body_of_revolution_give_all_masks_whatever_the_colour
     assert min(overlap(found.masks[view], masks[view]) for view in found.by_hull) > 0.95
 
 
-def polygon_around(mask: np.ndarray) -> list[list[float]]:
-    """A regular polygon with the area and the centre of a mask."""
-    angles, (rows, columns) = np.linspace(0, 2 * np.pi, 25)[:-1], np.nonzero(mask)
-    radius, middle = np.sqrt(len(rows) / np.pi), np.array([columns.mean() + 0.5, rows.mean() + 0.5])
+def polygon_around(mask: np.ndarray, count: int = 24, scale: float = 1.0) -> list[list[float]]:
+    """A regular polygon around the centre of a mask, for a scale of one of about its area."""
+    angles, (rows, columns) = np.linspace(0, 2 * np.pi, count + 1)[:-1], np.nonzero(mask)
+    radius, middle = scale * np.sqrt(len(rows) / np.pi), np.array([columns.mean() + 0.5, rows.mean() + 0.5])
     return (middle + radius * np.stack([np.cos(angles), np.sin(angles)], 1)).tolist()
 
 
 def test_masks_of_a_network_are_marked_and_compared_with_their_hull(
-    capture: Path, photographs: list, command: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+    capture: Path, photographs: list, mask: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     polygon, box, lost = polygon_around(photographs[1][1]), [10, 8, 80, 64], 3
 
     def track(model: Any, images: list, masks: dict, boxes: dict, progress: Callable[[], None]) -> dict:
         assert all(np.array_equal(image, photograph[0]) for image, photograph in zip(images, photographs, strict=True))
         assert (model, list(masks), boxes) == ("network", [1], {5: box})
-        found = {view: mask for view, (_, mask, _) in enumerate(photographs) if view not in masks}
+        found = {view: silhouette for view, (_, silhouette, _) in enumerate(photographs) if view not in masks}
         return found | {lost: np.zeros_like(found[lost])}
 
     monkeypatch.setattr(mask_files, "load_tracker", lambda folder: "network")
     monkeypatch.setattr(mask_files, "track_object", track)
-    printed = command("mask", f"data.root={capture}", f"outlines={{p_1:{polygon},p_5:{box}}}", "sam2=folder")
+    printed = mask(f"outlines={{p_1:{polygon},p_5:{box}}}", "sam2=folder")
     assert "1 masks are projections of the visual hull" in printed
     assert np.array_equal(read(capture, 1), polygon_mask(polygon, (WIDTH, HEIGHT)))
     methods = [method_of(capture / "photos" / f"mask_p_{view}.png") for view in (1, 2, lost, 5)]
     assert methods == ["polygon", "sam2", "visual hull", "sam2"]
     assert np.array_equal(read(capture, 2), photographs[2][1])
     assert overlap(read(capture, lost), photographs[lost][1]) > 0.8
-    assert "wrote 1 masks" in command("mask", f"data.root={capture}", "hull_only=true"), "the others are kept"
-    assert "sam2= segments all photographs" in command("mask", f"data.root={capture}", "sam2=folder", "view=true")
+    assert "wrote 1 masks" in mask("hull_only=true"), "the others are kept"
+    assert "sam2= segments all photographs" in mask("sam2=folder", "view=true")
 
 
-def test_polygons_are_the_masks_of_their_views(capture: Path, photographs: list, command: Callable[..., str]) -> None:
+def test_polygons_are_the_masks_of_their_views(capture: Path, photographs: list, mask: Callable[..., str]) -> None:
     polygons = {f"p_{view}": polygon_around(photographs[view][1]) for view in (1, 5, 9)}
     converted = {f"{name}.HEIC": polygon for name, polygon in polygons.items()}  # reconstruct converts photographs
     (capture / "outlines.json").write_text(json.dumps(converted))
-    command("mask", f"data.root={capture}", f"outlines={capture / 'outlines.json'}", "hull_only=true")
+    mask(f"outlines={capture / 'outlines.json'}", "hull_only=true")
     for name, polygon in polygons.items():
         assert np.array_equal(read(capture, int(name[2:])), polygon_mask(polygon, (WIDTH, HEIGHT)))
-    assert min(overlap(read(capture, view), mask) for view, (_, mask, _) in enumerate(photographs)) > 0.7
+    assert min(overlap(read(capture, view), photographs[view][1]) for view in range(NUM_VIEWS)) > 0.7
 
 
 def test_projections_are_made_again_and_edited_masks_are_kept(
-    capture: Path, photographs: list, command: Callable[..., str]
+    capture: Path, photographs: list, mask: Callable[..., str]
 ) -> None:
     for view in (1, 5, 9):
         Image.fromarray(np.uint8(255 * photographs[view][1])).save(capture / "photos" / f"mask_p_{view}.png")
-    assert "wrote 11 masks" in command("mask", f"data.root={capture}", "hull_only=true")
+    assert "wrote 11 masks" in mask("hull_only=true")
     file = capture / "photos" / "mask_p_3.png"
     assert method_of(file) == "body of revolution"
     assert method_of(capture / "photos" / "mask_p_1.png") is None
@@ -211,7 +214,7 @@ def test_projections_are_made_again_and_edited_masks_are_kept(
     edited.paste(0, (46, 34, 48, 36))
     edited.save(file, pnginfo=text)
     content = file.read_bytes()
-    assert "wrote 10 masks" in command("mask", f"data.root={capture}", "hull_only=true")
+    assert "wrote 10 masks" in mask("hull_only=true")
     assert file.read_bytes() == content
 
 
@@ -222,17 +225,15 @@ def test_a_polygon_covers_the_pixels_whose_centres_it_contains() -> None:
     assert np.array_equal(polygon_mask(square, (9, 6)), expected)
 
 
-def test_mistakes_are_reported_in_one_line(capture: Path, command: Callable[..., str]) -> None:
-    root, two_boxes = f"data.root={capture}", "outlines={p_0:[1,1,9,9],p_5:[1,1,9,9]}"
-    assert "hull_only=true needs masks or outlines of at least 3" in command("mask", root, two_boxes, "hull_only=true")
-    assert "no mask to start from" in command("mask", root)
+def test_mistakes_are_reported_in_one_line(capture: Path, mask: Callable[..., str]) -> None:
+    two_boxes = "outlines={p_0:[1,1,9,9],p_5:[1,1,9,9]}"
+    assert "hull_only=true needs masks or outlines of at least 3" in mask(two_boxes, "hull_only=true")
+    assert "no mask to start from" in mask()
     assert torch.is_grad_enabled()
-    assert "q_1 is not an image of the data set; names of the data set look like photos/p_" in command(
-        "mask", root, "outlines={q_1:[1,1,9,9]}"
-    )
-    assert "give a box [left,top,right,bottom]" in command("mask", root, "outlines={p_1:[9,9,1,1]}")
-    assert "nothing.json does not exist" in command("mask", root, "outlines=nothing.json")
-    assert "is part of nerfro" in command("mask", "data=blender", "data.root=embedded:torus")
+    assert "q_1 is not an image of the data set; names" in mask("outlines={q_1:[1,1,9,9]}")
+    assert "give a box [left,top,right,bottom]" in mask("outlines={p_1:[9,9,1,1]}")
+    assert "nothing.json does not exist" in mask("outlines=nothing.json")
+    assert "is part of nerfro" in mask("data=blender", "data.root=embedded:torus")
     assert not list((capture / "photos").glob("mask_*"))
 
 
@@ -251,30 +252,18 @@ def test_a_neighbour_that_looks_from_the_same_place_does_not_lead(
     assert np.mean(overlaps) > 0.9, overlaps
 
 
-def scrambled(photographs: list, generator: np.random.Generator) -> list:
-    """The same views, whose colours say nothing about the object."""
-    return [(np.uint8(generator.integers(0, 256, (HEIGHT, WIDTH, 3))), mask, pose) for _, mask, pose in photographs]
-
-
 @pytest.mark.parametrize("hull_only", [False, True])
 def test_the_hull_is_taken_where_colours_say_something_else(
     hull_only: bool, photographs: list, tmp_path: Path, command: Callable[..., str]
 ) -> None:
-    root = write_capture(tmp_path, scrambled(photographs, np.random.default_rng(0)))
+    noise = np.random.default_rng(0).integers(0, 256, (NUM_VIEWS, HEIGHT, WIDTH, 3), np.uint8)
+    root = write_capture(tmp_path, [(noise[view], None, pose) for view, (_, _, pose) in enumerate(photographs)])
     for view in range(0, NUM_VIEWS, 2):
         Image.fromarray(np.uint8(255 * photographs[view][1])).save(root / "photos" / f"mask_p_{view}.png")
     printed = command("mask", f"data.root={root}", f"hull_only={str(hull_only).lower()}")
     overlaps = [overlap(read(root, view), photographs[view][1]) for view in range(1, NUM_VIEWS, 2)]
     assert min(overlaps) > 0.85, overlaps
     assert "7 masks are projections of the body of revolution" in printed
-
-
-def circle(mask: np.ndarray) -> list[tuple[float, float]]:
-    """Vertices around a disk."""
-    (rows, columns), turn = np.nonzero(mask), np.linspace(0, 2 * np.pi, 11)[:-1]
-    radius = 1.05 * np.sqrt(len(rows) / np.pi)
-    vertices = np.stack([columns.mean() + radius * np.cos(turn), rows.mean() + radius * np.sin(turn)], 1) + 0.5
-    return [(float(x), float(y)) for x, y in vertices]
 
 
 def on_screen(browser: Browser, x: float, y: float) -> tuple[float, float]:
@@ -297,10 +286,7 @@ def choose(browser: Browser, view: int) -> str:
 
 @needs_chromium
 def test_drawn_outlines_lead_to_the_masks_of_the_command(
-    capture: Path,
-    photographs: list,
-    tmp_path: Path,
-    command: Callable[..., str],
+    capture: Path, photographs: list, tmp_path: Path, command: Callable[..., str]
 ) -> None:
     options = [f"data.root={capture}", "view=true", "open=false", "port=0"]
     served = Command("mask", options, tmp_path / "log")
@@ -309,7 +295,7 @@ def test_drawn_outlines_lead_to_the_masks_of_the_command(
         browser.wait_for("$('message').textContent.startsWith('0 masks or outlines do not determine the shape')")
         for view in (1, 5, 9):
             outline = choose(browser, view)
-            for x, y in circle(photographs[view][1]):
+            for x, y in polygon_around(photographs[view][1], 10, 1.05):
                 click(browser, x, y)
             assert len(browser.evaluate(outline)) == 10
         browser.wait_for("!$('message').classList.contains('busy') && Object.keys(state.notes).length === 3")

@@ -11,7 +11,6 @@ import torch
 import trimesh
 from torch import Tensor
 
-from nerfro.errors import NerfroError
 from nerfro.media.material import MATERIALS
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.samplers.paths.eikonal import Eikonal
@@ -19,6 +18,7 @@ from nerfro.samplers.paths.snell import Snell, trace_interfaces
 from nerfro.types import Path as RayPath
 from nerfro.types import Rays
 from tests.closed_forms import angle, make_rays
+from tests.conftest import refused
 
 CENTRES = ((-10.0, 0.0, 0.0), (10.0, 0.0, 0.0))  # of balls of radius 1
 
@@ -176,16 +176,13 @@ def test_the_index_of_one_body_and_the_absorption_of_the_other_are_learned_toget
 def test_wrong_bodies_are_refused_by_name(settings: Any, message: str, tmp_path: Path) -> None:
     if isinstance(settings, dict):
         settings = {"mesh": _ball(tmp_path, (0.0, 0.0, 0.0), 2), **settings}
-    with pytest.raises(NerfroError, match=message):
-        _medium(16, glass=settings)
+    refused(message, _medium, 16, glass=settings)
 
 
 def test_short_and_long_form_exclude_each_other(tmp_path: Path) -> None:
     bodies = {"glass": {"mesh": _ball(tmp_path, (0.0, 0.0, 0.0), 2), "ior": 1.5}}
-    with pytest.raises(NerfroError, match=r"medium\.abbe has no meaning beside bodies"):
-        SdfGrid(bodies=bodies, abbe=[50])
-    with pytest.raises(NerfroError, match="needs mesh"):
-        SdfGrid()
+    refused(r"medium\.abbe has no meaning beside bodies", SdfGrid, bodies=bodies, abbe=[50])
+    refused("needs mesh", SdfGrid)
 
 
 # Index of the d line and Abbe number, as data sheets and handbooks print them.

@@ -14,6 +14,7 @@ from nerfro.media.distance_grid import SURFACE_BLOCK
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball
 from tests.closed_forms import Luneburg, RoundedBox, Slab, grid_points
+from tests.conftest import refused
 
 BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
 
@@ -150,14 +151,8 @@ def test_mesh_becomes_a_distance_that_is_smooth_where_the_mesh_is(tmp_path: Path
 def test_bad_solids_are_named(tmp_path: Path) -> None:
     trimesh.creation.icosphere(2, 0.8).export(tmp_path / "ball.ply")
     mesh = str(tmp_path / "ball.ply")
-    with pytest.raises(NerfroError, match="one index for each inner mesh"):
-        SdfGrid(mesh, inner_meshes=[mesh], resolution=16, cache=False)
-    with pytest.raises(NerfroError, match=r"ior=0\.0 is not allowed; take more than 0"):
-        Ball(ior=0.0)
-    with pytest.raises(NerfroError, match=r"shell=0\.0 is not allowed"):
-        Ball(shell=0.0)
-    with pytest.raises(NerfroError, match=r"box_min=.*box_max="):
-        SdfGrid(mesh, box_min=[-1.5] * 3, box_max=[0.7] * 3, resolution=16, cache=False)
+    refused("one index for each inner mesh", SdfGrid, mesh, inner_meshes=[mesh], resolution=16, cache=False)
+    refused(r"box_min=.*box_max=", SdfGrid, mesh, box_min=[-1.5] * 3, box_max=[0.7] * 3, resolution=16, cache=False)
     with pytest.raises(NerfroError, match=r"medium\.box_min and medium\.box_max belong together"):
         SdfGrid(mesh, box_max=[1.5] * 3, resolution=16, cache=False)
 

@@ -13,12 +13,12 @@ import torch
 import trimesh
 from torch import Tensor
 
-from nerfro.errors import NerfroError
 from nerfro.media.bodies import origin_of
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.registry import discover
 from nerfro.samplers.paths.snell import Snell
 from tests.closed_forms import angle, make_rays
+from tests.conftest import refused
 
 FAR = [0.5, 0.0, -1e6]
 AXIS = torch.tensor([1.0, 2.0, 2.0]).double() / 3
@@ -149,10 +149,8 @@ def test_water_inside_a_wall_of_constant_thickness_is_an_offset_surface() -> Non
 def test_wrong_surfaces_are_refused(surface: Any, message: str) -> None:
     np.savez("positive.npz", distances=np.ones((4, 4, 4)), box=np.array([[0, 0, 0], [1, 1, 1]]))
     np.savez("empty.npz", box=np.zeros((2, 3)))
-    with pytest.raises(NerfroError, match=message):
-        _medium(surface)
+    refused(message, _medium, surface)
 
 
 def test_the_origin_of_a_mesh_without_a_file_is_refused() -> None:
-    with pytest.raises(NerfroError, match="surface=mesh needs file"):
-        origin_of({"bodies": {"body": {"surface": {"name": "mesh"}, "ior": 1.5}}})
+    refused("surface=mesh needs file", origin_of, {"bodies": {"body": {"surface": {"name": "mesh"}, "ior": 1.5}}})

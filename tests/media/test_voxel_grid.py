@@ -10,6 +10,7 @@ from nerfro.errors import NerfroError
 from nerfro.geometry.interpolation import gradient
 from nerfro.media.voxel_grid import VoxelGrid
 from tests.closed_forms import grid_points
+from tests.conftest import refused
 
 BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
 
@@ -69,29 +70,15 @@ def test_grids_are_not_in_checkpoints() -> None:
     assert not VoxelGrid.from_occupancy(_ball_occupancy(16), BOX, 1.5, 3, 1.0).state_dict()
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"box_max": [1.0, 0.8, 1.0]}, r"box_min=.*box_max="),
-        ({"box_max": [1.5, -2.0, 1.5]}, "min below max"),
-        ({"resolution": 2}, "resolution=2 is not allowed; take at least 4"),
-        ({"smoothing_size": 4}, "must be odd"),
-        ({"ior": -1.0}, "medium=voxel_grid: ior=-1.0 is not allowed"),
-    ],
-)
-def test_bad_options_are_named(sphere: str, options: dict, message: str) -> None:
-    with pytest.raises(NerfroError, match=message):
-        VoxelGrid(**{"mesh": sphere, "resolution": 32, "smoothing_size": 3, "cache": False, **options})
-
-
 def test_the_box_that_the_margin_message_names_is_accepted(sphere: str) -> None:
-    with pytest.raises(NerfroError, match="voxels of air") as error:
-        VoxelGrid(sphere, resolution=64, box_min=[-0.8] * 3, box_max=[0.8] * 3, cache=False)
-    low, high = (part.split("[")[1].split("]")[0] for part in str(error.value).split("medium.box_")[1:])
+    small: dict[str, list[float]] = {"box_min": [-0.8] * 3, "box_max": [0.8] * 3}
+    message = refused("voxels of air", VoxelGrid, sphere, resolution=64, cache=False, **small)
+    low, high = (part.split("[")[1].split("]")[0] for part in message.split("medium.box_")[1:])
     corners = [[float(number) for number in corner.split(",")] for corner in (low, high)]
     VoxelGrid(sphere, resolution=64, box_min=corners[0], box_max=corners[1], cache=False)
+    with pytest.raises(NerfroError, match=r"box_min=.*box_max="):
+        VoxelGrid(sphere, resolution=32, smoothing_size=3, box_max=[1.0, 0.8, 1.0], cache=False)
 
 
 def test_a_grid_without_margin_is_refused() -> None:
-    with pytest.raises(NerfroError, match="touches the grid's border"):
-        VoxelGrid.from_occupancy(torch.ones(8, 8, 8), BOX, 1.5, 3, 1.0)
+    refused("touches the grid's border", VoxelGrid.from_occupancy, torch.ones(8, 8, 8), BOX, 1.5, 3, 1.0)

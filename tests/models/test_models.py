@@ -17,8 +17,6 @@ from nerfro.samplers.paths.eikonal import Eikonal
 from nerfro.samplers.points.hierarchical import Hierarchical
 from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import example_rays
-from nerfro.training.module import TrainingModule
-from nerfro.training.optimizer import GroupConfig, OptimizerConfig
 from nerfro.types import Exits
 from tests.closed_forms import Luneburg
 
@@ -84,13 +82,3 @@ def test_chunks_bound_how_many_rays_are_rendered_at_once(parts: Components, monk
     none = model.render(example_rays()[:0])
     for name, values in vars(none).items():
         assert values.shape == (0, *getattr(rendered, name).shape[1:])
-
-
-def test_optimizer_gives_the_boundary_its_own_rate(parts: Components) -> None:
-    model = RefractiveModel(parts)
-    optimizer = OptimizerConfig(learning_rate=1e-3, groups={"background.*": GroupConfig(learning_rate=1e-2)})
-    groups = TrainingModule(model, {}, optimizer).configure_optimizers().param_groups
-    rates = {id(p): group["initial_lr"] for group in groups for p in group["params"]}
-    assert {rates[id(p)] for p in model.scene.fields.parameters()} == {1e-3}
-    assert {rates[id(p)] for p in model.scene.boundary.parameters()} == {1e-2}
-    assert len(rates) == len(list(model.parameters())), "every weight is learned"

@@ -4,6 +4,7 @@ import torch
 from torch.nn.functional import normalize
 
 from nerfro.boundaries.base import Boundary
+from nerfro.boundaries.constant import ConstantBoundary
 from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.cameras import Cameras
 from nerfro.draws import Draws
@@ -54,11 +55,6 @@ def photographs(num_views: int, seed: int) -> tuple[Path, torch.Tensor, torch.Te
     return path, *seen(path)
 
 
-class Nothing(Boundary):
-    def forward(self, exits: object) -> torch.Tensor:
-        return torch.zeros_like(exits.directions)
-
-
 def rendered(
     path: Path, sampler: DensityGridSampler, field: HashGridField, boundary: Boundary, draws: Draws | None = None
 ) -> torch.Tensor:
@@ -92,7 +88,7 @@ def scores(space: dict, boundary: Boundary, num_steps: int = 150) -> list[float]
 
 
 def test_a_volume_learns_a_room_and_what_stands_before_the_glass_where_a_box_under_a_sky_cannot() -> None:
-    volume = scores(SPACE, Nothing())
+    volume = scores(SPACE, ConstantBoundary([0.0, 0.0, 0.0]))
     sky = scores({"box_min": [-0.85] * 3, "box_max": [0.85] * 3}, EnvironmentMap([4, 8, 16, 32]))
     assert volume[0] > sky[0] + 6
     assert volume[1] > sky[1] + 5, "behind the glass"

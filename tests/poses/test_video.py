@@ -10,8 +10,8 @@ pytest.importorskip("cv2")
 
 import cv2
 
-from nerfro.errors import NerfroError
 from nerfro.poses.video import extract_frames
+from tests.conftest import refused
 
 SHARP = (1, 7, 8, 13)  # one in each quarter of the video
 
@@ -62,5 +62,4 @@ def test_what_is_no_video_is_refused(video: Path, tmp_path: Path) -> None:
         (tmp_path / "none.mp4", 4, "does not exist; give a video file, or images=FOLDER"),
         (video, 17, "has 16 readable frames, and frames=17 are asked for"),
     ):
-        with pytest.raises(NerfroError, match=message):
-            extract_frames(path, tmp_path / "frames", count)
+        refused(message, extract_frames, path, tmp_path / "frames", count)

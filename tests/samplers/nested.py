@@ -1,6 +1,8 @@
 """A ball in a ball, in closed form and as meshes."""
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 import trimesh
@@ -8,6 +10,7 @@ from torch import Tensor
 
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.solid import Solid
+from tests.closed_forms import grid_points
 
 
 class NestedBalls(Solid):
@@ -33,3 +36,10 @@ def nested_mesh(folder: Path) -> SdfGrid:
     outer.export(files[0])
     inner.export(files[1])
     return SdfGrid(files[0], 1.5, files[1:], [1.2], resolution=32, cache=False).double()
+
+
+def nested_grid(half_side: float, size: int, iors: Sequence[float], **glass: Any) -> SdfGrid:
+    """The same balls on a grid, in double precision."""
+    distances, _ = NestedBalls().signed_distances(grid_points(half_side, size, torch.float64))
+    box = torch.tensor([[-half_side] * 3, [half_side] * 3], dtype=torch.float64)
+    return SdfGrid.from_distances(distances.movedim(-1, 0), box, iors, 0.02, **glass)

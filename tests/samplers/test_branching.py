@@ -10,7 +10,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfro.errors import NerfroError
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball
 from nerfro.media.solid import Solid
@@ -19,19 +18,15 @@ from nerfro.samplers.paths.replay import smallest_cosine
 from nerfro.samplers.paths.snell import Snell, trace_interfaces
 from nerfro.samplers.paths.snell_law import reflectance
 from nerfro.types import Path, Rays
-from tests.closed_forms import RoundedBox, Slab, beam, grid_points, make_rays, random_rays
-from tests.samplers.nested import NestedBalls, nested_mesh
+from tests.closed_forms import RoundedBox, Slab, beam, make_rays, random_rays
+from tests.samplers.nested import NestedBalls, nested_grid, nested_mesh
 
 BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
 _rays = functools.partial(random_rays, width=1.6, seed=2, far=6)
 
 
 def _nested_grid(size: int = 40, iors: Sequence[float] = (1.5, 1.2), **glass: Any) -> SdfGrid:
-    p = grid_points(1.5, size)
-    centre = torch.tensor([0.2, 0.1, 0])
-    return SdfGrid.from_distances(
-        torch.stack([p.norm(dim=-1) - 0.8, (p - centre).norm(dim=-1) - 0.4]), BOX, iors, 0.02, **glass
-    )
+    return nested_grid(1.5, size, iors, **glass).float()
 
 
 def _fresnel(cosine: Tensor, n: float) -> Tensor:
@@ -180,12 +175,6 @@ def test_what_is_too_light_is_added_to_the_rest() -> None:
     for least in (0.3, 0.03, 0.003):
         counts = torch.bincount(Snell(branches="all", least_weight=least)(_rays(300), Ball().double()).ray)
         assert counts.max() <= 1 / least
-
-
-@pytest.mark.parametrize("least_weight", [0.0, 1.0])
-def test_least_weights_are_shares(least_weight: float) -> None:
-    with pytest.raises(NerfroError, match="least_weight"):
-        Snell(branches="all", least_weight=least_weight)
 
 
 @pytest.mark.parametrize("what", ["index", "origin"])

@@ -5,7 +5,6 @@ import math
 import pytest
 import torch
 
-from nerfro.errors import NerfroError
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball
@@ -139,10 +138,3 @@ def test_paths_of_different_capacity_agree() -> None:
         torch.testing.assert_close(path.positions[i, : alone.s.shape[1]], alone.positions[0])
         assert (path.s[i].diff() >= 0).all()
         torch.testing.assert_close(path.far[i], alone.far[0])
-
-
-def test_bad_options_are_named() -> None:
-    with pytest.raises(NerfroError, match="num_steps=1"):
-        Eikonal("euler", 1)
-    with pytest.raises(NerfroError, match=r"tolerance=0\.0 is not allowed; take more than 0"):
-        Eikonal(tolerance=0.0)

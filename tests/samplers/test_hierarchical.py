@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from nerfro.draws import Draws
-from nerfro.errors import NerfroError
 from nerfro.rendering import composite
 from nerfro.samplers.paths.straight import straight_path
 from nerfro.samplers.points.hierarchical import Hierarchical
@@ -87,15 +86,3 @@ def test_cones_are_redrawn_between_edges_with_max_blur_and_padding() -> None:
     for i, weight in ((3, 0.01), (4, 0.51), (5, 1.01), (6, 0.51), (7, 0.01)):
         inside = (fine.s >= coarse.samples.edges[:, i : i + 1]) & (fine.s < coarse.samples.edges[:, i + 1 : i + 2])
         assert (inside.sum(1) - 400 * weight / 2.16).abs().max() <= 2
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"num_coarse": 3}, "num_coarse=3 is not allowed; take at least 4"),
-        ({"num_fine": 0}, "num_fine=0 is not allowed; take at least 1"),
-    ],
-)
-def test_impossible_options_are_refused(options: dict, message: str) -> None:
-    with pytest.raises(NerfroError, match=message):
-        Hierarchical(**options)

@@ -23,7 +23,7 @@ from nerfro.samplers.paths.snell import Snell, trace_interfaces
 from nerfro.samplers.paths.straight import Straight
 from nerfro.types import Path, Rays, Samples
 from tests.closed_forms import RoundedBox, beam, grid_points, make_rays, random_rays
-from tests.samplers.nested import NestedBalls, nested_mesh
+from tests.samplers.nested import NestedBalls, nested_grid, nested_mesh
 
 BOX = torch.tensor([[-1.2] * 3, [1.2] * 3], dtype=torch.float64)
 _rays = functools.partial(random_rays, width=1.0, seed=0, far=4)
@@ -46,16 +46,9 @@ class PlainEikonal(Eikonal):
         return march_adaptive(rays, medium, 1e-3, self.max_steps)[0]
 
 
-def _ball(centre: list[float], radius: float) -> Tensor:
-    points = grid_points(1.2, 33, torch.float64)
-    return (points - torch.tensor(centre, dtype=torch.float64)).norm(dim=-1) - radius
-
-
 def _nested_grid(inner_ior: float = 1.0, **glass: Any) -> SdfGrid:
     """A ball of glass with a ball beside its middle, by default a bubble: rays are totally reflected at either."""
-    return SdfGrid.from_distances(
-        torch.stack([_ball([0, 0, 0], 0.8), _ball([0.2, 0.1, 0], 0.4)]), BOX, [1.5, inner_ior], 0.02, **glass
-    )
+    return nested_grid(1.2, 33, [1.5, inner_ior], **glass)
 
 
 def _cube_mesh(folder: FilePath) -> SdfGrid:
@@ -170,7 +163,8 @@ REFINED: list[tuple[PathSampler, Callable[[FilePath], Medium]]] = [
 
 
 def _voxels() -> VoxelGrid:
-    return VoxelGrid.from_occupancy((_ball([0, 0, 0], 0.8) < 0).double(), BOX, 1.5, 5, 1.0)
+    inside = grid_points(1.2, 33, torch.float64).norm(dim=-1) < 0.8
+    return VoxelGrid.from_occupancy(inside.double(), BOX, 1.5, 5, 1.0)
 
 
 @pytest.mark.parametrize(("sampler", "make"), REFINED)

@@ -87,16 +87,3 @@ def test_cones_fill_the_path_without_gaps() -> None:
         within = 0.5 / 16 + 1e-5 if draws else 1e-5
         even = torch.linspace(0, 1, 17)
         assert (fractions(path, samples.edges) - even).abs().max() <= within
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"num_samples": 1}, "num_samples=1 is not allowed; take at least 2"),
-        ({"offset": 1.0}, "offset=1.0 is not allowed; take at least 0 and less than 1"),
-        ({"cast": "cones", "draw": "vertices"}, "cones have no vertices to draw; set draw=arc_length"),
-    ],
-)
-def test_impossible_options_are_refused(options: dict, message: str) -> None:
-    with pytest.raises(NerfroError, match=message):
-        Stratified(**options)

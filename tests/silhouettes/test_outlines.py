@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from importlib import import_module
 
 import pytest
 import torch
@@ -10,16 +9,11 @@ import trimesh
 
 from benchmarks.cameras import disturbed
 from nerfro.cameras import Cameras
-from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.registry import discover
 from nerfro.silhouettes.visual_hull import Silhouettes
 from tests.ball_photographs import NUM_VIEWS, RADIUS, SIZE, cameras, soft_masks
-
-discover()
-PriorInformation = import_module("nerfro_plugins.refined_cameras.least_squares").PriorInformation
-RefinedCamera = import_module("nerfro_plugins.refined_cameras.refined").RefinedCamera
-align_to_outlines = import_module("nerfro_plugins.refined_cameras.outlines").align_to_outlines
+from tests.camera.refined_cameras import PriorInformation, RefinedCamera, align_to_outlines
+from tests.conftest import refused
 
 TRUE = cameras()
 
@@ -73,8 +67,7 @@ def test_masks_of_nothing_are_refused() -> None:
     camera = RefinedCamera()
     camera.begin(TRUE)
     nothing = Silhouettes.of(TRUE, torch.zeros(NUM_VIEWS, SIZE, SIZE))
-    with pytest.raises(NerfroError, match="belong together"):
-        align_to_outlines(camera, TRUE, lambda cameras: cameras, nothing, ellipsoid())
+    refused("belong together", align_to_outlines, camera, TRUE, lambda cameras: cameras, nothing, ellipsoid())
 
 
 def test_the_shared_lens_is_found_where_cameras_are_known() -> None:

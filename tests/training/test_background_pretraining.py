@@ -27,19 +27,14 @@ from nerfro.training.ray_batches import RayBatches
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
 from nerfro.types import Exits
 
-FOLDER = "hydra.run.dir"
-
 
 @pytest.fixture
-def weights(
-    train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path: Path
-) -> Callable[..., dict[str, Tensor]]:
+def weights(train: Callable[..., Any], tmp_path: Path) -> Callable[..., dict[str, Tensor]]:
     """Weights after a run whose rates are too small to move anything after its first steps."""
     still = ["trainer.max_steps=1", "evaluation.every=0", "optimizer.warmup_factor=0", "optimizer.warmup_steps=1000"]
 
     def run(name: str, *overrides: str) -> dict[str, Tensor]:
-        finished = train_here(*tiny_default_run, *still, f"{FOLDER}={tmp_path / name}", *overrides)
-        assert finished.code == 0, finished.out + finished.err
+        train(*still, f"hydra.run.dir={tmp_path / name}", *overrides)
         return load_checkpoint(tmp_path / name / LAST_CHECKPOINT)[0]["state_dict"]
 
     return run

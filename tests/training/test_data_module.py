@@ -24,8 +24,8 @@ from nerfro.training.data_module import Prefetcher, RayDataModule, can_prefetch,
 from nerfro.training.module import TrainingModule
 from nerfro.training.ray_batches import RayBatches
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
-from nerfro.types import Batch, Rays
-from tests.closed_forms import grid_points
+from nerfro.types import Batch
+from tests.closed_forms import grid_points, random_rays
 from tests.pretended_gpu import GPU, PretendedGpu
 
 
@@ -34,14 +34,6 @@ def ball() -> SdfGrid:
     points = grid_points(1.5, 40)
     box = torch.tensor([[-1.5] * 3, [1.5] * 3])
     return SdfGrid.from_distances(points.norm(dim=-1)[None] - 0.8, box, [1.5], 0.01)
-
-
-def rays(num: int, seed: int = 0) -> Rays:
-    generator = torch.Generator().manual_seed(seed)
-    origins = torch.nn.functional.normalize(torch.randn(num, 3, generator=generator), dim=-1) * 4
-    targets = torch.rand(num, 3, generator=generator) * 1.6 - 0.8
-    one = torch.ones(num)
-    return Rays(origins, torch.nn.functional.normalize(targets - origins, dim=-1), 0 * one, 2 * one, 6 * one)
 
 
 def running() -> list[str]:
@@ -65,7 +57,7 @@ def ahead():
 
 def test_paths_made_ahead_are_those_of_the_step_in_any_order(ahead, ball: SdfGrid) -> None:
     sampler = Snell()
-    make: Any = lambda step: sampler(rays(300, step), ball)  # noqa: E731
+    make: Any = lambda step: sampler(random_rays(300, 1.6, step, 6.0), ball)  # noqa: E731
     one = ahead(make)
     for step in (0, 1, 2, 7, 8, 3):
         expected, got = make(step), one(step)
@@ -127,7 +119,7 @@ def test_nothing_is_traced_ahead_where_paths_learn_or_python_is_needed(ball: Sdf
 
 
 def test_weights_depend_neither_on_the_thread_nor_on_an_interruption(
-    train_here: Callable[..., Any], tiny_default_run: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    train: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """The thread chooses samples by the density grid, which changes in every second step here."""
 
@@ -137,8 +129,7 @@ def test_weights_depend_neither_on_the_thread_nor_on_an_interruption(
         monkeypatch.setattr(DensityGridSampler, "after_step", lambda *given: time.sleep(0.05) or update(*given))
         even = ["optimizer.learning_rate=1e-2", "optimizer.final_learning_rate=1e-2"]
         options = [*even, "evaluation=none", "trainer.max_steps=7", "sampler.points.update_every=2", *overrides]
-        finished = train_here(*tiny_default_run, *options, f"hydra.run.dir={tmp_path / name}")
-        assert finished.code == 0, finished.err
+        train(*options, f"hydra.run.dir={tmp_path / name}")
         return load_checkpoint(tmp_path / name / LAST_CHECKPOINT)[0]["state_dict"]
 
     update = DensityGridSampler.after_step
@@ -179,15 +170,12 @@ def test_a_batch_is_made_when_its_step_begins_if_paths_learn(
     assert not running()
 
 
-def test_there_is_one_copy_of_the_training_pixels(
-    train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_there_is_one_copy_of_the_training_pixels(train: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
     """They move to the training device once, and steps of the cameras and of the background use them there."""
     moves, move = [], PixelStore.to
     monkeypatch.setattr(PixelStore, "to", lambda self, device: moves.append(device) or move(self, device))
     steps = ["trainer.max_steps=4", "camera=refined", "phase={cameras: {start: 1, every: 1}, background: {steps: 2}}"]
-    finished = train_here(*tiny_default_run, *steps, "evaluation.every=0", f"hydra.run.dir={tmp_path / 'run'}")
-    assert finished.code == 0, finished.err
+    train(*steps, "evaluation.every=0")
     assert len(moves) == 1
 
 

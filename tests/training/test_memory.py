@@ -20,6 +20,7 @@ from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import example_rays
 from nerfro.training import memory
 from nerfro.training.memory import require_memory
+from tests.conftest import refused
 from tests.pretended_gpu import GPU, OnGpu, PretendedGpu
 
 
@@ -40,8 +41,8 @@ def test_what_autograd_keeps_is_counted_and_grows_with_the_network() -> None:
 
 def test_run_that_does_not_fit_is_refused_with_what_to_change(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(memory, "available_bytes", lambda: 1e6)
-    with pytest.raises(NerfroError, match=r"needs about \d.* kB are for each ray: take a smaller batches\.size"):
-        require_memory(model_of(16), example_rays(), torch.device("cpu"))
+    message = r"needs about \d.* kB are for each ray: take a smaller batches\.size"
+    refused(message, require_memory, model_of(16), example_rays(), torch.device("cpu"))
     monkeypatch.setattr(memory, "available_bytes", lambda: math.inf)
     assert "memory: about" in require_memory(model_of(16), example_rays(), torch.device("cpu"))
 
@@ -65,15 +66,14 @@ def test_limit_of_a_control_group_counts_without_files_that_can_go(
 def test_what_does_not_fit_is_refused_before_it_is_begun(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(available, "available_bytes", lambda: 2e9)
     require_bytes(1e9, "medium.resolution=100")
-    with pytest.raises(NerfroError, match=r"=900 needs about 3\.0 GB of memory, but 2\.0 GB are free"):
-        require_bytes(3e9, "medium.resolution=900")
+    refused(r"=900 needs about 3\.0 GB of memory, but 2\.0 GB are free", require_bytes, 3e9, "medium.resolution=900")
 
 
 def needed_gigabytes(model: Renderer, monkeypatch: pytest.MonkeyPatch) -> float:
     monkeypatch.setattr(memory, "available_bytes", lambda: -1e12)
-    with pytest.raises(NerfroError) as refused:
-        require_memory(model, example_rays(), torch.device("cpu"))
-    return float(re.search(r"about ([\d.]+) GB", str(refused.value))[1])  # type: ignore[index]
+    pattern = r"about ([\d.]+) GB"
+    message = refused(pattern, require_memory, model, example_rays(), torch.device("cpu"))
+    return float(re.search(pattern, message)[1])  # type: ignore[index]
 
 
 def test_checkpoint_is_counted_with_weights_gradients_and_moments(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,9 +11,9 @@ import torch
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Timer
 
-from nerfro.errors import NerfroError
 from nerfro.training.module import training_progress
 from nerfro.training.optimizer import GroupConfig, OptimizerConfig, learning_rate_factor
+from tests.conftest import refused
 
 PAPER = OptimizerConfig(learning_rate=5e-4, final_learning_rate=5e-6, warmup_steps=2500, warmup_factor=0.01)
 
@@ -86,5 +86,4 @@ def test_the_last_matching_pattern_decides_and_a_misspelt_one_is_refused() -> No
     assert grouped(index, water) == {"common": names[:2], index: [names[2]], water: [names[3]]}
     assert grouped(water, index) == {"common": names[:2], index: names[2:]}
     assert grouped("bodies.*.material.absorption") == {"common": names}, "a group of an experiment may be absent"
-    with pytest.raises(NerfroError, match=r"bodies\.glas\.\* matches no .*choose from .*bodies\.glass\.material\.ior"):
-        grouped("bodies.glas.*")
+    refused(r"bodies\.glas\.\* matches no .*choose from .*bodies\.glass\.material\.ior", grouped, "bodies.glas.*")

@@ -14,9 +14,6 @@ def test_a_run_ends_with_finite_scores(
     precision: str, model: str, request: pytest.FixtureRequest, train_here: Callable[..., Any], tmp_path: Path
 ) -> None:
     options = [option for option in request.getfixturevalue(model) if "precision" not in option]
-    done = train_here(
-        *options, "trainer.max_steps=2", f"trainer.precision={precision}", f"hydra.run.dir={tmp_path / 'run'}"
-    )
-    assert done.code == 0, done.err
+    train_here(*options, "trainer.max_steps=2", f"trainer.precision={precision}", f"hydra.run.dir={tmp_path / 'run'}")
     scores = json.loads((tmp_path / "run" / "metrics.json").read_text())["test"]
     assert all(math.isfinite(value) for value in scores.values() if isinstance(value, float))

@@ -1,5 +1,6 @@
 """Random training pixels: which ones, how often, and the same ones after a resume."""
 
+import functools
 from dataclasses import replace
 
 import numpy as np
@@ -8,11 +9,11 @@ import torch
 
 from nerfro.cameras import Cameras
 from nerfro.data.base import Views
-from nerfro.errors import NerfroError
 from nerfro.media.shapes import Ball
 from nerfro.samplers.paths.snell import Snell
 from nerfro.subdivision import Subdivision
 from nerfro.training.ray_batches import RayBatches
+from tests.conftest import refused
 
 NUM_VIEWS, HEIGHT, WIDTH = 5, 12, 16
 
@@ -139,10 +140,8 @@ def test_without_masks_there_are_no_pixels_of_the_object(views, capsys):
 
 def test_pixels_of_an_object_need_all_images_and_an_object(views):
     masks = torch.zeros(NUM_VIEWS, HEIGHT, WIDTH)
-    with pytest.raises(NerfroError, match="all_images"):
-        RayBatches(replace(views, masks=masks + 1), 64, object_fraction=0.25)
-    with pytest.raises(NerfroError, match="the masks have none"):
-        RayBatches(replace(views, masks=masks), 64, "all_images", object_fraction=0.25)
+    refused("all_images", RayBatches, replace(views, masks=masks + 1), 64, object_fraction=0.25)
+    refused("the masks have none", RayBatches, replace(views, masks=masks), 64, "all_images", object_fraction=0.25)
 
 
 def test_every_view_has_its_own_usable_pixels(views, masked):
@@ -180,15 +179,13 @@ def test_masks_hold_while_precropped_and_in_every_share(masked, batching, size):
 
 
 def test_masks_that_leave_too_few_pixels_are_refused(masked):
-    with pytest.raises(NerfroError, match="batch_size=2 exceeds the 1 pixels that the mask of r_2 leaves; take a smal"):
-        RayBatches(masked, 2)
+    refused("batch_size=2 exceeds the 1 pixels that the mask of r_2 leaves; take a smal", RayBatches, masked, 2)
     RayBatches(masked, 500, "all_images")
     border = torch.ones(NUM_VIEWS, HEIGHT, WIDTH, dtype=torch.bool)
     border[:, 2:10, 2:14] = False
-    with pytest.raises(NerfroError, match="exceeds the 0 pixels that the mask of r_0 leaves while precropped"):
-        RayBatches(replace(masked, usable=border), 2, precrop_steps=1)
-    with pytest.raises(NerfroError, match="the masks leave no pixel to train on while precropped"):
-        RayBatches(replace(masked, usable=border), 2, "all_images", precrop_steps=1)
+    cropped = functools.partial(RayBatches, replace(masked, usable=border), 2, precrop_steps=1)
+    refused("exceeds the 0 pixels that the mask of r_0 leaves while precropped", cropped)
+    refused("the masks leave no pixel to train on while precropped", cropped, batching="all_images")
 
 
 @pytest.mark.parametrize("batching", ["single_image", "all_images"])
@@ -220,8 +217,7 @@ def test_batch_carries_the_cameras_of_the_window_it_is_drawn_from(views):
     ],
 )
 def test_option_out_of_range_is_refused(views, options, message):
-    with pytest.raises(NerfroError, match=message):
-        RayBatches(views, **options)
+    refused(message, RayBatches, views, **options)
 
 
 def test_batches_hold_all_polylines_of_their_rays(views):

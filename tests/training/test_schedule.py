@@ -17,6 +17,7 @@ from nerfro.training.callbacks import steps_by_phase
 from nerfro.training.phases.base import Phase, Run
 from nerfro.training.ray_batches import RayBatches
 from nerfro.training.schedule import Schedule
+from tests.conftest import refused
 
 
 class Counted(Phase):
@@ -51,8 +52,7 @@ def steps(schedule: Schedule, first: int, last: int) -> dict[str, Any]:
 
 def test_step_without_a_result_is_refused() -> None:
     phase = Mock(spec=Phase, begin=lambda run: {}, steps_before=lambda step: 1, step=lambda run, number, state: None)
-    with pytest.raises(NerfroError, match=r"phase\.mine: step returned None; return True"):
-        steps(Schedule({"mine": phase}, Mock(spec=Views)), 0, 1)
+    refused(r"phase\.mine: step returned None; return True", steps, Schedule({"mine": phase}, Mock(spec=Views)), 0, 1)
 
 
 def test_step_without_parameters_is_refused() -> None:
@@ -60,8 +60,7 @@ def test_step_without_parameters_is_refused() -> None:
     run = Run(renderer, Mock(spec=RayBatches), Mock(spec=Views), Mock(spec=Adam), 0.0)
     with pytest.raises(NerfroError, match=r"backgroud\.\* matches no learned .* choose from background\.colour"):
         run.parameters(["background.*", "backgroud.*"])
-    with pytest.raises(NerfroError, match="changes no parameter"):
-        run.descend(torch.zeros(()), run.parameters(["cameras.*"]))
+    refused("changes no parameter", run.descend, torch.zeros(()), run.parameters(["cameras.*"]))
 
 
 @pytest.mark.parametrize("stop", [0, 2, 3])

@@ -16,7 +16,6 @@ from PIL import Image
 from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.cameras import Cameras
 from nerfro.data.blender import BlenderData
-from nerfro.errors import NerfroError
 from nerfro.evaluation.image_metrics import psnr
 from nerfro.fields.base import Field
 from nerfro.files import lat_long
@@ -34,6 +33,7 @@ from nerfro.viewing.changes import with_changed_scene
 from nerfro.viewing.page import make_page
 from nerfro.viewing.trained_scene import TrainedScene
 from tests.closed_forms import Luneburg
+from tests.conftest import refused
 from tests.media.vessels import spherical_vessel
 from tests.viewing.browser import Browser, needs_chromium
 from tests.viewing.conftest import IOR, RADIUS, sky_of
@@ -72,6 +72,13 @@ def one_ray(scene: TrainedScene, cameras: Cameras | None = None) -> Float[torch.
     return scene.render(cameras or scene.cameras("test"), Subdivision()).rgb
 
 
+def in_embedded_scene(scene: TrainedScene, medium: SdfGrid) -> TrainedScene:
+    """The ball inside another medium, under the embedded scene's sky and seen by its cameras."""
+    sky = EnvironmentMap([128], image=str(resolve_path("embedded:torus/sky.png")))
+    renderer = with_changed_scene(scene.renderer, medium=medium, boundary=sky)
+    return TrainedScene(renderer, BlenderData("embedded:torus", downscale=2))
+
+
 @pytest.fixture
 def glass_cube(scene: TrainedScene) -> TrainedScene:
     """The embedded scene's glass, sky and cameras around the ball inside, and a bubble in the glass; both disperse."""
@@ -81,10 +88,7 @@ def glass_cube(scene: TrainedScene) -> TrainedScene:
     axes = torch.stack(torch.meshgrid(*[torch.linspace(-1.5, 1.5, 64)] * 3, indexing="ij"), -1)
     bubble = torch.linalg.vector_norm(axes - torch.tensor([-0.3, -0.3, 0.2]), dim=-1) - 0.15
     medium = SdfGrid.from_distances([outer.grids[0].distances, bubble], box, [1.5, 1.05], outer.shell, abbe=[8.0])
-    sky = EnvironmentMap([128], image=str(resolve_path("embedded:torus/sky.png")))
-    return TrainedScene(
-        with_changed_scene(scene.renderer, medium=medium, boundary=sky), BlenderData("embedded:torus", downscale=2)
-    )
+    return in_embedded_scene(scene, medium)
 
 
 @needs_chromium
@@ -100,10 +104,7 @@ def test_five_cameras_of_a_cube_with_bodies_inside_agree_with_nerfro(glass_cube:
 @needs_chromium
 def test_a_vessel_agrees_with_nerfro(scene: TrainedScene, tmp_path: Path) -> None:
     vessel = spherical_vessel(tmp_path, level=0.9, resolution=64, absorption=[0.3, 1.0, 2.0, 1.0, 0.0, 0.5])
-    sky = EnvironmentMap([128], image=str(resolve_path("embedded:torus/sky.png")))
-    vessel_scene = TrainedScene(
-        with_changed_scene(scene.renderer, medium=vessel, boundary=sky), BlenderData("embedded:torus", downscale=2)
-    )
+    vessel_scene = in_embedded_scene(scene, vessel)
     # Dyed walls of index 1 absorb, another liquid changes the picture, and air has no index to change.
     code = f"""(() => {{ {SHOT}
       const seen = [shot(0, 64), shot(9, 64)];
@@ -255,5 +256,4 @@ def test_page_begins_with_the_light_that_the_model_follows(scene: TrainedScene, 
 
 def test_page_of_a_medium_without_surface_is_refused(scene: TrainedScene) -> None:
     lens = replace(scene, renderer=with_changed_scene(scene.renderer, medium=Luneburg()))
-    with pytest.raises(NerfroError, match="bodies with a surface"):
-        make_page(lens, 8)
+    refused("bodies with a surface", make_page, lens, 8)

@@ -1,5 +1,6 @@
 """`python -m nerfro.render`: its frames and films, what it goes on with, and what it refuses."""
 
+import functools
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -15,23 +16,18 @@ import nerfro.render
 from nerfro.files.lat_long import save_lat_long
 from nerfro.subdivision import Subdivision
 from nerfro.viewing.trained_scene import TrainedScene
+from tests.conftest import Finished
 
 
 @pytest.fixture
 def render(
     scene: TrainedScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run_here: Callable
-) -> Callable[..., tuple[int, str]]:
-    """The entry point in this process, on the scene in closed form; exit code and output."""
+) -> Callable[..., Finished]:
+    """The entry point in this process, on the scene in closed form."""
     (tmp_path / "a.ckpt").write_bytes(b"scene")
     monkeypatch.setattr(nerfro.render, "load", lambda run, device, root: scene)
     monkeypatch.chdir(tmp_path)
-    common = ["checkpoint=a.ckpt", "out=O", "resolution=16", "subdivision.side=1"]
-
-    def run(*arguments: str) -> tuple[int, str]:
-        done = run_here("render", *common, *arguments)
-        return done.code, done.err if done.code else done.out
-
-    return run
+    return functools.partial(run_here, "render", "checkpoint=a.ckpt", "out=O", "resolution=16", "subdivision.side=1")
 
 
 def read(path: str) -> np.ndarray:
@@ -53,9 +49,8 @@ def psnr(one: np.ndarray, other: np.ndarray) -> float:
     return float(-10 * np.log10(((one - other) / 255).__pow__(2).mean()))
 
 
-def test_an_orbit_becomes_frames_and_films(render: Callable[..., tuple[int, str]]) -> None:
-    code, out = render("path=orbit", "frames=4", "seconds=2", "film=[mp4,gif]", "resolution=[34,25]")
-    assert code == 0, out
+def test_an_orbit_becomes_frames_and_films(render: Callable[..., Finished]) -> None:
+    render("path=orbit", "frames=4", "seconds=2", "film=[mp4,gif]", "resolution=[34,25]")
     stills = [read(f"O/frame_{number:04d}.png") for number in range(4)]
     assert {still.shape for still in stills} == {(25, 34, 3)}
     film = frames_of_film("O/film.mp4")
@@ -69,28 +64,25 @@ def test_an_orbit_becomes_frames_and_films(render: Callable[..., tuple[int, str]
         assert psnr(np.asarray(gif.convert("RGB"), float), stills[3]) > 25
 
 
-def test_an_interrupted_rendering_goes_on_and_another_is_not_mixed_in(render: Callable[..., tuple[int, str]]) -> None:
-    assert render("path=arc", "frames=3")[0] == 0
+def test_an_interrupted_rendering_goes_on_and_another_is_not_mixed_in(render: Callable[..., Finished]) -> None:
+    render("path=arc", "frames=3")
     whole = read("O/frame_0001.png")
     Path("O/frame_0001.png").unlink()
     kept = Path("O/frame_0000.png").stat().st_mtime_ns
-    code, out = render("path=arc", "frames=3")
-    assert code == 0, out
-    assert "2 of 3 frames exist already" in out
+    assert "2 of 3 frames exist already" in render("path=arc", "frames=3").out
     assert Path("O/frame_0000.png").stat().st_mtime_ns == kept
     np.testing.assert_array_equal(read("O/frame_0001.png"), whole)
-    code, err = render("path=arc", "frames=3", "azimuth=40")
-    assert code == 1
-    assert "frame_0000.png belongs to another rendering; give another out=... or overwrite=true" in err
+    refused = render("path=arc", "frames=3", "azimuth=40", code=1).error
+    assert "frame_0000.png belongs to another rendering; give another out=... or overwrite=true" in refused
     for damaged in ("", "{}", "[]", "null"):  # as a record of unknown frames
         Path("O/frames.json").write_text(damaged)
-        assert "belongs to another rendering" in render("path=arc", "frames=3")[1]
-    assert render("path=arc", "frames=3", "azimuth=40", "overwrite=true")[0] == 0
+        assert "belongs to another rendering" in render("path=arc", "frames=3", code=1).error
+    render("path=arc", "frames=3", "azimuth=40", "overwrite=true")
     assert not np.array_equal(read("O/frame_0001.png"), whole)
 
 
-def test_a_still_from_numbers_shows_what_lies_there(render: Callable[..., tuple[int, str]]) -> None:
-    assert render("position=[0,0,5]", "target=[0,0,0]", "fov=10", "what=inside", "resolution=8")[0] == 0
+def test_a_still_from_numbers_shows_what_lies_there(render: Callable[..., Finished]) -> None:
+    render("position=[0,0,5]", "target=[0,0,0]", "fov=10", "what=inside", "resolution=8")
     # The ball's top is at z = 0.35, and its colour is 0.4 + 0.5 of the place.
     linear = np.array([0.4, 0.4, 0.4 + 0.5 * 0.34])
     middle = read("O/frame_0000.png")[4, 4] / 255
@@ -99,9 +91,8 @@ def test_a_still_from_numbers_shows_what_lies_there(render: Callable[..., tuple[
 
 @pytest.mark.parametrize("what", ["depth", "normals", "opacity", "exits", "glass", "inside", "sky"])
 def test_every_layer_is_drawn_and_written_as_it_is(what: str, render: Callable, scene: TrainedScene) -> None:
-    assert render("views=test:1", f"what={what}")[0] == 0
-    code, err = render("views=test:1", f"what={what}", "format=exr")
-    assert code == 0, err
+    for form in ("png", "exr"):
+        render("views=test:1", f"what={what}", f"format={form}")
     values = OpenImageIO.ImageBuf("O/test_001.exr").get_pixels().squeeze()
     camera = scene.cameras().select([1]).resized(16, 16)
     parts = {"glass": {"inside": False}, "inside": {"glass": False}, "sky": {"inside": False, "glass": False}}
@@ -113,9 +104,9 @@ def test_every_layer_is_drawn_and_written_as_it_is(what: str, render: Callable, 
     assert shown.std() > 5
 
 
-def test_another_sky_replaces_the_scenes(render: Callable[..., tuple[int, str]]) -> None:
+def test_another_sky_replaces_the_scenes(render: Callable[..., Finished]) -> None:
     save_lat_long("light.hdr", torch.full((16, 32, 3), 0.5))
-    assert render("views=test:0", "what=sky", "sky=light.hdr")[0] == 0
+    render("views=test:0", "what=sky", "sky=light.hdr")
     np.testing.assert_allclose(read("O/test_000.png"), 255 * (1.055 * 0.5 ** (1 / 2.4) - 0.055), atol=2)
 
 
@@ -139,21 +130,17 @@ def test_another_sky_replaces_the_scenes(render: Callable[..., tuple[int, str]])
     ],
 )
 def test_what_cannot_be_rendered_is_refused_in_one_line(
-    arguments: list[str], message: str, render: Callable[..., tuple[int, str]]
+    arguments: list[str], message: str, render: Callable[..., Finished]
 ) -> None:
-    code, err = render(*arguments)
-    assert code == 1
-    assert message in err
-    assert err.count("\n") == 1
+    assert message in render(*arguments, code=1).error
     assert not Path("O").exists()
 
 
 def test_a_missing_ffmpeg_is_reported_before_frames_are_rendered(
-    render: Callable[..., tuple[int, str]], monkeypatch: pytest.MonkeyPatch
+    render: Callable[..., Finished], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("shutil.which", lambda name: None)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    code, out = render("path=orbit", "frames=2", "resolution=16")
-    assert code == 1
-    assert "needs ffmpeg, which is not installed; install ffmpeg, or pip install 'nerfro[video]'" in out
+    refused = render("path=orbit", "frames=2", "resolution=16", code=1).error
+    assert "needs ffmpeg, which is not installed; install ffmpeg, or pip install 'nerfro[video]'" in refused
     assert not Path("O").exists()

@@ -10,6 +10,7 @@ import pytest
 
 from nerfro.errors import NerfroError
 from nerfro.viewing.server import PageServer, _Handler
+from tests.conftest import refused
 
 
 def get(server: PageServer, path: str, **headers: str) -> tuple[int, str]:
@@ -80,8 +81,7 @@ def test_requests_of_the_page_alone_are_answered() -> None:
 
 
 def test_taken_port_is_told(server: PageServer) -> None:
-    with pytest.raises(NerfroError, match="is not available"):
-        PageServer("localhost", int(server.url.rpartition(":")[2]))
+    refused("is not available", PageServer, "localhost", int(server.url.rpartition(":")[2]))
 
 
 def test_a_thousand_requests_of_any_kind_leave_the_page_as_it_is(

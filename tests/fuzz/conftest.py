@@ -1,0 +1,12 @@
+"""What the tests of broken inputs share."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.fuzz.world import World
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory, tiny_scene: Path, tiny_default_run: list[str]) -> World:
+    return World(tmp_path_factory.mktemp("world"), tiny_scene, tiny_default_run)
