@@ -32,6 +32,7 @@ _OPTIONS = (
 def main() -> None:
     """Train with the interactive page, export the final page, and print where it is."""
     with errors_in_one_line():
+        print("nerfro: starting; the first start compiles kernels, up to a minute", file=sys.stderr, flush=True)
         folder = Path("outputs", f"demo_{datetime.now():%Y-%m-%d_%H-%M-%S}").resolve()
         _run("train", *_OPTIONS, f"hydra.run.dir={folder}", *sys.argv[1:])
         _run("export", f"checkpoint={folder}", "what=page", f"out={folder / 'page.html'}")

@@ -78,7 +78,9 @@ def preprocess(config: DictConfig, options: list[str], root: Path, folder: Path)
     automatic = [*as_overrides({"out": folder}), "refine=true", "wrong_masks=null", "symmetry=auto", "overwrite=true"]
     if "wall" not in config.medium and "shell_voxels" in config.medium and config.medium.get("bodies") is None:
         automatic.append("vessel=true")
-    options = [*options, *automatic, *shlex.split(config.preprocess)]
+    given = shlex.split(config.preprocess)
+    automatic = [option for option in automatic if not is_given(option.partition("=")[0], given)]
+    options = [*options, *automatic, *given]
     old = (folder / OLD_SCENE).is_file() and not (folder / SCENE).is_file()  # written by an earlier release
     scene = folder / (OLD_SCENE if old else SCENE)
     Stage("preprocess", options, scene, folder / SHEET, inputs).run()
