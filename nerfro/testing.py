@@ -30,7 +30,7 @@ from nerfro.data.base import DataSource, Views
 from nerfro.draws import Draws
 from nerfro.evaluation.image_metrics import ImageMetric
 from nerfro.fields.base import Field
-from nerfro.fields.nerf import NerfField
+from nerfro.fields.hash_grid import HashGridField
 from nerfro.losses.base import Loss
 from nerfro.media.base import Medium
 from nerfro.media.shapes import Ball
@@ -436,7 +436,9 @@ def example_components() -> Components:
         medium=Ball(),
         path_sampler=Straight(),
         point_sampler=Stratified(8),
-        make_field=lambda: NerfField(width=16, depth=2, skip=1, view_width=8),
+        make_field=lambda: HashGridField(
+            num_levels=2, log2_table_size=8, width=16, initial_depth=1.0, precision="float32"
+        ),
         boundary=ConstantBoundary(),
     )
 

@@ -8,15 +8,14 @@ import torch
 from nerfro.media.analytic import Vacuum
 from nerfro.media.shapes import Ball
 from nerfro.rendering import composite
-from nerfro.samplers.paths.eikonal import Eikonal
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.paths.straight import Straight, straight_path
-from nerfro.samplers.points.hierarchical import Hierarchical
 from nerfro.samplers.points.stepfun import volume_weights
 from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import NUM_RAYS, example_path, example_rays, example_samples
 from nerfro.types import Path, Radiance, Samples
 from tests.closed_forms import beam
+from tests.paper import Eikonal, Hierarchical
 
 
 def smooth_radiance(samples: Samples) -> Radiance:

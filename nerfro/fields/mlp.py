@@ -1,4 +1,4 @@
-"""The NeRF MLP: a trunk for density and a view-dependent branch for colour."""
+"""Layers and activations of fields and backgrounds, and their compilation by torch.compile."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerfro.errors import NerfroError
-from nerfro.kernels.linear import Linear, linear
+from nerfro.kernels.linear import Linear
 
 # Colours extend slightly beyond [0, 1], so that black and white need no infinite activation (mip-NeRF's code).
 RGB_PADDING = 1e-3
@@ -41,43 +41,8 @@ class SkipMLP(nn.Module):
         return y.view(*batch, self.num_outputs)
 
 
-class RadianceMLP(nn.Module):
-    """Map encoded positions and directions to density (softplus of raw - 1) and colour (padded sigmoid).
-
-    Args:
-        num_position, num_direction: widths of the encodings.
-        width, depth, skip: shape of the trunk; NeRF uses 256, 8 and 5.
-        view_width: width of the layer that takes the direction.
-    """
-
-    def __init__(
-        self, num_position: int, num_direction: int, width: int, depth: int, skip: int, view_width: int
-    ) -> None:
-        super().__init__()
-        self.trunk = SkipMLP(num_position, width, depth, skip)
-        self.density = glorot_linear(self.trunk.num_outputs, 1)
-        self.bottleneck = glorot_linear(self.trunk.num_outputs, width)
-        self.view = glorot_linear(width + num_direction, view_width)
-        self.rgb = glorot_linear(view_width, 3)
-
-    def forward(
-        self, position: Float[Tensor, "*batch P"], direction: Float[Tensor, "*batch D"]
-    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
-        features = self.trunk(position)
-        density = F.softplus(self.density(features).squeeze(-1).float() - 1.0)
-        return density, padded_sigmoid(self.rgb(F.relu(self._view(features, direction))))
-
-    def _view(
-        self, features: Float[Tensor, "*batch F"], direction: Float[Tensor, "*batch D"]
-    ) -> Float[Tensor, "*batch V"]:
-        """Apply bottleneck and view layer as one layer, because no activation lies between the two.
-
-        The product of their weights needs fewer operations than the two layers, and no memory for the bottleneck.
-        """
-        of_bottleneck, of_direction = self.view.weight.split([len(self.bottleneck.weight), direction.shape[-1]], 1)
-        weight = torch.cat([of_bottleneck @ self.bottleneck.weight, of_direction], 1)
-        bias = self.view.bias + of_bottleneck @ self.bottleneck.bias
-        return linear(weight, bias, features, direction)
+class Network(nn.Module):
+    """Base class of networks that `compile=` compiles as a whole; a `Sequential` needs no base class."""
 
 
 def compile_networks(model: nn.Module, backend: str) -> None:
@@ -86,7 +51,7 @@ def compile_networks(model: nn.Module, backend: str) -> None:
     if backend not in known:
         raise NerfroError(f"compile={backend} is not a backend of torch.compile; set one of {', '.join(known)}")
     for module in model.modules():
-        if isinstance(module, (RadianceMLP, nn.Sequential)):
+        if isinstance(module, (Network, nn.Sequential)):
             module.compile(backend=backend, dynamic=True)
 
 

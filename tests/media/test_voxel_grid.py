@@ -7,9 +7,8 @@ import torch
 import trimesh
 
 from nerfro.errors import NerfroError
-from nerfro.geometry.interpolation import gradient
-from nerfro.media.voxel_grid import VoxelGrid
 from tests.closed_forms import grid_points
+from tests.paper import VoxelGrid, gradient
 
 BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
 
