@@ -19,6 +19,7 @@ _PLUGINS = {
     "Eikonal": ("sampler/path", "eikonal"),
     "Hierarchical": ("sampler/points", "hierarchical"),
     "NerfField": ("field", "nerf"),
+    "Skybox": ("boundary", "skybox"),
 }
 
 

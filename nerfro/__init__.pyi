@@ -1,7 +1,6 @@
 # Public names of nerfro, which `lazy_loader` imports on first access.
 from .boundaries.constant import ConstantBoundary
 from .boundaries.envmap import EnvironmentMap
-from .boundaries.skybox import Skybox
 from .cameras import Cameras
 from .data.blender import BlenderData
 from .data.colmap import ColmapData
@@ -47,7 +46,6 @@ __all__ = [
     "Rays",
     "RefractiveModel",
     "SdfGrid",
-    "Skybox",
     "Snell",
     "Straight",
     "Stratified",

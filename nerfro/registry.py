@@ -68,6 +68,7 @@ MOVED_CLASSES = (
             ("mip_nerf", "MipNerfField", ("nerfro.fields", _LOCAL_PACKAGE)),
             ("mip_nerf", "MipNerfModel", ("nerfro.models", _LOCAL_PACKAGE)),
             ("nerf", "NerfField", ("nerfro.fields",)),
+            ("skybox", "Skybox", ("nerfro.boundaries",)),
             ("voxel_grid", "VoxelGrid", ("nerfro.media",)),
         )
         for package in packages

@@ -23,7 +23,7 @@ from omegaconf import OmegaConf
 
 from nerfro.boundaries.base import Boundary
 from nerfro.boundaries.constant import ConstantBoundary
-from nerfro.boundaries.skybox import Skybox
+from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.camera.base import Camera
 from nerfro.cameras import Cameras
 from nerfro.data.base import DataSource, Views
@@ -153,7 +153,7 @@ def example_run() -> Run:
     """Return a small model with a learned background, its batches and its optimizer; equal in every call."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        model = RefractiveModel(replace(example_components(), boundary=Skybox(width=8, depth=1)))
+        model = RefractiveModel(replace(example_components(), boundary=EnvironmentMap([8])))
     batches = RayBatches(example_views(), NUM_RAYS, "all_images")
     optimizer = torch.optim.Adam(model.parameters_by_name().values())
     return Run(model, batches, example_views(), optimizer, spent=0.0)

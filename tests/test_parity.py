@@ -14,7 +14,6 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from nerfro.boundaries.skybox import Skybox
 from nerfro.cameras import Cameras
 from nerfro.losses.base import Loss
 from nerfro.models.refractive import RefractiveModel
@@ -22,7 +21,7 @@ from nerfro.registry import create, discover, find
 from nerfro.rendering import Components
 from nerfro.testing import example_batch
 from nerfro.types import Batch, Rays, Rendering
-from tests.paper import Eikonal, Hierarchical, NerfField, VoxelGrid
+from tests.paper import Eikonal, Hierarchical, NerfField, Skybox, VoxelGrid
 
 discover()
 

@@ -6,22 +6,20 @@ frustums, and of `model=mip_nerf`.
 
 from __future__ import annotations
 
-import math
 from typing import Literal
 
-import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerfro.allowed import Depth, Width
 from nerfro.draws import Draws
 from nerfro.fields.base import Field
-from nerfro.fields.encoding import DIRECTION_DEGREE, positional_encoding
 from nerfro.registry import register
 from nerfro.rendering import Components, Renderer, composite
 from nerfro.types import Path, Radiance, Rendering, Samples
 
-from .radiance_mlp import RadianceMLP
+from .encoding import DIRECTION_DEGREE, integrated_positional_encoding, positional_encoding
+from .mlp import RadianceMLP
 
 
 @register("field", "mip_nerf")
@@ -69,16 +67,6 @@ def frustum_gaussians(samples: Samples) -> tuple[Float[Tensor, "R N 3"], Float[T
     squared = samples.directions**2
     variance = along[..., None] * squared + across[..., None] * (1 - squared)
     return mean, variance
-
-
-def integrated_positional_encoding(
-    mean: Float[Tensor, "*batch 3"], variance: Float[Tensor, "*batch 3"], num_octaves: int
-) -> Float[Tensor, "*batch F"]:
-    """Return expected sines and cosines of a Gaussian with diagonal covariance (mip-NeRF, Eqn. 13)."""
-    scales = 2.0 ** torch.arange(num_octaves, device=mean.device, dtype=mean.dtype)
-    angles = (mean[..., None, :] * scales[:, None]).flatten(-2)
-    damping = torch.exp(-0.5 * (variance[..., None, :] * scales[:, None] ** 2).flatten(-2))
-    return torch.cat([torch.sin(angles) * damping, torch.sin(angles + 0.5 * math.pi) * damping], dim=-1)
 
 
 @register("model", "mip_nerf")

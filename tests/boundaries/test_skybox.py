@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from nerfro.boundaries.constant import ConstantBoundary
-from nerfro.boundaries.skybox import Skybox
 from nerfro.errors import NerfroError
 from nerfro.types import Exits
+from tests.paper import Skybox
 
 
 def test_published_skybox_has_its_layers() -> None:

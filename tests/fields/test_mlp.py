@@ -5,11 +5,11 @@ import math
 import pytest
 import torch
 
-from nerfro.fields.mlp import RGB_PADDING, SkipMLP, compile_networks, padded_sigmoid, radiance
+from nerfro.fields.networks import compile_networks, radiance
 from nerfro.light import to_srgb
 from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import example_path, example_samples
-from tests.paper import MipNerfField, NerfField, RadianceMLP
+from tests.paper import RGB_PADDING, MipNerfField, NerfField, RadianceMLP, SkipMLP, padded_sigmoid
 
 
 def test_forward_equals_a_slow_loop_over_layers() -> None:

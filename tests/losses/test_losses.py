@@ -10,7 +10,6 @@ from torch import Tensor
 from torch.nn.functional import conv2d
 
 from nerfro.boundaries.envmap import EnvironmentMap
-from nerfro.boundaries.skybox import Skybox
 from nerfro.errors import NerfroError
 from nerfro.light import to_srgb
 from nerfro.losses.boundary import BoundaryRegulariser
@@ -24,7 +23,7 @@ from nerfro.samplers.points.stratified import point_samples
 from nerfro.testing import NUM_RAYS, example_batch, example_components, example_draws, example_path, example_rendering
 from nerfro.types import Batch, Rendering
 from tests.closed_forms import Luneburg
-from tests.paper import Eikonal, Hierarchical, NerfField
+from tests.paper import Eikonal, Hierarchical, NerfField, Skybox
 
 
 @pytest.fixture(scope="module")

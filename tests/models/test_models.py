@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from nerfro.boundaries.base import Boundary
-from nerfro.boundaries.skybox import Skybox
 from nerfro.models.refractive import RefractiveModel
 from nerfro.rendering import Components
 from nerfro.samplers.points.stratified import Stratified
@@ -16,7 +15,7 @@ from nerfro.training.module import TrainingModule
 from nerfro.training.optimizer import GroupConfig, OptimizerConfig
 from nerfro.types import Exits
 from tests.closed_forms import Luneburg
-from tests.paper import Eikonal, Hierarchical, MipNerfModel, NerfField
+from tests.paper import Eikonal, Hierarchical, MipNerfModel, NerfField, Skybox
 
 
 class Compass(Boundary):

@@ -5,10 +5,37 @@ from __future__ import annotations
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
-from nerfro.fields.mlp import Network, SkipMLP, glorot_linear, padded_sigmoid
-from nerfro.kernels.linear import linear
+from nerfro.fields.networks import Network
+
+from .linear import Linear, linear
+
+# Colours extend slightly beyond [0, 1], so that black and white need no infinite activation (mip-NeRF's code).
+RGB_PADDING = 1e-3
+
+
+class SkipMLP(nn.Module):
+    """ReLU layers with a skip connection: the input is concatenated to the output of layer `skip` (counted from 1).
+
+    Weights are Glorot-uniform and biases are zero, as in the authors' code.
+    """
+
+    def __init__(self, num_inputs: int, width: int, depth: int, skip: int) -> None:
+        super().__init__()
+        self.skip = skip
+        inputs = [num_inputs] + [width + num_inputs * (i == skip) for i in range(1, depth)]
+        self.layers = nn.ModuleList(glorot_linear(n, width) for n in inputs)
+        self.num_outputs = width + num_inputs * (skip == depth)
+
+    def forward(self, x: Float[Tensor, "*batch I"]) -> Float[Tensor, "*batch O"]:
+        batch = x.shape[:-1]
+        y = x = x.reshape(-1, x.shape[-1]).to(self.layers[0].weight.dtype)  # type: ignore[arg-type]
+        for i, layer in enumerate(self.layers, start=1):
+            y = F.relu(layer(y, x) if i == self.skip + 1 else layer(y), inplace=True)
+        if self.skip == len(self.layers):
+            y = torch.cat([y, x.to(y.dtype)], dim=-1)
+        return y.view(*batch, self.num_outputs)
 
 
 class RadianceMLP(Network):
@@ -48,3 +75,16 @@ class RadianceMLP(Network):
         weight = torch.cat([of_bottleneck @ self.bottleneck.weight, of_direction], 1)
         bias = self.view.bias + of_bottleneck @ self.bottleneck.bias
         return linear(weight, bias, features, direction)
+
+
+def glorot_linear(num_inputs: int, num_outputs: int) -> nn.Linear:
+    """Create a linear layer with Glorot-uniform weights and zero bias."""
+    layer = Linear(num_inputs, num_outputs)
+    nn.init.xavier_uniform_(layer.weight)
+    nn.init.zeros_(layer.bias)
+    return layer
+
+
+def padded_sigmoid(raw: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """Evaluate a sigmoid with range [-0.001, 1.001] in single precision."""
+    return torch.sigmoid(raw.float()) * (1 + 2 * RGB_PADDING) - RGB_PADDING
