@@ -20,14 +20,13 @@ from nerfro.light import to_srgb
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball
-from nerfro.media.voxel_grid import VoxelGrid
 from nerfro.paths import ASSETS_DIR
-from nerfro.samplers.paths.eikonal import Eikonal
 from nerfro.samplers.paths.snell import Snell
 from nerfro.subdivision import part_rays
 from nerfro.types import Path as RayPath
 from nerfro.types import Rays
 from tests.closed_forms import RoundedBox
+from tests.paper import Eikonal, VoxelGrid
 
 IMAGES = Path(__file__).resolve().parent.parent / "docs" / "images"
 

@@ -23,11 +23,10 @@ from torch import Tensor
 from nerfro.cameras import Cameras
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball
-from nerfro.media.voxel_grid import VoxelGrid
-from nerfro.samplers.paths.eikonal import Eikonal
 from nerfro.samplers.paths.snell import Snell
 from nerfro.types import Rays
 from tests.closed_forms import RoundedBox
+from tests.paper import Eikonal, VoxelGrid
 
 RADIUS, N_BALL = 0.8, 1.5
 HALF_SIDE, EDGE, N_CUBE = 0.75, 0.08, 1.52

@@ -14,6 +14,13 @@ import lazy_loader
 # The stub __init__.pyi lists the public names and their modules, which are imported on first access.
 _public, __dir__, _names = lazy_loader.attach_stub(__name__, __file__)
 __all__ = ["__version__", *_names]
+# Components that became plugins.
+_PLUGINS = {
+    "Eikonal": ("sampler/path", "eikonal"),
+    "Hierarchical": ("sampler/points", "hierarchical"),
+    "NerfField": ("field", "nerf"),
+    "Skybox": ("boundary", "skybox"),
+}
 
 
 def __getattr__(name: str) -> Any:
@@ -22,7 +29,19 @@ def __getattr__(name: str) -> Any:
     if name == "Scene":
         warnings.warn("nerfro.Scene is called nerfro.TrainedScene; the next release removes the old name", stacklevel=2)
         name = "TrainedScene"
+    if name in _PLUGINS:
+        return _plugin(name)
     return _public(name)
+
+
+def _plugin(name: str) -> type:
+    from nerfro.registry import discover, find
+
+    discover()
+    kind, plugin = _PLUGINS[name]
+    replacement = f"nerfro.registry.find({kind!r}, {plugin!r}).cls"
+    warnings.warn(f"nerfro.{name} is a plugin; take {replacement}; the next release removes the name", stacklevel=3)
+    return find(kind, plugin).cls
 
 
 def _version() -> str:

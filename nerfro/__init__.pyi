@@ -1,14 +1,12 @@
 # Public names of nerfro, which `lazy_loader` imports on first access.
 from .boundaries.constant import ConstantBoundary
 from .boundaries.envmap import EnvironmentMap
-from .boundaries.skybox import Skybox
 from .cameras import Cameras
 from .data.blender import BlenderData
 from .data.colmap import ColmapData
 from .data.nerfstudio import NerfstudioData
 from .evaluation.collection import metrics
 from .fields.hash_grid import HashGridField
-from .fields.nerf import NerfField
 from .losses.distortion import Distortion
 from .losses.photometric import Photometric
 from .media.sdf_grid import SdfGrid
@@ -17,10 +15,8 @@ from .models.refractive import RefractiveModel
 from .rays import Rays
 from .rendering.renderer import Components
 from .samplers.paths.bend import bend, polylines
-from .samplers.paths.eikonal import Eikonal
 from .samplers.paths.snell import Snell
 from .samplers.paths.straight import Straight
-from .samplers.points.hierarchical import Hierarchical
 from .samplers.points.stratified import Stratified
 from .training.build import build
 from .training.data_module import RayDataModule
@@ -39,12 +35,9 @@ __all__ = [
     "Components",
     "ConstantBoundary",
     "Distortion",
-    "Eikonal",
     "EnvironmentMap",
     "GroupConfig",
     "HashGridField",
-    "Hierarchical",
-    "NerfField",
     "NerfstudioData",
     "OptimizerConfig",
     "Photometric",
@@ -53,7 +46,6 @@ __all__ = [
     "Rays",
     "RefractiveModel",
     "SdfGrid",
-    "Skybox",
     "Snell",
     "Straight",
     "Stratified",

@@ -54,20 +54,29 @@ MOVED_CLASSES = (
     | {
         f"nerfro.samplers.{module}.{name}": f"nerfro.samplers.{group}.{module}.{name}"
         for group, module, name in (
-            ("paths", "eikonal", "Eikonal"),
             ("paths", "snell", "Snell"),
             ("paths", "straight", "Straight"),
             ("points", "density_grid", "DensityGridSampler"),
-            ("points", "hierarchical", "Hierarchical"),
             ("points", "stratified", "Stratified"),
         )
+    }
+    | {
+        f"{package}.{module}.{name}": f"{_LOCAL_PACKAGE}.paper.{module}.{name}"
+        for module, name, packages in (
+            ("eikonal", "Eikonal", ("nerfro.samplers", "nerfro.samplers.paths")),
+            ("hierarchical", "Hierarchical", ("nerfro.samplers", "nerfro.samplers.points")),
+            ("mip_nerf", "MipNerfField", ("nerfro.fields", _LOCAL_PACKAGE)),
+            ("mip_nerf", "MipNerfModel", ("nerfro.models", _LOCAL_PACKAGE)),
+            ("nerf", "NerfField", ("nerfro.fields",)),
+            ("skybox", "Skybox", ("nerfro.boundaries",)),
+            ("voxel_grid", "VoxelGrid", ("nerfro.media",)),
+        )
+        for package in packages
     }
     | {
         "nerfro.camera.refined.RefinedCamera": f"{_LOCAL_PACKAGE}.refined_cameras.refined.RefinedCamera",
         "nerfro.training.phases.cameras.CameraSteps": f"{_LOCAL_PACKAGE}.refined_cameras.phase.CameraSteps",
         "nerfro.data.opencv.OpenCVData": "nerfro.data.blender.OpenCVData",
-        "nerfro.fields.mip_nerf.MipNerfField": f"{_LOCAL_PACKAGE}.mip_nerf.MipNerfField",
-        "nerfro.models.mip_nerf.MipNerfModel": f"{_LOCAL_PACKAGE}.mip_nerf.MipNerfModel",
     }
 )
 ENTRY_POINTS = "nerfro.plugins"
@@ -385,8 +394,9 @@ def _import_folder(folder: Path) -> None:
     for module in pkgutil.iter_modules([str(folder)]):
         name = f"{_LOCAL_PACKAGE}.{module.name}"
         where = folder / (module.name if module.ispkg else f"{module.name}.py")
-        if name in sys.modules:
-            raise NerfroError(f"two plugin files are called {module.name}: {sys.modules[name].__file__} and {where}")
+        loaded = sys.modules.get(name)  # possibly imported by another plugin of this folder
+        if loaded is not None and Path(str(loaded.__file__)) not in (where, where / "__init__.py"):
+            raise NerfroError(f"two plugin files are called {module.name}: {loaded.__file__} and {where}")
         _import_plugin(name, str(where))
     _discovered.add(str(folder))
 

@@ -23,14 +23,14 @@ from omegaconf import OmegaConf
 
 from nerfro.boundaries.base import Boundary
 from nerfro.boundaries.constant import ConstantBoundary
-from nerfro.boundaries.skybox import Skybox
+from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.camera.base import Camera
 from nerfro.cameras import Cameras
 from nerfro.data.base import DataSource, Views
 from nerfro.draws import Draws
 from nerfro.evaluation.image_metrics import ImageMetric
 from nerfro.fields.base import Field
-from nerfro.fields.nerf import NerfField
+from nerfro.fields.hash_grid import HashGridField
 from nerfro.losses.base import Loss
 from nerfro.media.base import Medium
 from nerfro.media.shapes import Ball
@@ -153,7 +153,7 @@ def example_run() -> Run:
     """Return a small model with a learned background, its batches and its optimizer; equal in every call."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        model = RefractiveModel(replace(example_components(), boundary=Skybox(width=8, depth=1)))
+        model = RefractiveModel(replace(example_components(), boundary=EnvironmentMap([8])))
     batches = RayBatches(example_views(), NUM_RAYS, "all_images")
     optimizer = torch.optim.Adam(model.parameters_by_name().values())
     return Run(model, batches, example_views(), optimizer, spent=0.0)
@@ -436,7 +436,9 @@ def example_components() -> Components:
         medium=Ball(),
         path_sampler=Straight(),
         point_sampler=Stratified(8),
-        make_field=lambda: NerfField(width=16, depth=2, skip=1, view_width=8),
+        make_field=lambda: HashGridField(
+            num_levels=2, log2_table_size=8, width=16, initial_depth=1.0, precision="float32"
+        ),
         boundary=ConstantBoundary(),
     )
 

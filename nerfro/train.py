@@ -22,7 +22,7 @@ from nerfro.evaluation.results import RunMetrics, optimized
 from nerfro.evaluation.tables import report
 from nerfro.evaluation.treatments import score_split
 from nerfro.failures import EXIT_INTERRUPTED
-from nerfro.fields.mlp import compile_networks
+from nerfro.fields.networks import compile_networks
 from nerfro.rendering.scene_file import with_scene
 from nerfro.subdivision import Subdivision
 from nerfro.training.build import build_training, check_first_batch

@@ -13,7 +13,7 @@ import torch
 from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_map
 
-from nerfro.paths import PACKAGE_DIR
+from nerfro.paths import PACKAGE_DIR, PLUGINS_DIR
 
 GPU = torch.device("cuda", 0)
 
@@ -79,8 +79,9 @@ class PretendedGpu(TorchFunctionMode):
     def _waited(self, name: str) -> None:
         for frame in _frames():
             path = Path(frame.f_code.co_filename)
-            if PACKAGE_DIR in path.parents:
-                self.waits.add(f"{path.relative_to(PACKAGE_DIR)}: {frame.f_code.co_name} ({name})")
+            folder = next((folder for folder in (PLUGINS_DIR, PACKAGE_DIR) if folder in path.parents), None)
+            if folder is not None:
+                self.waits.add(f"{path.relative_to(folder)}: {frame.f_code.co_name} ({name})")
                 return
 
 

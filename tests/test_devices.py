@@ -21,7 +21,7 @@ from tests.test_experiments import SMALL, shrunk
 STEP = 100_000
 
 # Loops end when the last ray has ended, and triangles are met on the CPU.
-TRACING = ("samplers/paths/snell.py", "samplers/paths/eikonal.py", "samplers/paths/polylines.py", "media/sdf_grid.py")
+TRACING = ("samplers/paths/snell.py", "paper/eikonal.py", "samplers/paths/polylines.py", "media/sdf_grid.py")
 TRACING += ("geometry/intersection.py", "samplers/paths/wavefront.py")
 
 ADAPTIVE = ["sampler.path.integrator=adaptive", "sampler.path.max_steps=60", "sampler.points.draw=arc_length"]

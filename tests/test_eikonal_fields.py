@@ -14,14 +14,12 @@ from torch import Tensor
 from nerfro.boundaries.constant import ConstantBoundary
 from nerfro.data.base import Views
 from nerfro.fields.base import Field
-from nerfro.fields.nerf import NerfField
 from nerfro.files import lat_long
 from nerfro.files.images import save_png
 from nerfro.media.base import Medium
 from nerfro.media.shapes import Ball
 from nerfro.registry import discover, find
 from nerfro.rendering import Components, Renderer
-from nerfro.samplers.paths.eikonal import Eikonal
 from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import example_rays
 from nerfro.training.config import build_model
@@ -32,6 +30,7 @@ from nerfro.types import Radiance, Samples
 from tests.ball_photographs import save
 from tests.conftest import QUIET, refused
 from tests.exact_silhouettes import cameras_around
+from tests.paper import Eikonal, NerfField
 
 discover()
 IndexField = find("medium", "index_field").cls

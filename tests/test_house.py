@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from nerfro.paths import PACKAGE_DIR
+from nerfro.paths import PACKAGE_DIR, PLUGINS_DIR
 from tests.size import count_by_component, count_code_lines
 
 # From above to below: a package imports what follows it, and itself.
@@ -87,9 +87,10 @@ def test_no_package_is_large() -> None:
     assert {name: lines for name, lines in sizes.items() if lines > 3000 and name != "(top level)"} == {}
 
 
+PLUGINS = {str(file.relative_to(PLUGINS_DIR)): file for file in PLUGINS_DIR.rglob("*.py")}
 FUNCTIONS = [
     (module, node)
-    for module, file in FILES.items()
+    for module, file in (FILES | PLUGINS).items()
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
     if isinstance(node, ast.FunctionDef)
 ]

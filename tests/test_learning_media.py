@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 
 from nerfro.registry import discover, find
-from nerfro.samplers.paths.eikonal import Eikonal
 from nerfro.training.run_folder import load_checkpoint
 from tests.ball_photographs import TRAINING, photographs, save
 from tests.closed_forms import make_rays
+from tests.paper import Eikonal
 
 FIELDS = {"width": 8, "depth": 2, "skip": 0}
 

@@ -17,12 +17,12 @@ from nerfro.models.refractive import RefractiveModel
 from nerfro.rendering import composite
 from nerfro.samplers.paths.straight import straight_path
 from nerfro.samplers.points.density_grid import DensityGridSampler
-from nerfro.samplers.points.hierarchical import Hierarchical
 from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import NUM_RAYS, example_batch, example_components, example_draws, example_path, example_rays
 from nerfro.training.module import TrainingModule
 from nerfro.training.optimizer import GroupConfig, OptimizerConfig
 from nerfro.types import Exits, Path, Radiance
+from tests.paper import Hierarchical
 
 
 def split_path(of_straight: float) -> Path:

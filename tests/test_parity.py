@@ -14,18 +14,14 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from nerfro.boundaries.skybox import Skybox
 from nerfro.cameras import Cameras
-from nerfro.fields.nerf import NerfField
 from nerfro.losses.base import Loss
-from nerfro.media.voxel_grid import VoxelGrid
 from nerfro.models.refractive import RefractiveModel
 from nerfro.registry import create, discover, find
 from nerfro.rendering import Components
-from nerfro.samplers.paths.eikonal import Eikonal
-from nerfro.samplers.points.hierarchical import Hierarchical
 from nerfro.testing import example_batch
 from nerfro.types import Batch, Rays, Rendering
+from tests.paper import Eikonal, Hierarchical, NerfField, Skybox, VoxelGrid
 
 discover()
 

@@ -105,7 +105,7 @@ def test_missing_required_field_is_named() -> None:
     refused(r"data=opencv needs root; add data\.root=\.\.\.", configure, find("data", "opencv"), {})
 
 
-@pytest.mark.parametrize("target", ["os.system", "nerfro.samplers.paths.eikonal.march_uniform", None])
+@pytest.mark.parametrize("target", ["os.system", "nerfro_plugins.paper.eikonal.march_uniform", None])
 def test_target_that_is_not_registered_is_not_built(target: str | None, tmp_path: Path) -> None:
     node = {"_target_": target, "command": f"touch {tmp_path / 'ran'}"}
     refused(f"'{target}' is not registered; .*nerfro.plugins", build, node)

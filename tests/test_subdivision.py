@@ -15,12 +15,12 @@ from nerfro.media.shapes import Ball
 from nerfro.models.refractive import RefractiveModel
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.paths.straight import Straight
-from nerfro.samplers.points.hierarchical import Hierarchical
 from nerfro.subdivision import Subdivision, contrast, divergence, neighbour_rays, part_rays, pixel_rays
 from nerfro.testing import example_components
 from nerfro.training.ray_batches import RayBatches
 from nerfro.types import Batch
 from tests.closed_forms import RoundedBox
+from tests.paper import Hierarchical
 
 NUM_VIEWS, HEIGHT, WIDTH = 3, 8, 10
 SIDE, FOCAL = 33, 60.0

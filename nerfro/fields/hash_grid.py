@@ -15,7 +15,7 @@ from nerfro.cameras import Cameras
 from nerfro.fields import hash_encoding
 from nerfro.fields import spherical_harmonics as harmonics
 from nerfro.fields.base import Field
-from nerfro.fields.mlp import radiance
+from nerfro.fields.networks import radiance
 from nerfro.fields.observed_space import NUM_CELLS, observed_cells
 from nerfro.fields.selection import evaluate_selected, inside_box
 from nerfro.geometry.contraction import contract, contracted_box, contraction_scale

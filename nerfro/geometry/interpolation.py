@@ -1,4 +1,4 @@
-"""Interpolation, smoothing and finite differences on regular grids whose outer vertices lie on the box."""
+"""Interpolation and smoothing on regular grids whose outer vertices lie on the box."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def spline_coefficients(values: Float[Tensor, "X Y Z"]) -> Float[Tensor, "X Y Z"
     at creases, whereas this approximation has three taps.
     """
     for axis in range(3):
-        before, after = _neighbours(values, axis)
+        before, after = neighbours(values, axis)
         values = 1.25 * values - 0.125 * (before + after)
     return values.contiguous()
 
@@ -133,16 +133,7 @@ def smooth(values: Float[Tensor, "X Y Z *C"], size: int, sigma: float) -> Float[
     return torch.from_numpy(smoothed).to(values)
 
 
-def gradient(values: Float[Tensor, "X Y Z"], spacing: Float[Tensor, "3"]) -> Float[Tensor, "X Y Z 3"]:
-    """Return central differences, (next - previous) / 2h; replicated borders halve the gradient at the border."""
-    parts = []
-    for axis in range(3):
-        before, after = _neighbours(values, axis)
-        parts.append((after - before) / (2 * spacing[axis]))
-    return torch.stack(parts, -1)
-
-
-def _neighbours(values: Float[Tensor, "X Y Z"], axis: int) -> tuple[Float[Tensor, "X Y Z"], Float[Tensor, "X Y Z"]]:
+def neighbours(values: Float[Tensor, "X Y Z"], axis: int) -> tuple[Float[Tensor, "X Y Z"], Float[Tensor, "X Y Z"]]:
     """Return the values at the previous and at the next vertex along an axis, with replicated borders."""
     index = torch.arange(values.shape[axis], device=values.device)
     last = values.shape[axis] - 1

@@ -6,6 +6,7 @@ import ast
 import errno
 import functools
 import hashlib
+import importlib.util
 import inspect
 import os
 import shutil
@@ -124,14 +125,16 @@ def imported_sources(module: str) -> dict[str, bytes]:
             continue
         sources[name] = Path(file).read_bytes()
         if name != __name__:  # This module decides how kernels are compiled; its imports do not.
-            waiting += _imports(sources[name])
+            waiting += _imports(sources[name], getattr(sys.modules[name], "__package__", None))
     return sources
 
 
-def _imports(source: bytes) -> Iterator[str]:
+def _imports(source: bytes, package: str | None) -> Iterator[str]:
+    """Yield the names of imported modules, and of names in modules, which may be modules as well."""
     for node in ast.parse(source).body:
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom) and node.module is not None:
-            yield node.module
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            module = importlib.util.resolve_name("." * node.level + (node.module or ""), package)
+            yield module
+            yield from (f"{module}.{alias.name}" for alias in node.names)

@@ -19,10 +19,10 @@ from nerfro.kernels.available import require_bytes
 from nerfro.media.base import Medium, Vectors
 from nerfro.media.bodies import Body, mesh_surface, read_bodies
 from nerfro.media.distance_grid import DistanceGrid, DistanceGrids
+from nerfro.media.grid_box import BYTES_PER_VERTEX, grid_box
 from nerfro.media.material import learned_quantities, materials_of
 from nerfro.media.solid import Solid, body_names
 from nerfro.media.surface import Grid, make_surface
-from nerfro.media.voxel_grid import BYTES_PER_VERTEX, grid_box
 from nerfro.registry import register
 from nerfro.variants import variant
 

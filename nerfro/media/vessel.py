@@ -16,10 +16,10 @@ from nerfro.geometry.mesh import local_origin
 from nerfro.kernels.available import require_bytes
 from nerfro.media.base import Medium
 from nerfro.media.distance_grid import DistanceGrid
+from nerfro.media.grid_box import BYTES_PER_VERTEX, grid_box
 from nerfro.media.material import Material, materials_of
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.surface import Grid, MeshSurface, cached_distances, direction
-from nerfro.media.voxel_grid import BYTES_PER_VERTEX, grid_box
 from nerfro.registry import register
 from nerfro.variants import variant
 

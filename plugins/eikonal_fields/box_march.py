@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import torch
 from jaxtyping import Float
+from nerfro_plugins.paper.eikonal import march_uniform
+from nerfro_plugins.paper.integrators import Index, RayState
 from torch import Tensor
 
 from nerfro.errors import NerfroError
@@ -11,8 +13,6 @@ from nerfro.geometry.interpolation import intersect_box
 from nerfro.media.base import Medium
 from nerfro.registry import register
 from nerfro.samplers.base import PathSampler
-from nerfro.samplers.paths.eikonal import march_uniform
-from nerfro.samplers.paths.integrators import Index, RayState
 from nerfro.samplers.paths.straight import straight_path
 from nerfro.types import Path, Rays
 

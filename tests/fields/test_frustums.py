@@ -1,19 +1,15 @@
 """Conical frustums as Gaussians, against points drawn uniformly from a frustum."""
 
 import math
-from importlib import import_module
 
 import pytest
 import torch
 
-from nerfro.registry import discover
 from nerfro.samplers.paths.straight import straight_path
 from nerfro.samplers.points.stratified import cone_samples
 from nerfro.testing import example_path
 from nerfro.types import Rays, Samples
-
-discover()
-frustum_gaussians = import_module("nerfro_plugins.mip_nerf").frustum_gaussians
+from tests.paper import frustum_gaussians
 
 NUM_DRAWS = 400_000
 

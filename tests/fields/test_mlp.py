@@ -1,27 +1,15 @@
 """The networks: sizes as published, activations, and where the input is fed in again."""
 
 import math
-from importlib import import_module
 
 import pytest
 import torch
 
-from nerfro.fields.mlp import (
-    RGB_PADDING,
-    RadianceMLP,
-    SkipMLP,
-    compile_networks,
-    padded_sigmoid,
-    radiance,
-)
-from nerfro.fields.nerf import NerfField
+from nerfro.fields.networks import compile_networks, radiance
 from nerfro.light import to_srgb
-from nerfro.registry import discover
 from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import example_path, example_samples
-
-discover()
-MipNerfField = import_module("nerfro_plugins.mip_nerf").MipNerfField
+from tests.paper import RGB_PADDING, MipNerfField, NerfField, RadianceMLP, SkipMLP, padded_sigmoid
 
 
 def test_forward_equals_a_slow_loop_over_layers() -> None:

@@ -45,7 +45,7 @@ def test_a_kernel_is_compiled_again_where_a_constant_of_another_file_has_changed
     package = tmp_path / "plugin"
     package.mkdir()
     (package / "__init__.py").write_text("")
-    (package / "middle.py").write_text("from plugin.numbers import FACTOR\n")
+    (package / "middle.py").write_text("from .numbers import FACTOR\n")
     (package / "kernel.py").write_text(
         "from nerfro.kernels.compilation import compiled\n"
         "from plugin.middle import FACTOR\n\n\n"

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from nerfro.kernels.linear import Linear
+from tests.paper import Linear
 
 
 @pytest.mark.parametrize("batch", [(1024,), (2, 1024), (700,), (0,)])

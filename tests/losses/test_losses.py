@@ -10,8 +10,6 @@ from torch import Tensor
 from torch.nn.functional import conv2d
 
 from nerfro.boundaries.envmap import EnvironmentMap
-from nerfro.boundaries.skybox import Skybox
-from nerfro.fields.nerf import NerfField
 from nerfro.light import to_srgb
 from nerfro.losses.boundary import BoundaryRegulariser
 from nerfro.losses.photometric import Photometric
@@ -20,12 +18,11 @@ from nerfro.losses.total_variation import TotalVariation, direction_pairs
 from nerfro.models.refractive import RefractiveModel
 from nerfro.registry import create, find
 from nerfro.rendering import ColourSpace, Components, Renderer, Scene
-from nerfro.samplers.paths.eikonal import Eikonal
-from nerfro.samplers.points.hierarchical import Hierarchical
 from nerfro.samplers.points.stratified import point_samples
 from nerfro.testing import NUM_RAYS, example_batch, example_components, example_draws, example_path, example_rendering
 from nerfro.types import Batch, Rendering
 from tests.closed_forms import Luneburg
+from tests.paper import Eikonal, Hierarchical, NerfField, Skybox
 
 
 @pytest.fixture(scope="module")

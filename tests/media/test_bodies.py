@@ -13,12 +13,12 @@ from torch import Tensor
 
 from nerfro.media.material import MATERIALS
 from nerfro.media.sdf_grid import SdfGrid
-from nerfro.samplers.paths.eikonal import Eikonal
 from nerfro.samplers.paths.snell import Snell, trace_interfaces
 from nerfro.types import Path as RayPath
 from nerfro.types import Rays
 from tests.closed_forms import angle, make_rays
 from tests.conftest import refused
+from tests.paper import Eikonal
 
 CENTRES = ((-10.0, 0.0, 0.0), (10.0, 0.0, 0.0))  # of balls of radius 1
 

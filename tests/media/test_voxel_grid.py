@@ -7,10 +7,9 @@ import torch
 import trimesh
 
 from nerfro.errors import NerfroError
-from nerfro.geometry.interpolation import gradient
-from nerfro.media.voxel_grid import VoxelGrid
 from tests.closed_forms import grid_points
 from tests.conftest import refused
+from tests.paper import VoxelGrid, gradient
 
 BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
 

@@ -1,27 +1,19 @@
 """How the parts are composed: fields for each level, where the boundary is asked, and rendering in chunks."""
 
 from dataclasses import replace
-from importlib import import_module
 
 import pytest
 import torch
 from torch import Tensor
 
 from nerfro.boundaries.base import Boundary
-from nerfro.boundaries.skybox import Skybox
-from nerfro.fields.nerf import NerfField
 from nerfro.models.refractive import RefractiveModel
-from nerfro.registry import discover
 from nerfro.rendering import Components
-from nerfro.samplers.paths.eikonal import Eikonal
-from nerfro.samplers.points.hierarchical import Hierarchical
 from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import example_rays
 from nerfro.types import Exits
 from tests.closed_forms import Luneburg
-
-discover()
-MipNerfModel = import_module("nerfro_plugins.mip_nerf").MipNerfModel
+from tests.paper import Eikonal, Hierarchical, MipNerfModel, NerfField, Skybox
 
 
 class Compass(Boundary):

@@ -14,8 +14,6 @@ from scipy.integrate import quad, simpson
 from torch import Tensor
 
 from nerfro.media.base import Medium
-from nerfro.samplers.paths.eikonal import march_uniform
-from nerfro.samplers.paths.integrators import Integrator, euler, leapfrog
 from nerfro.types import Path, Rays
 from tests.closed_forms import (
     FIBRE_ALPHA,
@@ -28,6 +26,7 @@ from tests.closed_forms import (
     luneburg,
     make_rays,
 )
+from tests.paper import Integrator, euler, leapfrog, march_uniform
 
 NUM_STEPS = 256
 LEVELS = pytest.mark.parametrize(("dtype", "level"), [(torch.float64, 1e-5), (torch.float32, 1e-4)])

@@ -8,10 +8,8 @@ import torch
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball
-from nerfro.media.voxel_grid import VoxelGrid
-from nerfro.samplers.paths.eikonal import Eikonal, march_adaptive, march_uniform
-from nerfro.samplers.paths.integrators import euler
 from tests.closed_forms import Luneburg, RoundedBox, Slab, angle, grid_points, make_rays, random_rays
+from tests.paper import Eikonal, VoxelGrid, euler, march_adaptive, march_uniform
 
 BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
 

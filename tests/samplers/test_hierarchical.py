@@ -9,10 +9,10 @@ from torch import Tensor
 from nerfro.draws import Draws
 from nerfro.rendering import composite
 from nerfro.samplers.paths.straight import straight_path
-from nerfro.samplers.points.hierarchical import Hierarchical
 from nerfro.samplers.points.stepfun import midpoints
 from nerfro.testing import example_draws, example_path, example_rays
 from nerfro.types import Path, Radiance, Rendering
+from tests.paper import Hierarchical
 
 
 def render(path: Path, sampler: Hierarchical, weights: Tensor) -> Rendering:

@@ -8,14 +8,10 @@ from nerfro.media.analytic import Vacuum
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball
-from nerfro.media.voxel_grid import VoxelGrid
 from nerfro.rendering import composite
 from nerfro.samplers.base import PathSampler, PointSampler
-from nerfro.samplers.paths.eikonal import Eikonal
-from nerfro.samplers.paths.integrators import RayState, kick_drift_kick, leapfrog
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.paths.straight import Straight
-from nerfro.samplers.points.hierarchical import Hierarchical
 from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import example_path, example_rays
 from nerfro.types import Path, Radiance, Rendering
@@ -28,6 +24,7 @@ from tests.closed_forms import (
     grid_points,
     luneburg,
 )
+from tests.paper import Eikonal, Hierarchical, RayState, VoxelGrid, kick_drift_kick, leapfrog
 
 SMOOTH = [luneburg, fisheye, fibre]
 

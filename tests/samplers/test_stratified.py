@@ -6,12 +6,12 @@ import pytest
 import torch
 
 from nerfro.errors import NerfroError
-from nerfro.samplers.paths.eikonal import Eikonal
 from nerfro.samplers.paths.straight import straight_path
 from nerfro.samplers.points.stratified import LAST_DELTA, Stratified
 from nerfro.testing import example_draws, example_rays
 from nerfro.types import Path
 from tests.closed_forms import Luneburg
+from tests.paper import Eikonal
 
 NUM_VERTICES = 48
 

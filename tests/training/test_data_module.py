@@ -17,7 +17,6 @@ from nerfro.data.blender import BlenderData
 from nerfro.data.pixel_store import PixelStore
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.rendering import Renderer, Scene
-from nerfro.samplers.paths.eikonal import Eikonal
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.training.data_module import Prefetcher, RayDataModule, can_prefetch, multiplies_large_matrices
@@ -26,6 +25,7 @@ from nerfro.training.ray_batches import RayBatches
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
 from nerfro.types import Batch
 from tests.closed_forms import grid_points, random_rays
+from tests.paper import Eikonal
 from tests.pretended_gpu import GPU, PretendedGpu
 
 

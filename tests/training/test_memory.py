@@ -9,7 +9,6 @@ import torch
 
 from nerfro.boundaries.constant import ConstantBoundary
 from nerfro.errors import NerfroError
-from nerfro.fields.nerf import NerfField
 from nerfro.kernels import available
 from nerfro.kernels.available import available_bytes, require_bytes
 from nerfro.media.analytic import Vacuum
@@ -21,6 +20,7 @@ from nerfro.testing import example_rays
 from nerfro.training import memory
 from nerfro.training.memory import require_memory
 from tests.conftest import refused
+from tests.paper import NerfField
 from tests.pretended_gpu import GPU, OnGpu, PretendedGpu
 
 

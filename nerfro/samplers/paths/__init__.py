@@ -1,1 +1,1 @@
-"""Path samplers: straight rays, refraction at surfaces, and integration through a continuous index."""
+"""Path samplers: straight rays and refraction at surfaces."""

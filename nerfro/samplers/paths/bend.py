@@ -18,7 +18,7 @@ from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.solid import Solid
 from nerfro.paths import resolve_path
-from nerfro.samplers.paths.eikonal import Eikonal
+from nerfro.registry import discover, find
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.paths.traced_file import leave_box, make_rays
 
@@ -97,7 +97,10 @@ def polylines(
         NerfroError: the rays are not [R, 3] finite numbers.
     """
     rays = make_rays(*_checked_rays(origins, directions), medium, 0.0, length)
-    path = (Snell() if isinstance(medium, Solid) else Eikonal())(rays, medium)
+    if not isinstance(medium, Solid):
+        discover()  # the sampler is a plugin
+    sampler = Snell() if isinstance(medium, Solid) else find("sampler/path", "eikonal").cls()
+    path = sampler(rays, medium)
     vertices = zip(path.positions.numpy() + medium.origin, path.s.numpy(), strict=True)
     # All rows have the same length and repeat the last vertex.
     return [positions[np.diff(s, prepend=-1.0) > 0] for positions, s in vertices]

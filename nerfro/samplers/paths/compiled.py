@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int
-from torch import Tensor
+from jaxtyping import Int
 
 from nerfro.kernels.arrays import arrays
 from nerfro.samplers.paths.branching import Branching
@@ -17,9 +15,7 @@ from nerfro.samplers.paths.polylines import SnellTrace
 from nerfro.types import Path, Rays
 
 if TYPE_CHECKING:
-    from nerfro.kernels.lookup import Voxels
     from nerfro.media.sdf_grid import SdfGrid
-    from nerfro.media.voxel_grid import VoxelGrid
     from nerfro.samplers.paths.snell_cpu import TracedRows
 
 # Capacity of the first attempt, in vertices of a polyline and polylines of a ray. Rays that need more are traced again;
@@ -34,13 +30,13 @@ def snell_on_grid(rays: Rays, medium: SdfGrid, max_events: int, branching: Branc
     solids = medium.packed()
     settings = Settings(max_events, branching.num_events, branching.least_weight, branching.main_only)
     room = _ROOM if branching.num_events and not branching.main_only else 1
-    rows, counts = trace_snell(*_ray_arrays(rays), solids, settings, _CAPACITY, room)
+    rows, counts = trace_snell(*ray_arrays(rays), solids, settings, _CAPACITY, room)
     kept, needed = (counts <= (room, _CAPACITY)).all(1), counts.max(0, initial=1)
     width = max(int(needed[1]), 2)
     parts = [_polylines(rows, np.where(kept, counts[:, 0], 0), width)]
     if not kept.all():
         rest = (~kept).nonzero()[0]
-        rows, counts = trace_snell(*_ray_arrays(rays[torch.from_numpy(rest)]), solids, settings, width, int(needed[0]))
+        rows, counts = trace_snell(*ray_arrays(rays[torch.from_numpy(rest)]), solids, settings, width, int(needed[0]))
         again = _polylines(rows, counts[:, 0], width)
         parts.append((rest[again[0]], *again[1:]))
         order = np.argsort(np.concatenate([part[0] for part in parts]), kind="stable")
@@ -72,48 +68,6 @@ def _polylines(rows: TracedRows, counts: Int[np.ndarray, "R"], width: int) -> tu
     return ray, *of_vertices, *(column[valid] for column in of_rows)
 
 
-def eikonal_on_grid(
-    rays: Rays, medium: VoxelGrid | SdfGrid, step: float, tolerance: float, max_steps: int
-) -> tuple[Path, Bool[Tensor, "R"]]:
-    """Evaluate `samplers.paths.eikonal.march_adaptive` by the compiled kernel."""
-    from nerfro.kernels.lookup import NO_SOLIDS, NO_VOXELS
-    from nerfro.media.sdf_grid import SdfGrid
-    from nerfro.samplers.paths.eikonal_cpu import march_adaptive
-
-    packed = (NO_VOXELS, medium.packed()) if isinstance(medium, SdfGrid) else (_voxels(medium), NO_SOLIDS)
-    settings = step, tolerance, max_steps
-    *columns, counts, refracted, exceeded = march_adaptive(*_ray_arrays(rays), *packed, settings, _CAPACITY)
-    width = max(int(counts.max(initial=2)), 2)
-    if width > _CAPACITY:  # trace the rays with more vertices again
-        rows = np.nonzero(counts > _CAPACITY)[0]
-        again = march_adaptive(*_ray_arrays(rays[torch.from_numpy(rows)]), *packed, settings, width)[:3]
-        for i, (short, long) in enumerate(zip(columns, again, strict=True)):
-            columns[i] = np.concatenate([short, np.repeat(short[:, -1:], width - _CAPACITY, axis=1)], axis=1)
-            columns[i][rows] = long
-    return _path(rays, [column[:, :width] for column in columns], refracted), torch.from_numpy(exceeded)
-
-
-def uniform_on_grid(rays: Rays, medium: VoxelGrid, num_steps: int) -> Path:
-    """Evaluate `samplers.paths.eikonal.march_uniform` with Euler steps by the compiled kernel."""
-    from nerfro.samplers.paths.eikonal_cpu import march_uniform
-
-    *vertices, refracted = march_uniform(*_ray_arrays(rays), _voxels(medium), num_steps)
-    return _path(rays, vertices, refracted)
-
-
-def _ray_arrays(rays: Rays) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def ray_arrays(rays: Rays) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     origins, directions, near, far = arrays(rays.origins, rays.directions, rays.near, rays.far)
     return origins, directions, near, far
-
-
-def _voxels(medium: VoxelGrid) -> Voxels:
-    from nerfro.kernels.lookup import Voxels
-
-    low, high = medium.box.double().numpy()
-    inverse_spacing = (np.array(medium.table.shape[:3]) - 1) / (high - low)
-    return Voxels(medium.table.detach().numpy(), medium.clearance_grid.numpy(), low, high, inverse_spacing)
-
-
-def _path(rays: Rays, vertices: Sequence[np.ndarray], refracted: np.ndarray) -> Path:
-    positions, directions, s = (torch.from_numpy(np.ascontiguousarray(array)) for array in vertices)
-    return Path.unbranched(positions, directions, s, torch.from_numpy(refracted), rays.radii)

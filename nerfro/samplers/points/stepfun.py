@@ -72,13 +72,6 @@ def invert_cdf(
     return left + fraction * (right - left)
 
 
-def blur_weights(weights: Float[Tensor, "R B"], padding: float) -> Float[Tensor, "R B"]:
-    """Apply the max-then-average filter of mip-NeRF (Eqn. 18) and add a constant, so that fewer surfaces are missed."""
-    padded = torch.cat([weights[..., :1], weights, weights[..., -1:]], dim=-1)
-    highest = torch.maximum(padded[..., :-1], padded[..., 1:])
-    return 0.5 * (highest[..., :-1] + highest[..., 1:]) + padding
-
-
 def midpoints(edges: Float[Tensor, "R E"]) -> Float[Tensor, "R E-1"]:
     """Return the middle of each interval."""
     return 0.5 * (edges[..., 1:] + edges[..., :-1])

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from nerfro.kernels.tolerances import MIN_NORMAL_PART, RESOLVED
+from .tolerances import MIN_NORMAL_PART, RESOLVED
 
 Index = Callable[[Tensor], tuple[Tensor, Tensor]]
 

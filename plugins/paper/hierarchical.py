@@ -13,7 +13,7 @@ from nerfro.allowed import Range
 from nerfro.draws import Draws
 from nerfro.registry import register
 from nerfro.samplers.base import PointSampler
-from nerfro.samplers.points.stepfun import blur_weights, invert_cdf, midpoints, spread_uniform
+from nerfro.samplers.points.stepfun import invert_cdf, midpoints, spread_uniform
 from nerfro.samplers.points.stratified import Stratified, cone_samples, point_samples
 from nerfro.types import Path, Rendering, Samples
 
@@ -68,3 +68,10 @@ def _draw(
     edges: Float[Tensor, "R E"], weights: Float[Tensor, "R E-1"], u: Float[Tensor, "R N"]
 ) -> Float[Tensor, "R N"]:
     return invert_cdf(edges, weights.to(edges.dtype), u)
+
+
+def blur_weights(weights: Float[Tensor, "R B"], padding: float) -> Float[Tensor, "R B"]:
+    """Apply the max-then-average filter of mip-NeRF (Eqn. 18) and add a constant, so that fewer surfaces are missed."""
+    padded = torch.cat([weights[..., :1], weights, weights[..., -1:]], dim=-1)
+    highest = torch.maximum(padded[..., :-1], padded[..., 1:])
+    return 0.5 * (highest[..., :-1] + highest[..., 1:]) + padding

@@ -1,6 +1,6 @@
 """Compiled integration of the Eikonal equation through voxel grids and bodies with thin shells, one thread per ray.
 
-The algorithms are those of `samplers.paths.eikonal`, for one ray at a time.
+The algorithms are those of `eikonal`, for one ray at a time.
 """
 
 from __future__ import annotations
@@ -11,15 +11,11 @@ import numpy as np
 from numba import prange
 
 from nerfro.kernels.compilation import compiled, compiled_parallel, inlined
-from nerfro.kernels.lookup import (
-    block_at,
-    blocks_from,
-    box_span,
-    distance_out,
-    solid_index,
-    voxel_index,
-)
-from nerfro.kernels.tolerances import MIN_COSINE, MIN_NORMAL_PART, MIN_TURN, REACHED, RESOLVED
+from nerfro.kernels.lookup import block_at, blocks_from, box_span, distance_out
+from nerfro.kernels.tolerances import MIN_COSINE
+
+from .index_cpu import solid_index, voxel_index
+from .tolerances import MIN_NORMAL_PART, MIN_TURN, REACHED, RESOLVED
 
 
 @compiled

@@ -12,17 +12,19 @@ from torch import Tensor
 from nerfro.allowed import Count, Positive, Range
 from nerfro.errors import NerfroError
 from nerfro.geometry.interpolation import intersect_box
-from nerfro.kernels.tolerances import MIN_TURN, REACHED, STEPS_PER_SHELL
+from nerfro.kernels.tolerances import STEPS_PER_SHELL
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
-from nerfro.media.voxel_grid import VoxelGrid
 from nerfro.registry import register
 from nerfro.samplers.base import PathSampler
-from nerfro.samplers.paths.compiled import eikonal_on_grid, uniform_on_grid
-from nerfro.samplers.paths.integrators import Integrator, RayState, euler, leapfrog
 from nerfro.samplers.paths.polylines import PolylineBuilder
 from nerfro.samplers.paths.replay import Vertices, assembled, is_interior, with_gradient
 from nerfro.types import Path, Rays
+
+from .compiled import eikonal_on_grid, uniform_on_grid
+from .integrators import Integrator, RayState, euler, leapfrog
+from .tolerances import MIN_TURN, REACHED
+from .voxel_grid import VoxelGrid
 
 # Fraction of a step by which a replay may reach the end of a step earlier than the trace.
 _ROUNDING = 0.01

@@ -14,11 +14,12 @@ from torch import Tensor
 from nerfro.allowed import Depth, Width
 from nerfro.draws import Draws
 from nerfro.fields.base import Field
-from nerfro.fields.encoding import DIRECTION_DEGREE, integrated_positional_encoding, positional_encoding
-from nerfro.fields.mlp import RadianceMLP
 from nerfro.registry import register
 from nerfro.rendering import Components, Renderer, composite
 from nerfro.types import Path, Radiance, Rendering, Samples
+
+from .encoding import DIRECTION_DEGREE, integrated_positional_encoding, positional_encoding
+from .mlp import RadianceMLP
 
 
 @register("field", "mip_nerf")

@@ -11,11 +11,12 @@ from torch import Tensor
 
 from nerfro.allowed import AnyNumber, Depth, Range, Width, corners_of_box
 from nerfro.fields.base import Field
-from nerfro.fields.encoding import DIRECTION_DEGREE, positional_encoding
-from nerfro.fields.mlp import RadianceMLP
 from nerfro.fields.selection import evaluate_selected, inside_box
 from nerfro.registry import register
 from nerfro.types import Radiance, Samples
+
+from .encoding import DIRECTION_DEGREE, positional_encoding
+from .mlp import RadianceMLP
 
 
 @register("field", "nerf")

@@ -13,13 +13,14 @@ from torch import Tensor
 from nerfro.allowed import Positive, Range, Resolution, corners_of_box
 from nerfro.errors import NerfroError
 from nerfro.files.cache import cached_arrays, content_hash
-from nerfro.geometry.interpolation import gradient, smooth, trilinear
+from nerfro.geometry.interpolation import neighbours, smooth, trilinear
 from nerfro.geometry.mesh import local_origin, require_inside
 from nerfro.geometry.occupancy import occupancy_fraction
 from nerfro.geometry.signed_distance import distance_to_set
 from nerfro.kernels.available import require_bytes
 from nerfro.kernels.constants import constant
 from nerfro.media.base import Medium, Scalars, Vectors
+from nerfro.media.grid_box import BYTES_PER_VERTEX, check_margin
 from nerfro.media.surface import MeshSurface
 from nerfro.registry import register
 
@@ -27,8 +28,6 @@ from nerfro.registry import register
 _VERSION = 1
 # Inside tests along each side around a vertex.
 _SUBSAMPLES = 4
-_AIR = 4  # voxels around the object if its box is not given
-BYTES_PER_VERTEX = 64  # peak memory while a grid is built
 
 
 @register("medium", "voxel_grid")
@@ -159,6 +158,15 @@ class VoxelGrid(Medium):
         return (0.5 * self.spacing.min()).expand(directions.shape[:-1])
 
 
+def gradient(values: Float[Tensor, "X Y Z"], spacing: Float[Tensor, "3"]) -> Float[Tensor, "X Y Z 3"]:
+    """Return central differences, (next - previous) / 2h; replicated borders halve the gradient at the border."""
+    parts = []
+    for axis in range(3):
+        before, after = neighbours(values, axis)
+        parts.append((after - before) / (2 * spacing[axis]))
+    return torch.stack(parts, -1)
+
+
 def _clearance_of(
     table: Float[Tensor, "X Y Z 4"], spacing: Float[Tensor, "3"], box: Float[Tensor, "2 3"]
 ) -> Float[Tensor, "U V W"]:
@@ -172,63 +180,6 @@ def _clearance_of(
     distance = distance_to_set(varies.numpy(), cell) - np.linalg.norm(cell)
     diagonal = float(torch.linalg.vector_norm(box[1] - box[0]))
     return torch.from_numpy(distance.clip(0, diagonal)).to(table)
-
-
-def grid_box(
-    box_min: Sequence[float] | None,
-    box_max: Sequence[float] | None,
-    bounds: Float[np.ndarray, "2 3"],
-    resolution: int,
-) -> Float[np.ndarray, "2 3"]:
-    """Return the corners of a medium's grid: the given ones, or the bounds of the object with a margin of air.
-
-    A flat object gets a box at least half as thick as it is long, because voxels should not be much longer than wide.
-
-    Args:
-        box_min, box_max: given corners, world units; both None to use the bounds.
-        bounds: corners of the object, world units.
-        resolution: vertices along each side of the grid.
-
-    Raises:
-        NerfroError: one corner is given without the other, the corners do not make a box, or the object does not
-            fit into it.
-    """
-    if box_min is not None and box_max is not None:
-        box = corners_of_box(box_min, box_max)
-        check_margin(bounds, box, resolution, 2)
-        return box
-    if box_min is not None or box_max is not None:
-        raise NerfroError(
-            "medium.box_min and medium.box_max belong together; give both, or neither for the bounds of the mesh"
-        )
-    low, high = bounds
-    sides = np.maximum(high - low, 0.5 * (high - low).max())
-    share = min(2 * _AIR / (resolution - 1), 0.5)
-    return 0.5 * (low + high) + np.array([[-0.5], [0.5]]) * sides / (1 - share)
-
-
-def check_margin(bounds: Float[np.ndarray, "2 3"], box: Float[np.ndarray, "2 3"], resolution: int, voxels: int) -> None:
-    """Refuse an object that leaves fewer than `voxels` voxels of air on a side of the box."""
-    low, high = bounds
-    margin = voxels * (box[1] - box[0]) / (resolution - 1)
-    if (low - margin >= box[0]).all() and (high + margin <= box[1]).all():
-        return
-    # A larger box has larger voxels, so the margin is solved for.
-    share = 2 * voxels / (resolution - 1)
-    if share >= 0.9:
-        raise NerfroError(
-            f"medium.resolution={resolution} has no room for {voxels} voxels of air on each side; increase it"
-        )
-    margin = 0.5 * (high - low).max() * share / (1 - share)
-    raise NerfroError(
-        f"the object does not fit into the box with {voxels} voxels of air; it needs a box such as "
-        f"medium.box_min={_rounded(low - margin, -1)} medium.box_max={_rounded(high + margin, 1)}"
-    )
-
-
-def _rounded(corner: Float[np.ndarray, "3"], direction: int) -> str:
-    outward = np.floor if direction < 0 else np.ceil
-    return "[" + ",".join(f"{value:.12g}" for value in outward(corner * 100) / 100) + "]"
 
 
 def _faces(values: Tensor) -> list[Tensor]:

@@ -7,10 +7,11 @@ from torch import Tensor
 
 from nerfro.allowed import Depth, Width
 from nerfro.boundaries.base import Boundary
-from nerfro.fields.encoding import DIRECTION_DEGREE, positional_encoding
-from nerfro.fields.mlp import SkipMLP, glorot_linear, padded_sigmoid
 from nerfro.registry import register
 from nerfro.types import Exits
+
+from .encoding import DIRECTION_DEGREE, positional_encoding
+from .mlp import SkipMLP, glorot_linear, padded_sigmoid
 
 
 @register("boundary", "skybox")
