@@ -28,11 +28,6 @@ from scipy.spatial.transform import Rotation
 from nerfro.errors import NerfroError
 from nerfro.evaluation.lpips import NO_NETWORK, MissingNetwork
 from nerfro.paths import CONF_DIR
-from nerfro.synthetic import llvm
-from nerfro.synthetic.path_tracer import load_mitsuba
-
-# Before any test imports Mitsuba, which loads the library at once.
-llvm.select_llvm()
 
 # Workers of pytest-xdist share the cores; threads that wait for each other by spinning would slow all of them down.
 if "PYTEST_XDIST_WORKER" in os.environ:
@@ -155,8 +150,13 @@ def random_pose() -> Callable[[int], np.ndarray]:
 @pytest.fixture(scope="session")
 def mitsuba() -> ModuleType:
     """Mitsuba with its fastest variant; tests are skipped where only the scalar variant works, which takes minutes."""
+    from nerfro.registry import discover
+
+    discover()
+    llvm = importlib.import_module("nerfro_plugins.synthetic.llvm")
+    llvm.select_llvm()  # before Mitsuba is imported, which loads the library at once
     pytest.importorskip("mitsuba")
-    module = load_mitsuba()
+    module = importlib.import_module("nerfro_plugins.synthetic.path_tracer").load_mitsuba()
     if module.variant() == "scalar_rgb":
         pytest.skip(f"needs Mitsuba with LLVM or CUDA, but {llvm.missing_llvm()}; {llvm.HINT}")
     return module

@@ -8,11 +8,11 @@ import pytest
 from nerfro.light import to_srgb
 from nerfro.registry import discover
 from nerfro.synthetic import SCENES
-from nerfro.synthetic.scene import lat_long_texture
-from nerfro.synthetic.synthesis import find_scene
 
 discover()
-distance = import_module("nerfro_plugins.scenes.distance")
+lat_long_texture = import_module("nerfro_plugins.synthetic.scene").lat_long_texture
+find_scene = import_module("nerfro_plugins.synthetic.synthesis").find_scene
+distance = import_module("nerfro_plugins.synthetic.scenes.distance")
 
 
 def test_triangulation_lies_on_the_surface_and_faces_outward():

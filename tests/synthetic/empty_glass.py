@@ -2,13 +2,18 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from importlib import import_module
 from typing import Any
 
 import numpy as np
 
-from nerfro.synthetic.scene import Scene
-from nerfro.synthetic.surface import Surface, torus_angles
-from nerfro.synthetic.synthesis import find_scene
+from nerfro.registry import discover
+
+discover()
+Scene = import_module("nerfro_plugins.synthetic.scene").Scene
+surface = import_module("nerfro_plugins.synthetic.surface")
+Surface, torus_angles = surface.Surface, surface.torus_angles
+find_scene = import_module("nerfro_plugins.synthetic.synthesis").find_scene
 
 
 def empty_glass(glass: Surface, sky: Callable[[np.ndarray], np.ndarray], **options: Any) -> Scene:

@@ -1,13 +1,19 @@
 """Ground truth with partial reflection (`fresnel=true`) against Fresnel's equations; energy and radiance are kept."""
 
+from importlib import import_module
+
 import numpy as np
 import pytest
 
-from nerfro.synthetic.glass import PLUGIN
-from nerfro.synthetic.path_tracer import PathTracer, Pinhole, load_mitsuba
-from nerfro.synthetic.surface import rounded_box
-from nerfro.synthetic.viewpoints import look_at_origin
+from nerfro.registry import discover
 from tests.synthetic.empty_glass import empty_glass
+
+discover()
+PLUGIN = import_module("nerfro_plugins.synthetic.glass").PLUGIN
+path_tracer = import_module("nerfro_plugins.synthetic.path_tracer")
+PathTracer, Pinhole, load_mitsuba = path_tracer.PathTracer, path_tracer.Pinhole, path_tracer.load_mitsuba
+rounded_box = import_module("nerfro_plugins.synthetic.surface").rounded_box
+look_at_origin = import_module("nerfro_plugins.synthetic.viewpoints").look_at_origin
 
 pytestmark = pytest.mark.usefixtures("mitsuba")
 

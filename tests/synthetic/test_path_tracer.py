@@ -3,17 +3,24 @@
 import subprocess
 import sys
 from dataclasses import replace
+from importlib import import_module
 
 import numpy as np
 import pytest
 
 from nerfro.errors import NerfroError
-from nerfro.synthetic import path_tracer
-from nerfro.synthetic.dataset import CAMERA_ANGLE_X, CAMERA_DISTANCE
-from nerfro.synthetic.path_tracer import PathTracer, Pinhole, load_mitsuba
-from nerfro.synthetic.surface import rounded_box, sphere, torus_angles
-from nerfro.synthetic.synthesis import find_scene
-from nerfro.synthetic.viewpoints import directions_on_sphere, look_at_origin
+from nerfro.registry import discover
+
+discover()
+path_tracer = import_module("nerfro_plugins.synthetic.path_tracer")
+dataset = import_module("nerfro_plugins.synthetic.dataset")
+CAMERA_ANGLE_X, CAMERA_DISTANCE = dataset.CAMERA_ANGLE_X, dataset.CAMERA_DISTANCE
+PathTracer, Pinhole, load_mitsuba = path_tracer.PathTracer, path_tracer.Pinhole, path_tracer.load_mitsuba
+surface = import_module("nerfro_plugins.synthetic.surface")
+rounded_box, sphere, torus_angles = surface.rounded_box, surface.sphere, surface.torus_angles
+find_scene = import_module("nerfro_plugins.synthetic.synthesis").find_scene
+viewpoints = import_module("nerfro_plugins.synthetic.viewpoints")
+directions_on_sphere, look_at_origin = viewpoints.directions_on_sphere, viewpoints.look_at_origin
 
 IOR = 1.5
 
@@ -128,7 +135,8 @@ def test_background_pixels_show_the_sky_in_the_direction_of_the_pixel(poses):
 
 def test_a_missing_mitsuba_is_told_with_the_extra_to_install():
     """In a process of its own, which has not imported Mitsuba before."""
-    code = "import sys; sys.modules['mitsuba'] = None; import nerfro.synthetic.path_tracer as t; t.load_mitsuba()"
+    code = "import sys; sys.modules['mitsuba'] = None; from nerfro.registry import discover; discover()\n"
+    code += "import nerfro_plugins.synthetic.path_tracer as t; t.load_mitsuba()"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert "NerfroError" in result.stderr
     assert "pip install 'nerfro[synthesize]'" in result.stderr

@@ -1,11 +1,18 @@
 """Shapes, viewpoints and skies that the synthetic scenes are made of."""
 
+from importlib import import_module
+
 import numpy as np
 import pytest
 
-from nerfro.synthetic.scene import lat_long_texture
-from nerfro.synthetic.surface import rounded_box, sphere, torus_angles
-from nerfro.synthetic.viewpoints import directions_on_sphere, look_at_origin
+from nerfro.registry import discover
+
+discover()
+lat_long_texture = import_module("nerfro_plugins.synthetic.scene").lat_long_texture
+surface = import_module("nerfro_plugins.synthetic.surface")
+rounded_box, sphere, torus_angles = surface.rounded_box, surface.sphere, surface.torus_angles
+viewpoints = import_module("nerfro_plugins.synthetic.viewpoints")
+directions_on_sphere, look_at_origin = viewpoints.directions_on_sphere, viewpoints.look_at_origin
 
 
 def assert_closed_and_outward(surface, volume, tolerance):
