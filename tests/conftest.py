@@ -26,7 +26,6 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from nerfro.errors import NerfroError
-from nerfro.evaluation.lpips import NO_NETWORK, MissingNetwork
 from nerfro.paths import CONF_DIR
 
 # Workers of pytest-xdist share the cores; threads that wait for each other by spinning would slow all of them down.
@@ -208,8 +207,9 @@ def train_here(
 ) -> Callable[..., Finished]:
     """`python -m nerfro.train` in this process, without looking for LPIPS weights."""
     import nerfro.train
+    from nerfro.evaluation.metrics import ImageMetrics
 
-    monkeypatch.setattr(nerfro.train, "find_lpips_network", lambda: NO_NETWORK)
+    monkeypatch.setattr(nerfro.train, "prepared_metrics", ImageMetrics)
     return functools.partial(run_here, "train")
 
 
@@ -225,17 +225,19 @@ def evaluate_here(
 ) -> Callable[..., Finished]:
     """`python -m nerfro.evaluate` in this process, on the CPU and without looking for LPIPS weights."""
     import nerfro.evaluate
+    from nerfro.evaluation.metrics import ImageMetrics
 
-    monkeypatch.setattr(nerfro.evaluate, "find_lpips_network", lambda: MissingNetwork("no cable"))
+    monkeypatch.setattr(nerfro.evaluate, "prepared_metrics", ImageMetrics)
     return functools.partial(run_here, "evaluate", "device=cpu")
 
 
 def train_in(folder: Path, *overrides: str) -> Path:
     """Train like `train_here`, for fixtures that several tests share; returns the folder of the run."""
     import nerfro.train
+    from nerfro.evaluation.metrics import ImageMetrics
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(nerfro.train, "find_lpips_network", lambda: NO_NETWORK)
+        patch.setattr(nerfro.train, "prepared_metrics", ImageMetrics)
         patch.setattr(sys, "argv", ["nerfro.train", *overrides, f"hydra.run.dir={folder}"])
         nerfro.train.main()
     return folder

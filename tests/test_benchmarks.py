@@ -16,7 +16,7 @@ import torch
 from lightning.pytorch.callbacks import timer
 
 import nerfro.train
-from nerfro.evaluation.lpips import NO_NETWORK
+from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.poses.video import extract_frames
 from nerfro.viewing import server
 from tests import ball_photographs
@@ -55,7 +55,7 @@ def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> R
     def run_script(name: str, *arguments: object) -> list[str]:
         monkeypatch.syspath_prepend(str(FOLDER))
         monkeypatch.setattr(subprocess, "run", train_here)
-        monkeypatch.setattr(nerfro.train, "find_lpips_network", lambda: NO_NETWORK)
+        monkeypatch.setattr(nerfro.train, "prepared_metrics", ImageMetrics)
         monkeypatch.setattr(sys, "argv", [name, *map(str, arguments)])
         # Benchmarks replace these.
         for module, attribute in (
