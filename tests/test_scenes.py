@@ -8,10 +8,9 @@ import pytest
 from nerfro.light import to_srgb
 from nerfro.registry import discover
 from nerfro.synthetic import SCENES
+from tests.synthetic.renderer import find_scene, lat_long_texture
 
 discover()
-lat_long_texture = import_module("nerfro_plugins.synthetic.scene").lat_long_texture
-find_scene = import_module("nerfro_plugins.synthetic.synthesis").find_scene
 distance = import_module("nerfro_plugins.synthetic.scenes.distance")
 
 

@@ -2,18 +2,11 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from importlib import import_module
 from typing import Any
 
 import numpy as np
 
-from nerfro.registry import discover
-
-discover()
-Scene = import_module("nerfro_plugins.synthetic.scene").Scene
-surface = import_module("nerfro_plugins.synthetic.surface")
-Surface, torus_angles = surface.Surface, surface.torus_angles
-find_scene = import_module("nerfro_plugins.synthetic.synthesis").find_scene
+from tests.synthetic.renderer import Scene, Surface, find_scene, torus_angles
 
 
 def empty_glass(glass: Surface, sky: Callable[[np.ndarray], np.ndarray], **options: Any) -> Scene:

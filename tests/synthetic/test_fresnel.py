@@ -1,19 +1,10 @@
 """Ground truth with partial reflection (`fresnel=true`) against Fresnel's equations; energy and radiance are kept."""
 
-from importlib import import_module
-
 import numpy as np
 import pytest
 
-from nerfro.registry import discover
 from tests.synthetic.empty_glass import empty_glass
-
-discover()
-PLUGIN = import_module("nerfro_plugins.synthetic.glass").PLUGIN
-path_tracer = import_module("nerfro_plugins.synthetic.path_tracer")
-PathTracer, Pinhole, load_mitsuba = path_tracer.PathTracer, path_tracer.Pinhole, path_tracer.load_mitsuba
-rounded_box = import_module("nerfro_plugins.synthetic.surface").rounded_box
-look_at_origin = import_module("nerfro_plugins.synthetic.viewpoints").look_at_origin
+from tests.synthetic.renderer import PathTracer, Pinhole, glass, load_mitsuba, look_at_origin, rounded_box
 
 pytestmark = pytest.mark.usefixtures("mitsuba")
 
@@ -30,7 +21,7 @@ def reflectances(angles, n):
 def sampled(n, angles, number, from_inside=False):
     """Probability, weight and new cosine of one of the two events of nerfro's material, for rays at some angles."""
     mi = load_mitsuba()
-    bsdf = mi.load_dict({"type": PLUGIN, "int_ior": n, "fresnel": True})
+    bsdf = mi.load_dict({"type": glass.PLUGIN, "int_ior": n, "fresnel": True})
     interaction = mi.SurfaceInteraction3f()
     interaction.t = 1.0
     sign = -1.0 if from_inside else 1.0

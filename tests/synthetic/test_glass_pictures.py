@@ -1,6 +1,5 @@
 """Pictures of empty glass under a known sky: all branches of our rays against Mitsuba's path tracing."""
 
-from importlib import import_module
 from pathlib import Path as FilePath
 
 import numpy as np
@@ -13,19 +12,12 @@ from nerfro.evaluation.image_metrics import psnr
 from nerfro.light import to_srgb
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball
-from nerfro.registry import discover
 from nerfro.samplers.paths.snell import Snell
 from nerfro.subdivision import part_rays
 from nerfro.types import Path, Rays
 from tests.closed_forms import RoundedBox, grid_points
 from tests.synthetic.empty_glass import empty_glass
-
-discover()
-path_tracer = import_module("nerfro_plugins.synthetic.path_tracer")
-PathTracer, Pinhole = path_tracer.PathTracer, path_tracer.Pinhole
-surface = import_module("nerfro_plugins.synthetic.surface")
-Surface, rounded_box, sphere = surface.Surface, surface.rounded_box, surface.sphere
-look_at_origin = import_module("nerfro_plugins.synthetic.viewpoints").look_at_origin
+from tests.synthetic.renderer import PathTracer, Pinhole, Surface, look_at_origin, path_tracer, rounded_box, sphere
 
 # Sums over a pixel of a cube converge slowly: an edge sees lamps in many directions.
 SIDE, ANGLE, SPP, PARTS = 12, 0.5, 4096, 16

@@ -3,15 +3,12 @@
 import os
 import subprocess
 import sys
-from importlib import import_module
 from pathlib import Path
 
 import pytest
 
-from nerfro.registry import discover
+from tests.synthetic.renderer import llvm
 
-discover()
-llvm = import_module("nerfro_plugins.synthetic.llvm")
 newest, version_in_name = llvm.newest, llvm.version_in_name
 
 # Old libraries of this machine; Dr.Jit accepts LLVM 15, but aborts the process when it compiles with it.

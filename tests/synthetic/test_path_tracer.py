@@ -3,24 +3,25 @@
 import subprocess
 import sys
 from dataclasses import replace
-from importlib import import_module
 
 import numpy as np
 import pytest
 
 from nerfro.errors import NerfroError
-from nerfro.registry import discover
-
-discover()
-path_tracer = import_module("nerfro_plugins.synthetic.path_tracer")
-dataset = import_module("nerfro_plugins.synthetic.dataset")
-CAMERA_ANGLE_X, CAMERA_DISTANCE = dataset.CAMERA_ANGLE_X, dataset.CAMERA_DISTANCE
-PathTracer, Pinhole, load_mitsuba = path_tracer.PathTracer, path_tracer.Pinhole, path_tracer.load_mitsuba
-surface = import_module("nerfro_plugins.synthetic.surface")
-rounded_box, sphere, torus_angles = surface.rounded_box, surface.sphere, surface.torus_angles
-find_scene = import_module("nerfro_plugins.synthetic.synthesis").find_scene
-viewpoints = import_module("nerfro_plugins.synthetic.viewpoints")
-directions_on_sphere, look_at_origin = viewpoints.directions_on_sphere, viewpoints.look_at_origin
+from tests.synthetic.renderer import (
+    CAMERA_ANGLE_X,
+    CAMERA_DISTANCE,
+    PathTracer,
+    Pinhole,
+    directions_on_sphere,
+    find_scene,
+    load_mitsuba,
+    look_at_origin,
+    path_tracer,
+    rounded_box,
+    sphere,
+    torus_angles,
+)
 
 IOR = 1.5
 

@@ -1,18 +1,16 @@
 """Shapes, viewpoints and skies that the synthetic scenes are made of."""
 
-from importlib import import_module
-
 import numpy as np
 import pytest
 
-from nerfro.registry import discover
-
-discover()
-lat_long_texture = import_module("nerfro_plugins.synthetic.scene").lat_long_texture
-surface = import_module("nerfro_plugins.synthetic.surface")
-rounded_box, sphere, torus_angles = surface.rounded_box, surface.sphere, surface.torus_angles
-viewpoints = import_module("nerfro_plugins.synthetic.viewpoints")
-directions_on_sphere, look_at_origin = viewpoints.directions_on_sphere, viewpoints.look_at_origin
+from tests.synthetic.renderer import (
+    directions_on_sphere,
+    lat_long_texture,
+    look_at_origin,
+    rounded_box,
+    sphere,
+    torus_angles,
+)
 
 
 def assert_closed_and_outward(surface, volume, tolerance):
