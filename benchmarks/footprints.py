@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import math
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
 import torch
@@ -31,13 +32,16 @@ from nerfro.files import lat_long
 from nerfro.light import to_srgb
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.rays import Rays
+from nerfro.registry import discover
 from nerfro.rendering import Renderer
 from nerfro.samplers.paths.snell import Snell
 from nerfro.subdivision import Subdivision, contrast, divergence, neighbour_rays, part_rays, pixel_rays
-from nerfro.synthetic.scene import lat_long_texture
-from nerfro.synthetic.synthesis import find_scene
 from nerfro.types import Exits
 from tests.closed_forms import RoundedBox
+
+discover()
+lat_long_texture = import_module("nerfro_plugins.synthetic.scene").lat_long_texture
+find_scene = import_module("nerfro_plugins.synthetic.synthesis").find_scene
 
 TRUTH = 16  # rays a side of a pixel
 SIDES = (1, 2, 3, 4, 6, 8)  # rays a side

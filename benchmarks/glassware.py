@@ -12,11 +12,11 @@ with the scores of the reconstruction.
 from __future__ import annotations
 
 import argparse
-import importlib
 import itertools
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -32,16 +32,23 @@ from nerfro.evaluation.results import FULL, read_metrics_json
 from nerfro.light import to_srgb
 from nerfro.opencv import opencv
 from nerfro.progress import track
-from nerfro.synthetic.dataset import PlannedImage, write_image
-from nerfro.synthetic.path_tracer import PathTracer, Pinhole, panel_shape, triangle_shape
-from nerfro.synthetic.scene import Panel, Scene
-from nerfro.synthetic.surface import Surface
-from nerfro.synthetic.synthesis import find_scene
+from nerfro.registry import discover
 from nerfro.viewing.film import write_film
+
+discover()
+dataset = import_module("nerfro_plugins.synthetic.dataset")
+PlannedImage, write_image = dataset.PlannedImage, dataset.write_image
+path_tracer = import_module("nerfro_plugins.synthetic.path_tracer")
+PathTracer, Pinhole = path_tracer.PathTracer, path_tracer.Pinhole
+panel_shape, triangle_shape = path_tracer.panel_shape, path_tracer.triangle_shape
+modelled = import_module("nerfro_plugins.synthetic.scene")
+Panel, Scene = modelled.Panel, modelled.Scene
+Surface = import_module("nerfro_plugins.synthetic.surface").Surface
+find_scene = import_module("nerfro_plugins.synthetic.synthesis").find_scene
 
 dolphin = find_scene("dolphin_capture")
 distance, patterns, photographs = (
-    importlib.import_module(f"{dolphin.__package__}.{name}") for name in ("distance", "patterns", "photographs")
+    import_module(f"{dolphin.__package__}.{name}") for name in ("distance", "patterns", "photographs")
 )
 
 GLASS, WATER = 1.5, 1.333

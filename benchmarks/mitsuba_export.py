@@ -10,6 +10,7 @@ model that was trained with `sampler.path.branches=none`; `dielectric` is real g
 from __future__ import annotations
 
 import argparse
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,10 @@ import torch
 import nerfro
 from nerfro.evaluation.image_metrics import psnr
 from nerfro.light import to_srgb
-from nerfro.synthetic.path_tracer import load_mitsuba
+from nerfro.registry import discover
+
+discover()
+load_mitsuba = import_module("nerfro_plugins.synthetic.path_tracer").load_mitsuba
 
 
 def main() -> None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import math
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -21,10 +22,14 @@ import nerfro
 from nerfro.files import lat_long
 from nerfro.files.images import save_png
 from nerfro.light import to_srgb
-from nerfro.synthetic.dataset import CAMERA_ANGLE_X
-from nerfro.synthetic.path_tracer import PathTracer, Pinhole
-from nerfro.synthetic.scene import lat_long_texture
-from nerfro.synthetic.synthesis import build_scene
+from nerfro.registry import discover
+
+discover()
+CAMERA_ANGLE_X = import_module("nerfro_plugins.synthetic.dataset").CAMERA_ANGLE_X
+path_tracer = import_module("nerfro_plugins.synthetic.path_tracer")
+PathTracer, Pinhole = path_tracer.PathTracer, path_tracer.Pinhole
+lat_long_texture = import_module("nerfro_plugins.synthetic.scene").lat_long_texture
+build_scene = import_module("nerfro_plugins.synthetic.synthesis").build_scene
 
 # Opacity of things inside up to which a pixel shows sky alone.
 _CLEAR = 0.01

@@ -13,10 +13,9 @@ from omegaconf import DictConfig
 
 import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
 from nerfro.cli import entry_point
-from nerfro.evaluation.error_maps import write_error_sheet
+from nerfro.evaluation.error_sheets import write_error_sheet
 from nerfro.evaluation.folders import match_folders
-from nerfro.evaluation.lpips import find_lpips_network
-from nerfro.evaluation.metrics import ImageMetrics
+from nerfro.evaluation.metrics import prepared_metrics
 from nerfro.evaluation.request import EvaluateConfig, find_device, own_folder, record, require_one_task
 from nerfro.evaluation.results import RunMetrics
 from nerfro.evaluation.scoring import score_folders
@@ -51,13 +50,12 @@ def _evaluate_checkpoint(config: DictConfig) -> None:
     with own_folder(config, path.parent.parent / f"evaluate_{config.split}") as folder:
         scene = scene_of(checkpoint, trained, device)
         views = scene.views(config.split).checked()
-        lpips = find_lpips_network()
-        metrics = ImageMetrics(lpips)
+        metrics = prepared_metrics()
         record(folder, config)
         result, treated = score_split(scene.renderer, views, metrics, folder, scene.subdivision, config.split)
         for index, view in enumerate(result.views):
             prediction = load_png(folder / "images" / f"{view.name}.png")
-            write_error_sheet(folder, view.name, prediction, views.images[index], lpips)
+            write_error_sheet(folder, view.name, prediction, views.images[index], metrics.metrics)
         spent = Throughput()
         if "Throughput" in checkpoint["callbacks"]:  # absent if another Trainer has trained the module
             spent.load_state_dict(checkpoint["callbacks"]["Throughput"])
@@ -76,10 +74,9 @@ def _evaluate_folder(config: DictConfig) -> None:
         pair.load(config.alpha)
     device = find_device(config.device)
     with own_folder(config, predictions / "scores") as folder:
-        lpips = find_lpips_network()
-        metrics = ImageMetrics(lpips)
+        metrics = prepared_metrics()
         record(folder, config)
-        result = score_folders(pairs, config.alpha, metrics, lpips, folder, device)
+        result = score_folders(pairs, config.alpha, metrics, folder, device)
         report(RunMetrics(result), f"{predictions} against {references}", folder)
     print(f"images and tables: {folder}")
 

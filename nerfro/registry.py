@@ -49,7 +49,12 @@ _LOCAL_PACKAGE = "nerfro_plugins"
 MOVED_CLASSES = (
     {
         f"nerfro.data.{module}.{name}": f"{_LOCAL_PACKAGE}.data_formats.{module}.{name}"
-        for module, name in (("idr", "IdrData"), ("llff", "LlffData"), ("refref", "RefRefData"))
+        for module, name in (
+            ("idr", "IdrData"),
+            ("llff", "LlffData"),
+            ("nerfstudio", "NerfstudioData"),
+            ("refref", "RefRefData"),
+        )
     }
     | {
         f"nerfro.samplers.{module}.{name}": f"nerfro.samplers.{group}.{module}.{name}"

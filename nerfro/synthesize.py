@@ -12,7 +12,7 @@ from omegaconf import DictConfig
 import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
 from nerfro.cli import entry_point
 from nerfro.paths import CONF_DIR
-from nerfro.synthetic.synthesis import SynthesizeConfig, synthesize
+from nerfro.synthetic import SynthesizeConfig, synthesize
 
 
 @entry_point("synthesize", SynthesizeConfig, CONF_DIR / "synthesize")  # conf/scene would turn `scene=` into a group

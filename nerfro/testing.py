@@ -374,6 +374,8 @@ def _check_metric(metric: ImageMetric) -> None:
     _require(bool(equal > different) == (metric.better == "higher"), "equal images score better than different ones")
     masked = metric.score(target.flip(0), target, torch.ones(size, size, dtype=torch.bool))
     _require(math.isclose(masked, float(different), abs_tol=0.05), "a mask of all pixels does not change the score")
+    errors = metric.error_map(target.flip(0), target)
+    _require(errors is None or errors.values.shape == (size, size), "an error map has one value for each pixel")
 
 
 def _check_phase(phase: Phase) -> None:

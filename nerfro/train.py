@@ -16,8 +16,7 @@ from omegaconf import DictConfig
 import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
 from nerfro.cli import entry_point
 from nerfro.distributed import leave
-from nerfro.evaluation.lpips import find_lpips_network
-from nerfro.evaluation.metrics import ImageMetrics
+from nerfro.evaluation.metrics import prepared_metrics
 from nerfro.evaluation.results import RunMetrics, optimized
 from nerfro.evaluation.tables import report
 from nerfro.evaluation.treatments import score_split
@@ -58,7 +57,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetr
     test = training if split is None else source.load(split).checked()
     test = test.select(range(len(test))[: config.trainer.limit_test_batches])
     subdivision = Subdivision(**config.evaluation.subdivision)
-    lpips = find_lpips_network()
+    metrics = prepared_metrics()
     module, datamodule = build_training(config, source, training)
     renderer = module.renderer
     require_same_run(folder, checkpoint, config, module.parameter_groups())
@@ -93,7 +92,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetr
     scored, scores = None, {}
     try:
         if split is not None:
-            result, treated = score_split(renderer, test, ImageMetrics(lpips), folder, subdivision, split)
+            result, treated = score_split(renderer, test, metrics, folder, subdivision, split)
             scores = {f"{split}/{name}": mean for name, mean in result.means().items()}
             states = {each.state_key: each.state_dict() for each in trainer.callbacks}  # type: ignore[attr-defined]
             scored = RunMetrics(result, *spent, treated, steps_by_phase(states, spent[0]))

@@ -26,13 +26,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from nerfro.errors import NerfroError
-from nerfro.evaluation.lpips import NO_NETWORK, MissingNetwork
 from nerfro.paths import CONF_DIR
-from nerfro.synthetic import llvm
-from nerfro.synthetic.path_tracer import load_mitsuba
-
-# Before any test imports Mitsuba, which loads the library at once.
-llvm.select_llvm()
 
 # Workers of pytest-xdist share the cores; threads that wait for each other by spinning would slow all of them down.
 if "PYTEST_XDIST_WORKER" in os.environ:
@@ -159,8 +153,13 @@ def random_pose() -> Callable[[int], np.ndarray]:
 @pytest.fixture(scope="session")
 def mitsuba() -> ModuleType:
     """Mitsuba with its fastest variant; tests are skipped where only the scalar variant works, which takes minutes."""
+    from nerfro.registry import discover
+
+    discover()
+    llvm = importlib.import_module("nerfro_plugins.synthetic.llvm")
+    llvm.select_llvm()  # before Mitsuba is imported, which loads the library at once
     pytest.importorskip("mitsuba")
-    module = load_mitsuba()
+    module = importlib.import_module("nerfro_plugins.synthetic.path_tracer").load_mitsuba()
     if module.variant() == "scalar_rgb":
         pytest.skip(f"needs Mitsuba with LLVM or CUDA, but {llvm.missing_llvm()}; {llvm.HINT}")
     return module
@@ -212,8 +211,9 @@ def train_here(
 ) -> Callable[..., Finished]:
     """`python -m nerfro.train` in this process, without looking for LPIPS weights."""
     import nerfro.train
+    from nerfro.evaluation.metrics import ImageMetrics
 
-    monkeypatch.setattr(nerfro.train, "find_lpips_network", lambda: NO_NETWORK)
+    monkeypatch.setattr(nerfro.train, "prepared_metrics", ImageMetrics)
     return functools.partial(run_here, "train")
 
 
@@ -229,17 +229,19 @@ def evaluate_here(
 ) -> Callable[..., Finished]:
     """`python -m nerfro.evaluate` in this process, on the CPU and without looking for LPIPS weights."""
     import nerfro.evaluate
+    from nerfro.evaluation.metrics import ImageMetrics
 
-    monkeypatch.setattr(nerfro.evaluate, "find_lpips_network", lambda: MissingNetwork("no cable"))
+    monkeypatch.setattr(nerfro.evaluate, "prepared_metrics", ImageMetrics)
     return functools.partial(run_here, "evaluate", "device=cpu")
 
 
 def train_in(folder: Path, *overrides: str) -> Path:
     """Train like `train_here`, for fixtures that several tests share; returns the folder of the run."""
     import nerfro.train
+    from nerfro.evaluation.metrics import ImageMetrics
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(nerfro.train, "find_lpips_network", lambda: NO_NETWORK)
+        patch.setattr(nerfro.train, "prepared_metrics", ImageMetrics)
         patch.setattr(sys, "argv", ["nerfro.train", *overrides, f"hydra.run.dir={folder}"])
         nerfro.train.main()
     return folder

@@ -26,8 +26,7 @@ def _main(name: str, arguments: list[str], log: Path, environment: dict[str, str
     sys.argv = [f"nerfro.{name}", *arguments]
     os.environ.update(environment, HYDRA_FULL_ERROR="1")
     module = importlib.import_module(f"nerfro.{name}")
-    no_network = importlib.import_module("nerfro.evaluation.lpips").NO_NETWORK
-    module.find_lpips_network = lambda: no_network
+    module.prepared_metrics = importlib.import_module("nerfro.evaluation.metrics").ImageMetrics
     module.main()
 
 

@@ -16,7 +16,7 @@ import torch
 from lightning.pytorch.callbacks import timer
 
 import nerfro.train
-from nerfro.evaluation.lpips import NO_NETWORK
+from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.poses.video import extract_frames
 from nerfro.viewing import server
 from tests import ball_photographs
@@ -55,7 +55,7 @@ def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> R
     def run_script(name: str, *arguments: object) -> list[str]:
         monkeypatch.syspath_prepend(str(FOLDER))
         monkeypatch.setattr(subprocess, "run", train_here)
-        monkeypatch.setattr(nerfro.train, "find_lpips_network", lambda: NO_NETWORK)
+        monkeypatch.setattr(nerfro.train, "prepared_metrics", ImageMetrics)
         monkeypatch.setattr(sys, "argv", [name, *map(str, arguments)])
         # Benchmarks replace these.
         for module, attribute in (
@@ -186,17 +186,17 @@ def test_the_cost_of_a_viewer_is_measured(run: Run, tiny_default_run: list[str])
     run("viewer", "--seconds", 6, "--warm-up", 0, "--window", 2, "--options", *tiny_default_run)
 
 
+@pytest.mark.usefixtures("mitsuba")
 def test_mitsuba_renders_beside_a_run(run: Run, trained_run: Path, tmp_path: Path) -> None:
-    pytest.importorskip("mitsuba")
     write(nerfro.load(trained_run), "mitsuba", tmp_path / "scene.xml")
     assert len(run("mitsuba_export", trained_run, tmp_path / "scene.xml", "--views", 0, "--samples", 1)) == 3
     assert len(run("new_sky", trained_run, "--views", 1, "--spp", 1, "--texture", 16)) == 5
 
 
+@pytest.mark.usefixtures("mitsuba")
 def test_glassware_is_rendered_and_a_perfect_reconstruction_is_scored(
     run: Run, trained_run: Path, tmp_path: Path
 ) -> None:
-    pytest.importorskip("mitsuba")
     for kind in ("bottle", "jar", "tumbler", "wine"):
         run("glassware", kind, tmp_path / kind, "--photographs", 4, "--width", 24, "--spp", 1)
         assert len(json.loads((tmp_path / kind / "outlines.json").read_text())) == 3

@@ -18,14 +18,14 @@ from benchmarks.capture import measure
 from nerfro.data.blender import OpenCVData
 from nerfro.geometry.mesh import load_mesh
 from nerfro.registry import discover
-from nerfro.synthetic import path_tracer
-from nerfro.synthetic.synthesis import synthesize
+from nerfro.synthetic import synthesize
 from tests.exact_silhouettes import overlaps_of_convex_body
 from tests.test_synthesize import configured
 
 discover()
-photographs = import_module("nerfro_plugins.scenes.photographs")
-dolphin_capture = import_module("nerfro_plugins.scenes.dolphin_capture")
+path_tracer = import_module("nerfro_plugins.synthetic.path_tracer")
+photographs = import_module("nerfro_plugins.synthetic.scenes.photographs")
+dolphin_capture = import_module("nerfro_plugins.synthetic.scenes.dolphin_capture")
 
 
 def photograph(folder: Path, **options: object) -> Path:

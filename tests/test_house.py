@@ -12,7 +12,7 @@ from tests.size import count_by_component, count_code_lines
 
 # From above to below: a package imports what follows it, and itself.
 ORDER = (
-    "commands", "testing", "pipeline", "report", "training", "viewing", "evaluation", "synthetic", "capture", "models",
+    "commands", "testing", "pipeline", "report", "training", "viewing", "evaluation", "capture", "models",
     "losses", "rendering", "masks", "poses", "silhouettes", "boundaries", "camera", "samplers", "fields", "media",
     "data", "geometry", "kernels", "files", "core",
 )  # fmt: skip

@@ -19,7 +19,7 @@ import nerfro.train
 from nerfro.capture import refinement
 from nerfro.data.masks import find_mask
 from nerfro.errors import NerfroError
-from nerfro.evaluation.lpips import NO_NETWORK
+from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.files.images import save_png
 from nerfro.files.reading import open_image
 from nerfro.overrides import print_next, without_hints
@@ -338,7 +338,7 @@ def test_posed_photographs_of_a_ball_become_a_scene(
     for view, mask in enumerate(soft_masks(mesh())):
         save_png(data / "masks" / "train" / f"r_{view}.png", mask[..., None].expand(-1, -1, 3))
 
-    monkeypatch.setattr(nerfro.train, "find_lpips_network", lambda: NO_NETWORK)
+    monkeypatch.setattr(nerfro.train, "prepared_metrics", ImageMetrics)
     short = refinement.RefinementSettings((refinement.Stage(20, 1e-4, (3.0, 1.0)),), 1000)
     fast = functools.partial(refinement.refine_surface, settings=short)
     monkeypatch.setattr(refinement, "refine_surface", fast)

@@ -8,11 +8,10 @@ import pytest
 from nerfro.light import to_srgb
 from nerfro.registry import discover
 from nerfro.synthetic import SCENES
-from nerfro.synthetic.scene import lat_long_texture
-from nerfro.synthetic.synthesis import find_scene
+from tests.synthetic.renderer import find_scene, lat_long_texture
 
 discover()
-distance = import_module("nerfro_plugins.scenes.distance")
+distance = import_module("nerfro_plugins.synthetic.scenes.distance")
 
 
 def test_triangulation_lies_on_the_surface_and_faces_outward():

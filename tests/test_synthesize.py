@@ -12,7 +12,7 @@ from nerfro.data.blender import BlenderData
 from nerfro.geometry.mesh import load_mesh
 from nerfro.light import to_srgb
 from nerfro.paths import ASSETS_DIR, CONF_DIR
-from nerfro.synthetic.synthesis import SynthesizeConfig, synthesize
+from nerfro.synthetic import SynthesizeConfig, synthesize
 from nerfro.types import Exits
 from tests.conftest import refused
 from tests.exact_silhouettes import overlaps_of_convex_body

@@ -8,7 +8,6 @@ from torch import Tensor
 
 from nerfro.errors import NerfroError
 from nerfro.evaluation.image_metrics import ImageMetric, build_metrics
-from nerfro.evaluation.lpips import NO_NETWORK, find_lpips_network
 from nerfro.registry import discover, find
 
 
@@ -27,8 +26,9 @@ def metrics(*names: str) -> torchmetrics.MetricCollection:
     discover()
     for name in names:
         find("metric", name)
-    wants_lpips = not names or "lpips" in names
-    found = build_metrics(find_lpips_network() if wants_lpips else NO_NETWORK)
+    found = build_metrics()
+    for name in names or found:
+        found[name].prepare()
     for name in names:
         if found[name].missing is not None:
             raise NerfroError(f"metric={name} is not available: {found[name].missing}")

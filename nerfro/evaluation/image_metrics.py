@@ -8,22 +8,20 @@ from abc import ABC, abstractmethod
 from typing import ClassVar, Literal
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from nerfro.errors import NerfroError
-from nerfro.evaluation.error_maps import squared_error_map
-from nerfro.evaluation.flip import flip
-from nerfro.evaluation.flip import is_available as flip_available
-from nerfro.evaluation.lpips import MIN_SIZE, NO_NETWORK, LpipsNetwork, MissingNetwork
+from nerfro.evaluation.error_maps import SQUARED_ERROR_LIMIT, ErrorMap, squared_error_map
 from nerfro.evaluation.regions import mean_over, require_images
-from nerfro.evaluation.ssim import WINDOW, ssim
-from nerfro.registry import CHECKS, Plugin, create, plugins, register
+from nerfro.evaluation.ssim import WINDOW, ssim, ssim_map
+from nerfro.registry import CHECKS, Plugin, create, discover, plugins, register
 
 MAX_PSNR = 100.0  # dB; the infinite PSNR of equal images has no mean and no representation in JSON
 
-# Order in tables; metrics of other packages follow.
-_BUILT_IN = ("psnr", "ssim", "lpips", "flip")
+# Order in tables; other metrics follow.
+_FIRST = ("psnr", "ssim", "lpips", "flip")
 
 
 class ImageMetric(nn.Module, ABC):
@@ -61,6 +59,13 @@ class ImageMetric(nn.Module, ABC):
             Score; NaN if it is not defined, for example for an empty mask.
         """
 
+    def prepare(self) -> None:
+        """Load what scoring needs, such as a network, or set `missing`; called once before images are scored."""
+
+    def error_map(self, prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> ErrorMap | None:
+        """Compute the error of each pixel for sheets of error maps; by default, the metric has no map."""
+        return None
+
     def score(self, prediction: Tensor, target: Tensor, inside: Tensor | None = None) -> float:
         """Return the score as a number; NaN if the metric is not available or the image is too small."""
         if self.missing is not None or min(prediction.shape[:2]) < self.min_size:
@@ -93,20 +98,14 @@ def image_metrics() -> dict[str, type[ImageMetric]]:
     return {plugin.name: plugin.cls for plugin in _in_order()}
 
 
-def build_metrics(lpips: LpipsNetwork | MissingNetwork) -> dict[str, ImageMetric]:
-    """Build all registered metrics, by name in the order of tables.
-
-    Args:
-        lpips: network of LPIPS, see `find_lpips_network`.
-    """
-    return {
-        plugin.name: create(plugin, {}, **({"lpips": lpips} if "lpips" in plugin.parts else {}))
-        for plugin in _in_order()
-    }
+def build_metrics() -> dict[str, ImageMetric]:
+    """Build all registered metrics, by name in the order of tables; `prepare` makes each of them ready."""
+    return {plugin.name: create(plugin, {}) for plugin in _in_order()}
 
 
 def _in_order() -> list[Plugin]:
-    return sorted(plugins("metric"), key=lambda plugin: (*_BUILT_IN, plugin.name).index(plugin.name))
+    discover()
+    return sorted(plugins("metric"), key=lambda plugin: (*_FIRST, plugin.name).index(plugin.name))
 
 
 def psnr(
@@ -139,6 +138,9 @@ class Psnr(ImageMetric):
     decimals = 2
     forward = staticmethod(psnr)
 
+    def error_map(self, prediction: Tensor, target: Tensor) -> ErrorMap:
+        return ErrorMap("squared_error", "squared error", squared_error_map(prediction, target), SQUARED_ERROR_LIMIT)
+
 
 @register("metric", "ssim")
 class Ssim(ImageMetric):
@@ -149,34 +151,7 @@ class Ssim(ImageMetric):
     min_size = WINDOW
     forward = staticmethod(ssim)
 
-
-@register("metric", "lpips")
-class Lpips(ImageMetric):
-    """Learned perceptual image patch similarity.
-
-    Args:
-        lpips: network, see `find_lpips_network`.
-    """
-
-    title = "LPIPS"
-    better = "lower"
-    min_size = MIN_SIZE
-
-    def __init__(self, lpips: LpipsNetwork | MissingNetwork = NO_NETWORK) -> None:
-        super().__init__()
-        self.missing = lpips.reason if isinstance(lpips, MissingNetwork) else None
-        self.network = None if isinstance(lpips, MissingNetwork) else lpips
-
-    def forward(self, prediction: Tensor, target: Tensor, inside: Tensor | None = None) -> Tensor:
-        assert self.network is not None
-        return self.network(prediction, target, inside)
-
-
-@register("metric", "flip")
-class Flip(ImageMetric):
-    """FLIP, the difference that is visible when flipping between two images."""
-
-    title = "FLIP"
-    better = "lower"
-    missing = None if flip_available() else "the package flip-evaluator is not installed"
-    forward = staticmethod(flip)
+    def error_map(self, prediction: Tensor, target: Tensor) -> ErrorMap:
+        """Compute 1 - SSIM; NaN in a border of five pixels, because windows there would exceed the image."""
+        values = F.pad(1 - ssim_map(prediction, target).mean(-1), [WINDOW // 2] * 4, value=torch.nan)
+        return ErrorMap("ssim", "1 - SSIM", values, 1.0)

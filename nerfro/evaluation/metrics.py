@@ -12,22 +12,17 @@ from torch import Tensor, nn
 
 from nerfro.errors import NerfroError
 from nerfro.evaluation.image_metrics import ImageMetric, build_metrics
-from nerfro.evaluation.lpips import NO_NETWORK, LpipsNetwork, MissingNetwork
 from nerfro.evaluation.regions import crop_rectangle, object_pixels, require_images
 from nerfro.evaluation.results import FULL, OBJECT_REGIONS, EvaluationResult, Region, Score, ViewScores
 from nerfro.files.images import round_to_8bit
 
 
 class ImageMetrics(nn.Module):
-    """All scores of each view: on the full image, on the object's mask and on the crop around the object.
+    """All scores of each view: on the full image, on the object's mask and on the crop around the object."""
 
-    Args:
-        lpips: network of LPIPS, see `find_lpips_network`.
-    """
-
-    def __init__(self, lpips: LpipsNetwork | MissingNetwork = NO_NETWORK) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.metrics: Mapping[str, ImageMetric] = build_metrics(lpips)
+        self.metrics: Mapping[str, ImageMetric] = build_metrics()
         self.modules_to_move = nn.ModuleList(self.metrics.values())  # `to` moves modules of such lists alone
 
     @torch.no_grad()
@@ -96,3 +91,11 @@ class ImageMetrics(nn.Module):
                 too_small = f"images, masks or crops below {metric.min_size} pixels"
                 notes[name] = metric.missing or (too_small if metric.min_size > 1 else "it has no value")
         return notes
+
+
+def prepared_metrics() -> ImageMetrics:
+    """Build all metrics, and load what they need, such as networks, as far as available."""
+    metrics = ImageMetrics()
+    for metric in metrics.metrics.values():
+        metric.prepare()
+    return metrics

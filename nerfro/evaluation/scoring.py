@@ -11,9 +11,8 @@ import torch
 from nerfro.camera.exposure import fit_gain
 from nerfro.data.base import Views
 from nerfro.data.image_files import Alpha
-from nerfro.evaluation.error_maps import write_error_sheet
+from nerfro.evaluation.error_sheets import write_error_sheet
 from nerfro.evaluation.folders import ImagePair
-from nerfro.evaluation.lpips import LpipsNetwork, MissingNetwork
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.render_view import render_view
 from nerfro.evaluation.results import EvaluationResult, ViewScores
@@ -86,7 +85,6 @@ def score_folders(
     pairs: list[ImagePair],
     alpha: Alpha,
     metrics: ImageMetrics,
-    lpips: LpipsNetwork | MissingNetwork,
     folder: Path,
     device: torch.device,
 ) -> EvaluationResult:
@@ -97,5 +95,5 @@ def score_folders(
         prediction, reference = prediction.to(device), reference.to(device)
         coverage = None if coverage is None else coverage.to(device)
         scores.append(metrics.score(pair.name, prediction, reference, coverage))
-        write_error_sheet(folder, pair.name, prediction, reference, lpips)
+        write_error_sheet(folder, pair.name, prediction, reference, metrics.metrics)
     return metrics.result(scores)

@@ -1,5 +1,8 @@
-"""Data formats of other papers: `data=llff`, `data=idr` and `data=refref`; see docs/guides/data_formats.md."""
+"""Data formats of other projects: `data=nerfstudio`, `data=llff`, `data=idr` and `data=refref`.
 
-from . import idr, llff, refref
+See docs/guides/data_formats.md.
+"""
 
-__all__ = ["idr", "llff", "refref"]
+from . import idr, llff, nerfstudio, refref
+
+__all__ = ["idr", "llff", "nerfstudio", "refref"]

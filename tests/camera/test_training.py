@@ -5,6 +5,7 @@ import math
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +15,18 @@ import torch
 from benchmarks.cameras import disturbed
 from nerfro.camera.similarity import motion_between
 from nerfro.data.blender import BlenderData
-from nerfro.data.nerfstudio import NerfstudioData
 from nerfro.evaluation.results import read_metrics_json
 from nerfro.files.images import save_png
 from nerfro.geometry.mesh import load_mesh
 from nerfro.light import to_linear, to_srgb
+from nerfro.registry import discover
 from nerfro.silhouettes.silhouettes import mesh_silhouettes
 from nerfro.training.load import load
 from nerfro.training.run_folder import load_checkpoint
 from tests.ball_photographs import TRAINING, photographs, save
+
+discover()
+NerfstudioData = import_module("nerfro_plugins.data_formats.nerfstudio").NerfstudioData
 
 # A scene of a few steps has slopes for cameras to go by.
 LEARNED_SKY = ["optimizer.groups={background.*: {learning_rate: 0.1, start: 0}}", "optimizer.warmup_steps=0"]

@@ -20,7 +20,6 @@ from nerfro.data.base import DataSource, Views
 from nerfro.data.blender import BlenderData, OpenCVData
 from nerfro.data.colmap import ColmapData
 from nerfro.data.colmap_model import CAMERA_MODELS
-from nerfro.data.nerfstudio import NerfstudioData
 from nerfro.registry import discover
 
 from .photographs import (
@@ -39,7 +38,9 @@ from .photographs import (
 )
 
 discover()
-idr, llff, refref = (import_module(f"nerfro_plugins.data_formats.{name}") for name in ("idr", "llff", "refref"))
+NAMES = ("idr", "llff", "nerfstudio", "refref")
+idr, llff, nerfstudio, refref = (import_module(f"nerfro_plugins.data_formats.{name}") for name in NAMES)
+NerfstudioData = nerfstudio.NerfstudioData
 
 TRAIN, TEST = (1, 2, 4, 5), (0, 3)
 IDEAL = (FX, FX, WIDTH / 2, HEIGHT / 2)

@@ -12,7 +12,6 @@ import pytest
 from nerfro.camera.base import Camera
 from nerfro.data.blender import BlenderData
 from nerfro.data.lenses import Lens, check_lenses, read_lens
-from nerfro.data.nerfstudio import NerfstudioData
 from nerfro.lens import coefficients, opencv_coefficients
 from nerfro.viewing.camera_files import write_cameras
 from tests.conftest import refused
@@ -25,6 +24,7 @@ from .formats import (
     SHARED,
     TRAIN,
     K,
+    NerfstudioData,
     P,
     write_colmap,
     write_idr,

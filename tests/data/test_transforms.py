@@ -13,7 +13,6 @@ from PIL import Image
 
 from nerfro.data.base import Views
 from nerfro.data.blender import BlenderData, OpenCVData
-from nerfro.data.nerfstudio import NerfstudioData
 from nerfro.errors import NerfroError
 from nerfro.training.ray_batches import RayBatches
 from tests.conftest import refused
@@ -23,6 +22,7 @@ from .formats import (
     IDEAL,
     SHARED,
     K,
+    NerfstudioData,
     P,
     change_json,
     write_blender,

@@ -1,16 +1,20 @@
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor
 
-from nerfro.evaluation.error_maps import error_maps, squared_error_map, triptych, write_error_sheet
-from nerfro.evaluation.flip import flip
-from nerfro.evaluation.image_metrics import psnr
-from nerfro.evaluation.lpips import NO_NETWORK
+from nerfro.evaluation.error_maps import squared_error_map, triptych
+from nerfro.evaluation.error_sheets import error_maps, write_error_sheet
+from nerfro.evaluation.image_metrics import ImageMetric, build_metrics, psnr
 from nerfro.evaluation.ssim import ssim
 from nerfro.files.drawing import magma
 from nerfro.files.images import load_png, round_to_8bit
+from nerfro.registry import discover
+
+discover()
+flip = import_module("nerfro_plugins.metrics.flip").flip
 
 
 class Difference(torch.nn.Module):
@@ -20,10 +24,16 @@ class Difference(torch.nn.Module):
         return (prediction - target).abs().mean(-1)
 
 
+def with_lpips() -> dict[str, ImageMetric]:
+    metrics = build_metrics()
+    metrics["lpips"].network, metrics["lpips"].missing = Difference(), None
+    return metrics
+
+
 @pytest.mark.usefixtures("unchecked")
 def test_means_of_the_maps_are_the_metrics() -> None:
     prediction, target = torch.rand(2, 40, 36, 3, generator=torch.Generator().manual_seed(0))
-    maps = {error.name: error for error in error_maps(prediction, target, Difference())}
+    maps = {error.name: error for error in error_maps(prediction, target, with_lpips())}
     assert list(maps) == ["squared_error", "ssim", "lpips", "flip"]
     assert all(error.values.shape == (40, 36) for error in maps.values())
     assert -10 * maps["squared_error"].values.mean().log10() == pytest.approx(psnr(prediction, target).item(), abs=1e-5)
@@ -34,7 +44,7 @@ def test_means_of_the_maps_are_the_metrics() -> None:
 
 def test_border_without_a_window_has_no_similarity_and_is_grey() -> None:
     prediction, target = torch.rand(2, 16, 20, 3, generator=torch.Generator().manual_seed(0))
-    error = error_maps(prediction, target)[1]
+    error = error_maps(prediction, target, build_metrics())[1]
     assert error.values[5:-5, 5:-5].isfinite().all()
     assert error.values.isnan().sum() == 16 * 20 - 6 * 10
     colours = error.colours()
@@ -45,13 +55,13 @@ def test_border_without_a_window_has_no_similarity_and_is_grey() -> None:
 @pytest.mark.usefixtures("unchecked")
 def test_maps_that_a_picture_is_too_small_for_are_left_out() -> None:
     prediction, target = torch.rand(2, 10, 30, 3, generator=torch.Generator().manual_seed(0))
-    maps = error_maps(prediction, target, Difference())
+    maps = error_maps(prediction, target, with_lpips())
     assert [error.name for error in maps] == ["squared_error", "flip"]
 
 
 def test_sheet_shows_pictures_and_maps(tmp_path: Path) -> None:
     prediction, target = torch.rand(2, 64, 128, 3, generator=torch.Generator().manual_seed(0))
-    write_error_sheet(tmp_path, "a", prediction, target, NO_NETWORK)
+    write_error_sheet(tmp_path, "a", prediction, target, build_metrics())
     sheet = load_png(tmp_path / "errors" / "a.png")
     for column, shown in enumerate((prediction, target, magma(squared_error_map(prediction, target), 0.05))):
         enlarged = round_to_8bit(shown).repeat_interleave(2, 0).repeat_interleave(2, 1)

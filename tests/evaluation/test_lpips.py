@@ -1,5 +1,6 @@
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 from typing import NamedTuple
 
@@ -7,15 +8,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfro.evaluation import pretrained
-from nerfro.evaluation.lpips import (
-    CONVOLUTIONS,
-    LpipsNetwork,
-    MissingNetwork,
-    find_lpips_network,
-    load_lpips_network,
-)
+from nerfro.registry import discover
 from tests.conftest import refused
+
+discover()
+pretrained, lpips = (import_module(f"nerfro_plugins.metrics.{name}") for name in ("pretrained", "lpips"))
+CONVOLUTIONS, Lpips, LpipsNetwork = lpips.CONVOLUTIONS, lpips.Lpips, lpips.LpipsNetwork
+load_lpips_network = lpips.load_lpips_network
 
 
 class Reference(NamedTuple):
@@ -89,16 +88,18 @@ def test_model_that_holds_the_network_neither_trains_nor_stores_it(network: Lpip
 def test_a_missing_network_is_reported_with_the_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     monkeypatch.setattr(pretrained, "unreachable", lambda url: "no cable")
-    found = find_lpips_network()
-    assert isinstance(found, MissingNetwork)
-    reason = found.reason
+    metric = Lpips()
+    metric.prepare()
+    reason = metric.missing
     assert reason.startswith("no weights; AlexNet is not in the cache of torch, and there is no network (no cable)")
     assert f" to {tmp_path}" in reason
     assert "\n" not in reason
     cache = tmp_path / "hub" / "checkpoints"
     cache.mkdir(parents=True)
     torch.save(random_weights(), cache / "alexnet-owt-7be5be79.pth")
-    assert isinstance(find_lpips_network(), LpipsNetwork)
+    metric.prepare()
+    assert metric.missing is None
+    assert isinstance(metric.network, LpipsNetwork)
 
 
 def test_weights_of_another_network_are_refused() -> None:

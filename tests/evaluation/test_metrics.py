@@ -1,6 +1,7 @@
 """Metrics of images against other packages, and scores of views and regions."""
 
 import math
+from importlib import import_module
 from pathlib import Path
 
 import flip_evaluator
@@ -13,15 +14,18 @@ from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
 import nerfro
-from nerfro.evaluation.flip import flip, flip_map
 from nerfro.evaluation.image_metrics import psnr
-from nerfro.evaluation.lpips import MissingNetwork
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.regions import crop_rectangle, mean_over, object_pixels
 from nerfro.evaluation.results import EvaluationResult
 from nerfro.evaluation.ssim import ssim, ssim_map
 from nerfro.files.images import load_png, round_to_8bit, save_png
+from nerfro.registry import discover
 from tests.conftest import refused
+
+discover()
+flips = import_module("nerfro_plugins.metrics.flip")
+flip, flip_map = flips.flip, flips.flip_map
 
 
 def pictures(seed: int = 0, height: int = 37, width: int = 45) -> tuple[Tensor, Tensor]:
@@ -77,8 +81,9 @@ def test_every_region_has_the_scores_of_its_pixels() -> None:
     coverage[60:100, 80:95] = 0.7
     coverage[100:103, 80:95] = 0.3
     inside = coverage > 0.5
-    network = HalfOfTheDifference()
-    result = scored((prediction, target, coverage), metrics=ImageMetrics(network))
+    metrics, network = ImageMetrics(), HalfOfTheDifference()
+    metrics.metrics["lpips"].network, metrics.metrics["lpips"].missing = network, None
+    result = scored((prediction, target, coverage), metrics=metrics)
     crop = slice(60 - 17, 100 + 17), slice(80 - 17, 95 + 17)
     regions = {
         "full": (prediction, target, None),
@@ -105,12 +110,12 @@ def test_views_without_the_object_have_the_full_image_only() -> None:
 
 
 def test_missing_metrics_are_none_with_a_reason() -> None:
-    result = scored(pictures(), pictures(height=10), metrics=ImageMetrics(MissingNetwork("no cable")))
+    result = scored(pictures(), pictures(height=10), metrics=ImageMetrics())
     assert result.mean("psnr") is not None
     assert result.mean("flip") is not None
     assert [row.scores["ssim"] is None for row in result.views] == [False, True]
     assert result.mean("ssim") is None
-    assert result.notes == {"ssim": "images, masks or crops below 11 pixels", "lpips": "no cable"}
+    assert result.notes == {"ssim": "images, masks or crops below 11 pixels", "lpips": "no network was given"}
 
 
 def test_an_evaluation_without_views_is_refused() -> None:

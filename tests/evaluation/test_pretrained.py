@@ -4,6 +4,7 @@ import io
 import socket
 import threading
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -11,9 +12,12 @@ import torch
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from nerfro.evaluation import pretrained
-from nerfro.evaluation.pretrained import ALEXNET, load_weights, unreachable
+from nerfro.registry import discover
 from tests.conftest import refused
+
+discover()
+pretrained = import_module("nerfro_plugins.metrics.pretrained")
+ALEXNET, load_weights, unreachable = pretrained.ALEXNET, pretrained.load_weights, pretrained.unreachable
 
 WEIGHTS = {"features.0.weight": torch.arange(6.0)}
 

@@ -27,7 +27,7 @@ from unittest import mock
 import numpy as np
 
 from nerfro.errors import NerfroError
-from nerfro.evaluation.lpips import NO_NETWORK
+from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.failures import in_one_line
 from nerfro.files import cache
 
@@ -84,8 +84,8 @@ class World:
         # Compiled kernels stay where they are.
         patches += [mock.patch.object(cache, "cache_dir", return_value=self.root / "cache")]
         patches += [mock.patch.object(tempfile, "tempdir", str(self.caught))]
-        if hasattr(module, "find_lpips_network"):
-            patches.append(mock.patch.object(module, "find_lpips_network", return_value=NO_NETWORK))
+        if hasattr(module, "prepared_metrics"):
+            patches.append(mock.patch.object(module, "prepared_metrics", ImageMetrics))
         with contextlib.ExitStack() as stack:
             for patch in patches:
                 stack.enter_context(patch)

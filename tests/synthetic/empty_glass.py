@@ -6,9 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from nerfro.synthetic.scene import Scene
-from nerfro.synthetic.surface import Surface, torus_angles
-from nerfro.synthetic.synthesis import find_scene
+from tests.synthetic.renderer import Scene, Surface, find_scene, torus_angles
 
 
 def empty_glass(glass: Surface, sky: Callable[[np.ndarray], np.ndarray], **options: Any) -> Scene:

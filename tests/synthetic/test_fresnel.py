@@ -3,11 +3,8 @@
 import numpy as np
 import pytest
 
-from nerfro.synthetic.glass import PLUGIN
-from nerfro.synthetic.path_tracer import PathTracer, Pinhole, load_mitsuba
-from nerfro.synthetic.surface import rounded_box
-from nerfro.synthetic.viewpoints import look_at_origin
 from tests.synthetic.empty_glass import empty_glass
+from tests.synthetic.renderer import PathTracer, Pinhole, glass, load_mitsuba, look_at_origin, rounded_box
 
 pytestmark = pytest.mark.usefixtures("mitsuba")
 
@@ -24,7 +21,7 @@ def reflectances(angles, n):
 def sampled(n, angles, number, from_inside=False):
     """Probability, weight and new cosine of one of the two events of nerfro's material, for rays at some angles."""
     mi = load_mitsuba()
-    bsdf = mi.load_dict({"type": PLUGIN, "int_ior": n, "fresnel": True})
+    bsdf = mi.load_dict({"type": glass.PLUGIN, "int_ior": n, "fresnel": True})
     interaction = mi.SurfaceInteraction3f()
     interaction.t = 1.0
     sign = -1.0 if from_inside else 1.0

@@ -7,14 +7,18 @@ from pathlib import Path
 
 import pytest
 
-from nerfro.synthetic.llvm import newest, version_in_name
+from tests.synthetic.renderer import llvm
+
+newest, version_in_name = llvm.newest, llvm.version_in_name
 
 # Old libraries of this machine; Dr.Jit accepts LLVM 15, but aborts the process when it compiles with it.
 OLD = sorted(str(file) for file in Path("/usr/lib").glob("*/libLLVM*.so.*") if (version_in_name(file) or 99) < 16)
 RENDER = """
-from nerfro.synthetic.path_tracer import PathTracer, Pinhole
-from nerfro.synthetic.synthesis import find_scene
-from nerfro.synthetic.viewpoints import look_at_origin
+from nerfro.registry import discover
+discover()
+from nerfro_plugins.synthetic.path_tracer import PathTracer, Pinhole
+from nerfro_plugins.synthetic.synthesis import find_scene
+from nerfro_plugins.synthetic.viewpoints import look_at_origin
 tracer = PathTracer(find_scene("torus").build(0.3), False, Pinhole.square(0.7, 2))
 print(tracer.mitsuba.variant(), tracer.render(look_at_origin([0, 0.1, 4]), spp=1, seed=0).mean() > 0)
 """
@@ -45,6 +49,7 @@ def test_the_newest_library_is_chosen_and_old_ones_are_not() -> None:
 @pytest.mark.parametrize("library", ["/missing/libLLVM.so", *OLD[-1:]])
 def test_without_a_usable_library_a_scene_is_rendered_by_the_scalar_variant(library: str) -> None:
     """In a process of its own, because Dr.Jit loads a library only once."""
+    llvm.select_llvm()  # before Mitsuba is imported, which loads the library at once
     pytest.importorskip("mitsuba")
     environment = {**os.environ, "DRJIT_LIBLLVM_PATH": library, "CUDA_VISIBLE_DEVICES": ""}
     result = subprocess.run([sys.executable, "-c", RENDER], capture_output=True, text=True, env=environment)

@@ -8,12 +8,20 @@ import numpy as np
 import pytest
 
 from nerfro.errors import NerfroError
-from nerfro.synthetic import path_tracer
-from nerfro.synthetic.dataset import CAMERA_ANGLE_X, CAMERA_DISTANCE
-from nerfro.synthetic.path_tracer import PathTracer, Pinhole, load_mitsuba
-from nerfro.synthetic.surface import rounded_box, sphere, torus_angles
-from nerfro.synthetic.synthesis import find_scene
-from nerfro.synthetic.viewpoints import directions_on_sphere, look_at_origin
+from tests.synthetic.renderer import (
+    CAMERA_ANGLE_X,
+    CAMERA_DISTANCE,
+    PathTracer,
+    Pinhole,
+    directions_on_sphere,
+    find_scene,
+    load_mitsuba,
+    look_at_origin,
+    path_tracer,
+    rounded_box,
+    sphere,
+    torus_angles,
+)
 
 IOR = 1.5
 
@@ -128,7 +136,8 @@ def test_background_pixels_show_the_sky_in_the_direction_of_the_pixel(poses):
 
 def test_a_missing_mitsuba_is_told_with_the_extra_to_install():
     """In a process of its own, which has not imported Mitsuba before."""
-    code = "import sys; sys.modules['mitsuba'] = None; import nerfro.synthetic.path_tracer as t; t.load_mitsuba()"
+    code = "import sys; sys.modules['mitsuba'] = None; from nerfro.registry import discover; discover()\n"
+    code += "import nerfro_plugins.synthetic.path_tracer as t; t.load_mitsuba()"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert "NerfroError" in result.stderr
     assert "pip install 'nerfro[synthesize]'" in result.stderr

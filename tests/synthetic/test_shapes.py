@@ -3,9 +3,14 @@
 import numpy as np
 import pytest
 
-from nerfro.synthetic.scene import lat_long_texture
-from nerfro.synthetic.surface import rounded_box, sphere, torus_angles
-from nerfro.synthetic.viewpoints import directions_on_sphere, look_at_origin
+from tests.synthetic.renderer import (
+    directions_on_sphere,
+    lat_long_texture,
+    look_at_origin,
+    rounded_box,
+    sphere,
+    torus_angles,
+)
 
 
 def assert_closed_and_outward(surface, volume, tolerance):

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -14,10 +15,10 @@ from nerfro.fields.base import Field
 from nerfro.files import lat_long
 from nerfro.media.shapes import Ball
 from nerfro.models.refractive import RefractiveModel
+from nerfro.registry import discover
 from nerfro.rendering import Components
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.points.stratified import Stratified
-from nerfro.synthetic.viewpoints import look_at_origin
 from nerfro.types import Radiance, Samples
 from nerfro.viewing.server import PageServer
 from nerfro.viewing.trained_scene import TrainedScene
@@ -49,6 +50,8 @@ class Photographs(DataSource):
 
     def load(self, split: str) -> Views:
         places = [(4, 0, 1), (0, 4, 0.5), (-3, 2, -1)] if split == "test" else [(4, 0, 0), (0, -4, 0), (-2, 2, 2.8)]
+        discover()
+        look_at_origin = import_module("nerfro_plugins.synthetic.viewpoints").look_at_origin
         poses = np.stack([look_at_origin(np.array(place, float))[:3] for place in places])
         size = 32
         focal = torch.full((len(places),), 0.5 * size / math.tan(0.5 * 0.7))

@@ -11,8 +11,8 @@ import itertools
 import numpy as np
 
 from nerfro.poses.boards import TagBoard, twelve_faces
-from nerfro.synthetic.scene import Panel, Scene, Vector
 
+from ..scene import Panel, Scene, Vector
 from . import distance, starlamp
 from .distance import Colour, ball, capsule, ellipsoid, join, mirrored, moved, painted, smooth_union
 from .patterns import chosen, fractal_noise, hashed, mix, smoothstep

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from nerfro.light import to_linear
-from nerfro.synthetic.scene import Scene
-from nerfro.synthetic.surface import rounded_box, torus_angles
 
+from ..scene import Scene
+from ..surface import rounded_box, torus_angles
 from .patterns import chosen, hashed, mix, smoothstep
 from .skies import clouds, elevation, skyline
 

@@ -7,9 +7,9 @@ import functools
 import numpy as np
 
 from nerfro.light import to_linear
-from nerfro.synthetic.scene import Scene
-from nerfro.synthetic.surface import rounded_box
 
+from ..scene import Scene
+from ..surface import rounded_box
 from .distance import ball, block, capsule, join, painted
 from .patterns import chosen, fractal_noise, hashed, mix, smoothstep
 from .skies import azimuth, clouds, elevation, skyline

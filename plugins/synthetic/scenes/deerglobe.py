@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from nerfro.light import to_linear
-from nerfro.synthetic.scene import Scene
-from nerfro.synthetic.surface import sphere
 
+from ..scene import Scene
+from ..surface import sphere
 from .distance import ball, capsule, ellipsoid, join, mirrored, painted, smooth_union
 from .patterns import chosen, fractal_noise, hashed, mix, smoothstep
 from .skies import azimuth, elevation, skyline

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from nerfro.light import to_srgb
-from nerfro.synthetic.dataset import DataSet, PlannedImage, write_image, write_json
-from nerfro.synthetic.path_tracer import Pinhole
-from nerfro.synthetic.scene import Scene, Vector
-from nerfro.synthetic.viewpoints import look_at_origin
 
+from ..dataset import DataSet, PlannedImage, write_image, write_json
+from ..path_tracer import Pinhole
+from ..scene import Scene, Vector
+from ..viewpoints import look_at_origin
 from .baking import bake
 
 DISTANCE, ELEVATIONS, LAPS = 4.5, (5.0, 68.0), 4

@@ -24,9 +24,10 @@ from nerfro.files.folder_lock import require_only
 from nerfro.files.images import save_image
 from nerfro.files.reading import read_json
 from nerfro.light import to_srgb
-from nerfro.synthetic.path_tracer import Pinhole
-from nerfro.synthetic.scene import Scene, lat_long_texture
-from nerfro.synthetic.viewpoints import directions_on_sphere, look_at_origin
+
+from .path_tracer import Pinhole
+from .scene import Scene, lat_long_texture
+from .viewpoints import directions_on_sphere, look_at_origin
 
 CAMERA_ANGLE_X = 0.6911112070083618  # field of view of the NeRF synthetic scenes and of the paper's scenes
 CAMERA_DISTANCE = 4.03

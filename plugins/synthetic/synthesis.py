@@ -3,60 +3,26 @@
 from __future__ import annotations
 
 import importlib
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated, Optional
 
-from omegaconf import MISSING, DictConfig
+from omegaconf import DictConfig
 
-from nerfro.allowed import Count, Names, Natural, NotNegative, Positive, Range
 from nerfro.errors import NerfroError
 from nerfro.files.folder_lock import lock_folder
 from nerfro.paths import user_path
 from nerfro.progress import progress_bar
 from nerfro.registry import discover
 from nerfro.synthetic import SCENES
-from nerfro.synthetic.dataset import DataSet, Views
-from nerfro.synthetic.path_tracer import PathTracer, load_mitsuba
-from nerfro.synthetic.scene import Scene
 
-SceneName = Annotated[str, Names(lambda: SCENES)]
-
-
-@dataclass
-class ViewCounts:
-    """Number of views per split."""
-
-    train: Count = MISSING  # number of training views
-    val: Count = MISSING  # number of validation views
-    test: Count = MISSING  # number of test views
-
-
-@dataclass
-class SynthesizeConfig:
-    """Options of `nerfro.synthesize`; conf/synthesize/synthesize.yaml gives and explains the defaults."""
-
-    scene: SceneName = MISSING
-    out: str = MISSING
-    resolution: Annotated[int, Range(at_least=8, at_most=16384)] = MISSING
-    spp: Count = MISSING
-    test_spp: Count = MISSING
-    views: ViewCounts = field(default_factory=ViewCounts)
-    photographs: Count = MISSING
-    noise: NotNegative = MISSING
-    fresnel: bool = MISSING
-    absorption: list[NotNegative] = MISSING
-    ior: Optional[Positive] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
-    seed: Natural = MISSING
-    sky_height: Annotated[int, Range(at_least=16, at_most=16384)] = MISSING
-    extras: bool = MISSING
-    variant: str = MISSING
-    overwrite: bool = MISSING
+from .dataset import DataSet, Views
+from .path_tracer import PathTracer, load_mitsuba
+from .scene import Scene
 
 
 def find_scene(name: str) -> ModuleType:
-    """Import the module of a scene of the package or of a plugin.
+    """Import the module of a scene.
 
     Raises:
         NerfroError: the name is unknown.

@@ -11,7 +11,6 @@ Source:
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -21,9 +20,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from nerfro.errors import NerfroError
-from nerfro.evaluation.pretrained import load_weights
+from nerfro.evaluation.error_maps import ErrorMap
+from nerfro.evaluation.image_metrics import ImageMetric
 from nerfro.evaluation.regions import mean_over, require_images
 from nerfro.paths import ASSETS_DIR
+from nerfro.registry import register
+
+from .pretrained import load_weights
 
 _HEADS = ASSETS_DIR / "_lpips/heads.npz"  # arrays alex<l> of lpips v0.1
 MIN_SIZE = 31  # pixels; in smaller images, the last pooling has an empty input
@@ -148,16 +151,6 @@ class LpipsNetwork(nn.Module):
         return features
 
 
-@dataclass(frozen=True)
-class MissingNetwork:
-    """Takes the place of a network that is not available, for a stated reason."""
-
-    reason: str
-
-
-NO_NETWORK = MissingNetwork("no network was given")
-
-
 def unit_length(features: Float[Tensor, "1 C h w"]) -> Float[Tensor, "1 C h w"]:
     """Normalize the feature vector of each position to unit length; zero stays zero."""
     return features / (features.square().sum(dim=1, keepdim=True).sqrt() + 1e-10)
@@ -170,9 +163,30 @@ def load_lpips_network(weights: dict[str, Tensor]) -> LpipsNetwork:
     return LpipsNetwork(weights, heads)
 
 
-def find_lpips_network() -> LpipsNetwork | MissingNetwork:
-    """Load the network, or return the reason why its weights are not available."""
-    try:
-        return load_lpips_network(load_weights())
-    except NerfroError as error:
-        return MissingNetwork(str(error))
+@register("metric", "lpips")
+class Lpips(ImageMetric):
+    """Learned perceptual image patch similarity."""
+
+    title = "LPIPS"
+    better = "lower"
+    min_size = MIN_SIZE
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.missing = "no network was given"
+        self.network: LpipsNetwork | None = None
+
+    def prepare(self) -> None:
+        """Load the network, or keep the reason why its weights are not available."""
+        try:
+            self.network, self.missing = load_lpips_network(load_weights()), None
+        except NerfroError as error:
+            self.missing = str(error)
+
+    def forward(self, prediction: Tensor, target: Tensor, inside: Tensor | None = None) -> Tensor:
+        assert self.network is not None
+        return self.network(prediction, target, inside)
+
+    def error_map(self, prediction: Tensor, target: Tensor) -> ErrorMap:
+        assert self.network is not None
+        return ErrorMap("lpips", "LPIPS", self.network.distance_map(prediction, target), 1.0)

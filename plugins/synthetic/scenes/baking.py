@@ -8,8 +8,9 @@ import numpy as np
 from skimage.transform import resize
 
 from nerfro.light import to_linear, to_srgb
-from nerfro.synthetic.path_tracer import PathTracer, Pinhole
-from nerfro.synthetic.scene import Panel, Scene
+
+from ..path_tracer import PathTracer, Pinhole
+from ..scene import Panel, Scene
 
 TEXELS = 16  # resolution of the light on a panel
 _ABOVE = 2e-3  # world units; more than the offsets of the renderer, less than the gap under the globe

@@ -12,8 +12,8 @@ from dataclasses import replace
 import numpy as np
 from skimage.measure import marching_cubes
 
-from nerfro.synthetic.scene import Vector
-from nerfro.synthetic.surface import Surface
+from ..scene import Vector
+from ..surface import Surface
 
 Distance = Callable[[np.ndarray], np.ndarray]
 Colour = Callable[[np.ndarray], np.ndarray]

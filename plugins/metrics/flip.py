@@ -15,7 +15,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from nerfro.evaluation.error_maps import ErrorMap
+from nerfro.evaluation.image_metrics import ImageMetric
 from nerfro.evaluation.regions import mean_over, require_images
+from nerfro.registry import register
 
 
 def is_available() -> bool:
@@ -56,3 +59,16 @@ def flip(
     """
     require_images(prediction, target, inside)
     return mean_over(flip_map(prediction, target), inside)
+
+
+@register("metric", "flip")
+class Flip(ImageMetric):
+    """FLIP, the difference that is visible when flipping between two images."""
+
+    title = "FLIP"
+    better = "lower"
+    missing = None if is_available() else "the package flip-evaluator is not installed"
+    forward = staticmethod(flip)
+
+    def error_map(self, prediction: Tensor, target: Tensor) -> ErrorMap:
+        return ErrorMap("flip", "FLIP", flip_map(prediction, target), 1.0)

@@ -12,10 +12,11 @@ import numpy as np
 
 from nerfro.errors import NerfroError
 from nerfro.light import to_linear
-from nerfro.synthetic import llvm
-from nerfro.synthetic.glass import EMBEDDED, PLUGIN, register_materials
-from nerfro.synthetic.scene import Panel, Scene, Sky
-from nerfro.synthetic.surface import Surface
+
+from . import llvm
+from .glass import EMBEDDED, PLUGIN, register_materials
+from .scene import Panel, Scene, Sky
+from .surface import Surface
 
 VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb", "scalar_rgb")
 # Hammersley points: at most one point lies in each row and column, which edges may be parallel to.

@@ -7,8 +7,8 @@ import functools
 import numpy as np
 
 from nerfro.light import to_linear
-from nerfro.synthetic.scene import Scene
 
+from ..scene import Scene
 from . import distance
 from .patterns import chosen, fractal_noise, hashed, mix, smoothstep
 

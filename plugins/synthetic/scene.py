@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerfro.files import lat_long
-from nerfro.synthetic.surface import Surface
+
+from .surface import Surface
 
 Sky = Callable[[np.ndarray], np.ndarray]
 """Maps unit directions [..., 3], z up, to linear radiance [..., 3] of at most 1, so that 8-bit images never clip."""

@@ -1,0 +1,1 @@
+"""Procedural scenes; see docs/guides/synthetic_scenes.md."""
