@@ -40,8 +40,8 @@ from nerfro.types import Exits
 from tests.closed_forms import RoundedBox
 
 discover()
-lat_long_texture = import_module("nerfro_plugins.synthetic.scene").lat_long_texture
-find_scene = import_module("nerfro_plugins.synthetic.synthesis").find_scene
+lat_long_texture = import_module("nerfro_plugins.synthetic_scenes.scene").lat_long_texture
+find_scene = import_module("nerfro_plugins.synthetic_scenes.synthesis").find_scene
 
 TRUTH = 16  # rays a side of a pixel
 SIDES = (1, 2, 3, 4, 6, 8)  # rays a side

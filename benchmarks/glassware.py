@@ -36,15 +36,15 @@ from nerfro.registry import discover
 from nerfro.viewing.film import write_film
 
 discover()
-dataset = import_module("nerfro_plugins.synthetic.dataset")
+dataset = import_module("nerfro_plugins.synthetic_scenes.dataset")
 PlannedImage, write_image = dataset.PlannedImage, dataset.write_image
-path_tracer = import_module("nerfro_plugins.synthetic.path_tracer")
+path_tracer = import_module("nerfro_plugins.synthetic_scenes.path_tracer")
 PathTracer, Pinhole = path_tracer.PathTracer, path_tracer.Pinhole
 panel_shape, triangle_shape = path_tracer.panel_shape, path_tracer.triangle_shape
-modelled = import_module("nerfro_plugins.synthetic.scene")
+modelled = import_module("nerfro_plugins.synthetic_scenes.scene")
 Panel, Scene = modelled.Panel, modelled.Scene
-Surface = import_module("nerfro_plugins.synthetic.surface").Surface
-find_scene = import_module("nerfro_plugins.synthetic.synthesis").find_scene
+Surface = import_module("nerfro_plugins.synthetic_scenes.surface").Surface
+find_scene = import_module("nerfro_plugins.synthetic_scenes.synthesis").find_scene
 
 dolphin = find_scene("dolphin_capture")
 distance, patterns, photographs = (

@@ -22,7 +22,7 @@ from nerfro.light import to_srgb
 from nerfro.registry import discover
 
 discover()
-load_mitsuba = import_module("nerfro_plugins.synthetic.path_tracer").load_mitsuba
+load_mitsuba = import_module("nerfro_plugins.synthetic_scenes.path_tracer").load_mitsuba
 
 
 def main() -> None:

@@ -25,11 +25,11 @@ from nerfro.light import to_srgb
 from nerfro.registry import discover
 
 discover()
-CAMERA_ANGLE_X = import_module("nerfro_plugins.synthetic.dataset").CAMERA_ANGLE_X
-path_tracer = import_module("nerfro_plugins.synthetic.path_tracer")
+CAMERA_ANGLE_X = import_module("nerfro_plugins.synthetic_scenes.dataset").CAMERA_ANGLE_X
+path_tracer = import_module("nerfro_plugins.synthetic_scenes.path_tracer")
 PathTracer, Pinhole = path_tracer.PathTracer, path_tracer.Pinhole
-lat_long_texture = import_module("nerfro_plugins.synthetic.scene").lat_long_texture
-build_scene = import_module("nerfro_plugins.synthetic.synthesis").build_scene
+lat_long_texture = import_module("nerfro_plugins.synthetic_scenes.scene").lat_long_texture
+build_scene = import_module("nerfro_plugins.synthetic_scenes.synthesis").build_scene
 
 # Opacity of things inside up to which a pixel shows sky alone.
 _CLEAR = 0.01

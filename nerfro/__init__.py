@@ -16,6 +16,7 @@ _public, __dir__, _names = lazy_loader.attach_stub(__name__, __file__)
 __all__ = ["__version__", *_names]
 # Components that became plugins.
 _PLUGINS = {
+    "ColmapData": ("data", "colmap"),
     "Eikonal": ("sampler/path", "eikonal"),
     "Hierarchical": ("sampler/points", "hierarchical"),
     "NerfField": ("field", "nerf"),

@@ -3,7 +3,6 @@ from .boundaries.constant import ConstantBoundary
 from .boundaries.envmap import EnvironmentMap
 from .cameras import Cameras
 from .data.blender import BlenderData
-from .data.colmap import ColmapData
 from .data.nerfstudio import NerfstudioData
 from .evaluation.collection import metrics
 from .fields.hash_grid import HashGridField
@@ -31,7 +30,6 @@ __all__ = [
     "Ball",
     "BlenderData",
     "Cameras",
-    "ColmapData",
     "Components",
     "ConstantBoundary",
     "Distortion",

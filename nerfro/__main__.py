@@ -30,7 +30,7 @@ def main() -> None:
         elif name == "--complete":
             print("\n".join(completions(known, arguments)))
         elif name not in known:
-            raise NerfroError(f"there is no command '{name}'; {nearest_of(name, known)}")
+            raise NerfroError(f"there is no command '{name}'; {nearest_of(name, list(known))}")
     if name not in known:
         return
     del sys.argv[1]

@@ -53,6 +53,7 @@ MOVED_CLASSES = (
             ("idr", "IdrData"),
             ("llff", "LlffData"),
             ("nerfstudio", "NerfstudioData"),
+            ("colmap", "ColmapData"),
             ("refref", "RefRefData"),
         )
     }

@@ -1,4 +1,4 @@
-"""Names of synthetic scenes, and options of `nerfro.synthesize`; `plugins/synthetic/` models and renders the scenes."""
+"""Names of synthetic scenes, and options of `nerfro.synthesize`; `plugins/synthetic_scenes/` renders the scenes."""
 
 from __future__ import annotations
 
@@ -61,4 +61,4 @@ def synthesize(config: DictConfig) -> Any:
         NerfroError: Mitsuba is missing, or `out` contains another data set or other files.
     """
     discover()
-    return importlib.import_module("nerfro_plugins.synthetic.synthesis").synthesize(config)
+    return importlib.import_module("nerfro_plugins.synthetic_scenes.synthesis").synthesize(config)

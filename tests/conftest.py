@@ -156,10 +156,10 @@ def mitsuba() -> ModuleType:
     from nerfro.registry import discover
 
     discover()
-    llvm = importlib.import_module("nerfro_plugins.synthetic.llvm")
+    llvm = importlib.import_module("nerfro_plugins.synthetic_scenes.llvm")
     llvm.select_llvm()  # before Mitsuba is imported, which loads the library at once
     pytest.importorskip("mitsuba")
-    module = importlib.import_module("nerfro_plugins.synthetic.path_tracer").load_mitsuba()
+    module = importlib.import_module("nerfro_plugins.synthetic_scenes.path_tracer").load_mitsuba()
     if module.variant() == "scalar_rgb":
         pytest.skip(f"needs Mitsuba with LLVM or CUDA, but {llvm.missing_llvm()}; {llvm.HINT}")
     return module

@@ -23,9 +23,9 @@ from tests.exact_silhouettes import overlaps_of_convex_body
 from tests.test_synthesize import configured
 
 discover()
-path_tracer = import_module("nerfro_plugins.synthetic.path_tracer")
-photographs = import_module("nerfro_plugins.synthetic.scenes.photographs")
-dolphin_capture = import_module("nerfro_plugins.synthetic.scenes.dolphin_capture")
+path_tracer = import_module("nerfro_plugins.synthetic_scenes.path_tracer")
+photographs = import_module("nerfro_plugins.synthetic_scenes.scenes.photographs")
+dolphin_capture = import_module("nerfro_plugins.synthetic_scenes.scenes.dolphin_capture")
 
 
 def photograph(folder: Path, **options: object) -> Path:

@@ -11,7 +11,7 @@ from nerfro.synthetic import SCENES
 from tests.synthetic.renderer import find_scene, lat_long_texture
 
 discover()
-distance = import_module("nerfro_plugins.synthetic.scenes.distance")
+distance = import_module("nerfro_plugins.synthetic_scenes.scenes.distance")
 
 
 def test_triangulation_lies_on_the_surface_and_faces_outward():

@@ -17,8 +17,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from nerfro.data.lenses import Lens
 from nerfro.errors import NerfroError
 from nerfro.files.reading import MAX_ARRAY_BYTES, read_text
+from nerfro.lens import coefficients, opencv_coefficients
 
 # Name and number of parameters of each camera model; the index is the model's identifier in binary files.
 CAMERA_MODELS = (
@@ -229,3 +231,16 @@ _READERS = {
     ".bin": (_binary_cameras, _binary_images, _binary_points),
     ".txt": (_text_cameras, _text_images, _text_points),
 }
+
+
+def lens_of(camera: ColmapCamera, where: str) -> Lens:
+    """Convert the intrinsics of a perspective COLMAP camera; both use the same pixel coordinates."""
+    p = camera.params
+    if camera.model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
+        return Lens(p[0], p[0], p[1], p[2], coefficients(p[3:]))
+    if camera.model in ("PINHOLE", "OPENCV", "FULL_OPENCV"):
+        return Lens(p[0], p[1], p[2], p[3], opencv_coefficients(p[4:]))
+    raise NerfroError(
+        f"{where} has the model {camera.model}, which is not supported; undistort the images with "
+        "`colmap image_undistorter`, or reconstruct with PINHOLE, RADIAL, OPENCV or FULL_OPENCV"
+    )

@@ -20,8 +20,7 @@ from scipy.ndimage import binary_dilation
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from nerfro.data.colmap import lens_of
-from nerfro.data.colmap_model import read_colmap
+from nerfro.data.colmap_model import lens_of, read_colmap
 from nerfro.data.image_files import read_mask, to_unit
 from nerfro.data.lenses import Lens, check_lenses
 from nerfro.errors import NerfroError

@@ -15,15 +15,13 @@ from omegaconf import MISSING, DictConfig
 from nerfro.allowed import Count, Names, Positive
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
-from nerfro.files.cache import save_arrays
-from nerfro.files.lat_long import save_lat_long
 from nerfro.registry import discover
 from nerfro.viewing import PLUGIN_EXPORTS
 from nerfro.viewing.page import make_page
-from nerfro.viewing.trained_scene import SKY_HEIGHT, TrainedScene
-from nerfro.viewing.volume import RESOLUTION, sample_field
+from nerfro.viewing.trained_scene import TrainedScene
+from nerfro.viewing.volume import RESOLUTION
 
-ExportName = Annotated[str, Names(lambda: (*EXPORTS, *PLUGIN_EXPORTS))]
+ExportName = Annotated[str, Names(lambda: ("page", *PLUGIN_EXPORTS))]
 
 
 @dataclass
@@ -83,28 +81,15 @@ def export_of(what: str) -> Export:
         NerfroError: the name is unknown, or the module of the plugin defines no export.
     """
     discover()
-    names = (*EXPORTS, *PLUGIN_EXPORTS)
-    if what not in names:
-        raise NerfroError(f"what={what} is not known; choose {', '.join(names)}")
-    if what in EXPORTS:
-        return EXPORTS[what]
+    if what == "page":
+        return PAGE
+    if what not in PLUGIN_EXPORTS:
+        raise NerfroError(f"what={what} is not known; choose {', '.join(('page', *PLUGIN_EXPORTS))}")
     module = importlib.import_module(PLUGIN_EXPORTS[what])
     export = getattr(module, "EXPORT", None)
     if not isinstance(export, Export):
         raise NerfroError(f"the plugin {module.__file__} of what={what} defines no EXPORT, an exports.Export")
     return export
-
-
-def _write_sky(scene: TrainedScene, out: Path, config: DictConfig) -> str:
-    sky = scene.sky_of_height(config.resolution or SKY_HEIGHT)
-    save_lat_long(out, sky)
-    return f"the sky: {sky.shape[1]}x{sky.shape[0]} pixels, lat-long, z up"
-
-
-def _write_volume(scene: TrainedScene, out: Path, config: DictConfig) -> str:
-    volume = sample_field(scene, config.resolution or RESOLUTION)
-    save_arrays(out, {name: getattr(volume, name).numpy() for name in ("density", "rgb", "box")})
-    return f"the inside: {'x'.join(map(str, volume.density.shape))} vertices with density and linear rgb"
 
 
 def _write_page(scene: TrainedScene, out: Path, config: DictConfig) -> str:
@@ -113,8 +98,4 @@ def _write_page(scene: TrainedScene, out: Path, config: DictConfig) -> str:
     return f"an interactive page of {len(page) / 1e6:.1f} MB"
 
 
-EXPORTS = {
-    "page": Export((".html",), _write_page),
-    "sky": Export((".hdr", ".exr", ".png"), _write_sky),
-    "volume": Export((".npz",), _write_volume),
-}
+PAGE = Export((".html",), _write_page)

@@ -18,7 +18,6 @@ from scipy.spatial.transform import Rotation
 
 from nerfro.data.base import DataSource, Views
 from nerfro.data.blender import BlenderData, OpenCVData
-from nerfro.data.colmap import ColmapData
 from nerfro.data.colmap_model import CAMERA_MODELS
 from nerfro.registry import discover
 
@@ -38,9 +37,9 @@ from .photographs import (
 )
 
 discover()
-NAMES = ("idr", "llff", "nerfstudio", "refref")
-idr, llff, nerfstudio, refref = (import_module(f"nerfro_plugins.data_formats.{name}") for name in NAMES)
-NerfstudioData = nerfstudio.NerfstudioData
+NAMES = ("colmap", "idr", "llff", "nerfstudio", "refref")
+colmap, idr, llff, nerfstudio, refref = (import_module(f"nerfro_plugins.data_formats.{name}") for name in NAMES)
+ColmapData, NerfstudioData = colmap.ColmapData, nerfstudio.NerfstudioData
 
 TRAIN, TEST = (1, 2, 4, 5), (0, 3)
 IDEAL = (FX, FX, WIDTH / 2, HEIGHT / 2)

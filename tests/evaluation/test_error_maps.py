@@ -14,7 +14,7 @@ from nerfro.files.images import load_png, round_to_8bit
 from nerfro.registry import discover
 
 discover()
-flip = import_module("nerfro_plugins.metrics.flip").flip
+flip = import_module("nerfro_plugins.perceptual_metrics.flip").flip
 
 
 class Difference(torch.nn.Module):

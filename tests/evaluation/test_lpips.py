@@ -12,7 +12,7 @@ from nerfro.registry import discover
 from tests.conftest import refused
 
 discover()
-pretrained, lpips = (import_module(f"nerfro_plugins.metrics.{name}") for name in ("pretrained", "lpips"))
+pretrained, lpips = (import_module(f"nerfro_plugins.perceptual_metrics.{name}") for name in ("pretrained", "lpips"))
 CONVOLUTIONS, Lpips, LpipsNetwork = lpips.CONVOLUTIONS, lpips.Lpips, lpips.LpipsNetwork
 load_lpips_network = lpips.load_lpips_network
 

@@ -24,7 +24,7 @@ from nerfro.registry import discover
 from tests.conftest import refused
 
 discover()
-flips = import_module("nerfro_plugins.metrics.flip")
+flips = import_module("nerfro_plugins.perceptual_metrics.flip")
 flip, flip_map = flips.flip, flips.flip_map
 
 

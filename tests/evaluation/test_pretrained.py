@@ -16,7 +16,7 @@ from nerfro.registry import discover
 from tests.conftest import refused
 
 discover()
-pretrained = import_module("nerfro_plugins.metrics.pretrained")
+pretrained = import_module("nerfro_plugins.perceptual_metrics.pretrained")
 ALEXNET, load_weights, unreachable = pretrained.ALEXNET, pretrained.load_weights, pretrained.unreachable
 
 WEIGHTS = {"features.0.weight": torch.arange(6.0)}

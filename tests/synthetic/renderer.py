@@ -1,4 +1,4 @@
-"""Functions and classes of `plugins/synthetic/`, for imports by tests."""
+"""Functions and classes of `plugins/synthetic_scenes/`, for imports by tests."""
 
 from importlib import import_module
 
@@ -6,7 +6,7 @@ from nerfro.registry import discover
 
 discover()
 dataset, glass, llvm, path_tracer, scene, surface, synthesis, viewpoints = (
-    import_module(f"nerfro_plugins.synthetic.{name}")
+    import_module(f"nerfro_plugins.synthetic_scenes.{name}")
     for name in ("dataset", "glass", "llvm", "path_tracer", "scene", "surface", "synthesis", "viewpoints")
 )
 CAMERA_ANGLE_X, CAMERA_DISTANCE = dataset.CAMERA_ANGLE_X, dataset.CAMERA_DISTANCE

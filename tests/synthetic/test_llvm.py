@@ -16,9 +16,9 @@ OLD = sorted(str(file) for file in Path("/usr/lib").glob("*/libLLVM*.so.*") if (
 RENDER = """
 from nerfro.registry import discover
 discover()
-from nerfro_plugins.synthetic.path_tracer import PathTracer, Pinhole
-from nerfro_plugins.synthetic.synthesis import find_scene
-from nerfro_plugins.synthetic.viewpoints import look_at_origin
+from nerfro_plugins.synthetic_scenes.path_tracer import PathTracer, Pinhole
+from nerfro_plugins.synthetic_scenes.synthesis import find_scene
+from nerfro_plugins.synthetic_scenes.viewpoints import look_at_origin
 tracer = PathTracer(find_scene("torus").build(0.3), False, Pinhole.square(0.7, 2))
 print(tracer.mitsuba.variant(), tracer.render(look_at_origin([0, 0.1, 4]), spp=1, seed=0).mean() > 0)
 """

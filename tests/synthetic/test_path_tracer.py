@@ -137,7 +137,7 @@ def test_background_pixels_show_the_sky_in_the_direction_of_the_pixel(poses):
 def test_a_missing_mitsuba_is_told_with_the_extra_to_install():
     """In a process of its own, which has not imported Mitsuba before."""
     code = "import sys; sys.modules['mitsuba'] = None; from nerfro.registry import discover; discover()\n"
-    code += "import nerfro_plugins.synthetic.path_tracer as t; t.load_mitsuba()"
+    code += "import nerfro_plugins.synthetic_scenes.path_tracer as t; t.load_mitsuba()"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert "NerfroError" in result.stderr
     assert "pip install 'nerfro[synthesize]'" in result.stderr

@@ -51,7 +51,7 @@ class Photographs(DataSource):
     def load(self, split: str) -> Views:
         places = [(4, 0, 1), (0, 4, 0.5), (-3, 2, -1)] if split == "test" else [(4, 0, 0), (0, -4, 0), (-2, 2, 2.8)]
         discover()
-        look_at_origin = import_module("nerfro_plugins.synthetic.viewpoints").look_at_origin
+        look_at_origin = import_module("nerfro_plugins.synthetic_scenes.viewpoints").look_at_origin
         poses = np.stack([look_at_origin(np.array(place, float))[:3] for place in places])
         size = 32
         focal = torch.full((len(places),), 0.5 * size / math.tan(0.5 * 0.7))

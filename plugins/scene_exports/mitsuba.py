@@ -12,7 +12,7 @@ import numpy as np
 import torch
 import trimesh
 from jaxtyping import Float
-from nerfro_plugins.synthetic.path_tracer import envmap_texture
+from nerfro_plugins.synthetic_scenes.path_tracer import envmap_texture
 from omegaconf import DictConfig
 from trimesh.exchange.ply import export_ply
 
@@ -43,9 +43,9 @@ def write_mitsuba(scene: TrainedScene, out: Path, config: DictConfig) -> str:
     """Write an .xml scene, with meshes and sky beside the file (`MITSUBA_FILES`).
 
     The glass is a `dielectric`, with partial reflection; the parameter `glass` selects another material, such as
-    `transmitting_glass` (see `plugins/synthetic/glass.py`) for a model without partial reflection. The content is a
-    light source with the radiance that is seen from outside. The sensors are the test cameras in their order, or the
-    cameras of another split if there are no test cameras. `config` is an `ExportConfig`.
+    `transmitting_glass` (see `plugins/synthetic_scenes/glass.py`) for a model without partial reflection. The content
+    is a light source with the radiance that is seen from outside. The sensors are the test cameras in their order, or
+    the cameras of another split if there are no test cameras. `config` is an `ExportConfig`.
 
     Raises:
         NerfroError: bodies lie inside others or overlap.

@@ -9,13 +9,11 @@ import numpy as np
 
 from nerfro.data.base import Frame
 from nerfro.data.bounds import find_bounds, usable_points
-from nerfro.data.colmap_model import ColmapCamera, read_colmap
+from nerfro.data.colmap_model import lens_of, read_colmap
 from nerfro.data.frames import Every, FrameSet, PosedImages
 from nerfro.data.image_files import read_size
-from nerfro.data.lenses import Lens
 from nerfro.data.masks import find_mask
 from nerfro.errors import NerfroError
-from nerfro.lens import coefficients, opencv_coefficients
 from nerfro.registry import register
 
 _MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "")
@@ -79,16 +77,3 @@ class ColmapData(PosedImages):
                 return folder
         tried = ", ".join(map(str, folders))
         raise NerfroError(f"there is no COLMAP model (cameras.bin or .txt) in {tried}; set data.model to its folder")
-
-
-def lens_of(camera: ColmapCamera, where: str) -> Lens:
-    """Convert the intrinsics of a perspective COLMAP camera; both use the same pixel coordinates."""
-    p = camera.params
-    if camera.model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
-        return Lens(p[0], p[0], p[1], p[2], coefficients(p[3:]))
-    if camera.model in ("PINHOLE", "OPENCV", "FULL_OPENCV"):
-        return Lens(p[0], p[1], p[2], p[3], opencv_coefficients(p[4:]))
-    raise NerfroError(
-        f"{where} has the model {camera.model}, which is not supported; undistort the images with "
-        "`colmap image_undistorter`, or reconstruct with PINHOLE, RADIAL, OPENCV or FULL_OPENCV"
-    )

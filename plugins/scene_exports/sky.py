@@ -1,0 +1,21 @@
+"""Export of the background radiance as a latitude-longitude image."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from omegaconf import DictConfig
+
+from nerfro.files.lat_long import save_lat_long
+from nerfro.viewing.exports import Export
+from nerfro.viewing.trained_scene import SKY_HEIGHT, TrainedScene
+
+
+def write_sky(scene: TrainedScene, out: Path, config: DictConfig) -> str:
+    """Write the background radiance; `config` is an `ExportConfig`, whose resolution is the number of rows."""
+    sky = scene.sky_of_height(config.resolution or SKY_HEIGHT)
+    save_lat_long(out, sky)
+    return f"the sky: {sky.shape[1]}x{sky.shape[0]} pixels, lat-long, z up"
+
+
+EXPORT = Export((".hdr", ".exr", ".png"), write_sky)

@@ -1,0 +1,22 @@
+"""Export of the radiance field as arrays on a regular grid."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from omegaconf import DictConfig
+
+from nerfro.files.cache import save_arrays
+from nerfro.viewing.exports import Export
+from nerfro.viewing.trained_scene import TrainedScene
+from nerfro.viewing.volume import RESOLUTION, sample_field
+
+
+def write_volume(scene: TrainedScene, out: Path, config: DictConfig) -> str:
+    """Write density, linear radiance and the corners of the grid as .npz; `config` is an `ExportConfig`."""
+    volume = sample_field(scene, config.resolution or RESOLUTION)
+    save_arrays(out, {name: getattr(volume, name).numpy() for name in ("density", "rgb", "box")})
+    return f"the inside: {'x'.join(map(str, volume.density.shape))} vertices with density and linear rgb"
+
+
+EXPORT = Export((".npz",), write_volume)
