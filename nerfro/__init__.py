@@ -20,6 +20,7 @@ _PLUGINS = {
     "Eikonal": ("sampler/path", "eikonal"),
     "Hierarchical": ("sampler/points", "hierarchical"),
     "NerfField": ("field", "nerf"),
+    "NerfstudioData": ("data", "nerfstudio"),
     "Skybox": ("boundary", "skybox"),
 }
 
@@ -30,9 +31,7 @@ def __getattr__(name: str) -> Any:
     if name == "Scene":
         warnings.warn("nerfro.Scene is called nerfro.TrainedScene; the next release removes the old name", stacklevel=2)
         name = "TrainedScene"
-    if name in _PLUGINS:
-        return _plugin(name)
-    return _public(name)
+    return _plugin(name) if name in _PLUGINS else _public(name)
 
 
 def _plugin(name: str) -> type:

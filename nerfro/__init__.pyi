@@ -3,7 +3,6 @@ from .boundaries.constant import ConstantBoundary
 from .boundaries.envmap import EnvironmentMap
 from .cameras import Cameras
 from .data.blender import BlenderData
-from .data.nerfstudio import NerfstudioData
 from .evaluation.collection import metrics
 from .fields.hash_grid import HashGridField
 from .losses.distortion import Distortion
@@ -36,7 +35,6 @@ __all__ = [
     "EnvironmentMap",
     "GroupConfig",
     "HashGridField",
-    "NerfstudioData",
     "OptimizerConfig",
     "Photometric",
     "RayBatches",

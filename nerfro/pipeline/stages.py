@@ -61,7 +61,9 @@ class Stage:
             print(f"{self.command}: done; {self.result} is kept (delete the file to repeat the stage)", flush=True)
             return
         print(f"\n{self.command}: {shlex.join(['python', '-m', f'nerfro.{self.command}', *self.options])}", flush=True)
-        incomplete = f"{self.command} is incomplete; repeat the same command to start this stage again"
+        # Training has saved a checkpoint.
+        again = "continue" if self.command == "train" else "start this stage again"
+        incomplete = f"{self.command} is incomplete; repeat the same command to {again}"
         try:
             # A command depends on no random numbers of earlier stages.
             with without_hints(), torch.random.fork_rng(devices=[]):
@@ -74,8 +76,7 @@ class Stage:
         except SystemExit as end:
             if end.code != EXIT_INTERRUPTED:
                 raise
-            # Training has saved a checkpoint.
-            raise Interrupted(f"{self.command} is incomplete; repeat the same command to continue") from None
+            raise Interrupted(incomplete) from None
         except Exception as error:
             if os.environ.get("NERFRO_DEBUG"):
                 raise

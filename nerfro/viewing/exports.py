@@ -69,8 +69,7 @@ def find_export(what: str, out: Path) -> Export:
     """
     export = export_of(what)
     if out.suffix.lower() not in export.suffixes:
-        raise NerfroError(f"out={out} has another ending than the exported file; it must end in "
-                          f"{' or '.join(export.suffixes)}")  # fmt: skip
+        raise NerfroError(f"out={out} is not a file of {what}; it must end in {' or '.join(export.suffixes)}")
     return export
 
 

@@ -178,7 +178,7 @@ def test_mitsuba_renders_the_same_picture(
 @pytest.mark.parametrize(
     ("what", "name", "message"),
     [
-        ("fog", "a.glb", "what=fog is not known; choose page, sky"),
+        ("fog", "a.glb", "what=fog is not known; choose page, mesh"),
         ("mesh", "a.ply", "must end in .glb"),
         ("volume", "a.vdb", "must end in .npz"),
     ],
