@@ -226,7 +226,7 @@ def write_scene(request: Request, found: SceneFile, cameras: Cameras, mesh: Tria
     file = request.folder / SCENE
     scene.save(file)
     print(f"results: {', '.join(str(file) for file in request.files if file.exists())}")
-    print_hint("for near surroundings, add experiment=refractive_room; for straight rays, experiment=mipnerf_sky")
+    print_hint("for photographs in a room, add experiment=glass_room; for straight rays, experiment=straight")
     print_next("train on it", "train", as_overrides({"scene": file}))
     if scene.vessel:
         print_next("train on the vessel", "train", as_overrides({"scene": file, "medium": "vessel"}))
