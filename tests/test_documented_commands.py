@@ -141,7 +141,7 @@ def test_job_files_are_scripts() -> None:
 
 
 def test_help_lists_what_plugins_add() -> None:
-    names: dict[str, list[str]] = {"export": ["page", *PLUGIN_EXPORTS], "synthesize": list(SCENES)}
+    names: dict[str, list[str]] = {"export": list(PLUGIN_EXPORTS), "synthesize": list(SCENES)}
     names["train"] = [plugin.name for plugin in plugins()]
     names["trace"] = [plugin.name for kind in ("medium", "surface", "sampler/path") for plugin in plugins(kind)]
     for command, added in names.items():

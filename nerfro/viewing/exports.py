@@ -14,14 +14,11 @@ from omegaconf import MISSING, DictConfig
 
 from nerfro.allowed import Count, Names, Positive
 from nerfro.errors import NerfroError
-from nerfro.files.atomic import write_atomically
 from nerfro.registry import discover
 from nerfro.viewing import PLUGIN_EXPORTS
-from nerfro.viewing.page import make_page
 from nerfro.viewing.trained_scene import TrainedScene
-from nerfro.viewing.volume import RESOLUTION
 
-ExportName = Annotated[str, Names(lambda: ("page", *PLUGIN_EXPORTS))]
+ExportName = Annotated[str, Names(lambda: PLUGIN_EXPORTS)]
 
 
 @dataclass
@@ -80,21 +77,10 @@ def export_of(what: str) -> Export:
         NerfroError: the name is unknown, or the module of the plugin defines no export.
     """
     discover()
-    if what == "page":
-        return PAGE
     if what not in PLUGIN_EXPORTS:
-        raise NerfroError(f"what={what} is not known; choose {', '.join(('page', *PLUGIN_EXPORTS))}")
+        raise NerfroError(f"what={what} is not known; choose {', '.join(PLUGIN_EXPORTS)}")
     module = importlib.import_module(PLUGIN_EXPORTS[what])
     export = getattr(module, "EXPORT", None)
     if not isinstance(export, Export):
         raise NerfroError(f"the plugin {module.__file__} of what={what} defines no EXPORT, an exports.Export")
     return export
-
-
-def _write_page(scene: TrainedScene, out: Path, config: DictConfig) -> str:
-    page = make_page(scene, config.resolution or RESOLUTION)
-    write_atomically(out, page)
-    return f"an interactive page of {len(page) / 1e6:.1f} MB"
-
-
-PAGE = Export((".html",), _write_page)

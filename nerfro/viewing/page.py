@@ -2,26 +2,30 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from markupsafe import Markup
+from omegaconf import DictConfig
 from PIL import Image
 from torch import Tensor
 
 from nerfro.cameras import Cameras
 from nerfro.data.base import DataSource, Views
 from nerfro.errors import NerfroError
+from nerfro.files.atomic import write_atomically
 from nerfro.files.images import data_uri, to_8bit
 from nerfro.files.templates import fill_template
 from nerfro.paths import ASSETS_DIR
 from nerfro.rendering import ColourSpace
 from nerfro.viewing.baking import Baked, bake_sky, bake_surface, bake_volume
 from nerfro.viewing.camera_paths import up_direction
+from nerfro.viewing.exports import Export
 from nerfro.viewing.trained_scene import TrainedScene
-from nerfro.viewing.volume import MIN_OPTICAL_DEPTH, sample_field
+from nerfro.viewing.volume import MIN_OPTICAL_DEPTH, RESOLUTION, sample_field
 
 _TEMPLATES = ASSETS_DIR / "_page"
 _MAX_PHOTOGRAPHS = 24  # photographs on the page, spread evenly over the cameras
@@ -149,3 +153,12 @@ def contraction_radius(scene: TrainedScene) -> float | None:
     """Return the radius beyond which the point sampler contracts space, or None if samples lie in a box."""
     radius: float | None = getattr(scene.renderer.point_sampler, "radius", None)
     return radius
+
+
+def _write(scene: TrainedScene, out: Path, config: DictConfig) -> str:
+    page = make_page(scene, config.resolution or RESOLUTION)
+    write_atomically(out, page)
+    return f"an interactive page of {len(page) / 1e6:.1f} MB"
+
+
+EXPORT = Export((".html",), _write)

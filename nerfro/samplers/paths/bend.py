@@ -97,10 +97,11 @@ def polylines(
         NerfroError: the rays are not [R, 3] finite numbers.
     """
     rays = make_rays(*_checked_rays(origins, directions), medium, 0.0, length)
-    if not isinstance(medium, Solid):
+    if isinstance(medium, Solid):
+        path = Snell()(rays, medium)
+    else:
         discover()  # the sampler is a plugin
-    sampler = Snell() if isinstance(medium, Solid) else find("sampler/path", "eikonal").cls()
-    path = sampler(rays, medium)
+        path = find("sampler/path", "eikonal").cls()(rays, medium)
     vertices = zip(path.positions.numpy() + medium.origin, path.s.numpy(), strict=True)
     # All rows have the same length and repeat the last vertex.
     return [positions[np.diff(s, prepend=-1.0) > 0] for positions, s in vertices]
