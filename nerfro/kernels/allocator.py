@@ -10,7 +10,7 @@ _NEVER = 2**31 - 1
 
 
 def keep_freed_memory() -> bool:
-    """Let the process keep freed memory for the tensors of the next step.
+    """Let the process keep memory that is freed from now on, for the tensors of the next step.
 
     By default, glibc returns large blocks to the system when a tensor is freed. Every step then allocates the same
     memory again, one page fault and 4 KiB of zeros at a time, which can cost more than the arithmetic. The price is
@@ -21,7 +21,9 @@ def keep_freed_memory() -> bool:
         Whether the C library supports the setting.
     """
     try:
-        mallopt = ctypes.CDLL(None).mallopt
+        library = ctypes.CDLL(None)
+        mallopt, trim = library.mallopt, library.malloc_trim
     except (OSError, TypeError, AttributeError):  # not a Unix, or another C library
         return False
+    trim(0)
     return bool(mallopt(_M_MMAP_THRESHOLD, _NEVER)) and bool(mallopt(_M_TRIM_THRESHOLD, _NEVER))

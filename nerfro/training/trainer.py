@@ -131,9 +131,8 @@ def lightning_precision(config: DictConfig) -> str:
 
 
 def prepare_process(seed: int) -> None:
-    """Set the seed, the memory allocator and the messages of Lightning for this process."""
+    """Set the seed and the messages of Lightning for this process."""
     _quieten_lightning()
-    keep_freed_memory()
     pl.seed_everything(seed, verbose=False)
 
 
@@ -149,6 +148,7 @@ def fit(
     Raises:
         NerfroError: the state of the trainer in the checkpoint cannot be restored, or another process has ended.
     """
+    keep_freed_memory()  # of training, but not of tables that were built before
     try:
         trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
     except Exception as error:  # Lightning and its callbacks raise many kinds of errors on a damaged state

@@ -19,7 +19,7 @@ from nerfro.rendering import Components, Renderer, composite
 from nerfro.types import Path, Radiance, Rendering, Samples
 
 from .encoding import DIRECTION_DEGREE, integrated_positional_encoding, positional_encoding
-from .mlp import RadianceMLP
+from .mlp import RadianceMLP, in_blocks
 
 
 @register("field", "mip_nerf")
@@ -45,10 +45,14 @@ class MipNerfField(Field):
         self.mlp = RadianceMLP(num_position, num_direction, width, depth, skip, view_width)
 
     def forward(self, samples: Samples) -> Radiance:
-        mean, variance = frustum_gaussians(samples)
+        return Radiance(*in_blocks(self._decode_block, *frustum_gaussians(samples), samples.directions))
+
+    def _decode_block(
+        self, mean: Float[Tensor, "P 3"], variance: Float[Tensor, "P 3"], directions: Float[Tensor, "P 3"]
+    ) -> tuple[Float[Tensor, "P"], Float[Tensor, "P 3"]]:
         position = integrated_positional_encoding(mean, variance, self.position_degree)
-        direction = positional_encoding(samples.directions, DIRECTION_DEGREE)
-        return Radiance(*self.mlp(position, direction))
+        direction = positional_encoding(directions, DIRECTION_DEGREE)
+        return self.mlp(position, direction)
 
 
 def frustum_gaussians(samples: Samples) -> tuple[Float[Tensor, "R N 3"], Float[Tensor, "R N 3"]]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
@@ -13,6 +15,19 @@ from .linear import Linear, linear
 
 # Colours extend slightly beyond [0, 1], so that black and white need no infinite activation (mip-NeRF's code).
 RGB_PADDING = 1e-3
+
+# Points that are evaluated together. Results of layers have equal sizes, so the allocator reuses freed memory.
+_BLOCK = 2**12
+
+
+def in_blocks(
+    evaluate: Callable[..., tuple[Float[Tensor, "P"], Float[Tensor, "P 3"]]], *points: Float[Tensor, "*batch _"]
+) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
+    """Evaluate densities and colours in blocks of points, whose intermediate results need little memory."""
+    batch = points[0].shape[:-1]
+    blocks = zip(*(tensor.flatten(0, -2).split(_BLOCK) for tensor in points), strict=True)
+    densities, colours = zip(*(evaluate(*block) for block in blocks), strict=True)
+    return torch.cat(densities).view(batch), torch.cat(colours).view(*batch, 3)
 
 
 class SkipMLP(nn.Module):

@@ -16,7 +16,7 @@ from nerfro.registry import register
 from nerfro.types import Radiance, Samples
 
 from .encoding import DIRECTION_DEGREE, positional_encoding
-from .mlp import RadianceMLP
+from .mlp import RadianceMLP, in_blocks
 
 
 @register("field", "nerf")
@@ -63,6 +63,11 @@ class NerfField(Field):
         self, positions: Float[Tensor, "*batch 3"], directions: Float[Tensor, "*batch 3"]
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
         """Evaluate density and colour at positions for unit directions."""
+        return in_blocks(self._decode_block, positions, directions)
+
+    def _decode_block(
+        self, positions: Float[Tensor, "P 3"], directions: Float[Tensor, "P 3"]
+    ) -> tuple[Float[Tensor, "P"], Float[Tensor, "P 3"]]:
         position = positional_encoding(positions, self.position_degree)
         direction = positional_encoding(directions, DIRECTION_DEGREE)
         return self.mlp(position, direction)

@@ -73,6 +73,20 @@ def test_mip_nerf_field_sees_the_size_of_the_cone() -> None:
     assert not torch.allclose(field(samples).density, field(wider).density)
 
 
+def test_points_evaluated_in_blocks_equal_single_points_with_their_gradients() -> None:
+    field = NerfField(width=8, depth=2, skip=1, view_width=4)
+    positions, directions = torch.randn(3, 1700, 3), torch.randn(3, 1700, 3)  # the last of two blocks is smaller
+    density, rgb = field.decode(positions, directions)
+    assert density.shape == (3, 1700)
+    assert rgb.shape == (3, 1700, 3)
+    chosen = torch.tensor([0, 4095, 4096, 5099])
+    few = field.decode(positions.flatten(0, 1)[chosen], directions.flatten(0, 1)[chosen])
+    torch.testing.assert_close((density.flatten()[chosen], rgb.flatten(0, 1)[chosen]), few)
+    parts = [field.decode(*part)[1].sum() for part in zip(positions, directions, strict=True)]
+    grads = [torch.autograd.grad(total, [*field.mlp.trunk.parameters()]) for total in (rgb.sum(), sum(parts))]
+    torch.testing.assert_close(*grads)
+
+
 def test_nerf_field_with_a_box_equals_one_without_inside_and_is_empty_outside() -> None:
     everywhere = NerfField(width=16, depth=2, skip=1, view_width=8)
     inside = NerfField(width=16, depth=2, skip=1, view_width=8, box_min=[-0.4, -0.5, -0.6], box_max=[0.6, 0.5, 0.4])
