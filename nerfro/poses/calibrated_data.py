@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nerfro.files.atomic import write_atomically
+from nerfro.geometry.lines import nearest_point
 from nerfro.poses.calibration import Calibration
 
 SPLITS = ("train", "val", "test")
@@ -116,6 +117,8 @@ def _plot_cameras(
 ) -> bytes:
     """Plot the cameras from the side and from above, as arrows along the optical axes.
 
+    Without a board, the axes of the world are arbitrary, and the mean of the upper edges of the images points upwards.
+
     Args:
         poses: camera-to-world matrices in OpenCV's axes.
         errors: reprojection errors, in pixels, shown as colours.
@@ -131,16 +134,31 @@ def _plot_cameras(
     if len(points):
         low, high = np.quantile(points, (0.02, 0.98), axis=0)
         points = points[((points >= low) & (points <= high)).all(1)][:: -(-len(points) // _MAX_POINTS)]
+    axes_shown = np.eye(3) if quads else _upright(np.array([0, 0, 1e-9]) - poses[:, :, 1].mean(0))
+    cameras, points = np.einsum("ij,vjk->vik", axes_shown, poses), points @ axes_shown.T
+    focus = nearest_point(cameras[:, :, 3], cameras[:, :, 2])
     figure = Figure(figsize=(13, 6.5), layout="constrained", dpi=110)
-    for axes, (across, up) in zip(figure.subplots(1, 2), ((0, 2), (0, 1)), strict=True):
+    for axes, title, (across, up) in zip(
+        figure.subplots(1, 2), ("from the side", "from above"), ((0, 2), (0, 1)), strict=True
+    ):
         for quad in quads:
             axes.fill(quad[:, across], quad[:, up], facecolor="0.75", edgecolor="0.2")
         axes.plot(points[:, across], points[:, up], ".", markersize=1, color="0.4")
-        ends = (poses[:, axis, column] for column in (3, 2) for axis in (across, up))
+        axes.plot(focus[across], focus[up], "rx", markersize=12, label="point nearest to the optical axes")
+        ends = (cameras[:, axis, column] for column in (3, 2) for axis in (across, up))
         arrows = axes.quiver(*ends, errors, clim=(0, max(0.5, float(errors.max()))), angles="xy", width=0.004)
-        axes.set(xlabel="xyz"[across], ylabel="xyz"[up], aspect="equal")
+        axes.set(title=title, aspect="equal")
         axes.margins(0.1)
+        axes.legend(loc="upper right")
     figure.colorbar(arrows, ax=figure.axes, shrink=0.6, label="reprojection error, pixels (rms)")
     content = io.BytesIO()
     FigureCanvasAgg(figure).print_png(content)
     return content.getvalue()
+
+
+def _upright(up: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """Return axes whose last one points in a direction."""
+    up = up / np.linalg.norm(up)
+    across = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    across /= np.linalg.norm(across)
+    return np.stack([across, np.cross(up, across), up])
