@@ -7,7 +7,8 @@ paths (`samplers.paths.replay`). Three measures make the descent converge:
 - The surroundings are blurred first, because the gradient of a photograph is informative only over the width of its
   details.
 - The error is robust, because pixels that show opaque objects inside the body have large errors for every surface.
-- The contours of the surface stay in place, because the masks determine the contours.
+- The contours of the surface stay in place, because the masks determine the contours. A surface that loses overlap
+  with the masks is rejected.
 
 The photographs of validation views select the surface, and how much the surface is smoothed before and after the
 descent, because a visual hull is as rough as its voxels.
@@ -40,6 +41,7 @@ from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.progress import bar
 from nerfro.samplers.paths.snell import Snell
+from nerfro.silhouettes.pose_conventions import overlap
 from nerfro.silhouettes.rims import RimFinder
 from nerfro.silhouettes.silhouettes import mesh_silhouettes
 from nerfro.silhouettes.visual_hull import Silhouettes
@@ -58,6 +60,9 @@ _MAX_INCREASE = 0.03
 # of the reflections, the tint and the interior: errors decreased by 0.012 to 0.11 for better surfaces, and by up to
 # 0.009 for worse ones (docs/lab/surface_refinement.md).
 _MIN_GAIN = 0.01
+# Largest decrease of the mean overlap with the masks: smoothing decreases the error a little even where it cuts edges.
+_MAX_OVERLAP_LOSS = 0.003
+_OVERLAP_PIXELS = 256  # per side; larger masks are subsampled
 _BLUR_SAMPLES = 32
 
 
@@ -125,6 +130,7 @@ def refine_surface(
     learn_index: bool = False,
     progress: Callable[[float], None] = lambda done: None,
     settings: RefinementSettings = RefinementSettings(),
+    masks: bool = True,
 ) -> Refined:
     """Refine the surface of the first body of a medium by the refractions in photographs.
 
@@ -137,11 +143,12 @@ def refine_surface(
         learn_index: whether to refine the indices together with the surface.
         progress: called with the completed fraction.
         settings: settings of the descent.
+        masks: whether the silhouettes are masks, and not projections of the surface.
 
     Raises:
         NerfroError: no pixel shows known surroundings through the object.
     """
-    descent = _Descent(mesh, medium, silhouettes, through, surroundings, learn_index, settings)
+    descent = _Descent(mesh, medium, silhouettes, through, surroundings, learn_index, settings, masks)
     error = descent.initial_error
     smoothed = descent.smooth_start(error)
     steps, errors, best = [0, 0], [error, smoothed], descent.values()
@@ -163,7 +170,7 @@ def refine_surface(
     refined, smoothed = descent.smoothed(descent.medium(), min(errors))
     progress(1.0)
     steps, errors = [*steps, steps[-1]], [*errors, smoothed]
-    if smoothed > (1 - _MIN_GAIN) * error:
+    if smoothed > (1 - _MIN_GAIN) * error or not descent.keeps_outlines(refined):
         return Refined(mesh, medium, steps, errors)
     return Refined(_project_onto(mesh, refined), refined, steps, errors)
 
@@ -190,14 +197,16 @@ def refine(
     """
     through, surroundings, cameras = observations.through, observations.surroundings, observations.views.cameras
     assert isinstance(medium, SdfGrid)  # see Request.check
-    start = mesh.relative_to(observations.shift)
+    start, masks = mesh.relative_to(observations.shift), silhouettes is not None
     if silhouettes is None:
         silhouettes = Silhouettes.of(cameras, mesh_silhouettes(start, cameras, 1).float())
     else:
         silhouettes = replace(silhouettes, cameras=silhouettes.cameras.relative_to(observations.shift))
     try:
         with bar("surface") as progress:
-            refined = refine_surface(start, medium, silhouettes, through, surroundings, learn_index, progress)
+            refined = refine_surface(
+                start, medium, silhouettes, through, surroundings, learn_index, progress, masks=masks
+            )
     except NerfroError as reason:  # keep the results of the other steps
         warn(f"surface unchanged: {reason}")
         return mesh
@@ -260,6 +269,7 @@ class _Descent:
         surroundings: Surroundings,
         learn_index: bool,
         settings: RefinementSettings,
+        masks: bool,
     ) -> None:
         self.settings, self.given, self.start, self.surroundings = settings, medium, medium, surroundings
         self.iors = nn.Parameter(medium.iors.clone(), requires_grad=learn_index)
@@ -274,6 +284,7 @@ class _Descent:
         if not known.any():
             raise NerfroError("no pixel shows known surroundings through the object; remove refine=true")
         self.validation, self.initial_errors = self.validation[known], errors[known]
+        self.mesh, self.masks = mesh, silhouettes if masks else None
         rims, cameras = RimFinder(mesh, silhouettes).find(), silhouettes.cameras
         self.rims = torch.from_numpy(rims.points).float()
         middle = torch.from_numpy(mesh.bounds.mean(0)).float()
@@ -335,19 +346,30 @@ class _Descent:
 
     @torch.no_grad()
     def smoothed(self, medium: SdfGrid, error: float) -> tuple[SdfGrid, float]:
-        """Smooth the first body as far as the validation error decreases, and return the medium and its error.
+        """Smooth the first body as far as the validation error decreases and the outlines stay.
 
         Args:
             medium: the medium.
             error: validation error of the medium.
+
+        Returns:
+            The medium and its validation error.
         """
         grid, best = medium.grids[0], medium
         for fraction in self.settings.smoothings:
             sigma = fraction * self.size / float(grid.spacing.min())
             candidate = medium.grown(grid.distances - smooth(grid.distances, 2 * math.ceil(3 * sigma) + 1, sigma))
-            if (new := self.validation_error(candidate)) < error:
+            if (new := self.validation_error(candidate)) < error and self.keeps_outlines(candidate):
                 best, error = candidate, new
         return best, error
+
+    def keeps_outlines(self, medium: SdfGrid) -> bool:
+        """Return whether the silhouettes of a medium overlap with the masks as well as those of the given surface."""
+        if self.masks is None:
+            return True
+        surfaces = self.mesh, _project_onto(self.mesh, medium)
+        before, after = (overlap(surface, self.masks, _OVERLAP_PIXELS).mean() for surface in surfaces)
+        return bool(before - after <= _MAX_OVERLAP_LOSS)
 
     @property
     def initial_error(self) -> float:

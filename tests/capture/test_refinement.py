@@ -1,4 +1,4 @@
-"""A dent that no outline shows, from photographs of what is seen through it."""
+"""A dent inside the outlines, from photographs of what is seen through it."""
 
 import functools
 import json
@@ -42,8 +42,9 @@ SHORT = RefinementSettings((Stage(150, 5e-4, (3.0, 1.0)), Stage(50, 1e-4, (0.0, 
 
 @functools.cache
 def shown() -> tuple[Silhouettes, Pixels, Surroundings]:
-    """Outlines, pixels that the dented ball fills, and what is around it."""
-    silhouettes = Silhouettes.of(cameras(), mesh_silhouettes(mesh(), cameras(), 1).float())
+    """Outlines of the dented ball, pixels that it fills, and what is around it."""
+    outlines = mesh_silhouettes(refinement._project_onto(mesh(), dented()), cameras(), 1)
+    silhouettes = Silhouettes.of(cameras(), outlines.float())
     beside, through = divide_pixels(photographs_of(dented()), mesh())
     return silhouettes, through, learn_surroundings(beside, mesh(), False)
 
@@ -91,6 +92,15 @@ def test_a_rough_surface_is_smoothed_as_much_as_its_judges_like() -> None:
     assert degrees_off(found.medium) < 0.6 * degrees_off(start)
     assert found.steps == [0, 0, 0]
     assert found.errors[1] < 0.9 * found.errors[0]
+
+
+def test_a_surface_that_loses_overlap_with_the_masks_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(refinement._Descent, "validation_error", lambda *_: 0.0)
+    before, shrinking = dented(), RefinementSettings(stages=(), smoothings=(0.3,))
+    assert refined(before, shrinking).medium is before
+    through, surroundings = shown()[1:]
+    unmasked = refine_surface(mesh(), before, shown()[0], through, surroundings, settings=shrinking, masks=False)
+    assert unmasked.medium is not before
 
 
 class PaintedShell(Room):
@@ -151,7 +161,7 @@ def test_preprocess_writes_the_refined_surface(preprocess: Callable, monkeypatch
 
 
 def test_a_surface_that_cannot_be_refined_stays_as_it_is(preprocess: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
-    def nothing_known(*_: object) -> Refined:
+    def nothing_known(*_: object, **__: object) -> Refined:
         raise NerfroError("no pixel shows known surroundings")
 
     monkeypatch.setattr(refinement, "refine_surface", nothing_known)
@@ -165,7 +175,7 @@ def test_a_refinement_begins_with_the_index_that_was_found(
 ) -> None:
     begun: list[SdfGrid] = []
 
-    def kept(mesh: object, medium: SdfGrid, *_: object) -> Refined:
+    def kept(mesh: object, medium: SdfGrid, *_: object, **__: object) -> Refined:
         begun.append(medium)
         raise NerfroError("enough is known")
 
