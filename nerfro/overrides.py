@@ -21,9 +21,14 @@ def without_hints() -> Iterator[None]:
         _prints_hints.reset(token)
 
 
+def hint(text: str) -> str:
+    """Return a hint about the next step, or an empty text inside `without_hints`."""
+    return text if _prints_hints.get() else ""
+
+
 def print_hint(text: str) -> None:
     """Print a hint about the next step, except inside `without_hints`."""
-    if _prints_hints.get():
+    if hint(text):
         print(text)
 
 

@@ -100,9 +100,10 @@ def find_vessel(
         f"{name} {value:.3g}" + ("" if name in fit.unknown else f" +- {fit.standard_errors[name]:.2g}")
         for name, value in fit.lengths.items()
     ]
-    print(f"vessel, {'partly filled' if 'level' in fit.lengths else 'empty'}: {', '.join(values)} world units")
+    content = "with a liquid" if "level" in fit.lengths else "empty"
+    print(f"vessel of height {vessel.height:.3g}, {content}: {', '.join(values)} world units")
     if fit.unknown:
-        warn(f"the photographs do not determine {' and '.join(fit.unknown)}, which keep typical values")
+        warn(f"typical values of {' and '.join(fit.unknown)} are kept, because the photographs do not determine them")
     return {"up": up, "ior": _GLASS, "liquid_ior": liquid_ior} | lengths, vessel
 
 

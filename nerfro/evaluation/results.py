@@ -22,10 +22,11 @@ Score = float | None  # None if not available; the notes contain the reason
 
 Region = Literal["full", "mask", "crop"]  # see nerfro/evaluation/regions.py
 FULL: Region = "full"
+OBJECT: Region = "mask"
 # Scores with the given cameras and exposure, and with exposures that are fitted to the left halves of the photographs,
 # which belong to the right halves; docs/reference/metrics.md.
 AS_GIVEN, EXPOSED = "as given", "exposed"
-OBJECT_REGIONS: tuple[Region, ...] = ("mask", "crop")  # regions that require a mask of the object
+OBJECT_REGIONS: tuple[Region, ...] = (OBJECT, "crop")  # regions that require a mask of the object
 
 
 @dataclass(frozen=True)

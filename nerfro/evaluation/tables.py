@@ -168,12 +168,12 @@ def regions_table(result: EvaluationResult, title: str) -> Table:
 
 
 def treatments_table(metrics: RunMetrics, title: str) -> Table:
-    """Tabulate the mean scores of the test views under each treatment (see `nerfro.evaluation.treatments`)."""
+    """Tabulate the mean scores of the views under each treatment (see `nerfro.evaluation.treatments`)."""
     treated = {
         f"{name}, right halves" if name == EXPOSED else name: result.means()
         for name, result in metrics.treatments.items()
     }
-    return _scores_table(title, "test views", {AS_GIVEN: metrics.result.means()} | treated, [])
+    return _scores_table(title, "views", {AS_GIVEN: metrics.result.means()} | treated, [])
 
 
 def short(reason: str) -> str:
@@ -201,7 +201,9 @@ def report(metrics: RunMetrics, title: str, folder: Path, brief: bool = False) -
     if brief or len(result.regions) > 1:
         rich.print(to_rich(regions_table(result, f"mean of {len(result.views)} view{'s' * (len(result.views) > 1)}")))
     if metrics.treatments:
-        rich.print(to_rich(treatments_table(metrics, "means; compare only rows of the same pixels")))
+        rich.print(
+            to_rich(treatments_table(metrics, "with fitted cameras or exposures; compare only rows of the same pixels"))
+        )
 
 
 def write_table(table: Table, stem: Path | str) -> list[Path]:

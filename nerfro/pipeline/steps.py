@@ -107,7 +107,9 @@ def train(config: DictConfig, overrides: list[str], scene: Path, out: Path) -> N
         trials = [out / "trials" / hypothesis.folder for hypothesis in candidates] if len(candidates) > 1 else []
         for hypothesis, trial in zip(candidates, trials, strict=False):
             print(f"\nhypothesis: {hypothesis.name}")
-            _run_training([*hypothesis.options, *common, *hypothesis.trial_options(config.trial_steps)], inputs, trial)
+            short = hypothesis.trial_options(config.trial_steps)
+            lasting = [option for option in common if not is_given(option.partition("=")[0], short)]
+            _run_training([*hypothesis.options, *lasting, *short], inputs, trial)
         options = _best_hypothesis(candidates, trials).options
         inputs += [trial / "metrics.json" for trial in trials]
     _run_training([*options, *common], inputs, out / "run")

@@ -9,7 +9,7 @@ from typing import Any
 
 from nerfro.errors import NerfroError
 from nerfro.evaluation.image_metrics import ImageMetric, image_metrics
-from nerfro.evaluation.results import FULL, Region
+from nerfro.evaluation.results import FULL, OBJECT, Region
 from nerfro.evaluation.tables import MISSING, Column, Row, Table, short
 from nerfro.report.runs import Budget, EvaluationSet, Run, shown
 from nerfro.training.settings import TABLE_ROW, settings
@@ -57,18 +57,24 @@ def compare(runs: Sequence[Run], methods: Mapping[str, str], scenes: Mapping[str
 
 
 def to_table(comparison: Comparison, metrics: Mapping[str, type[ImageMetric]], region: Region) -> Table:
-    """Tabulate means and standard deviations over seeds, without empty columns; medals mark the best three methods."""
+    """Tabulate means and standard deviations over seeds, without empty columns; medals mark the best three methods.
+
+    In a table of full images, the first metric is also tabulated for the object.
+    """
+    scores = [(name, region) for name in metrics]
+    if region == FULL:
+        scores.insert(1, (scores[0][0], OBJECT))
     columns = [
-        Column(metric.title, metric.better, metric.decimals, group=title)
-        for title in comparison.scenes.values()
-        for metric in metrics.values()
+        Column(metric.title if part == region else f"{metric.title} object", metric.better, metric.decimals, scene)
+        for scene in comparison.scenes.values()
+        for metric, part in ((metrics[name], part) for name, part in scores)
     ]
     rows, notes = [], list(comparison.notes)
     for method in comparison.methods:
         cells = [
-            _score(comparison.cells.get((method, scene), ()), name, region)
+            _score(comparison.cells.get((method, scene), ()), name, part)
             for scene in comparison.scenes
-            for name in metrics
+            for name, part in scores
         ]
         rows.append(Row(method, tuple(mean for mean, _ in cells), tuple(spread for _, spread in cells)))
     notes += dict.fromkeys(

@@ -54,8 +54,8 @@ def report_overlaps(
         list_all: print the overlap of every view.
     """
     overlaps = overlap(mesh, silhouettes, _MAX_PIXELS)
-    print("overlap (intersection over union) of the silhouette of the surface with each mask:")
-    for name, value in zip(views.names, overlaps, strict=True) if list_all else ():
+    print("overlap (intersection over union) of the silhouettes of the surface and the masks:")
+    for name, value in sorted(zip(views.names, overlaps, strict=True)) if list_all else ():
         print(f"  {value:.4f}  {name}")
     worst = int(overlaps.argmin())
     print(f"  {overlaps.mean():.4f}  mean; {overlaps[worst]:.4f} lowest, {views.names[worst]}")
