@@ -66,6 +66,7 @@ def draw_light(folder: Path, side: int) -> None:
         for options in ({}, {"absorption": [1.2, 0.25, 0.8]}, {"abbe": [8.0]})  # type: ignore[arg-type]
     )
     ball = Ball(RADIUS, N_BALL).double()
+    flint_ball = SdfGrid.from_distances(grid_distances(ball, 128), BOX, [N_BALL], 0.02, abbe=[8.0])
     pictures: dict[str, tuple[RayPath, Medium, dict[str, np.ndarray]]] = {
         "optics_branches.png": (splitting(beam, ball), ball, {
             "one path": picture(Snell(), clear, side),
@@ -76,7 +77,7 @@ def draw_light(folder: Path, side: int) -> None:
             "clear": picture(Snell(branches="all"), clear, side),
             "absorption 1.2, 0.25, 0.8": picture(Snell(branches="all"), green, side),
         }),
-        "optics_dispersion.png": (Snell()(into_cube, flint), flint, {
+        "optics_dispersion.png": (Snell()(beam[-1:], flint_ball), flint_ball, {
             "one index": picture(Snell(branches="all"), clear, side),
             "Abbe number 8, three bands": picture(Snell(branches="all"), flint, side),
             "the same, nine bands": picture(
