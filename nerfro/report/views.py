@@ -55,12 +55,13 @@ class View:
     """A view rendered by all methods.
 
     Attributes:
-        index: index of the view in its split.
+        index, name: index of the view in its split, and file of the image in the data set.
         reference: ground truth.
         predictions, errors: images and error maps, by index of the method in the comparison.
     """
 
     index: int
+    name: str
     reference: PageImage
     predictions: Mapping[int, PageImage]
     errors: Mapping[int, PageImage]
@@ -103,7 +104,7 @@ def scene_images(comparison: Comparison, test_set: EvaluationSet, selection: Sel
     figure = _median_view(list(runs.values()), selection)
     count = min(selection.num_views or test_set.num_views, test_set.num_views)
     views = {
-        index: _view(index, references.images[index], runs, titles, selection)
+        index: _view(index, references, runs, titles, selection)
         for index in sorted({round(i) for i in np.linspace(0, test_set.num_views - 1, count)} | {figure})
     }
     return SceneImages(
@@ -130,9 +131,9 @@ def _score(run: Run, view: int, selection: Selection) -> Score:
 
 
 def _view(
-    index: int, reference: Tensor, runs: Mapping[int, Run], titles: Mapping[int, str], selection: Selection
+    index: int, references: Views, runs: Mapping[int, Run], titles: Mapping[int, str], selection: Selection
 ) -> View:
-    metric = image_metrics()[selection.metric]
+    metric, name, reference = image_metrics()[selection.metric], references.names[index], references.images[index]
     predictions, errors = {}, {}
     for number, run in runs.items():
         image, title = _prediction(run, index), titles[number]
@@ -141,7 +142,7 @@ def _view(
         error = squared_error_colours(image, reference)
         predictions[number] = PageImage(f"{title}, view {index}", score, embed_image(image))
         errors[number] = PageImage(f"squared error of {title}, view {index}", score, embed_image(error))
-    return View(index, PageImage(f"reference, view {index}", "", embed_image(reference)), predictions, errors)
+    return View(index, name, PageImage(f"reference, view {index}", "", embed_image(reference)), predictions, errors)
 
 
 def _prediction(run: Run, index: int) -> Float[Tensor, "H W 3"]:
