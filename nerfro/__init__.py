@@ -17,6 +17,7 @@ __all__ = ["__version__", *_names]
 # Components that became plugins.
 _PLUGINS = {
     "ColmapData": ("data", "colmap"),
+    "Distortion": ("loss", "distortion"),
     "Eikonal": ("sampler/path", "eikonal"),
     "Hierarchical": ("sampler/points", "hierarchical"),
     "NerfField": ("field", "nerf"),

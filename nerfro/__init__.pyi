@@ -5,7 +5,6 @@ from .cameras import Cameras
 from .data.blender import BlenderData
 from .evaluation.collection import metrics
 from .fields.hash_grid import HashGridField
-from .losses.distortion import Distortion
 from .losses.photometric import Photometric
 from .media.sdf_grid import SdfGrid
 from .media.shapes import Ball
@@ -31,7 +30,6 @@ __all__ = [
     "Cameras",
     "Components",
     "ConstantBoundary",
-    "Distortion",
     "EnvironmentMap",
     "GroupConfig",
     "HashGridField",

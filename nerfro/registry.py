@@ -83,6 +83,8 @@ MOVED_CLASSES = (
         "nerfro.camera.refined.RefinedCamera": f"{_LOCAL_PACKAGE}.refined_cameras.refined.RefinedCamera",
         "nerfro.training.phases.cameras.CameraSteps": f"{_LOCAL_PACKAGE}.refined_cameras.phase.CameraSteps",
         "nerfro.data.opencv.OpenCVData": "nerfro.data.blender.OpenCVData",
+        "nerfro.losses.distortion.Distortion": f"{_LOCAL_PACKAGE}.distortion.Distortion",
+        "nerfro.losses.smoothness.Smoothness": f"{_LOCAL_PACKAGE}.paper.smoothness.Smoothness",
     }
 )
 ENTRY_POINTS = "nerfro.plugins"

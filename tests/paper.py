@@ -17,4 +17,5 @@ NerfField, Skybox, frustum_gaussians = paper.nerf.NerfField, paper.skybox.Skybox
 RGB_PADDING, RadianceMLP, SkipMLP, padded_sigmoid = mlp.RGB_PADDING, mlp.RadianceMLP, mlp.SkipMLP, mlp.padded_sigmoid
 Linear, positional_encoding = paper.linear.Linear, paper.encoding.positional_encoding
 integrated_positional_encoding = paper.encoding.integrated_positional_encoding
+Smoothness, tile_roughness = paper.smoothness.Smoothness, paper.smoothness.tile_roughness
 VoxelGrid, gradient = paper.voxel_grid.VoxelGrid, paper.voxel_grid.gradient

@@ -11,7 +11,6 @@ from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.files import lat_long
 from nerfro.light import to_linear, to_srgb
 from nerfro.losses.boundary import BoundaryRegulariser
-from nerfro.losses.distortion import Distortion
 from nerfro.losses.photometric import Photometric
 from nerfro.models.refractive import RefractiveModel
 from nerfro.rendering import composite
@@ -73,8 +72,8 @@ def test_random_numbers_are_drawn_for_each_ray(sampler: Stratified | Hierarchica
     assert torch.equal(samples.s[::2], sampler(same, None, example_draws()).s), "and splitting changes nobody's"
 
 
-@pytest.mark.parametrize("loss", [Photometric(), BoundaryRegulariser(), Distortion()])
-def test_losses_take_rays_that_split(loss: Photometric | BoundaryRegulariser | Distortion) -> None:
+@pytest.mark.parametrize("loss", [Photometric(), BoundaryRegulariser()])
+def test_losses_take_rays_that_split(loss: Photometric | BoundaryRegulariser) -> None:
     model, batch = RefractiveModel(example_components()).eval(), example_batch()
     with torch.no_grad():
         bent = model.render_path(example_path())

@@ -6,11 +6,11 @@ The settings `+experiment=paper_*` and the baselines `nerf` and `mipnerf` use th
 - `sampler/path=eikonal`: paths by the Eikonal equation; `integrator=euler` is the method of the paper.
 - `sampler/points=hierarchical`: coarse and fine samples.
 - `field=nerf`, and `field=mip_nerf` with `model=mip_nerf`: the networks of NeRF and mip-NeRF.
-- `boundary=skybox`: the network of the background.
+- `boundary=skybox`: the network of the background, and `loss=smoothness`.
 
-Losses and rendering are components of nerfro.
+Other losses and rendering are components of nerfro.
 """
 
-from . import eikonal, hierarchical, mip_nerf, nerf, skybox, voxel_grid
+from . import eikonal, hierarchical, mip_nerf, nerf, skybox, smoothness, voxel_grid
 
-__all__ = ["eikonal", "hierarchical", "mip_nerf", "nerf", "skybox", "voxel_grid"]
+__all__ = ["eikonal", "hierarchical", "mip_nerf", "nerf", "skybox", "smoothness", "voxel_grid"]

@@ -1,14 +1,19 @@
 """The distortion loss against its definition."""
 
+from importlib import import_module
 from unittest.mock import Mock
 
 import pytest
 import torch
 
-from nerfro.losses.distortion import Distortion, distortion
+from nerfro.registry import discover
 from nerfro.rendering import Scene
 from nerfro.testing import example_batch
 from nerfro.types import Path, Rendering, Samples
+
+discover()
+plugin = import_module("nerfro_plugins.distortion")
+Distortion, distortion = plugin.Distortion, plugin.distortion
 
 SCENE = Mock(spec=Scene)
 

@@ -13,7 +13,6 @@ from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.light import to_srgb
 from nerfro.losses.boundary import BoundaryRegulariser
 from nerfro.losses.photometric import Photometric
-from nerfro.losses.smoothness import Smoothness, tile_roughness
 from nerfro.losses.total_variation import TotalVariation, direction_pairs
 from nerfro.models.refractive import RefractiveModel
 from nerfro.registry import create, find
@@ -22,7 +21,7 @@ from nerfro.samplers.points.stratified import point_samples
 from nerfro.testing import NUM_RAYS, example_batch, example_components, example_draws, example_path, example_rendering
 from nerfro.types import Batch, Rendering
 from tests.closed_forms import Luneburg
-from tests.paper import Eikonal, Hierarchical, NerfField, Skybox
+from tests.paper import Eikonal, Hierarchical, NerfField, Skybox, Smoothness, tile_roughness
 
 
 @pytest.fixture(scope="module")
