@@ -21,15 +21,15 @@ def without_hints() -> Iterator[None]:
         _prints_hints.reset(token)
 
 
-def hint(text: str) -> str:
-    """Return a hint about the next step, or an empty text inside `without_hints`."""
-    return text if _prints_hints.get() else ""
-
-
 def print_hint(text: str) -> None:
     """Print a hint about the next step, except inside `without_hints`."""
-    if hint(text):
+    if prints_hints():
         print(text)
+
+
+def prints_hints() -> bool:
+    """Whether hints are printed, outside `without_hints`."""
+    return _prints_hints.get()
 
 
 def print_next(label: str, command: str, options: Sequence[str]) -> None:

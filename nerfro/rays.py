@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -32,9 +33,10 @@ class Rays:
     def __getitem__(self, index: slice | Tensor) -> Rays:
         return Rays(*(tensor[index] for tensor in vars(self).values()))
 
-    def followed_by(self, other: Rays) -> Rays:
-        """Concatenate with other rays."""
-        return Rays(*(torch.cat(pair) for pair in zip(vars(self).values(), vars(other).values(), strict=True)))
+    @classmethod
+    def joined(cls, parts: Sequence[Rays]) -> Rays:
+        """Concatenate rays."""
+        return cls(*(torch.cat(columns) for columns in zip(*(vars(part).values() for part in parts), strict=True)))
 
     def to(self, where_or_what: torch.device | str | torch.dtype) -> Rays:
         """Move the rays to a device, or convert to a precision."""

@@ -116,7 +116,7 @@ def subdivide(
     parts, pixel = part_rays(cameras, pixels[parted], subdivision.side), parted.repeat_interleave(num_parts)
     part = torch.arange(num_parts, device=pixels.device).repeat(len(parted))
     return PixelRays(
-        rays=rays[whole].followed_by(parts),
+        rays=Rays.joined([rays[whole], parts]),
         path=Path.joined([path.of_rays(whole), trace(parts, view[pixel])]),
         pixel=torch.cat([whole, pixel]),
         part=torch.cat([torch.zeros_like(whole), part]),

@@ -22,7 +22,7 @@ from nerfro.evaluation.tables import report
 from nerfro.evaluation.treatments import score_split
 from nerfro.failures import EXIT_INTERRUPTED
 from nerfro.fields.networks import compile_networks
-from nerfro.overrides import hint
+from nerfro.overrides import prints_hints
 from nerfro.rendering.scene_file import with_scene
 from nerfro.subdivision import Subdivision
 from nerfro.training.build import build_training, check_first_batch
@@ -81,7 +81,8 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetr
         return None
     if interruption.received:
         finish_logs(trainer, {})
-        print(f"nerfro: interrupted after step {trainer.global_step} and saved{hint('; ' + resume_advice(folder))}")
+        advice = f"; {resume_advice(folder)}" if prints_hints() else ""
+        print(f"nerfro: interrupted after step {trainer.global_step} and saved{advice}")
         sys.exit(EXIT_INTERRUPTED)
 
     write_cameras(folder / "cameras.json", renderer.to(device).scene.camera, training, source.origin)

@@ -367,8 +367,8 @@ class _Descent:
         """Return whether the silhouettes of a medium overlap with the masks as well as those of the given surface."""
         if self.masks is None:
             return True
-        surfaces = self.mesh, _project_onto(self.mesh, medium)
-        before, after = (overlap(surface, self.masks, _OVERLAP_PIXELS).mean() for surface in surfaces)
+        moved = _project_onto(self.mesh, medium)
+        before, after = (overlap(mesh, self.masks, _OVERLAP_PIXELS).mean() for mesh in (self.mesh, moved))
         return bool(before - after <= _MAX_OVERLAP_LOSS)
 
     @property

@@ -100,8 +100,7 @@ def find_vessel(
         f"{name} {value:.3g}" + ("" if name in fit.unknown else f" +- {fit.standard_errors[name]:.2g}")
         for name, value in fit.lengths.items()
     ]
-    content = "with a liquid" if "level" in fit.lengths else "empty"
-    print(f"vessel of height {vessel.height:.3g}, {content}: {', '.join(values)} world units")
+    print(f"vessel, {'with a liquid' if liquid_ior > 1 else 'empty'}: {', '.join(values)}, height {vessel.height:.3g}")
     if fit.unknown:
         warn(f"typical values of {' and '.join(fit.unknown)} are kept, because the photographs do not determine them")
     return {"up": up, "ior": _GLASS, "liquid_ior": liquid_ior} | lengths, vessel

@@ -201,9 +201,7 @@ def report(metrics: RunMetrics, title: str, folder: Path, brief: bool = False) -
     if brief or len(result.regions) > 1:
         rich.print(to_rich(regions_table(result, f"mean of {len(result.views)} view{'s' * (len(result.views) > 1)}")))
     if metrics.treatments:
-        rich.print(
-            to_rich(treatments_table(metrics, "with fitted cameras or exposures; compare only rows of the same pixels"))
-        )
+        rich.print(to_rich(treatments_table(metrics, "with fitted exposures or cameras; compare rows of equal pixels")))
 
 
 def write_table(table: Table, stem: Path | str) -> list[Path]:

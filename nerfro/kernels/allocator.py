@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import ctypes
 
-# Parameters of glibc's mallopt (malloc.h).
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
-_NEVER = 2**31 - 1
+# Settings of glibc's mallopt (malloc.h). Blocks above M_MMAP_THRESHOLD (-3), 32 MiB, are returned to the system: no step
+# of training allocates such blocks, but fits of the background do. M_TRIM_THRESHOLD (-1): nothing else is returned.
+_SETTINGS = {-3: 2**25, -1: 2**31 - 1}
 
 
 def keep_freed_memory() -> bool:
@@ -22,8 +22,7 @@ def keep_freed_memory() -> bool:
     """
     try:
         library = ctypes.CDLL(None)
-        mallopt, trim = library.mallopt, library.malloc_trim
+        library.malloc_trim(0)
     except (OSError, TypeError, AttributeError):  # not a Unix, or another C library
         return False
-    trim(0)
-    return bool(mallopt(_M_MMAP_THRESHOLD, _NEVER)) and bool(mallopt(_M_TRIM_THRESHOLD, _NEVER))
+    return all(library.mallopt(*setting) for setting in _SETTINGS.items())

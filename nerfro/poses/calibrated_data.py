@@ -138,9 +138,8 @@ def _plot_cameras(
     cameras, points = np.einsum("ij,vjk->vik", axes_shown, poses), points @ axes_shown.T
     focus = nearest_point(cameras[:, :, 3], cameras[:, :, 2])
     figure = Figure(figsize=(13, 6.5), layout="constrained", dpi=110)
-    for axes, title, (across, up) in zip(
-        figure.subplots(1, 2), ("from the side", "from above"), ((0, 2), (0, 1)), strict=True
-    ):
+    sides = ("from the side", 0, 2), ("from above", 0, 1)
+    for axes, (title, across, up) in zip(figure.subplots(1, 2), sides, strict=True):
         for quad in quads:
             axes.fill(quad[:, across], quad[:, up], facecolor="0.75", edgecolor="0.2")
         axes.plot(points[:, across], points[:, up], ".", markersize=1, color="0.4")

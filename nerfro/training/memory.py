@@ -73,8 +73,8 @@ def _require(needed: float, free: float, where: str, advice: str) -> None:
 
 
 def _kept_bytes(renderer: Renderer, rays: Rays) -> float:
-    """Count the bytes per ray saved by autograd for the backward pass, without parameters."""
-    of_model = {tensor.untyped_storage().data_ptr() for tensor in renderer.state_dict().values()}
+    """Count the bytes per ray saved by autograd for the backward pass, without parameters and buffers."""
+    of_model = {tensor.untyped_storage().data_ptr() for tensor in (*renderer.parameters(), *renderer.buffers())}
     kept: dict[int, int] = {}
 
     def keep(tensor: Tensor) -> Tensor:

@@ -98,9 +98,7 @@ def test_a_surface_that_loses_overlap_with_the_masks_is_rejected(monkeypatch: py
     monkeypatch.setattr(refinement._Descent, "validation_error", lambda *_: 0.0)
     before, shrinking = dented(), RefinementSettings(stages=(), smoothings=(0.3,))
     assert refined(before, shrinking).medium is before
-    through, surroundings = shown()[1:]
-    unmasked = refine_surface(mesh(), before, shown()[0], through, surroundings, settings=shrinking, masks=False)
-    assert unmasked.medium is not before
+    assert refine_surface(mesh(), before, *shown(), settings=shrinking, masks=False).medium is not before
 
 
 class PaintedShell(Room):

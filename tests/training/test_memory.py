@@ -7,7 +7,9 @@ from pathlib import Path
 import pytest
 import torch
 
+from nerfro.boundaries.base import Boundary
 from nerfro.boundaries.constant import ConstantBoundary
+from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.errors import NerfroError
 from nerfro.kernels import available
 from nerfro.kernels.available import available_bytes, require_bytes
@@ -24,11 +26,12 @@ from tests.paper import NerfField
 from tests.pretended_gpu import GPU, OnGpu, PretendedGpu
 
 
-def model_of(width: int) -> Renderer:
+def model_of(width: int, boundary: Boundary | None = None) -> Renderer:
     def field() -> NerfField:
         return NerfField(width=width, depth=8, skip=4, view_width=8)
 
-    return RefractiveModel(Components(Vacuum(), Straight(), Stratified(8), field, ConstantBoundary(), chunk_size=256))
+    parts = Vacuum(), Straight(), Stratified(8), field, boundary or ConstantBoundary()
+    return RefractiveModel(Components(*parts, chunk_size=256))
 
 
 def test_what_autograd_keeps_is_counted_and_grows_with_the_network() -> None:
@@ -37,6 +40,11 @@ def test_what_autograd_keeps_is_counted_and_grows_with_the_network() -> None:
     # Each of eight layers keeps its activations of 4 bytes.
     assert kept[1] - kept[0] == pytest.approx(8 * samples * (256 - 64) * 4, rel=0.5)
     assert memory._kept_bytes(model_of(64), rays[:4]) == pytest.approx(kept[0], rel=0.1)
+
+
+def test_tables_of_a_fine_background_are_not_counted_for_each_ray() -> None:
+    coarse, fine = (memory._kept_bytes(model_of(16, EnvironmentMap([4, n])), example_rays()) for n in (8, 256))
+    assert fine == pytest.approx(coarse, rel=0.1)
 
 
 def test_run_that_does_not_fit_is_refused_with_what_to_change(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -28,6 +28,8 @@ _MOST_PIXELS = 8
 _SHARE, _MOST_RAYS = 0.15, 2**19
 # Rays through the object count if at least this fraction of their light is background.
 _BACKGROUND = 0.7
+# Rays that are made together, which bounds the memory.
+_CHUNK = 2**18
 # Turns between background and exposures in the first step.
 _TURNS = 10
 
@@ -88,24 +90,34 @@ class Background(Phase):
         most_pixels = min(run.batches.num_pixels, _MOST_PIXELS * background.levels.sizes[-1])
         num_parts = self.steps * run.batches.num_pixels // most_pixels
         pixels = run.batches.rows(part * num_parts // self.steps, num_parts)
-        rays = _rays(run, pixels)
-        misses_object = misses(box, rays)
+        beside, rays, crossing = _divided(run, pixels, box)
         if number == 0 and run.renderer.scene.camera.exposure is not None:
             for turn in range(_TURNS):
-                observed_pixels = _observe_beside_object(
-                    run, pixels[misses_object], rays[misses_object], fits_gains=turn > 0
-                )
+                observed_pixels = _observe_beside_object(run, beside, rays, fits_gains=turn > 0)
                 background.fit(observed_pixels, torch.zeros_like(state["weights"]))
-        observed = [_observe_beside_object(run, pixels[misses_object], rays[misses_object])]
+        observed = [_observe_beside_object(run, beside, rays)]
         if number_of_pass > 0:
             assert self.start is not None
             num_trained = self.start * 2 ** (number_of_pass - 1) * run.batches.batch_size
             num_rays = min(_SHARE * num_trained, _MOST_RAYS)
-            crossing = pixels[~misses_object]
             crossing = crossing[:: max(1, math.ceil(len(crossing) * self.steps / num_rays))]
             observed += [_observe_through_object(run, chunk) for chunk in crossing.split(run.renderer.chunk_size)]
         state["weights"] += background.fit(Observed.joined(observed), state["weights"])
         return True
+
+
+def _divided(
+    run: Run, pixels: Int[Tensor, "P"], box: Float[Tensor, "2 3"]
+) -> tuple[Int[Tensor, "M"], Rays, Int[Tensor, "C"]]:
+    """Return the pixels whose rays miss a box, with their rays, and the other pixels."""
+    beside, rays, crossing = [], [], []
+    for chunk in pixels.split(_CHUNK):
+        of_chunk = _rays(run, chunk)
+        beside_box = misses(box, of_chunk)
+        beside.append(chunk[beside_box])
+        rays.append(of_chunk[beside_box])
+        crossing.append(chunk[~beside_box])
+    return torch.cat(beside), Rays.joined(rays), torch.cat(crossing)
 
 
 def _observe_through_object(run: Run, pixels: Int[Tensor, "P"]) -> Observed:
