@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import ctypes
 
-# Settings of glibc's mallopt (malloc.h). Blocks above M_MMAP_THRESHOLD (-3), 32 MiB, are returned to the system: steps of
-# training allocate no such blocks, but fits of the background do. M_TRIM_THRESHOLD (-1): nothing else is returned.
+# Settings of glibc's mallopt (malloc.h). Blocks above M_MMAP_THRESHOLD (-3), 32 MiB, are returned to the system: steps
+# of training allocate no such blocks, but fits of the background do. M_TRIM_THRESHOLD (-1): nothing else is returned.
 _SETTINGS = {-3: 2**25, -1: 2**31 - 1}
 
 
