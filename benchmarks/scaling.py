@@ -29,6 +29,7 @@ import numpy as np
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullLocator
 from training import SCENE, Training, write_images
 
 from nerfro.evaluation.render_view import render_view
@@ -180,16 +181,26 @@ def slope(curve: list[tuple[int, Costs]], cost: str) -> str:
 
 
 def draw(curves: dict[str, list[tuple[int, Costs]]], heads: list[str], file: Path) -> None:
-    """Draw every cost against every axis, in logarithmic axes."""
-    figure = Figure(figsize=(3 * len(curves), 2.2 * len(COSTS)), layout="constrained")
+    """Draw every measured cost against every axis, in logarithmic axes."""
+    measured = {
+        cost: head
+        for cost, head in zip(COSTS, heads, strict=True)
+        if any(costs[cost] is not None for curve in curves.values() for _, costs in curve)
+    }
+    figure = Figure(figsize=(3 * len(curves), 2.2 * len(measured)), layout="constrained")
     FigureCanvasAgg(figure)
-    grid = figure.subplots(len(COSTS), len(curves), squeeze=False, sharex="col", sharey="row")
+    grid = figure.subplots(len(measured), len(curves), squeeze=False, sharex="col", sharey="row")
     for column, (name, curve) in enumerate(curves.items()):
-        for row, (cost, head) in enumerate(zip(COSTS, heads, strict=True)):
+        for row, (cost, head) in enumerate(measured.items()):
             points = sorted((value, costs[cost]) for value, costs in curve if costs[cost] is not None)
             axes = grid[row, column]
             axes.loglog([value for value, _ in points], [value for _, value in points], "o-")
-            axes.grid(alpha=0.3, which="both")
+            axes.set_xticks(sorted(value for value, _ in curve), minor=False)
+            axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            for axis in (axes.xaxis, axes.yaxis):
+                axis.set_major_formatter("{x:g}")
+                axis.set_minor_locator(NullLocator())
+            axes.grid(alpha=0.3)
             if column == 0:
                 axes.set_ylabel(head)
         grid[-1, column].set_xlabel("pixels per side" if name == "pixels" else name)
