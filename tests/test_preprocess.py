@@ -1,6 +1,5 @@
 """`python -m nerfro.preprocess`: what it writes, the command that it prints, and what it refuses."""
 
-import functools
 import json
 import re
 import shlex
@@ -151,7 +150,7 @@ def test_a_hull_far_from_the_origin_is_searched_and_refined(
     preprocess: Callable[..., str], capture: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     quick = RefinementSettings((Stage(25, 5e-4, (3.0, 1.0)),), 1000, (8,))
-    monkeypatch.setattr(refinement, "refine_surface", functools.partial(refinement.refine_surface, settings=quick))
+    monkeypatch.setattr(refinement, "RefinementSettings", lambda: quick)
     place = 200.0, 0.0, 0.0
     save(photographs([1.45]), capture, place)
     (capture / "mesh.ply").unlink()

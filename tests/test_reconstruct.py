@@ -341,8 +341,7 @@ def test_posed_photographs_of_a_ball_become_a_scene(
 
     monkeypatch.setattr(nerfro.train, "prepared_metrics", ImageMetrics)
     short = refinement.RefinementSettings((refinement.Stage(20, 1e-4, (3.0, 1.0)),), 1000)
-    fast = functools.partial(refinement.refine_surface, settings=short)
-    monkeypatch.setattr(refinement, "refine_surface", fast)
+    monkeypatch.setattr(refinement, "RefinementSettings", lambda: short)
     train = ["evaluation.split=train", "evaluation.every=0", "evaluation.subdivision.side=1", "logger=none",
              "trainer.accelerator=cpu", "trainer.max_steps=2", "trainer.max_time=null", "batches.size=64",
              "boundary.resolutions=[4,8]", "field.num_levels=2", "field.log2_table_size=8",

@@ -60,9 +60,6 @@ _MAX_INCREASE = 0.03
 # of the reflections, the tint and the interior: errors decreased by 0.012 to 0.11 for better surfaces, and by up to
 # 0.009 for worse ones (docs/lab/surface_refinement.md).
 _MIN_GAIN = 0.01
-# Largest decrease of the mean overlap with the masks: smoothing decreases the error a little even where it cuts edges.
-_MAX_OVERLAP_LOSS = 0.003
-_OVERLAP_PIXELS = 256  # per side; larger masks are subsampled
 _BLUR_SAMPLES = 32
 
 
@@ -91,6 +88,8 @@ class RefinementSettings:
         num_pixels: number of pixels in each step.
         levels: numbers of control points along each side of the splines that displace the surface.
         smoothings: standard deviations of the tested smoothings, as fractions of the object's size.
+        max_overlap_loss: largest decrease of the mean overlap with the silhouettes, because smoothing decreases the
+            error a little even where it cuts edges. Infinite for silhouettes that are no masks.
     """
 
     stages: tuple[Stage, ...] = (
@@ -102,6 +101,7 @@ class RefinementSettings:
     num_pixels: int = 6000
     levels: tuple[int, ...] = (12, 24, 48)
     smoothings: tuple[float, ...] = (0.005, 0.007, 0.01, 0.014)
+    max_overlap_loss: float = 0.003
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,6 @@ def refine_surface(
     learn_index: bool = False,
     progress: Callable[[float], None] = lambda done: None,
     settings: RefinementSettings = RefinementSettings(),
-    masks: bool = True,
 ) -> Refined:
     """Refine the surface of the first body of a medium by the refractions in photographs.
 
@@ -143,12 +142,11 @@ def refine_surface(
         learn_index: whether to refine the indices together with the surface.
         progress: called with the completed fraction.
         settings: settings of the descent.
-        masks: whether the silhouettes are masks, and not projections of the surface.
 
     Raises:
         NerfroError: no pixel shows known surroundings through the object.
     """
-    descent = _Descent(mesh, medium, silhouettes, through, surroundings, learn_index, settings, masks)
+    descent = _Descent(mesh, medium, silhouettes, through, surroundings, learn_index, settings)
     error = descent.initial_error
     smoothed = descent.smooth_start(error)
     steps, errors, best = [0, 0], [error, smoothed], descent.values()
@@ -197,16 +195,15 @@ def refine(
     """
     through, surroundings, cameras = observations.through, observations.surroundings, observations.views.cameras
     assert isinstance(medium, SdfGrid)  # see Request.check
-    start, masks = mesh.relative_to(observations.shift), silhouettes is not None
+    start, settings = mesh.relative_to(observations.shift), RefinementSettings()
     if silhouettes is None:
+        settings = replace(settings, max_overlap_loss=math.inf)
         silhouettes = Silhouettes.of(cameras, mesh_silhouettes(start, cameras, 1).float())
     else:
         silhouettes = replace(silhouettes, cameras=silhouettes.cameras.relative_to(observations.shift))
     try:
         with bar("surface") as progress:
-            refined = refine_surface(
-                start, medium, silhouettes, through, surroundings, learn_index, progress, masks=masks
-            )
+            refined = refine_surface(start, medium, silhouettes, through, surroundings, learn_index, progress, settings)
     except NerfroError as reason:  # keep the results of the other steps
         warn(f"surface unchanged: {reason}")
         return mesh
@@ -269,7 +266,6 @@ class _Descent:
         surroundings: Surroundings,
         learn_index: bool,
         settings: RefinementSettings,
-        masks: bool,
     ) -> None:
         self.settings, self.given, self.start, self.surroundings = settings, medium, medium, surroundings
         self.iors = nn.Parameter(medium.iors.clone(), requires_grad=learn_index)
@@ -284,7 +280,7 @@ class _Descent:
         if not known.any():
             raise NerfroError("no pixel shows known surroundings through the object; remove refine=true")
         self.validation, self.initial_errors = self.validation[known], errors[known]
-        self.mesh, self.masks = mesh, silhouettes if masks else None
+        self.mesh, self.silhouettes, self.overlap = mesh, silhouettes, overlap(mesh, silhouettes).mean()
         rims, cameras = RimFinder(mesh, silhouettes).find(), silhouettes.cameras
         self.rims = torch.from_numpy(rims.points).float()
         middle = torch.from_numpy(mesh.bounds.mean(0)).float()
@@ -364,12 +360,11 @@ class _Descent:
         return best, error
 
     def keeps_outlines(self, medium: SdfGrid) -> bool:
-        """Return whether the silhouettes of a medium overlap with the masks as well as those of the given surface."""
-        if self.masks is None:
+        """Return whether the silhouettes of a medium overlap with the given ones as well as those of the surface."""
+        if self.settings.max_overlap_loss == math.inf:
             return True
-        moved = _project_onto(self.mesh, medium)
-        before, after = (overlap(mesh, self.masks, _OVERLAP_PIXELS).mean() for mesh in (self.mesh, moved))
-        return bool(before - after <= _MAX_OVERLAP_LOSS)
+        after = overlap(_project_onto(self.mesh, medium), self.silhouettes).mean()
+        return bool(self.overlap - after <= self.settings.max_overlap_loss)
 
     @property
     def initial_error(self) -> float:

@@ -16,12 +16,11 @@ from nerfro.files.atomic import write_atomically
 from nerfro.files.drawing import sheet
 from nerfro.files.images import save_image
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.silhouettes.pose_conventions import GOOD_OVERLAP, better_wrong_masks, overlap
+from nerfro.silhouettes.pose_conventions import GOOD_OVERLAP, OVERLAP_PIXELS, better_wrong_masks, overlap
 from nerfro.silhouettes.silhouettes import mesh_silhouettes, pixel_stride
 from nerfro.silhouettes.visual_hull import Silhouettes
 
 SHEET, REPORT = "overlays.png", "overlaps.json"
-_MAX_PIXELS = 256  # per side; larger images are subsampled
 _MAX_VIEWS, _COLUMNS = 48, 8
 _WIDTH = 192  # width of a tile, in pixels
 _BOTH, _MASK_ONLY, _SURFACE_ONLY = (60, 190, 90), (235, 60, 45), (40, 110, 240)
@@ -53,7 +52,7 @@ def report_overlaps(
         folder: output folder.
         list_all: print the overlap of every view.
     """
-    overlaps = overlap(mesh, silhouettes, _MAX_PIXELS)
+    overlaps = overlap(mesh, silhouettes)
     print("overlap (intersection over union) of the silhouettes of the surface and the masks:")
     for name, value in sorted(zip(views.names, overlaps, strict=True)) if list_all else ():
         print(f"  {value:.4f}  {name}")
@@ -86,7 +85,7 @@ def _draw_overlays(views: Views, mesh: TriangleMesh, overlaps: Float[np.ndarray,
     Green pixels belong to mask and silhouette, red ones to the mask alone, blue ones to the silhouette alone.
     """
     assert views.masks is not None
-    stride = pixel_stride(views.cameras, _MAX_PIXELS)
+    stride = pixel_stride(views.cameras, OVERLAP_PIXELS)
     chosen = np.argsort(overlaps, kind="stable")[:_MAX_VIEWS].tolist()
     pictures, captions = [], []
     cameras = views.cameras.select(chosen)

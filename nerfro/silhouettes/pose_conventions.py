@@ -18,6 +18,7 @@ from nerfro.silhouettes.visual_hull import Silhouettes, carve_mesh, find_box
 _COARSE_VOXELS, _COARSE_PIXELS = 48, 64
 # The silhouettes of a visual hull agree with its masks; a smaller overlap or agreement indicates an error in the input.
 GOOD_OVERLAP = 0.9
+OVERLAP_PIXELS = 256  # per side, for overlaps; larger masks are subsampled
 # Tolerance of the coarse hull at outlines, in pixels of the downscaled masks.
 _SLACK = 1.5
 # One wrong view is allowed per so many views; an agreement is better only if the gain exceeds the second number.
@@ -41,7 +42,7 @@ _ALTERNATIVES: tuple[tuple[str, bool, _Turn], ...] = (
 )
 
 
-def overlap(mesh: TriangleMesh, silhouettes: Silhouettes, max_pixels: int) -> Float[np.ndarray, "V"]:
+def overlap(mesh: TriangleMesh, silhouettes: Silhouettes, max_pixels: int = OVERLAP_PIXELS) -> Float[np.ndarray, "V"]:
     """Compute the intersection over union of the silhouette of a mesh with each mask; 1 where both are empty."""
     stride = pixel_stride(silhouettes.cameras, max_pixels)
     ours, theirs = mesh_silhouettes(mesh, silhouettes.cameras, stride), silhouettes.masks[:, ::stride, ::stride] > 0.5

@@ -31,7 +31,7 @@ _BOX_FACTORS = (1.0, 1.3, 1.7)
 _MARGIN_VOXELS = 2
 # A body of revolution is preferred although its overlap may be smaller by this amount, because a free surface is rough
 # and follows errors of the masks; the overlap is computed at the given number of pixels per side.
-_MAX_OVERLAP_LOSS, _MAX_PIXELS = {"axis": 0.01, "auto": 0.005}, 256
+_MAX_OVERLAP_LOSS = {"axis": 0.01, "auto": 0.005}
 # Cameras within this angle, in degrees, see the object from one side.
 _ONE_SIDE = 75.0
 
@@ -147,9 +147,7 @@ def _choose_symmetry(
         if symmetry == "axis":
             raise NerfroError("symmetry=axis is not possible, because the visual hull has no axis; remove the option")
         return free
-    symmetric, unconstrained = (
-        float(np.median(overlap(mesh, silhouettes, _MAX_PIXELS))) for mesh in (revolution, free)
-    )
+    symmetric, unconstrained = (float(np.median(overlap(mesh, silhouettes))) for mesh in (revolution, free))
     result = f"median overlap with the masks: {symmetric:.4f} as a body of revolution, {unconstrained:.4f} otherwise"
     if symmetry == "axis" and symmetric < unconstrained - _MAX_OVERLAP_LOSS[symmetry]:
         warn(f"{result}; the object is no body of revolution, and symmetry=axis is ignored")

@@ -2,7 +2,9 @@
 
 import functools
 import json
+import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -98,7 +100,7 @@ def test_a_surface_that_loses_overlap_with_the_masks_is_rejected(monkeypatch: py
     monkeypatch.setattr(refinement._Descent, "validation_error", lambda *_: 0.0)
     before, shrinking = dented(), RefinementSettings(stages=(), smoothings=(0.3,))
     assert refined(before, shrinking).medium is before
-    assert refine_surface(mesh(), before, *shown(), settings=shrinking, masks=False).medium is not before
+    assert refined(before, replace(shrinking, max_overlap_loss=math.inf)).medium is not before
 
 
 class PaintedShell(Room):
@@ -149,7 +151,7 @@ def preprocess(tmp_path: Path, run_here: Callable) -> Callable:
 
 def test_preprocess_writes_the_refined_surface(preprocess: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
     quick = RefinementSettings((Stage(75, 5e-4, (3.0, 1.0)),), 2000, (8, 16))
-    monkeypatch.setattr(refinement, "refine_surface", functools.partial(refine_surface, settings=quick))
+    monkeypatch.setattr(refinement, "RefinementSettings", lambda: quick)
     out, printed = preprocess("room=false")
     assert "surface refined and used" in printed
     assert f"scene={out / 'scene.json'}" in printed
@@ -159,7 +161,7 @@ def test_preprocess_writes_the_refined_surface(preprocess: Callable, monkeypatch
 
 
 def test_a_surface_that_cannot_be_refined_stays_as_it_is(preprocess: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
-    def nothing_known(*_: object, **__: object) -> Refined:
+    def nothing_known(*_: object) -> Refined:
         raise NerfroError("no pixel shows known surroundings")
 
     monkeypatch.setattr(refinement, "refine_surface", nothing_known)
@@ -173,7 +175,7 @@ def test_a_refinement_begins_with_the_index_that_was_found(
 ) -> None:
     begun: list[SdfGrid] = []
 
-    def kept(mesh: object, medium: SdfGrid, *_: object, **__: object) -> Refined:
+    def kept(mesh: object, medium: SdfGrid, *_: object) -> Refined:
         begun.append(medium)
         raise NerfroError("enough is known")
 
