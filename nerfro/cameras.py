@@ -17,6 +17,9 @@ from nerfro.errors import NerfroError
 from nerfro.lens import distort, undistort
 from nerfro.rays import Rays
 
+# The up direction is an axis of the world if the mean up direction of the photographs is closer than this to the axis.
+_MIN_AXIS_COSINE = math.cos(math.radians(15))
+
 
 class Window(NamedTuple):
     """A rectangle of pixels."""
@@ -30,6 +33,20 @@ class Window(NamedTuple):
         """Crop the window from images."""
         rows, columns = slice(self.top, self.top + self.height), slice(self.left, self.left + self.width)
         return images[:, rows, columns].contiguous()
+
+
+def up_direction(upward: Float[Tensor, "V 3"]) -> Float[Tensor, "3"]:
+    """Estimate the up direction of the world: the mean over the cameras, or a world axis close to the mean.
+
+    Args:
+        upward: direction from the centre of each image to its upper edge, in world space.
+    """
+    mean = upward.mean(0).cpu()
+    if float(mean.norm()) < 0.1:  # the cameras have no common up direction
+        return torch.tensor([0.0, 0.0, 1.0])
+    up = torch.nn.functional.normalize(mean, dim=0)
+    axis = torch.eye(3).to(up)[up.abs().argmax()] * up[up.abs().argmax()].sign()
+    return axis if float(up @ axis) > _MIN_AXIS_COSINE else up
 
 
 def central_window(height: int, width: int, fraction: float) -> Window:

@@ -9,8 +9,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Float
 
+from nerfro.cameras import up_direction
 from nerfro.files.atomic import write_atomically
 from nerfro.geometry.lines import nearest_point
 from nerfro.poses.calibration import Calibration
@@ -117,7 +119,7 @@ def _plot_cameras(
 ) -> bytes:
     """Plot the cameras from the side and from above, as arrows along the optical axes.
 
-    Without a board, the axes of the world are arbitrary, and the mean of the upper edges of the images points upwards.
+    Without a board, the axes of the world are arbitrary, and the up direction is that of the cameras.
 
     Args:
         poses: camera-to-world matrices in OpenCV's axes.
@@ -134,7 +136,7 @@ def _plot_cameras(
     if len(points):
         low, high = np.quantile(points, (0.02, 0.98), axis=0)
         points = points[((points >= low) & (points <= high)).all(1)][:: -(-len(points) // _MAX_POINTS)]
-    axes_shown = np.eye(3) if quads else _upright(np.array([0, 0, 1e-9]) - poses[:, :, 1].mean(0))
+    axes_shown = np.eye(3) if quads else _upright(up_direction(torch.from_numpy(-poses[:, :, 1])).numpy())
     cameras, points = np.einsum("ij,vjk->vik", axes_shown, poses), points @ axes_shown.T
     focus = nearest_point(cameras[:, :, 3], cameras[:, :, 2])
     figure = Figure(figsize=(13, 6.5), layout="constrained", dpi=110)
@@ -156,8 +158,7 @@ def _plot_cameras(
 
 
 def _upright(up: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Return axes whose last one points in a direction."""
-    up = up / np.linalg.norm(up)
+    """Return axes whose last one is a unit vector."""
     across = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
     across /= np.linalg.norm(across)
     return np.stack([across, np.cross(up, across), up])

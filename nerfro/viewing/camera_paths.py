@@ -11,20 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from nerfro.cameras import Cameras
-
-# The up direction is an axis of the world if the mean up direction of the photographs is closer than this to the axis.
-_MIN_AXIS_COSINE = math.cos(math.radians(15))
-
-
-def up_direction(cameras: Cameras) -> Float[Tensor, "3"]:
-    """Estimate the up direction of the world: the mean over the cameras, or a world axis close to the mean."""
-    mean = cameras.camera_to_world[:, :, 1].mean(0).cpu()
-    if float(mean.norm()) < 0.1:  # the cameras have no common up direction
-        return torch.tensor([0.0, 0.0, 1.0])
-    up = functional.normalize(mean, dim=0)
-    axis = torch.eye(3)[up.abs().argmax()] * up[up.abs().argmax()].sign()
-    return axis if float(up @ axis) > _MIN_AXIS_COSINE else up
+from nerfro.cameras import Cameras, up_direction
 
 
 @dataclass(frozen=True)
@@ -57,7 +44,12 @@ class CaptureGeometry:
         """Measure the geometry of photographs of an object in the given bounds."""
         cameras, centre = cameras.to("cpu"), bounds.mean(0)
         distance = torch.linalg.vector_norm(cameras.camera_to_world[:, :, 3] - centre, dim=-1).median()
-        return cls(centre, up_direction(cameras), float(distance), replace(cameras.select([0]), distortion=None))
+        return cls(
+            centre,
+            up_direction(cameras.camera_to_world[:, :, 1]),
+            float(distance),
+            replace(cameras.select([0]), distortion=None),
+        )
 
     def position_at(self, position: OrbitPosition) -> Float[Tensor, "3"]:
         """Convert angles and a distance to a point; azimuth 0 is along the x axis of the world, or y if x is up."""

@@ -13,7 +13,7 @@ from omegaconf import DictConfig
 from PIL import Image
 from torch import Tensor
 
-from nerfro.cameras import Cameras
+from nerfro.cameras import Cameras, up_direction
 from nerfro.data.base import DataSource, Views
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
@@ -22,7 +22,6 @@ from nerfro.files.templates import fill_template
 from nerfro.paths import ASSETS_DIR
 from nerfro.rendering import ColourSpace
 from nerfro.viewing.baking import Baked, bake_sky, bake_surface, bake_volume
-from nerfro.viewing.camera_paths import up_direction
 from nerfro.viewing.exports import Export
 from nerfro.viewing.trained_scene import TrainedScene
 from nerfro.viewing.volume import MIN_OPTICAL_DEPTH, RESOLUTION, sample_field
@@ -96,7 +95,7 @@ def static_parts(scene: TrainedScene, views: Views, split: str) -> dict[str, Any
             "target": box.mean(0).tolist(),
             "radius": float((box[1] - box[0]).norm() / 2),
             "halfWidth": float((box[1] - box[0]).min() / 2),
-            "up": up_direction(cameras).tolist(),
+            "up": up_direction(cameras.camera_to_world[:, :, 1]).tolist(),
             "near": near,
         },
         "cameras": [
