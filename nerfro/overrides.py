@@ -42,6 +42,12 @@ def is_given(option: str, overrides: Iterable[str]) -> bool:
     return option in {_name(text) for text in overrides}
 
 
+def not_given(options: Iterable[str], overrides: Iterable[str]) -> list[str]:
+    """Select the options that overrides do not set."""
+    given = {_name(text) for text in overrides}
+    return [option for option in options if _name(option) not in given]
+
+
 def is_scene_file(argument: str) -> bool:
     """Test whether an argument names a scene file; `scene=NAME` selects the settings of a known scene."""
     return argument.startswith("scene=") and argument.strip("'\"").endswith(".json")

@@ -14,7 +14,7 @@ from nerfro.data.frames import list_images
 from nerfro.errors import NerfroError, warn
 from nerfro.evaluation.results import EXPOSED, FULL, read_metrics_json
 from nerfro.files.reading import read_json
-from nerfro.overrides import as_overrides, is_given
+from nerfro.overrides import as_overrides, is_given, not_given
 from nerfro.paths import user_path
 from nerfro.pipeline.hypotheses import Hypothesis, hypotheses
 from nerfro.pipeline.options import common_options
@@ -79,8 +79,7 @@ def preprocess(config: DictConfig, options: list[str], root: Path, folder: Path)
     if "wall" not in config.medium and "shell_voxels" in config.medium and config.medium.get("bodies") is None:
         automatic.append("vessel=true")
     given = shlex.split(config.preprocess)
-    automatic = [option for option in automatic if not is_given(option.partition("=")[0], given)]
-    options = [*options, *automatic, *given]
+    options = [*options, *not_given(automatic, given), *given]
     old = (folder / OLD_SCENE).is_file() and not (folder / SCENE).is_file()  # written by an earlier release
     scene = folder / (OLD_SCENE if old else SCENE)
     Stage("preprocess", options, scene, folder / SHEET, inputs).run()
@@ -108,8 +107,7 @@ def train(config: DictConfig, overrides: list[str], scene: Path, out: Path) -> N
         for hypothesis, trial in zip(candidates, trials, strict=False):
             print(f"\nhypothesis: {hypothesis.name}")
             short = hypothesis.trial_options(config.trial_steps)
-            lasting = [option for option in common if not is_given(option.partition("=")[0], short)]
-            _run_training([*hypothesis.options, *lasting, *short], inputs, trial)
+            _run_training([*hypothesis.options, *not_given(common, short), *short], inputs, trial)
         options = _best_hypothesis(candidates, trials).options
         inputs += [trial / "metrics.json" for trial in trials]
     _run_training([*options, *common], inputs, out / "run")
