@@ -10,9 +10,11 @@ from torch import Tensor
 from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.files import lat_long
 from nerfro.light import to_linear, to_srgb
+from nerfro.losses.base import Loss
 from nerfro.losses.boundary import BoundaryRegulariser
 from nerfro.losses.photometric import Photometric
 from nerfro.models.refractive import RefractiveModel
+from nerfro.registry import find
 from nerfro.rendering import composite
 from nerfro.samplers.paths.straight import straight_path
 from nerfro.samplers.points.density_grid import DensityGridSampler
@@ -72,8 +74,8 @@ def test_random_numbers_are_drawn_for_each_ray(sampler: Stratified | Hierarchica
     assert torch.equal(samples.s[::2], sampler(same, None, example_draws()).s), "and splitting changes nobody's"
 
 
-@pytest.mark.parametrize("loss", [Photometric(), BoundaryRegulariser()])
-def test_losses_take_rays_that_split(loss: Photometric | BoundaryRegulariser) -> None:
+@pytest.mark.parametrize("loss", [Photometric(), BoundaryRegulariser(), find("loss", "distortion").cls()])
+def test_losses_take_rays_that_split(loss: Loss) -> None:
     model, batch = RefractiveModel(example_components()).eval(), example_batch()
     with torch.no_grad():
         bent = model.render_path(example_path())
