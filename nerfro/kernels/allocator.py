@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import ctypes
 
-# Settings of glibc's mallopt (malloc.h). Blocks above M_MMAP_THRESHOLD (-3), 32 MiB, are returned to the system: steps
-# of training allocate no such blocks, but fits of the background do. M_TRIM_THRESHOLD (-1): nothing else is returned.
-_SETTINGS = {-3: 2**25, -1: 2**31 - 1}
+# Settings of glibc's mallopt (malloc.h). Blocks above M_MMAP_THRESHOLD (-3), 64 MiB, are returned to the system: steps
+# of training and rendering allocate smaller blocks, and fits of the background larger ones. M_TRIM_THRESHOLD (-1):
+# nothing else is returned.
+_SETTINGS = {-3: 2**26, -1: 2**31 - 1}
 
 
 def keep_freed_memory() -> bool:
