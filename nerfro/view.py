@@ -34,7 +34,7 @@ class ViewConfig:
     open: bool = True  # whether to open a browser
     resolution: Annotated[int, Range(at_least=2)] = RESOLUTION  # grid vertices along the longest side of the volume
     root: Optional[str] = None  # folder of the data, if it has moved since training
-    device: str = "auto"  # `cpu`, or `cuda` (untested); `auto` means the CPU
+    device: str = "auto"  # `cpu` or `cuda`; `auto` means the CPU
 
 
 @entry_point("view", ViewConfig)

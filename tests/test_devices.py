@@ -20,28 +20,26 @@ from tests.test_experiments import SMALL, shrunk
 # A step at which all losses have begun and densities are looked at.
 STEP = 100_000
 
-# Loops end when the last ray has ended, and triangles are met on the CPU.
-TRACING = ("samplers/paths/snell.py", "paper/eikonal.py", "samplers/paths/polylines.py", "media/sdf_grid.py")
-TRACING += ("geometry/intersection.py", "samplers/paths/wavefront.py")
+# Rays are traced on the CPU, and travel there and back.
+TRACING = ("kernels/arrays.py", "samplers/paths/", "geometry/intersection.py", "media/sdf_grid.py", "rays.py")
+TRACING += ("paper/compiled.py", "paper/eikonal.py")
 
 ADAPTIVE = ["sampler.path.integrator=adaptive", "sampler.path.max_steps=60", "sampler.points.draw=arc_length"]
 
 # A constant is copied to the device once. Fields are asked for samples in the object alone, whose number must be known.
 ONCE = "kernels/constants.py: constant (tensor)"
-# Triangles are met on the CPU, and the rays travel there and back.
-TO_CPU = {"rays.py: <genexpr> (to)", "samplers/paths/replay.py: <genexpr> (to)"}
 SELECTED = "fields/selection.py: evaluate_selected (nonzero)"
 
 
 @pytest.mark.parametrize(
     ("experiment", "waits"),
     [
-        (["refractive", "sampler.path.max_events=2"], {ONCE, SELECTED}),
-        (["refractive", "sampler.path.interface=mesh"], {ONCE, SELECTED, *TO_CPU}),
-        (["refractive_room", "sampler.path.max_events=2"], {ONCE}),
+        (["refractive"], {ONCE, SELECTED}),
+        (["refractive", "sampler.path.interface=mesh"], {ONCE, SELECTED}),
+        (["refractive_room"], {ONCE}),
         (["straight"], {ONCE}),
         (["mipnerf"], set()),
-        (["paper_refractive"], {ONCE}),
+        (["paper_refractive"], set()),
         (["paper_refractive", *ADAPTIVE], {ONCE}),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",

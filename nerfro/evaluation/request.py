@@ -43,7 +43,7 @@ class EvaluateConfig:
     alpha: Annotated[str, Literal["drop", "white", "black"]] = "drop"
     # Folder for images and tables; by default beside the folder of checkpoints, or `scores` in `predictions`.
     out: Optional[str] = None
-    device: str = "auto"  # `cpu`, or `cuda` (untested); `auto` means the CPU
+    device: str = "auto"  # `cpu` or `cuda`; `auto` means the CPU
     overwrite: bool = False  # whether to replace an earlier evaluation in `out`
 
 
@@ -91,7 +91,7 @@ def report_unused_gpu(option: str) -> None:
     """
     if torch.cuda.is_available() or torch.backends.mps.is_available():
         warn(
-            "the CPU is used, because nerfro has no GPU kernels and has not been tested on a GPU; "
+            "the CPU is used, because nerfro has no GPU kernels and its speed on a GPU is unknown; "
             f"set {option} to use the GPU nevertheless"
         )
 

@@ -7,5 +7,5 @@ from torch import Tensor
 
 
 def arrays(*tensors: Tensor) -> list[np.ndarray]:
-    """Return CPU tensors as NumPy arrays without gradients, sharing memory if the tensors are contiguous."""
-    return [tensor.detach().contiguous().numpy() for tensor in tensors]
+    """Return tensors as NumPy arrays without gradients; contiguous tensors on the CPU share their memory."""
+    return [tensor.detach().cpu().contiguous().numpy() for tensor in tensors]

@@ -30,6 +30,9 @@ _VALIDATIONS_PER_IMAGE = 5
 NO_IMAGE = -1
 # Weights of linear layers; the default field has 9,000, the networks of the paper 1.2 million.
 _LARGE = 100_000
+# Threads of PyTorch beside the tracing thread, for networks without large layers. A step on 16 threads took 1.6 times as
+# long as on 8 (docs/lab/threads.md).
+_MOST_THREADS = 7
 
 
 class RayDataModule(LightningDataModule):
@@ -59,7 +62,7 @@ class RayDataModule(LightningDataModule):
         shared = self.batches.share(self.trainer.global_rank, self.trainer.world_size)
         self.batches = shared.to(device, cast(torch.dtype, module.dtype))
         self.end_thread()
-        if device.type == "cpu" and can_prefetch(module.renderer):
+        if can_prefetch(module.renderer):
             self._ahead = Prefetcher(self._batch, spare_core=not multiplies_large_matrices(module.renderer))
         # Lightning calls this method after restoring a checkpoint, so a resumed run continues with the next batch.
         return itertools.count(self.trainer.global_step)
@@ -121,7 +124,7 @@ class Prefetcher(Generic[Made]):
     Args:
         make: function that makes the batch of a step.
         spare_core: whether PyTorch has one thread less meanwhile, because its threads spin while they wait for one that
-            has no core.
+            has no core, and at most `_MOST_THREADS`.
     """
 
     def __init__(self, make: Callable[[int], Made], spare_core: bool = True) -> None:
@@ -132,7 +135,8 @@ class Prefetcher(Generic[Made]):
         self._thread = ThreadPoolExecutor(1, "paths", lambda: torch.set_num_threads(1))
         self._thread.submit(torch.get_num_threads).result()
         HELPERS.append(self._thread)
-        torch.set_num_threads(max(1, self._num_threads - spare_core))
+        if spare_core:
+            torch.set_num_threads(min(max(1, self._num_threads - 1), _MOST_THREADS))
 
     def __call__(self, step: int) -> Made:
         """Return the batch of a step; errors of the thread are raised here."""

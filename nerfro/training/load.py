@@ -22,7 +22,7 @@ def load(run: str | Path, device: str = "auto", root: str | Path | None = None) 
 
     Args:
         run: folder of the run, or one of its checkpoints.
-        device: `cpu`, or `cuda` (untested); `auto` means the CPU.
+        device: `cpu` or `cuda`; `auto` means the CPU.
         root: folder of the data, if it has moved since training.
 
     Raises:

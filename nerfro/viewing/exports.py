@@ -35,7 +35,7 @@ class ExportConfig:
     half_depth: Optional[Positive] = None
     sky: Optional[str] = None  # lat-long image that replaces the sky (.hdr, .exr, .png, .jpg)
     root: Optional[str] = None  # folder of the data, if it has moved since training
-    device: str = "auto"  # `cpu`, or `cuda` (untested); `auto` means the CPU
+    device: str = "auto"  # `cpu` or `cuda`; `auto` means the CPU
     overwrite: bool = False  # whether existing output files may be replaced
 
 

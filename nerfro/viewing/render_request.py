@@ -58,7 +58,7 @@ class RenderConfig:
     format: Annotated[str, Literal["png", "exr"]] = "png"
     film: list[FilmFormat] = dataclasses.field(default_factory=lambda: ["mp4"])  # mp4, gif, both or none
     root: Optional[str] = None  # folder of the data, if it has moved since training
-    device: str = "auto"  # `cpu`, or `cuda` (untested); `auto` means the CPU
+    device: str = "auto"  # `cpu` or `cuda`; `auto` means the CPU
     overwrite: bool = False  # whether other frames in `out` may be replaced
 
 

@@ -26,7 +26,7 @@ _CAPACITY = 18
 def eikonal_on_grid(
     rays: Rays, medium: VoxelGrid | SdfGrid, step: float, tolerance: float, max_steps: int
 ) -> tuple[Path, Bool[Tensor, "R"]]:
-    """Evaluate `eikonal.march_adaptive` by the compiled kernel."""
+    """Evaluate `eikonal.march_adaptive` by the compiled kernel, on the CPU for rays on any device."""
     from .eikonal_cpu import march_adaptive
     from .index_cpu import NO_SOLIDS, NO_VOXELS
 
@@ -40,11 +40,12 @@ def eikonal_on_grid(
         for i, (short, long) in enumerate(zip(columns, again, strict=True)):
             columns[i] = np.concatenate([short, np.repeat(short[:, -1:], width - _CAPACITY, axis=1)], axis=1)
             columns[i][rows] = long
-    return _path(rays, [column[:, :width] for column in columns], refracted), torch.from_numpy(exceeded)
+    path = _path(rays, [column[:, :width] for column in columns], refracted)
+    return path, torch.from_numpy(exceeded).to(path.s.device)
 
 
 def uniform_on_grid(rays: Rays, medium: VoxelGrid, num_steps: int) -> Path:
-    """Evaluate `eikonal.march_uniform` with Euler steps by the compiled kernel."""
+    """Evaluate `eikonal.march_uniform` with Euler steps by the compiled kernel, on the CPU for rays on any device."""
     from .eikonal_cpu import march_uniform
 
     *vertices, refracted = march_uniform(*ray_arrays(rays), _voxels(medium), num_steps)
@@ -54,11 +55,13 @@ def uniform_on_grid(rays: Rays, medium: VoxelGrid, num_steps: int) -> Path:
 def _voxels(medium: VoxelGrid) -> Voxels:
     from .index_cpu import Voxels
 
-    low, high = medium.box.double().numpy()
+    low, high = medium.box.double().cpu().numpy()
     inverse_spacing = (np.array(medium.table.shape[:3]) - 1) / (high - low)
-    return Voxels(medium.table.detach().numpy(), medium.clearance_grid.numpy(), low, high, inverse_spacing)
+    table, clearance = medium.host_arrays
+    return Voxels(table, clearance, low, high, inverse_spacing)
 
 
 def _path(rays: Rays, vertices: Sequence[np.ndarray], refracted: np.ndarray) -> Path:
-    positions, directions, s = (torch.from_numpy(np.ascontiguousarray(array)) for array in vertices)
-    return Path.unbranched(positions, directions, s, torch.from_numpy(refracted), rays.radii)
+    device = rays.radii.device
+    positions, directions, s = (torch.from_numpy(np.ascontiguousarray(array)).to(device) for array in vertices)
+    return Path.unbranched(positions, directions, s, torch.from_numpy(refracted).to(device), rays.radii)

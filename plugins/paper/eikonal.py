@@ -57,15 +57,14 @@ class Eikonal(PathSampler):
         """Trace rays from near to far; bent adaptive paths end outside the medium's box, beyond far if necessary."""
         if medium.absorption is not None or medium.disperses:
             raise NerfroError("medium.absorption and medium.abbe need sharp surfaces; take sampler/path=snell")
-        on_cpu = rays.origins.device.type == "cpu"
         if self.integrator != "adaptive":
-            if on_cpu and isinstance(medium, VoxelGrid):
+            if isinstance(medium, VoxelGrid):
                 return uniform_on_grid(rays, medium, self.num_steps)
             return march_uniform(rays, medium, euler, self.num_steps)
         tolerance = self.tolerance * float(torch.linalg.vector_norm(medium.box[1] - medium.box[0]))
-        if on_cpu and isinstance(medium, VoxelGrid):
+        if isinstance(medium, VoxelGrid):
             return eikonal_on_grid(rays, medium, 0.5 * float(medium.spacing.min()), tolerance, self.max_steps)[0]
-        if on_cpu and isinstance(medium, SdfGrid):
+        if isinstance(medium, SdfGrid):
             step = 2 * medium.shell / STEPS_PER_SHELL
             return eikonal_on_grid(rays, medium, step, tolerance, self.max_steps)[0]
         return march_adaptive(rays, medium, tolerance, self.max_steps)[0]

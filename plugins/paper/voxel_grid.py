@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Annotated
 
 import numpy as np
@@ -17,6 +18,7 @@ from nerfro.geometry.interpolation import neighbours, smooth, trilinear
 from nerfro.geometry.mesh import local_origin, require_inside
 from nerfro.geometry.occupancy import occupancy_fraction
 from nerfro.geometry.signed_distance import distance_to_set
+from nerfro.kernels.arrays import arrays
 from nerfro.kernels.available import require_bytes
 from nerfro.kernels.constants import constant
 from nerfro.media.base import Medium, Scalars, Vectors
@@ -127,6 +129,11 @@ class VoxelGrid(Medium):
     def with_indices(self, indices: Float[Tensor, "K"]) -> VoxelGrid:
         smoothing = self.smoothing_size, self.smoothing_sigma
         return self.from_occupancy(self.occupancy.cpu(), self.box.cpu(), float(indices), *smoothing).to(self.box.device)
+
+    @cached_property
+    def host_arrays(self) -> list[np.ndarray]:
+        """Table and clearance grid in the memory of the host."""
+        return arrays(self.table, self.clearance_grid)
 
     @property
     def spacing(self) -> Float[Tensor, "3"]:

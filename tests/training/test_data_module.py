@@ -87,11 +87,13 @@ def test_what_goes_wrong_in_the_thread_is_raised_where_the_batch_is_asked_for(ah
         one(2)
 
 
-@pytest.mark.parametrize(("width", "expected"), [(8, 2), (512, 3)])
-def test_the_thread_takes_one_core_from_torch_unless_matrices_are_large(width: int, expected: int) -> None:
+@pytest.mark.parametrize(("width", "available", "expected"), [(8, 3, 2), (512, 3, 3), (8, 16, 7), (512, 16, 16)])
+def test_torch_has_one_thread_less_and_at_most_seven_unless_matrices_are_large(
+    width: int, available: int, expected: int
+) -> None:
     threads, renderer = torch.get_num_threads(), Mock(spec=Renderer, modules=lambda: [torch.nn.Linear(width, width)])
     try:
-        torch.set_num_threads(3)
+        torch.set_num_threads(available)
         prefetcher = Prefetcher(
             lambda step: (torch.get_num_threads(), torch.is_grad_enabled()),
             spare_core=not multiplies_large_matrices(renderer),
@@ -99,7 +101,7 @@ def test_the_thread_takes_one_core_from_torch_unless_matrices_are_large(width: i
         assert prefetcher(0) == (1, False)
         assert torch.get_num_threads() == expected
         prefetcher.close()
-        assert torch.get_num_threads() == 3
+        assert torch.get_num_threads() == available
     finally:
         torch.set_num_threads(threads)
 

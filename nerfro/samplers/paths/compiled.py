@@ -24,7 +24,10 @@ _CAPACITY, _ROOM = 18, 8
 
 
 def snell_on_grid(rays: Rays, medium: SdfGrid, max_events: int, branching: Branching) -> SnellTrace:
-    """Evaluate `samplers.paths.snell.trace_interfaces` by the compiled kernel."""
+    """Evaluate `samplers.paths.snell.trace_interfaces` by the compiled kernel, on the CPU for rays on any device.
+
+    A GPU would need a million small operators of PyTorch for the rays of one training step.
+    """
     from nerfro.samplers.paths.snell_cpu import Settings, trace_snell
 
     solids = medium.packed()
@@ -41,7 +44,7 @@ def snell_on_grid(rays: Rays, medium: SdfGrid, max_events: int, branching: Branc
         parts.append((rest[again[0]], *again[1:]))
         order = np.argsort(np.concatenate([part[0] for part in parts]), kind="stable")
         parts = [tuple(np.concatenate(column)[order] for column in zip(*parts, strict=True))]
-    owner, *columns = (torch.from_numpy(column) for column in parts[0])
+    owner, *columns = (torch.from_numpy(column).to(rays.radii.device) for column in parts[0])
     positions, directions, s, body, surface, across, weight, num_vertices, num_events, exceeded = columns
     radii = rays.radii[owner] if branching.num_events else rays.radii
     path = Path.unbranched(positions, directions, s, num_vertices > 2, radii)

@@ -131,7 +131,7 @@ class Snell(PathSampler):
                     "mesh, or set sampler.path.interface=sdf"
                 )
             return _trace_triangles(rays, medium, self.max_events, branching)
-        if isinstance(medium, SdfGrid) and rays.origins.device.type == "cpu":
+        if isinstance(medium, SdfGrid):
             return snell_on_grid(rays, medium, self.max_events, branching)
         return trace_interfaces(rays, medium, self.max_events, branching)
 
