@@ -30,8 +30,8 @@ _VALIDATIONS_PER_IMAGE = 5
 NO_IMAGE = -1
 # Weights of linear layers; the default field has 9,000, the networks of the paper 1.2 million.
 _LARGE = 100_000
-# Threads of PyTorch beside the tracing thread, for networks without large layers. A step on 16 threads took 1.6 times as
-# long as on 8 (docs/lab/threads.md).
+# Threads of PyTorch beside the tracing thread, for networks without large layers. A step on 16 threads took 1.6 times
+# as long as on 8 (docs/lab/threads.md).
 _MOST_THREADS = 7
 
 
