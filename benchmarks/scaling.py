@@ -1,6 +1,6 @@
 """Measure how the cost of training and rendering grows, with a separate process for each row.
 
-    python benchmarks/scaling.py [--steps 300] [--psnr 26] [AXIS=VALUE,VALUE ...]
+    python benchmarks/scaling.py [--steps 300] [--psnr 22] [AXIS=VALUE,VALUE ...]
 
 AXIS is `pixels` (per side of an image), `views`, `bodies` (one inside the other) or `threads`; each varies while the
 others keep their first value. Images of the embedded scene are scaled, and repeated for more than 100 views. Prints a
@@ -20,9 +20,10 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from datetime import date
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import lightning.pytorch as pl
 import numpy as np
@@ -32,10 +33,12 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 from training import SCENE, Training, write_images
 
+import nerfro
 from nerfro.evaluation.render_view import render_view
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.registry import build
 from nerfro.subdivision import Subdivision
+from nerfro.training.module import TrainingModule
 from nerfro.training.validation import ValidationPixels
 from nerfro.types import Batch
 
@@ -55,14 +58,15 @@ COSTS = {
 Costs = dict[str, float | None]
 FIGURE = Path(__file__).resolve().parent.parent / "docs" / "images" / "scaling.png"
 EVERY = 20  # steps between two measurements of the PSNR
+STEPS = 40  # whose median time is reported
 RENDERED = 128  # pixels per side of the view whose rendering is measured
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
     parser.add_argument("axes", nargs="*", metavar="AXIS=VALUE,VALUE")
-    parser.add_argument("--steps", type=int, default=300, help="of training")
-    parser.add_argument("--psnr", type=float, default=26.0, help="that training has to reach on test views, dB")
+    parser.add_argument("--steps", type=int, default=300, help="of the training to a PSNR, at most")
+    parser.add_argument("--psnr", type=float, default=22.0, help="that training has to reach on test views, dB")
     parser.add_argument("--figure", type=Path, default=FIGURE)
     parser.add_argument("--options", nargs="+", default=[], help="of nerfro.train, for all rows")
     parser.add_argument("--measure", help=argparse.SUPPRESS)  # one row, in a process of its own
@@ -132,41 +136,46 @@ def write_bodies(folder: Path, count: int) -> list[str]:
 
 
 class Quality(pl.Callback):
-    """Measure the PSNR of test pixels every `EVERY` steps.
+    """Stop when the PSNR of test pixels reaches a goal; it is measured every `EVERY` steps.
 
     Attributes:
-        reached: number of steps after which the PSNR reached the goal; None if it did not.
+        seconds: time until the goal without the measurements; None if the goal was not reached.
     """
 
-    def __init__(self, training: Training, pixels: ValidationPixels, goal: float) -> None:
-        self.training, self.pixels, self.goal = training, pixels, goal
-        self.reached: int | None = None
+    def __init__(self, pixels: ValidationPixels, goal: float, clock: Callable[[], float]) -> None:
+        self.pixels, self.goal, self.clock, self.start = pixels, goal, clock, clock()
+        self.seconds: float | None = None
 
     def on_train_batch_end(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Batch, batch_idx: int
     ) -> None:
-        if self.reached is None and (batch_idx + 1) % EVERY == 0:
+        if (batch_idx + 1) % EVERY == 0:
+            now = self.clock()
             with torch.no_grad():
-                psnr = self.pixels.psnr(self.training.renderer, Subdivision())
+                psnr = self.pixels.psnr(cast(TrainingModule, pl_module).renderer, Subdivision())
             if float(psnr) >= self.goal:
-                self.reached = batch_idx + 1
+                self.seconds, trainer.should_stop = now - self.start, True
+            self.start += self.clock() - now
 
 
 def measure(overrides: list[str], steps: int, psnr: float, by_clock: bool, begun: float) -> Costs:
-    """Measure the costs of one training and of rendering one view."""
+    """Measure the costs of steps, of rendering one view, and of a whole training with all phases."""
+    clock = time.perf_counter if by_clock else time.process_time
     training = Training(*overrides)
     training.run(1)
     costs: Costs = {"first step": time.time() - begun if by_clock else time.process_time()}
+    timed = training.run(STEPS)
+    costs["step"] = 1e3 * float(np.median(timed.seconds if by_clock else timed.processor))
     test = build(training.config.data).load("test")
-    quality = Quality(training, ValidationPixels.of(test), psnr)
-    timed = training.run(steps, callbacks=[quality])
-    per_step = float(np.median(timed.seconds if by_clock else timed.processor))
-    costs["step"] = 1e3 * per_step
-    costs["quality"] = None if quality.reached is None else quality.reached * per_step
-    cameras, clock = test.cameras.resized(RENDERED, RENDERED), time.perf_counter if by_clock else time.process_time
-    render_view(training.renderer, cameras, 0, Subdivision())  # compiles
+    module, data = nerfro.build(overrides=[*overrides, "evaluation.every=0"])
+    quality = Quality(ValidationPixels.of(test), psnr, clock)
+    quiet = dict.fromkeys(("logger", "enable_checkpointing", "enable_progress_bar", "enable_model_summary"), False)
+    pl.Trainer(max_steps=steps, callbacks=[quality], accelerator="cpu", **quiet).fit(module, datamodule=data)
+    costs["quality"] = quality.seconds
+    cameras = test.cameras.resized(RENDERED, RENDERED)
+    render_view(module.renderer, cameras, 0, Subdivision())  # compiles
     start = clock()
-    render_view(training.renderer, cameras, 0, Subdivision())
+    render_view(module.renderer, cameras, 0, Subdivision())
     costs["render"] = (clock() - start) * 1e6 / RENDERED**2
     costs["memory"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     return costs
