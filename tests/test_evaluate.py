@@ -88,7 +88,6 @@ def test_damaged_picture_is_told_before_anything_is_scored(
         (["predictions=a", "references=b", "root=c"], "root=c has no effect with predictions=...; remove it"),
         (["predictions=a", "references=b", "split=val"], "split=val has no effect with predictions=...; remove it"),
         (["predictions=a", "references=b", "alpha=red"], "alpha='red' is not allowed; choose 'drop', 'white', 'black'"),
-        (["predictions=/nowhere", "references=b"], "predictions=/nowhere is not a folder"),
     ],
 )
 def test_contradictions_are_refused_in_one_line(arguments: list[str], message: str, evaluate_here: Runner) -> None:

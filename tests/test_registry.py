@@ -114,7 +114,6 @@ def test_unknown_field_of_a_lightning_object_is_refused() -> None:
 @pytest.mark.parametrize(
     ("losses", "message"),
     [
-        ({"photometrc": {}}, "no loss is called 'photometrc'; known: backdrop, .*photometric, smoothness"),
         (
             {"photometric": {"weigth": 1}},
             "loss=photometric: Key 'weigth' not in 'PhotometricConfig'; its fields: coarse",
