@@ -17,6 +17,7 @@ from functools import partial
 
 import torch
 from torch import Tensor, nn
+from tracing import fastest
 
 from nerfro.boundaries import cube_map
 from nerfro.boundaries.envmap import EnvironmentMap
@@ -160,14 +161,8 @@ def drawing_tasks(num_rays: int) -> list[tuple[str, Task, Task]]:
 
 def report(label: str, reference: Task, compiled: Task, rounds: int, clock: Callable[[], float]) -> None:
     """Print a table row; both tasks run once before they are timed."""
-    fastest = [float("inf"), float("inf")]
-    for turn in range(rounds + 1):
-        for side, task in enumerate((reference, compiled)):
-            start = clock()
-            task()
-            if turn > 0:
-                fastest[side] = min(fastest[side], 1e3 * (clock() - start))
-    print(f"| {label} | {fastest[0]:.2f} | {fastest[1]:.2f} | {fastest[0] / fastest[1]:.1f}x |", flush=True)
+    slow, fast = (1e3 * seconds for seconds in fastest([reference, compiled], rounds + 1, clock))
+    print(f"| {label} | {slow:.2f} | {fast:.2f} | {slow / fast:.1f}x |", flush=True)
 
 
 if __name__ == "__main__":

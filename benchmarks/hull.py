@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import trimesh
 from capture import read_cameras, similarity, volume_overlap
 from jaxtyping import Float
 
@@ -19,6 +18,7 @@ from nerfro.paths import resolve_path
 from nerfro.registry import discover, find
 from nerfro.samplers.paths.snell import Snell
 from nerfro.silhouettes.silhouettes import pixel_stride
+from tests.exact_silhouettes import volume
 
 _MARGIN_SHARE = 0.15
 _MAX_PIXELS = 160
@@ -77,7 +77,7 @@ def measure(mesh: TriangleMesh, true: TriangleMesh, views: Views, ior: float) ->
     tilt, area = normal_errors(mesh, exact)
     return {
         "volume, intersection over union": volume_overlap(mesh, true),
-        "volume, ratio": _volume(mesh) / _volume(true),
+        "volume, ratio": volume(mesh) / volume(true),
         "normals, mean error in degrees": float((tilt * area).sum() / area.sum()),
         "exit directions, median error in degrees": float(np.median(error)),
         "exit directions, mean error in degrees": float(error.mean()),
@@ -94,13 +94,8 @@ def normal_errors(mesh: TriangleMesh, exact: SdfGrid) -> tuple[Float[np.ndarray,
 
 def _medium(mesh: TriangleMesh, box: Float[np.ndarray, "2 3"], ior: float) -> SdfGrid:
     with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "mesh.ply"
-        trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(file)
+        mesh.save(file := Path(folder) / "mesh.ply")
         return SdfGrid(str(file), ior, box_min=box[0].tolist(), box_max=box[1].tolist(), cache=False)
-
-
-def _volume(mesh: TriangleMesh) -> float:
-    return float(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).volume)
 
 
 def _degrees(first: Float[np.ndarray, "N 3"], second: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N"]:

@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 import torch
 import trimesh
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from tracing import BOX, EULER, N_BALL, RADIUS, angles, exits, grid_distances, make_rays, view
+from concept_figures import IMAGES, canvas
+from tracing import BOX, EULER, FAR, N_BALL, NEAR, RADIUS, exits, grid_distances, view
 
 from nerfro.cameras import central_window
 from nerfro.evaluation.path_plot import plot_paths
@@ -25,10 +24,16 @@ from nerfro.samplers.paths.snell import Snell
 from nerfro.subdivision import part_rays
 from nerfro.types import Path as RayPath
 from nerfro.types import Rays
-from tests.closed_forms import RoundedBox
+from tests.closed_forms import RoundedBox, angle, ball_exits, make_rays
 from tests.paper import Eikonal, VoxelGrid
 
-IMAGES = Path(__file__).resolve().parent.parent / "docs" / "images"
+TILT = np.radians(33)
+SLANTED = np.array([[np.cos(TILT), np.sin(TILT), 0.0]])
+
+
+def beam_at(heights: np.ndarray) -> Rays:
+    """Parallel rays along x through the ball."""
+    return make_rays(np.stack([0 * heights - 4, heights, 0 * heights], -1), [[1.0, 0, 0]] * len(heights), 0.0, 12.0)
 
 
 def main() -> None:
@@ -55,11 +60,8 @@ def main() -> None:
 
 def draw_light(folder: Path, side: int) -> None:
     """Light that splits, is absorbed and disperses: paths, and an empty cube under the torus scene's sky."""
-    heights = np.linspace(-0.7, 0.7, 7)
-    beam = make_rays(np.stack([0 * heights - 4, heights, 0 * heights], -1), np.tile([[1.0, 0, 0]], (7, 1)), 0.0, 12.0)
-    tilt = np.radians(33)
-    slanted = np.array([[np.cos(tilt), np.sin(tilt), 0.0]])
-    into_cube = make_rays(-4 * slanted + 0.1, slanted, 0.0, 12.0)
+    beam = beam_at(np.linspace(-0.7, 0.7, 7))
+    into_cube = make_rays(-4 * SLANTED + 0.1, SLANTED, 0.0, 12.0)
     splitting = Snell(branches="all", least_weight=0.002)
     clear, green, flint = (
         cube_of_distances(**options)
@@ -86,8 +88,7 @@ def draw_light(folder: Path, side: int) -> None:
         }),
     }  # fmt: skip
     for name, (path, medium, shown) in pictures.items():
-        figure = Figure(figsize=(3.6 * (1 + len(shown)), 3.9), layout="constrained")
-        FigureCanvasAgg(figure)
+        figure = canvas(3.6 * (1 + len(shown)), 3.9)
         axes = figure.subplots(1, 1 + len(shown))
         plot_paths(axes[0], path, medium)
         for panel, (title, image) in zip(axes[1:], shown.items(), strict=True):
@@ -119,18 +120,18 @@ def picture(sampler: Snell, medium: SdfGrid, side: int, parts: int = 3) -> np.nd
 
 def draw_paths(voxels: VoxelGrid, file: Path) -> None:
     """A beam through a ball and a cube by Snell's law, and through the ball by the paper's tracker."""
-    figure = Figure(figsize=(13, 4.6), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = canvas(13, 4.6)
     axes = figure.subplots(1, 3)
-    heights = np.linspace(-0.78, 0.78, 19)
-    beam = make_rays(np.stack([0 * heights - 4, heights, 0 * heights], -1), np.tile([[1.0, 0, 0]], (19, 1)), 0.0, 12.0)
-    tilt = np.radians(33)
-    slanted = np.array([[np.cos(tilt), np.sin(tilt), 0.0]])
-    offsets = np.linspace(-0.55, 0.3, 8)[:, None] * np.array([[-np.sin(tilt), np.cos(tilt), 0.0]])
-    into_cube = make_rays(offsets - 4 * slanted, np.repeat(slanted, 8, 0), 0.0, 12.0)
+    beam = beam_at(np.linspace(-0.78, 0.78, 19))
+    offsets = np.linspace(-0.55, 0.3, 8)[:, None] * np.array([[-np.sin(TILT), np.cos(TILT), 0.0]])
+    into_cube = make_rays(offsets - 4 * SLANTED, np.repeat(SLANTED, 8, 0), 0.0, 12.0)
     panels: list[tuple[str, Medium, RayPath]] = [
         ("snell, ball of n 1.5", Ball(RADIUS, N_BALL).double(), Snell()(beam, Ball(RADIUS, N_BALL).double())),
-        ("euler, 768 steps, 256^3 voxels", voxels, Eikonal("euler", 768)(_between(beam, 2.0, 6.0), voxels)),
+        (
+            "euler, 768 steps, 256^3 voxels",
+            voxels,
+            Eikonal("euler", 768)(make_rays(beam.origins, beam.directions, NEAR, FAR), voxels),
+        ),
         ("snell, rounded cube of n 1.52", RoundedBox().double(), Snell()(into_cube, RoundedBox().double())),
     ]
     for panel, (title, medium, path) in zip(axes, panels, strict=True):
@@ -141,17 +142,15 @@ def draw_paths(voxels: VoxelGrid, file: Path) -> None:
 
 def draw_errors(voxels: VoxelGrid, file: Path, resolution: int) -> None:
     """Error of the exit direction against the impact parameter."""
-    figure = Figure(figsize=(7.5, 4.6), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = canvas(7.5, 4.6)
     axes = figure.subplots()
     share = np.linspace(0.01, 0.99, 400)
     turn = np.random.default_rng(0).normal(size=(400, 3))
     turn /= np.linalg.norm(turn, axis=1, keepdims=True)
     side = np.cross(turn, np.random.default_rng(1).normal(size=(400, 3)))
     side /= np.linalg.norm(side, axis=1, keepdims=True)
-    deviation = 2 * (np.arcsin(share) - np.arcsin(share / N_BALL))[:, None]
-    exact = torch.from_numpy(turn * np.cos(deviation) - side * np.sin(deviation))
-    rays = make_rays(side * share[:, None] * RADIUS - 4 * turn, turn)
+    rays = make_rays(side * share[:, None] * RADIUS - 4 * turn, turn, NEAR, FAR)
+    exact = ball_exits(rays, RADIUS, N_BALL)
     spacing = 3 / (resolution - 1)
     distances = grid_distances(Ball(RADIUS).double(), resolution)
     curves = [
@@ -164,7 +163,7 @@ def draw_errors(voxels: VoxelGrid, file: Path, resolution: int) -> None:
     curves.append(("snell, signed distance", exits(Snell(), solid)))
     curves.append(("snell, analytic", exits(Snell(), Ball(RADIUS, N_BALL).double())))
     for name, trace in curves:
-        axes.semilogy(share, angles(trace(rays), exact).clip(1e-6), ".", markersize=3, label=name)
+        axes.semilogy(share, angle(trace(rays), exact).clip(1e-6), ".", markersize=3, label=name)
     axes.axhline(0.1, color="grey", linewidth=0.8)
     axes.text(1.0, 0.07, "one pixel of 400", color="grey", fontsize=8, ha="right", va="top")
     axes.set_xlabel("impact parameter b / R")
@@ -172,10 +171,6 @@ def draw_errors(voxels: VoxelGrid, file: Path, resolution: int) -> None:
     axes.set_title(f"Glass ball, R {RADIUS}, n {N_BALL}, {resolution}^3 grids")
     axes.legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 0.04))
     figure.savefig(file, dpi=90)
-
-
-def _between(rays: Rays, near: float, far: float) -> Rays:
-    return make_rays(rays.origins.numpy(), rays.directions.numpy(), near, far)
 
 
 if __name__ == "__main__":

@@ -11,8 +11,10 @@ import argparse
 import math
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,7 +27,7 @@ from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball
 from nerfro.samplers.paths.snell import Snell
 from nerfro.types import Rays
-from tests.closed_forms import RoundedBox
+from tests.closed_forms import RoundedBox, angle, ball_exits, make_rays
 from tests.paper import Eikonal, VoxelGrid
 
 RADIUS, N_BALL = 0.8, 1.5
@@ -86,10 +88,8 @@ def sphere_errors(voxels: VoxelGrid, mesh_ball: SdfGrid, resolution: int, num: i
     u = np.cross(d, generator.normal(size=(num, 3)))
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     share = np.linspace(0, 0.95, num)
-    deviation = 2 * (np.arcsin(share) - np.arcsin(share / N_BALL))[:, None]
-    exact = torch.from_numpy(d * np.cos(deviation) - u * np.sin(deviation))
-    rays = make_rays(u * share[:, None] * RADIUS - 4 * d, d)
-
+    rays = make_rays(u * share[:, None] * RADIUS - 4 * d, d, NEAR, FAR)
+    exact = ball_exits(rays, RADIUS, N_BALL)
     analytic = Ball(RADIUS, N_BALL).double()
     exact_grid = SdfGrid.from_distances(grid_distances(analytic, resolution), BOX, [N_BALL], mesh_ball.shell)
     rows: list[tuple[str, Trace, tuple[float, ...] | None]] = [
@@ -109,7 +109,7 @@ def sphere_errors(voxels: VoxelGrid, mesh_ball: SdfGrid, resolution: int, num: i
     print("| sampler | " + " | ".join(name for name, _, _ in BINS) + " | bound on the median | met |")
     print("|---|---|---|---|---|---|")
     for name, trace, bounds in rows:
-        error = angles(trace(rays), exact)
+        error = angle(trace(rays), exact).numpy()
         chosen = [error[(share >= low) & (share < high)] for _, low, high in BINS]
         cells = [f"{np.median(part):.4f} ({part.max():.3f})" for part in chosen]
         met = "" if bounds is None else verdict(all(np.median(p) <= b for p, b in zip(chosen, bounds, strict=True)))
@@ -132,12 +132,11 @@ def cube_errors(mesh_cube: SdfGrid, resolution: int, num: int) -> None:
     traces = [
         [trace_rounded_cube(p, q, *shape) for p, q in zip(start, d, strict=True)] for start in (x, x + side, x - side)
     ]
-    exact, beside, opposite = (np.stack([direction for direction, _ in trace]) for trace in traces)
+    exact, beside, opposite = (torch.tensor(np.stack([direction for direction, _ in trace])) for trace in traces)
     bounces = np.array([[count for _, count in trace] for trace in traces])
     same = (bounces == bounces[0]).all(0) & (bounces[0] >= 0) & (bounces[0] <= 3)
-    moved = np.maximum(angles(torch.from_numpy(beside), torch.from_numpy(exact)),
-                       angles(torch.from_numpy(opposite), torch.from_numpy(exact)))  # fmt: skip
-    sound = same & (moved < 0.5)
+    moved = torch.maximum(angle(beside, exact), angle(opposite, exact))
+    sound = same & (moved < 0.5).numpy()
     rays = make_rays(x, d, near=0.0, far=14.0)  # reflected paths are long
     analytic = RoundedBox(HALF_SIDE, EDGE, N_CUBE).double()
     grid = SdfGrid.from_distances(grid_distances(analytic, resolution), BOX, [N_CUBE], mesh_cube.shell)
@@ -154,7 +153,7 @@ def cube_errors(mesh_cube: SdfGrid, resolution: int, num: int) -> None:
         ("snell, mesh", exits(Snell("mesh"), mesh_cube)),
         (f"eikonal, {resolution}^3 signed distance", exits(Eikonal(), grid)),
     ):
-        error = angles(trace(rays), torch.from_numpy(exact))[sound]
+        error = angle(trace(rays), exact).numpy()[sound]
         median, high = np.median(error), np.quantile(error, 0.95)
         met = verdict(median <= 0.02 and high <= 0.5) if name.startswith("snell") else ""
         bound = "0.02 / 0.5" if name.startswith("snell") else ""
@@ -179,13 +178,7 @@ def speed(baselines: list[VoxelGrid], solids: dict[str, SdfGrid], side: int) -> 
             ("eikonal", exits(Eikonal(), solid), 10.0),
             ("snell", exits(Snell(), solid), 20.0),
         ]
-        best = [math.inf] * len(rows)
-        for _ in range(4):  # the first pass warms up; it can only be slower
-            for i, (_, trace, _) in enumerate(rows):
-                start = time.perf_counter()
-                for first in range(0, len(rays), CHUNK):
-                    trace(rays[first : first + CHUNK])
-                best[i] = min(best[i], time.perf_counter() - start)
+        best = fastest([partial(trace_all, trace, rays) for _, trace, _ in rows], 4, time.perf_counter)
         baseline = min(best[: len(baselines)])
         for (name, _, bound), seconds in zip(rows, best, strict=True):
             ratio = baseline / seconds
@@ -202,35 +195,44 @@ def branches(solids: dict[str, SdfGrid], side: int) -> None:
     print("| object | branches, least weight | paths a ray that meets it | ms | million rays/s | against one path |")
     print("|---|---|---|---|---|---|")
     rays = view(side).image_rays(0)
-    chunks = [rays[first : first + CHUNK] for first in range(0, len(rays), CHUNK)]
     ways = {"none": Snell(), "first, 0.02": Snell(branches="first")}
     ways |= {f"all, {least}": Snell(branches="all", least_weight=least) for least in (0.05, 0.02, 0.005)}
     for scene, solid in solids.items():
-        best = dict.fromkeys(ways, math.inf)
-        for _ in range(4):
-            for name, sampler in ways.items():
-                start = time.process_time()
-                for chunk in chunks:
-                    sampler(chunk, solid)
-                best[name] = min(best[name], time.process_time() - start)
-        for name, sampler in ways.items():
-            met = torch.cat([path.ray[path.refracted] + CHUNK * i for i, path in
-                             enumerate(sampler(chunk, solid) for chunk in chunks)])  # fmt: skip
-            ratio = best[name] / best["none"]
+        traces = [partial(sampler, medium=solid) for sampler in ways.values()]
+        best = fastest([partial(trace_all, trace, rays) for trace in traces], 4, time.process_time)
+        for name, trace, seconds in zip(ways, traces, best, strict=True):
+            met = torch.cat([path.ray[path.refracted] + CHUNK * i for i, path in enumerate(in_chunks(trace, rays))])
             paths = len(met) / len(met.unique())
-            cost = f"{1e3 * best[name]:.0f} | {1e-6 * len(rays) / best[name]:.2f}"
-            print(f"| {scene} | {name} | {paths:.2f} | {cost} | {ratio:.2f}x |", flush=True)
+            cost = f"{1e3 * seconds:.0f} | {1e-6 * len(rays) / seconds:.2f}"
+            print(f"| {scene} | {name} | {paths:.2f} | {cost} | {seconds / best[0]:.2f}x |", flush=True)
+
+
+def in_chunks(trace: Callable[[Rays], Any], rays: Rays) -> Iterator[Any]:
+    """Trace rays as in evaluation, not all at once."""
+    for first in range(0, len(rays), CHUNK):
+        yield trace(rays[first : first + CHUNK])
+
+
+def trace_all(trace: Callable[[Rays], object], rays: Rays) -> None:
+    """Trace rays and keep nothing."""
+    for _ in in_chunks(trace, rays):
+        pass
+
+
+def fastest(tasks: Sequence[Callable[[], object]], turns: int, clock: Callable[[], float]) -> list[float]:
+    """Return the seconds of each task in its fastest turn; the first turn, which may compile, can only be slower."""
+    best = [math.inf] * len(tasks)
+    for _ in range(turns):
+        for number, task in enumerate(tasks):
+            start = clock()
+            task()
+            best[number] = min(best[number], clock() - start)
+    return best
 
 
 def exits(sampler: Eikonal | Snell, medium: torch.nn.Module) -> Trace:
     """Exit directions by a sampler."""
     return lambda rays: sampler(rays, medium).exit_directions
-
-
-def make_rays(origins: np.ndarray, directions: np.ndarray, near: float = NEAR, far: float = FAR) -> Rays:
-    """Rays in double precision."""
-    ones = torch.ones(len(origins), dtype=torch.float64)
-    return Rays(torch.from_numpy(origins), torch.from_numpy(directions), 0 * ones, near * ones, far * ones)
 
 
 def grid_distances(shape: Ball | RoundedBox, resolution: int) -> Tensor:
@@ -279,12 +281,6 @@ def view(side: int) -> Cameras:
     pose = torch.from_numpy(np.stack([x, np.cross(z, x), z, 4.03 * z], -1)[None]).float()
     focal, centre = torch.tensor([0.5 * side / math.tan(0.5 * 0.6911)]), torch.tensor([side / 2])
     return Cameras(pose, focal, focal, centre, centre, side, side, NEAR, FAR)
-
-
-def angles(a: Tensor, b: Tensor) -> np.ndarray:
-    """Angles between unit vectors in degrees, exact for small ones."""
-    half_chord = 0.5 * torch.linalg.vector_norm(a.double() - b.double(), dim=-1)
-    return torch.rad2deg(2 * torch.asin(half_chord.clamp(max=1))).numpy()
 
 
 def verdict(met: bool) -> str:

@@ -13,14 +13,12 @@ from pathlib import Path
 import numpy as np
 import torch
 import trimesh
-from torch import Tensor
-from torch.nn.functional import normalize
 
 from nerfro.media.sdf_grid import SdfGrid
-from nerfro.media.solid import Solid
 from nerfro.media.vessel import SdfVessel
 from nerfro.rays import Rays
 from nerfro.samplers.paths.snell import Snell
+from tests.closed_forms import angle, make_rays
 
 # A drinking glass in millimetres, and the world unit.
 HEIGHT, RADIUS_BELOW, RADIUS_ABOVE, WALL, FOOT, LEVEL = 120.0, 30.0, 38.0, 2.5, 10.0, 80.0
@@ -65,7 +63,7 @@ def main() -> None:
             "level higher by 5 mm": vessel(level=LEVEL + 5),
             "wall of 1.52": vessel(ior=1.52),
         }.items():
-            errors = angles(medium, rays, told.exit_directions)
+            errors = angle(Snell()(rays, medium).exit_directions, told.exit_directions)
             parts = (f"{errors[part].median():8.2f}{(errors[part] > 1).double().mean():7.0%}" for part in (wet, dry))
             print(f"{name:24}{''.join(parts)}")
 
@@ -80,16 +78,7 @@ def rays_at(count: int) -> Rays:
     targets = torch.stack(
         [wide * (6.28 * other).cos(), wide * (6.28 * other).sin(), (2 * z - 1) * 0.5 * HEIGHT / MILLIMETRES], -1
     )
-    origins = 4.0 * eyes
-    ones = torch.ones(count, dtype=torch.float64)
-    return Rays(origins, normalize(targets - origins, dim=-1), 0.001 * ones, 0.5 * ones, 9.0 * ones)
-
-
-@torch.no_grad()
-def angles(medium: Solid, rays: Rays, expected: Tensor) -> Tensor:
-    """Between the directions in which rays leave a medium and others, degrees."""
-    found = Snell()(rays, medium).exit_directions
-    return torch.rad2deg(2 * torch.asin((0.5 * torch.linalg.vector_norm(found - expected, dim=-1)).clamp(max=1)))
+    return make_rays(4.0 * eyes, targets - 4.0 * eyes, 0.5, 9.0)
 
 
 if __name__ == "__main__":

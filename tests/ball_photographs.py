@@ -20,6 +20,7 @@ from nerfro.media.sdf_grid import SdfGrid
 from nerfro.samplers.paths.snell import Snell
 from nerfro.silhouettes.silhouettes import mesh_silhouettes
 from nerfro.types import Exits
+from tests.cameras_at import cameras_at
 from tests.closed_forms import grid_points
 
 SIZE, NUM_VIEWS, RADIUS, INNER = 40, 30, 0.7, 0.35
@@ -35,6 +36,14 @@ TRAINING = [
     "medium.ior=1.45",
 ]  # fmt: skip
 
+# Overrides of a reconstruction of these photographs, and of its trainings.
+RECONSTRUCTION = ["data=blender", "data.near=0.5", "medium.resolution=32", "preprocess=resolution=24"]
+RECONSTRUCTION_TRAINING = [
+    "evaluation.split=train", "evaluation.every=0", "evaluation.subdivision.side=1", "logger=none",
+    "trainer.accelerator=cpu", "trainer.max_time=null", "batches.size=64", "boundary.resolutions=[4,8]",
+    "field.num_levels=2", "field.log2_table_size=8", "sampler.points.num_samples=4", "sampler.points.resolution=16",
+]  # fmt: skip
+
 
 def cameras() -> Cameras:
     """Around the origin, looking at it."""
@@ -44,8 +53,7 @@ def cameras() -> Cameras:
     back = torch.stack([flat * turn.cos(), flat * turn.sin(), z], -1)
     right = normalize(torch.linalg.cross(torch.tensor([0.3, 0.9, 0.1]).expand_as(back), back), dim=-1)
     poses = torch.stack([right, torch.linalg.cross(back, right), back, 3 * back], -1)
-    focal, middle = torch.full((NUM_VIEWS,), 0.8 * SIZE), torch.full((NUM_VIEWS,), SIZE / 2)
-    return Cameras(poses, focal, focal, middle, middle, SIZE, SIZE, 0.5, 6.0)
+    return cameras_at(poses, SIZE, SIZE, 0.8 * SIZE, near=0.5)
 
 
 def soft_masks(mesh: TriangleMesh) -> Tensor:
@@ -93,6 +101,13 @@ def photographs_of(
 def mesh() -> TriangleMesh:
     made = trimesh.creation.icosphere(5, RADIUS)
     return TriangleMesh(made.vertices, made.faces)
+
+
+def save_with_masks(root: Path) -> None:
+    """Write photographs of a glass ball of index 1.45 like `save`, and masks of shares of pixels."""
+    save(photographs([1.45]), root)
+    for view, mask in enumerate(soft_masks(mesh())):
+        save_png(root / "masks" / "train" / f"r_{view}.png", mask[..., None].expand(-1, -1, 3))
 
 
 def save(views: Views, root: Path, place: tuple[float, ...] = (0, 0, 0)) -> None:

@@ -1,7 +1,7 @@
 """Media whose rays are known in closed form, and what tests of optics share. Lengths are in world units."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -114,6 +114,16 @@ def random_rays(num: int, width: float, seed: int, far: float) -> Rays:
 def angle(a: Tensor, b: Tensor) -> Tensor:
     """Angle between unit vectors in degrees, exact for small ones."""
     return torch.rad2deg(2 * torch.asin((0.5 * torch.linalg.vector_norm(a.double() - b.double(), dim=-1)).clamp(max=1)))
+
+
+def ball_exits(rays: Rays, radius: float, ior: float | Tensor, centre: Sequence[float] = (0, 0, 0)) -> Tensor:
+    """Directions of rays behind a ball, turned by 2 (i - t) with sin i = b / R and sin t = b / (n R)."""
+    origins = rays.origins - rays.origins.new_tensor(centre)
+    nearest = origins - (origins * rays.directions).sum(-1, keepdim=True) * rays.directions
+    impact = torch.linalg.vector_norm(nearest, dim=-1, keepdim=True)
+    sine = torch.where(impact < radius, impact / radius, 0.0)
+    turn = 2 * (torch.asin(sine) - torch.asin(sine / ior))
+    return turn.cos() * rays.directions - turn.sin() * nearest / impact.clamp(min=1e-12)
 
 
 def luneburg(x: Tensor) -> tuple[Tensor, Tensor]:

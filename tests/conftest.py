@@ -137,19 +137,6 @@ def _seed() -> None:
     torch.manual_seed(0)
 
 
-def _random_pose(seed: int) -> np.ndarray:
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.random(random_state=seed).as_matrix()
-    pose[:3, 3] = np.random.default_rng(seed).normal(size=3)
-    return pose
-
-
-@pytest.fixture
-def random_pose() -> Callable[[int], np.ndarray]:
-    """Camera-to-world matrix [4, 4] of a seed, with any orientation."""
-    return _random_pose
-
-
 @pytest.fixture(scope="session")
 def mitsuba() -> ModuleType:
     """Mitsuba with its fastest variant; tests are skipped where only the scalar variant works, which takes minutes."""
@@ -181,8 +168,11 @@ class Finished(NamedTuple):
         return lines[0]
 
 
+Runner = Callable[..., Finished]  # runs a command, or one with some options, in this process
+
+
 @pytest.fixture
-def run_here(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Finished]:
+def run_here(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Runner:
     """Run a command's main in this process to its end, as in `run_here("train", "seed=1")`.
 
     The command must end with the exit code `code`, by default successfully; None permits any.
@@ -206,9 +196,7 @@ def run_here(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 
 
 @pytest.fixture
-def train_here(
-    unchecked: None, run_here: Callable[..., Finished], monkeypatch: pytest.MonkeyPatch
-) -> Callable[..., Finished]:
+def train_here(unchecked: None, run_here: Runner, monkeypatch: pytest.MonkeyPatch) -> Runner:
     """`python -m nerfro.train` in this process, without looking for LPIPS weights."""
     import nerfro.train
     from nerfro.evaluation.metrics import ImageMetrics
@@ -218,15 +206,19 @@ def train_here(
 
 
 @pytest.fixture
-def train(train_here: Callable[..., Finished], tiny_default_run: list[str], tmp_path: Path) -> Callable[..., Finished]:
+def train(train_here: Runner, tiny_default_run: list[str], tmp_path: Path) -> Runner:
     """Train the default experiment on the tiny scene in tmp_path/run."""
     return functools.partial(train_here, *tiny_default_run, f"hydra.run.dir={tmp_path / 'run'}")
 
 
 @pytest.fixture
-def evaluate_here(
-    unchecked: None, run_here: Callable[..., Finished], monkeypatch: pytest.MonkeyPatch
-) -> Callable[..., Finished]:
+def train_paper(train_here: Runner, tiny_run: list[str], tmp_path: Path) -> Runner:
+    """Train the paper's components on the tiny scene in tmp_path/run."""
+    return functools.partial(train_here, *tiny_run, f"hydra.run.dir={tmp_path / 'run'}")
+
+
+@pytest.fixture
+def evaluate_here(unchecked: None, run_here: Runner, monkeypatch: pytest.MonkeyPatch) -> Runner:
     """`python -m nerfro.evaluate` in this process, on the CPU and without looking for LPIPS weights."""
     import nerfro.evaluate
     from nerfro.evaluation.metrics import ImageMetrics
@@ -245,6 +237,13 @@ def train_in(folder: Path, *overrides: str) -> Path:
         patch.setattr(sys, "argv", ["nerfro.train", *overrides, f"hydra.run.dir={folder}"])
         nerfro.train.main()
     return folder
+
+
+def weights_of(run: Path) -> dict[str, torch.Tensor]:
+    """The weights in the last checkpoint of a run."""
+    from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
+
+    return load_checkpoint(run / LAST_CHECKPOINT)[0]["state_dict"]
 
 
 UTM = (345678.0, 5234567.0, 120.0)  # typical coordinates of georeferenced data

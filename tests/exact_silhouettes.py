@@ -11,6 +11,7 @@ from nerfro.data.base import Views
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.silhouettes.silhouettes import mesh_silhouettes
 from nerfro.silhouettes.visual_hull import Silhouettes, carve_mesh, find_box
+from tests.cameras_at import cameras_at
 
 
 def cameras_around(count: int, size: int, distance: float = 4.0, focal: float = 1.4, spread: float = 1.0) -> Cameras:
@@ -21,9 +22,7 @@ def cameras_around(count: int, size: int, distance: float = 4.0, focal: float = 
     right = np.cross([0.3, 0.9, 0.1], back)
     right /= np.linalg.norm(right, axis=-1, keepdims=True)
     poses = np.stack([right, np.cross(back, right), back, distance * back], -1)
-    ones = torch.ones(count)
-    pixels = focal * size * ones
-    return Cameras(torch.from_numpy(poses).float(), pixels, pixels, size / 2 * ones, size / 2 * ones, size, size, 1, 9)
+    return cameras_at(poses, size, size, focal * size, near=1.0, far=9.0)
 
 
 def photographed(mesh: trimesh.Trimesh, cameras: Cameras) -> Silhouettes:

@@ -3,6 +3,8 @@
 from importlib import import_module
 
 from nerfro.registry import discover
+from nerfro.rendering import Components
+from tests.closed_forms import Luneburg
 
 discover()
 paper = import_module("nerfro_plugins.paper")
@@ -19,3 +21,14 @@ Linear, positional_encoding = paper.linear.Linear, paper.encoding.positional_enc
 integrated_positional_encoding = paper.encoding.integrated_positional_encoding
 Smoothness, tile_roughness = paper.smoothness.Smoothness, paper.smoothness.tile_roughness
 VoxelGrid, gradient = paper.voxel_grid.VoxelGrid, paper.voxel_grid.gradient
+
+
+def small_components() -> Components:
+    """Small components of the paper's model, around a Luneburg lens."""
+    return Components(
+        medium=Luneburg(),
+        path_sampler=Eikonal("euler", 64),
+        point_sampler=Hierarchical(8, 8),
+        make_field=lambda: NerfField(width=16, depth=2, skip=1, view_width=8),
+        boundary=Skybox(width=8),
+    )

@@ -1,13 +1,11 @@
 """Which values annotations allow: in constructors, in configurations, and how the others are refused."""
 
 import math
-from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 import pytest
-from omegaconf import OmegaConf
 
-from nerfro.allowed import AnyNumber, Count, NotNegative, Positive, Range, check_settings, checked, corners_of_box
+from nerfro.allowed import AnyNumber, Count, Positive, Range, checked, corners_of_box
 from nerfro.registry import create, discover, find
 from tests.conftest import refused
 
@@ -46,31 +44,6 @@ def test_what_is_allowed_passes() -> None:
 )
 def test_what_is_not_allowed_is_refused(arguments: dict[str, object], message: str) -> None:
     refused(message, Thing, **{"count": 1, **arguments})
-
-
-@dataclass
-class Inner:
-    share: NotNegative = 0.5
-
-
-@dataclass
-class Outer:
-    size: Count = 3
-    inner: Inner = field(default_factory=Inner)
-
-
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("size=0", "^size=0 is not allowed; take at least 1"),
-        ("inner.share=.nan", r"^inner\.share=nan is not allowed; take at least 0"),
-    ],
-)
-def test_setting_of_a_configuration_is_named_in_full(override: str, message: str) -> None:
-    config = OmegaConf.structured(Outer)
-    check_settings(config, Outer)
-    config.merge_with_dotlist([override])
-    refused(message, check_settings, config, Outer)
 
 
 MESH = "embedded:torus/mesh.ply"

@@ -11,6 +11,7 @@ import pytest
 import trimesh
 from PIL import Image
 
+from tests.conftest import Runner
 from tests.data.formats import change_json
 
 
@@ -67,12 +68,11 @@ DAMAGES: dict[str, tuple[Callable[[Path], object], list[str]]] = {
 
 
 @pytest.fixture
-def require_refusal(train_here: Callable[..., Any], tiny_run: list[str], tmp_path: Path) -> Callable[..., None]:
+def require_refusal(train_paper: Runner, tmp_path: Path) -> Callable[..., None]:
     """Require that a training is refused with some words, before anything is written."""
 
     def require(words: list[str], *overrides: str) -> None:
-        options = ["trainer.max_steps=1", f"hydra.run.dir={tmp_path / 'run'}", *overrides]
-        refused = train_here(*tiny_run, *options, code=1).error
+        refused = train_paper("trainer.max_steps=1", *overrides, code=1).error
         for word in words:
             assert word in refused
         assert not list((tmp_path / "run").rglob("*"))
@@ -154,7 +154,7 @@ def test_mistake_on_the_command_line_is_told_in_one_line(
 
 
 def test_a_field_that_rays_miss_is_told_before_training(
-    train_here: Callable[..., Any], tiny_run: list[str], tmp_path: Path
+    train_here: Runner, tiny_run: list[str], tmp_path: Path
 ) -> None:
     sky = "boundary=skybox", "boundary.width=8"
     run = [text for text in tiny_run if text not in sky]
@@ -171,9 +171,7 @@ def test_a_field_that_rays_miss_is_told_before_training(
     assert "pass the field's box" not in train_here(*run, *whole, f"hydra.run.dir={tmp_path / 'whole'}").out
 
 
-def test_straight_rays_without_an_object_ask_for_the_box(
-    train: Callable[..., Any], tiny_scene: Path, tmp_path: Path
-) -> None:
+def test_straight_rays_without_an_object_ask_for_the_box(train: Runner, tiny_scene: Path, tmp_path: Path) -> None:
     root = tmp_path / "data"
     shutil.copytree(tiny_scene, root)
     (root / "mesh.ply").unlink()

@@ -5,25 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 
 from nerfro.cameras import Cameras, Window, central_window
 from nerfro.testing import example_draws
-
-
-def cameras_at(poses: np.ndarray, width: int, height: int, fx: float, fy: float, cx: float, cy: float) -> Cameras:
-    fill = lambda value: torch.full((len(poses),), value)  # noqa: E731
-    pose = torch.tensor(poses[:, :3], dtype=torch.float32)
-    return Cameras(pose, fill(fx), fill(fy), fill(cx), fill(cy), width, height, 2.0, 6.0)
+from tests.cameras_at import cameras_at, random_poses
 
 
 @pytest.fixture
 def cameras() -> Cameras:
     """Five cameras of any orientation, with unequal focal lengths and the principal point off centre."""
-    poses = np.tile(np.eye(4), (5, 1, 1))
-    poses[:, :3, :3] = Rotation.random(5, random_state=0).as_matrix()
-    poses[:, :3, 3] = np.random.default_rng(0).normal(size=(5, 3))
-    return cameras_at(poses, width=20, height=14, fx=15.0, fy=17.0, cx=9.2, cy=7.7)
+    return cameras_at(random_poses(5), width=20, height=14, fx=15.0, fy=17.0, cx=9.2, cy=7.7)
 
 
 def distance_to_ray(point: list[float], origin: torch.Tensor, direction: torch.Tensor) -> float:
@@ -34,9 +25,9 @@ def distance_to_ray(point: list[float], origin: torch.Tensor, direction: torch.T
 def test_ray_meets_the_point_that_is_projected_onto_its_pixel_by_hand():
     # From (0, 0, 4) along -z: (0.4, 0.2, 0) lies 4 in front, so it is seen at 32 + 100 * 0.4 / 4 = 42 from the left
     # and 24 - 100 * 0.2 / 4 = 19 from the top: the corner of pixel (19, 42).
-    pose = np.eye(4)[None]
+    pose = np.eye(4)[None, :3]
     pose[0, 2, 3] = 4
-    camera = cameras_at(pose, 64, 48, 100.0, 100.0, 32.0, 24.0)
+    camera = cameras_at(pose, 64, 48, 100.0)
     zero = torch.tensor([0])
     corner = camera.rays(zero, torch.tensor([19]), torch.tensor([42]), torch.zeros(1, 2))
     assert distance_to_ray([0.4, 0.2, 0.0], corner.origins[0], corner.directions[0]) < 1e-6
@@ -66,7 +57,7 @@ def test_points_on_rays_project_back_onto_their_pixels(cameras):
 
 
 def test_disc_of_the_radius_has_the_variance_of_the_pixel():
-    camera = cameras_at(np.eye(4)[None], 1, 1, 8.0, 8.0, 0.5, 0.5)
+    camera = cameras_at(np.eye(4)[None, :3], 1, 1, 8.0)
     radius = float(camera.image_rays(0).radii)
     # A disc of radius r has variance r^2 / 4 along an axis, a square of side w has w^2 / 12.
     assert radius**2 / 4 == pytest.approx((1 / 8) ** 2 / 12, rel=1e-6)

@@ -5,7 +5,7 @@ import math
 import re
 import shlex
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -19,6 +19,7 @@ from nerfro.data.blender import OpenCVData
 from nerfro.geometry.mesh import load_mesh
 from nerfro.registry import discover
 from nerfro.synthetic import synthesize
+from tests.conftest import Runner
 from tests.exact_silhouettes import overlaps_of_convex_body
 from tests.test_synthesize import configured
 
@@ -67,8 +68,8 @@ def test_from_photographs_to_a_table(
     request: pytest.FixtureRequest,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    run_here: Callable,
-    train_here: Callable,
+    run_here: Runner,
+    train_here: Runner,
 ) -> None:
     """The commands of docs/lab/simulated_capture.md as each prints the next, with few small photographs."""
     pytest.importorskip("pyapriltags")

@@ -6,7 +6,6 @@ import shlex
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -16,7 +15,8 @@ from nerfro.completion import completions
 from nerfro.options import Described, recall, remember
 from nerfro.paths import PACKAGE_DIR
 from nerfro.viewing.server import open_page
-from tests.conftest import refused
+from tests.conftest import Runner, refused
+from tests.processes import python
 
 DESCRIBED = Described(
     "All options.",
@@ -35,8 +35,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def start(*arguments: str) -> subprocess.CompletedProcess[str]:
     """Run `python -m nerfro.ARGUMENTS`, and list the imported modules on standard error."""
-    command = [sys.executable, "-X", "importtime", "-m", f"nerfro.{arguments[0]}", *arguments[1:]]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60)
+    return python("-X", "importtime", "-m", f"nerfro.{arguments[0]}", *arguments[1:])
 
 
 @pytest.mark.parametrize(
@@ -61,11 +60,7 @@ def test_help_version_and_mistakes_do_not_wait_for_torch(arguments: list[str], p
 @pytest.mark.parametrize(
     ("mistake", "message"),
     [
-        ("sed=1", "sed is not a setting; did you mean seed"),
-        ("+trainer.max_tim=5m", "trainer.max_tim is not a setting; did you mean max_time"),
         ("field=nref", "field=nref does not exist; did you mean nerf"),
-        ("experiment=glas", "experiment=glas does not exist; did you mean glass"),
-        ("field.widht=3", "field.widht is not a setting; did you mean width"),
         ("metric=psnr", "metric=psnr: all registered metrics are scored"),
         ("+metric=psnr", r"\+metric=psnr: all registered metrics are scored"),
     ],
@@ -85,14 +80,14 @@ def test_the_cache_ends_when_a_plugin_changes(cache: Path) -> None:
     assert recall("train") is None
 
 
-def test_a_missing_option_is_told_with_an_example(run_here: Callable, unchecked: None) -> None:
+def test_a_missing_option_is_told_with_an_example(run_here: Runner, unchecked: None) -> None:
     done = run_here("view", code=1)
     assert done.err == "nerfro: error: checkpoint=... is missing; for example: nerfro view checkpoint=outputs/first\n"
 
 
 def test_ctrl_c_during_the_imports_ends_in_one_line() -> None:
     program = "import sys, nerfro.startup\nsys.argv = ['x']\nnerfro.startup.begin('plugins')\nraise KeyboardInterrupt"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    done = python("-c", program)
     assert done.stderr == "nerfro: interrupted\n"
     assert done.returncode not in (0, 1)
 
@@ -119,7 +114,7 @@ def test_completion_of_commands_options_and_choices(
 
 
 def test_demo_opens_the_page_and_ends_with_the_score_in_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run_here: Callable
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run_here: Runner
 ) -> None:
     program = "import json, sys; print('much'); print('nerfro: the page: http://localhost:1', flush=True)\n"
     program += "folder = next(a for a in sys.argv if a.startswith('hydra.run.dir=')).partition('=')[2]\n"
@@ -165,10 +160,6 @@ COMMANDS = {file.stem for file in PACKAGE_DIR.glob("*.py") if "\n@entry_point" i
 }
 
 
-def run(*command: str | Path, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, *command], cwd=folder, capture_output=True, text=True, timeout=300)
-
-
 @pytest.fixture
 def script(tmp_path: Path) -> Path:
     """The console script, as pip writes it from pyproject.toml."""
@@ -181,7 +172,7 @@ def script(tmp_path: Path) -> Path:
 
 
 def test_every_command_is_listed_in_one_line() -> None:
-    listed = run("-m", "nerfro")
+    listed = python("-m", "nerfro")
     lines = [line.split(maxsplit=1) for line in listed.stdout.splitlines()[2:-2]]
     assert {name for name, _ in lines} == COMMANDS, listed.stderr
     assert all(len(purpose) > 15 and purpose.endswith(".") for _, purpose in lines)
@@ -189,7 +180,7 @@ def test_every_command_is_listed_in_one_line() -> None:
 
 
 def test_an_unknown_command_is_refused_in_one_line(script: Path) -> None:
-    refused = run(script, "trian")
+    refused = python(str(script), "trian")
     assert refused.returncode == 1
     assert refused.stderr.startswith("nerfro: error: there is no command 'trian'; did you mean train?")
     assert refused.stderr.count("\n") == 1
@@ -197,16 +188,16 @@ def test_an_unknown_command_is_refused_in_one_line(script: Path) -> None:
 
 def test_arguments_reach_the_command_and_its_status_comes_back(script: Path, cache: Path) -> None:
     remember("train", DESCRIBED)
-    helped = run(script, "train", "seed=1", "--help")
+    helped = python(str(script), "train", "seed=1", "--help")
     assert (helped.returncode, helped.stdout, helped.stderr) == (0, "All options.\n", "")
-    refused = run("-m", "nerfro", "train", "sed=1")
+    refused = python("-m", "nerfro", "train", "sed=1")
     assert (refused.returncode, refused.stdout) == (1, "")
     assert refused.stderr == "nerfro: error: sed is not a setting; did you mean seed?\n"
 
 
 def test_the_recorded_command_of_a_script_repeats_the_run(script: Path, tiny_run: list[str], tmp_path: Path) -> None:
     options = [*tiny_run, "trainer.max_steps=1", f"hydra.run.dir={tmp_path / 'run'}"]
-    done = run(script, "train", *options, folder=tmp_path)
+    done = python(str(script), "train", *options, folder=tmp_path)
     assert done.returncode == 0, done.stderr
     command = shlex.split(json.loads((tmp_path / "run" / "run.json").read_text())["command"])
     assert command[1:] == ["-m", "nerfro.train", *options]

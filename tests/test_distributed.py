@@ -24,6 +24,8 @@ from nerfro.training.config import TrainConfig
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
 from nerfro.training.trainer import make_trainer
 from nerfro.types import Batch
+from tests.conftest import Runner, weights_of
+from tests.processes import OFFLINE
 
 # Gradients are sums in another order, so they differ in their last bits. Adam divides them by their size, and would
 # make whole steps of what rounding has left of zero.
@@ -81,14 +83,7 @@ def start(tmp_path: Path) -> Callable[..., subprocess.Popen[str]]:
     plugins = tmp_path / "watching_plugins"
     plugins.mkdir()
     (plugins / "watching.py").write_text(WATCHING_LOSS)
-    environment = {
-        **os.environ,
-        "NERFRO_PLUGINS": str(plugins),
-        "OMP_NUM_THREADS": "1",
-        # Nobody listens there: the search for LPIPS weights ends at once.
-        "https_proxy": "http://127.0.0.1:9",
-        "TORCH_HOME": str(tmp_path / "torch"),
-    }
+    environment = os.environ | OFFLINE | {"NERFRO_PLUGINS": str(plugins), "TORCH_HOME": str(tmp_path / "torch")}
 
     def start(name: str, *overrides: str, launcher: Sequence[str] = (), **variables: str) -> subprocess.Popen[str]:
         command = [sys.executable, *launcher, "-m", "nerfro.train", *overrides, *TWO_PROCESSES]
@@ -113,10 +108,6 @@ def finish(process: subprocess.Popen[str], code: int = 0) -> str:
     return out
 
 
-def weights(folder: Path) -> dict[str, torch.Tensor]:
-    return load_checkpoint(folder / LAST_CHECKPOINT)[0]["state_dict"]
-
-
 def num_rays(folder: Path) -> int:
     count: int = load_checkpoint(folder / LAST_CHECKPOINT)[0]["callbacks"]["Throughput"]["num_rays"]
     return count
@@ -124,7 +115,7 @@ def num_rays(folder: Path) -> int:
 
 def require_alike(together: Path, alone: Path) -> None:
     """Two processes have learned what one has, from as many rays."""
-    expected, got = weights(alone), weights(together)
+    expected, got = weights_of(alone), weights_of(together)
     assert expected.keys() == got.keys()
     for name in expected:
         torch.testing.assert_close(got[name], expected[name], rtol=0, atol=1e-5, msg=lambda m, n=name: f"{n}: {m}")
@@ -137,10 +128,7 @@ def require_alike(together: Path, alone: Path) -> None:
 
 @pytest.mark.slow
 def test_signal_to_one_process_stops_both_and_both_resume_to_learn_what_one_learns(
-    small: list[str],
-    train_here: Callable[..., Any],
-    start: Callable[..., subprocess.Popen[str]],
-    tmp_path: Path,
+    small: list[str], train_here: Runner, start: Callable[..., subprocess.Popen[str]], tmp_path: Path
 ) -> None:
     stopped = start("two", *small)
     assert stopped.stdout is not None
@@ -199,7 +187,7 @@ def test_time_ends_both_processes_at_one_step(
     ],
 )
 def test_what_two_processes_cannot_do_is_refused_in_one_line(
-    overrides: list[str], message: str, tiny_run: list[str], train_here: Callable[..., Any], tmp_path: Path
+    overrides: list[str], message: str, tiny_run: list[str], train_here: Runner, tmp_path: Path
 ) -> None:
     folders = [f"hydra.run.dir={tmp_path / 'run'}", f"hydra.sweep.dir={tmp_path / 'sweep'}"]
     finished = train_here(*tiny_run, "trainer.max_steps=2", *TWO_PROCESSES, *folders, *overrides, code=1)

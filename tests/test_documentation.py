@@ -1,8 +1,9 @@
-"""The Python code of README and guides runs, and the plugins that the guides define train."""
+"""The Python code of README, guides and notebooks runs, and the plugins that the guides define train."""
 
+import json
+import linecache
 import re
 import runpy
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from nerfro.registry import discover, find
 from nerfro.testing import check
 from nerfro.viewing import PLUGIN_EXPORTS
 from nerfro.viewing.exports import ExportConfig, find_export
+from tests.conftest import Runner
 
 CHECKOUT = PACKAGE_DIR.parent
 pytestmark = pytest.mark.skipif(not (CHECKOUT / "docs").is_dir(), reason="there is no checkout with docs")
@@ -59,7 +61,7 @@ def test_plugins_of_the_guide_keep_their_contracts(guide_plugins: list[str]) -> 
 
 @pytest.mark.parametrize("path", ["sampler.path.branches=all", "sampler/path=mirage"])
 def test_plugins_of_the_guide_train(
-    path: str, guide_plugins: list[str], train_here: Callable[..., Any], tiny_default_run: list[str], tmp_path: Path
+    path: str, guide_plugins: list[str], train_here: Runner, tiny_default_run: list[str], tmp_path: Path
 ) -> None:
     loss = ("+loss.half_transparent.weight=0.1", "+loss.half_transparent.power=2")
     options = ("sampler/points=square_root", *loss, "boundary=horizon", "+phase.mean_colour={}", path)
@@ -127,3 +129,28 @@ def test_the_example_of_several_bodies_agrees_with_the_closed_form(
     for line in capsys.readouterr().out.splitlines():
         traced, exact = map(float, line.split())
         assert traced == pytest.approx(exact, abs=1e-4)
+
+
+NOTEBOOKS = sorted((PACKAGE_DIR.parent / "docs" / "notebooks").glob("*.ipynb"))
+
+
+@pytest.mark.skipif(not NOTEBOOKS, reason="there is no checkout with docs")
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebook_runs(notebook: Path, trained_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import matplotlib.pyplot as plt
+
+    monkeypatch.setenv("NERFRO_RUN", str(trained_run))
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    monkeypatch.chdir(tmp_path)
+    plt.switch_backend("agg")
+    document = json.loads(notebook.read_text(encoding="utf-8"))
+    assert document["nbformat"] == 4
+    cells = ["".join(cell["source"]) for cell in document["cells"] if cell["cell_type"] == "code"]
+    assert len(cells) > 2
+    namespace: dict[str, Any] = {"__name__": "__main__"}
+    for number, source in enumerate(cells):
+        name = f"{notebook.name}, cell {number}"
+        linecache.cache[name] = len(source), None, source.splitlines(keepends=True), name  # for tracebacks
+        exec(compile(source, name, "exec"), namespace)
+    assert len(plt.get_fignums()) >= 3, "it draws pictures"
+    plt.close("all")

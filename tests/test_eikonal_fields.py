@@ -28,7 +28,7 @@ from nerfro.training.optimizer import OptimizerConfig
 from nerfro.training.run_folder import load_checkpoint, restore
 from nerfro.types import Radiance, Samples
 from tests.ball_photographs import save
-from tests.conftest import QUIET, refused
+from tests.conftest import QUIET, Runner, refused
 from tests.exact_silhouettes import cameras_around
 from tests.paper import Eikonal, NerfField
 
@@ -176,7 +176,7 @@ RADIUS, SHELL, IOR = 0.6, 0.2, 1.33
 
 
 @pytest.mark.slow
-def test_the_index_of_a_homogeneous_ball_is_recovered(train_here: Callable[..., Any], tmp_path: Path) -> None:
+def test_the_index_of_a_homogeneous_ball_is_recovered(train_here: Runner, tmp_path: Path) -> None:
     """From twelve images of 20x20 pixels before a known sky, from n = 1 on, within 2 %.
 
     The ball's surface is a shell in which the index rises smoothly, because a smooth field cannot be sharp.

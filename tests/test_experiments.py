@@ -2,9 +2,7 @@
 
 import functools
 import json
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import jaxtyping
 import pytest
@@ -14,7 +12,7 @@ from nerfro.paths import CONF_DIR
 from nerfro.registry import build, discover
 from nerfro.training.config import build_model
 from nerfro.training.module import TrainingModule
-from tests.conftest import QUIET, composed
+from tests.conftest import QUIET, Runner, composed
 
 discover()
 
@@ -36,7 +34,7 @@ SMALL = [
 
 
 @pytest.fixture(autouse=True)
-def _checked(train_here: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
+def _checked(train_here: Runner, monkeypatch: pytest.MonkeyPatch) -> None:
     """Turn on the checks of annotations that other trainings do without."""
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", False)
 
@@ -62,7 +60,7 @@ def shrunk(config: DictConfig) -> list[str]:
 
 
 @pytest.mark.parametrize("experiment", [name for name in EXPERIMENTS if name not in ABLATIONS])
-def test_experiment_trains_for_two_steps(experiment: str, train_here: Callable[..., Any], tmp_path: Path) -> None:
+def test_experiment_trains_for_two_steps(experiment: str, train_here: Runner, tmp_path: Path) -> None:
     small = shrunk(composed(f"+experiment={experiment}"))
     train_here(f"+experiment={experiment}", *SMALL, *small, f"hydra.run.dir={tmp_path}")
     metrics = json.loads((tmp_path / "metrics.json").read_text())

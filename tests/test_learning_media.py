@@ -1,15 +1,13 @@
 """A medium that learns must learn, whatever the model and the path sampler are made of."""
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from nerfro.registry import discover, find
-from nerfro.training.run_folder import load_checkpoint
 from tests.ball_photographs import TRAINING, photographs, save
 from tests.closed_forms import make_rays
+from tests.conftest import Runner, weights_of
 from tests.paper import Eikonal
 
 FIELDS = {"width": 8, "depth": 2, "skip": 0}
@@ -28,13 +26,13 @@ def test_a_medium_of_constant_index_learns_from_adaptive_paths() -> None:
 
 
 @pytest.mark.slow
-def test_an_index_that_is_off_is_mended_in_training(train_here: Callable[..., Any], tmp_path: Path) -> None:
+def test_an_index_that_is_off_is_mended_in_training(train_here: Runner, tmp_path: Path) -> None:
     save(photographs([1.45]), tmp_path / "ball")
     options = [*TRAINING, f"data.root={tmp_path / 'ball'}", f"medium.ior={1.02 * 1.45}", "medium.learn_ior=true"]
     options += ["optimizer.groups={bodies.*.ior: {learning_rate: 0.006, start: 60}}", "trainer.max_steps=220"]
     options += ["batches.subdivision.side=2"]
     train_here(*options, f"hydra.run.dir={tmp_path / 'run'}")
-    state = load_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")[0]["state_dict"]
-    assert state["renderer.scene.medium.materials.0.ior"].item() == pytest.approx(
+    found = weights_of(tmp_path / "run")["renderer.scene.medium.materials.0.ior"]
+    assert found.item() == pytest.approx(
         1.45, rel=0.01
     )  # 1.462 from above and from below: the grid's ball is not the photographs'

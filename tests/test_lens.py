@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 
 from nerfro.cameras import Cameras
 from nerfro.lens import coefficients, distort, opencv_coefficients, undistort
+from tests.cameras_at import cameras_at, random_poses
 
 LENSES = {
     "barrel": coefficients([-0.18, 0.03]),
@@ -67,13 +67,9 @@ def test_undistorting_inverts_distorting(lens, points):
 @pytest.fixture
 def cameras() -> Cameras:
     """Three cameras of any orientation, one of them without distortion."""
-    poses = torch.zeros(3, 3, 4)
-    poses[:, :, :3] = torch.from_numpy(Rotation.random(3, random_state=0).as_matrix()).float()
-    poses[:, :, 3] = torch.randn(3, 3)
-    fill = lambda value: torch.full((3,), value)  # noqa: E731
     ideal = (0.0,) * 9
     distortion = torch.tensor([LENSES["barrel"], ideal, LENSES["rational"]])
-    return Cameras(poses, fill(40.0), fill(42.0), fill(24.6), fill(17.1), 48, 36, 0.1, 9.0, distortion)
+    return replace(cameras_at(random_poses(3), 48, 36, 40.0, 42.0, 24.6, 17.1), distortion=distortion)
 
 
 def test_radii_follow_the_area_of_the_pixel(cameras):

@@ -1,10 +1,7 @@
 """`import nerfro` as a library: a run from its folder, and the optics alone."""
 
 import math
-import subprocess
-import sys
 import urllib.request
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -16,13 +13,14 @@ from PIL import Image
 import nerfro
 from nerfro.errors import NerfroError
 from nerfro.files.images import load_png
-from tests.conftest import UTM, moved_mesh, refused
+from tests.closed_forms import ball_exits, beam
+from tests.conftest import UTM, Runner, moved_mesh, refused
+from tests.processes import printed_by
 
 
 def test_importing_nerfro_imports_nothing_heavy() -> None:
     source = "import sys, nerfro; print(*(m for m in ('torch', 'numpy', 'numba', 'hydra') if m in sys.modules))"
-    done = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True, timeout=60)
-    assert done.stdout.strip() == "", done.stderr
+    assert printed_by("-c", source).strip() == ""
 
 
 def test_what_is_not_there_is_an_attribute_error() -> None:
@@ -33,7 +31,7 @@ def test_what_is_not_there_is_an_attribute_error() -> None:
         assert getattr(nerfro, name) is not None
 
 
-def test_a_run_is_loaded_rendered_and_exported(trained_run: Path, tmp_path: Path, run_here: Callable) -> None:
+def test_a_run_is_loaded_rendered_and_exported(trained_run: Path, tmp_path: Path, run_here: Runner) -> None:
     scene = nerfro.load(trained_run, device="cpu")
     cameras = scene.cameras("test")
     views = scene.render(cameras)
@@ -55,15 +53,12 @@ def test_a_run_is_loaded_rendered_and_exported(trained_run: Path, tmp_path: Path
         f"import sys, nerfro; scene = nerfro.load({str(trained_run)!r}, device='cpu'); "
         "scene.render(scene.cameras('test').select([0])); assert 'lightning' not in sys.modules"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
+    printed_by("-c", program)
     refused(r"checkpoint .* does not exist", nerfro.load, tmp_path / "gone")
 
     common = f"checkpoint={trained_run}/checkpoints/last.ckpt", "device=cpu", "resolution=8"
-    run_here("render", *common, "path=orbit", "frames=2", f"out={tmp_path / 'O'}")
     run_here("export", *common, "what=sky", f"out={tmp_path / 'sky.hdr'}")
-    for name in ("O/frame_0000.png", "O/frame_0001.png", "O/film.mp4", "sky.hdr"):
-        assert (tmp_path / name).stat().st_size > 0
+    assert (tmp_path / "sky.hdr").stat().st_size > 0
     run_here("export", *common, "what=sky", f"out={tmp_path / 'sky.hdr'}", code=1)  # nothing is overwritten
 
 
@@ -84,9 +79,8 @@ def test_bending_at_a_ball_is_as_in_closed_form(interface: str, tmp_path: Path, 
         turned = torch.linalg.vector_norm(other.directions - near.directions, dim=-1).max().rad2deg()
         assert turned < 0.01
         np.testing.assert_allclose(other.positions - torch.tensor(place), near.positions, atol=1e-4)
-    deviation = 2 * (np.arcsin(heights / 0.8) - np.arcsin(heights / 1.2))
-    expected = np.stack([np.cos(deviation), -np.sin(deviation), 0 * heights], -1)
-    np.testing.assert_allclose(bent.directions.numpy(), expected, atol=5e-3)
+    expected = ball_exits(beam(torch.from_numpy(heights)), 0.8, 1.5)
+    np.testing.assert_allclose(bent.directions, expected, atol=5e-3)
     assert bent.hit.all()
     # What is left on the way to the box is on the line that leaves the ball.
     beyond = torch.linalg.vector_norm(bent.positions, dim=-1)

@@ -1,8 +1,9 @@
-"""Light adds: several polylines of a ray, linear radiance from parts to pixels, and what a model learns."""
+"""Light adds: transfer function, polylines of a ray, radiance from parts to pixels, and what a model learns."""
 
 from dataclasses import replace
 from pathlib import Path as FilePath
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -156,3 +157,24 @@ def test_all_that_learns_has_a_group_and_a_rate() -> None:
     assert model.paths_learn
     with torch.no_grad():
         assert not model.paths_learn
+
+
+def test_middle_grey_and_the_ends_are_the_standards() -> None:
+    torch.testing.assert_close(to_linear(torch.tensor([0.0, 0.5, 1.0])), torch.tensor([0.0, 0.214041, 1.0]))
+
+
+def test_encoding_undoes_decoding_with_finite_gradients() -> None:
+    srgb = torch.linspace(0, 1, 256, requires_grad=True)
+    linear = to_linear(srgb)
+    torch.testing.assert_close(to_srgb(linear), srgb, rtol=0, atol=1e-6)
+    to_srgb(linear).sum().backward()
+    assert srgb.grad is not None
+    assert srgb.grad.isfinite().all()
+
+
+def test_arrays_are_coded_as_tensors_are() -> None:
+    values = np.linspace(0, 1.5, 24, dtype=np.float32).reshape(4, 6)[::-1]  # negative strides, as in flipped pictures
+    for code in (to_linear, to_srgb):
+        np.testing.assert_array_equal(code(values), code(torch.tensor(values.copy())).numpy())
+        assert code(values).dtype == np.float32
+    assert to_srgb(np.array(0.18)).shape == ()

@@ -5,7 +5,6 @@ import csv
 import json
 import os
 import shutil
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -31,7 +30,8 @@ from nerfro.training.phases.base import Phase, Run
 from nerfro.viewing import PLUGIN_EXPORTS
 from nerfro.viewing.exports import Export, find_export
 from nerfro.viewing.trained_scene import TrainedScene
-from tests.conftest import Finished, refused
+from tests.conftest import Finished, Runner, refused
+from tests.processes import printed_by, python
 
 discover()
 
@@ -266,9 +266,9 @@ TEMPLATES = {
 
 @pytest.fixture
 def train_template(
-    train_here: Callable[..., Finished], tiny_run: list[str], tiny_scene: Path, tmp_path: Path,
+    train_here: Runner, tiny_run: list[str], tiny_scene: Path, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-) -> Callable[..., Finished]:  # fmt: skip
+) -> Runner:  # fmt: skip
     """Train twenty steps with some overrides, and without the tiny settings of components that they replace."""
     monkeypatch.setenv("NERFRO_PLUGINS", str(PLUGINS_DIR / "opt_in"))
     discover()
@@ -300,7 +300,7 @@ def train_template(
 @pytest.mark.parametrize(
     "template", sorted(str(p.relative_to(PLUGINS_DIR)) for p in PLUGINS_DIR.glob("**/example_*.py"))
 )
-def test_template_trains(template: str, train_template: Callable[..., Finished]) -> None:
+def test_template_trains(template: str, train_template: Runner) -> None:
     finished = train_template(TEMPLATES[template.removesuffix(".py")])
     assert "20 steps in" in finished.out
 
@@ -348,14 +348,14 @@ def test_export_without_a_writer_is_refused(monkeypatch: pytest.MonkeyPatch) -> 
     refused(r"test_plugins\.py of what=broken defines no EXPORT", find_export, "broken", Path("out.csv"))
 
 
-def test_loss_that_is_no_scalar_is_refused(train_template: Callable[..., Finished]) -> None:
+def test_loss_that_is_no_scalar_is_refused(train_template: Runner) -> None:
     members = {"__doc__": "Not a scalar.", **loss(lambda rendering, _: rendering.opacity)}
     register("loss", "opacities")(type("Opacities", (Loss,), members))
     assert "loss=opacities returned shape [" in train_template(["+loss.opacities.weight=1"], code=1).error
 
 
 def test_metric_of_a_plugin_is_in_tables_files_log_and_report(
-    train_template: Callable[..., Finished], tmp_path: Path, run_here: Callable[..., Finished]
+    train_template: Runner, tmp_path: Path, run_here: Runner
 ) -> None:
     trained, run = train_template([]), tmp_path / "run"
     mean = json.loads((run / "metrics.json").read_text())["test"]["mean_absolute_error"]
@@ -374,7 +374,7 @@ def test_metric_of_a_plugin_is_in_tables_files_log_and_report(
 # The list.
 
 
-def test_list_shows_every_plugin_with_its_fields_defaults_and_summary(run_here: Callable[..., Finished]) -> None:
+def test_list_shows_every_plugin_with_its_fields_defaults_and_summary(run_here: Runner) -> None:
     words = " ".join(run_here("plugins").out.split())
     for plugin in plugins():
         assert f"{plugin.kind}={plugin.name}" in words
@@ -392,7 +392,7 @@ def test_list_shows_every_plugin_with_its_fields_defaults_and_summary(run_here: 
         ("field=x", "no field is called 'x'; known: "),
     ],
 )
-def test_list_of_nothing_known_is_refused(argument: str, message: str, run_here: Callable[..., Finished]) -> None:
+def test_list_of_nothing_known_is_refused(argument: str, message: str, run_here: Runner) -> None:
     assert message in run_here("plugins", argument, code=1).error
 
 
@@ -434,21 +434,15 @@ def test_installed_package_is_found_listed_and_checked(tmp_path: Path) -> None:
     (project / "nerfro_grey" / "__init__.py").touch()
     (project / "nerfro_grey" / "boundary.py").write_text(BOUNDARY.format(name="installed_grey"))
     install(project, site)
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(site), os.environ.get("PYTHONPATH", "")])}
-
-    def python(*arguments: str) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, *arguments]
-        return subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=120)
-
-    used = python("-c", USE_IT)
-    assert used.returncode == 0, used.stderr
-    listed, kept, job = used.stdout.partition("kept its contract\n")
+    found = os.pathsep.join([str(site), os.environ.get("PYTHONPATH", "")])
+    used = printed_by("-c", USE_IT, folder=tmp_path, PYTHONPATH=found)
+    listed, kept, job = used.partition("kept its contract\n")
     assert "The same grey in every direction." in listed
     assert kept
     assert "grey: 0.25" in job
     # One that cannot be imported stops the run and is named.
     (site / "nerfro_grey" / "boundary.py").write_text("import no_such_package\n")
-    broken = python("-m", "nerfro.plugins")
+    broken = python("-m", "nerfro.plugins", folder=tmp_path, PYTHONPATH=found)
     assert broken.returncode == 1
     assert broken.stderr.strip() == (
         "nerfro: error: plugin 'grey' of an installed package (nerfro_grey.boundary) cannot be imported: "
@@ -459,8 +453,7 @@ def test_installed_package_is_found_listed_and_checked(tmp_path: Path) -> None:
 def install(project: Path, site: Path) -> None:
     """`pip install` a project offline into a folder; skips where hatchling is not installed."""
     pytest.importorskip("hatchling")
-    if shutil.which("pip") is None and subprocess.run([sys.executable, "-m", "pip", "--version"]).returncode:
+    if shutil.which("pip") is None and python("-m", "pip", "--version").returncode:
         pytest.skip("pip is not installed")
     options = ["--no-deps", "--no-build-isolation", "--no-index", "--quiet", "--target", str(site)]
-    command = [sys.executable, "-m", "pip", "install", *options, str(project)]
-    subprocess.run(command, check=True, timeout=120)
+    printed_by("-m", "pip", "install", *options, str(project))

@@ -7,7 +7,6 @@ import shlex
 import shutil
 import signal
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -26,11 +25,8 @@ from nerfro.overrides import print_next, without_hints
 from nerfro.pipeline import stages
 from nerfro.pipeline.hypotheses import Hypothesis
 from nerfro.pipeline.stages import terminated_in_one_line
-from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
-from tests.ball_photographs import mesh, photographs, save, soft_masks
-from tests.conftest import Finished
-
-Reconstruct = Callable[..., Finished]
+from tests.ball_photographs import RECONSTRUCTION, RECONSTRUCTION_TRAINING, save_with_masks
+from tests.conftest import Runner, weights_of
 
 
 @pytest.fixture
@@ -144,8 +140,8 @@ def pretended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pretended:
 
 
 @pytest.fixture
-def reconstruct(run_here: Reconstruct, pretended: Pretended, photos: Path) -> Reconstruct:
-    """Reconstruct the photographs and their masks by pretended commands."""
+def reconstruct(run_here: Runner, pretended: Pretended, photos: Path) -> Runner:
+    """Runner the photographs and their masks by pretended commands."""
     given = f"images={photos}", f"masks={photos.parent / 'silhouettes'}", f"out={pretended.out}"
     return functools.partial(run_here, "reconstruct", *given)
 
@@ -154,7 +150,7 @@ TRIALS = ["train"] * 3  # straight rays, solid body, vessel
 ALL = ["calibrate", "preprocess", *TRIALS, "train", "summary", "export"]
 
 
-def test_photographs_pass_all_stages_once(reconstruct: Reconstruct, pretended: Pretended) -> None:
+def test_photographs_pass_all_stages_once(reconstruct: Runner, pretended: Pretended) -> None:
     options = "medium.resolution=64", "train=trainer.max_steps=3 logger=none", "preprocess=keep=1"
     done = reconstruct("data.far=9", *options)
     assert pretended.names == ALL
@@ -183,7 +179,7 @@ def test_photographs_pass_all_stages_once(reconstruct: Reconstruct, pretended: P
     assert again.out.endswith(f"report: {pretended.out}/report/report.html\npage: {pretended.out}/page.html\n")
 
 
-def test_what_changed_is_followed_by_what_is_made_of_it(reconstruct: Reconstruct, pretended: Pretended) -> None:
+def test_what_changed_is_followed_by_what_is_made_of_it(reconstruct: Runner, pretended: Pretended) -> None:
     reconstruct()
     pretended.write("../silhouettes/IMG_1.png")
     done = reconstruct()
@@ -208,7 +204,7 @@ def test_what_changed_is_followed_by_what_is_made_of_it(reconstruct: Reconstruct
     ],
 )
 def test_training_continues_with_the_hypothesis_that_the_validation_photographs_prefer(
-    reconstruct: Reconstruct, pretended: Pretended, doubts: list[str], psnr: dict[str, float], chosen: str, printed: str
+    reconstruct: Runner, pretended: Pretended, doubts: list[str], psnr: dict[str, float], chosen: str, printed: str
 ) -> None:
     pretended.doubts = doubts
     pretended.psnr |= psnr
@@ -227,7 +223,7 @@ def test_training_continues_with_the_hypothesis_that_the_validation_photographs_
     [(["solid body", "vessel"], 0, "straight"), (["solid body"], 2, "glass"), (["vessel"], 2, "unknown")],
 )
 def test_bodies_that_the_pixels_do_not_support_are_not_tried(
-    reconstruct: Reconstruct, pretended: Pretended, unsupported: list[str], trials: int, chosen: str
+    reconstruct: Runner, pretended: Pretended, unsupported: list[str], trials: int, chosen: str
 ) -> None:
     pretended.unsupported = unsupported
     reconstruct()
@@ -244,7 +240,7 @@ def test_stages_print_no_next_command(capsys: pytest.CaptureFixture[str]) -> Non
 
 
 @pytest.mark.parametrize("end", [SystemExit(130), KeyboardInterrupt()])  # from training, and from any other stage
-def test_an_interrupted_training_goes_on(end: BaseException, reconstruct: Reconstruct, pretended: Pretended) -> None:
+def test_an_interrupted_training_goes_on(end: BaseException, reconstruct: Runner, pretended: Pretended) -> None:
     pretended.ends["train"] = end
     stopped = reconstruct("trial_steps=0", code=130)
     assert stopped.err == "nerfro: interrupted; train is incomplete; repeat the same command to continue\n"
@@ -255,7 +251,7 @@ def test_an_interrupted_training_goes_on(end: BaseException, reconstruct: Recons
     assert pretended.ran[3][1] == [*pretended.ran[2][1], "ckpt_path=last"]
 
 
-def test_a_stage_that_fails_is_named_and_the_others_wait(reconstruct: Reconstruct, pretended: Pretended) -> None:
+def test_a_stage_that_fails_is_named_and_the_others_wait(reconstruct: Runner, pretended: Pretended) -> None:
     pretended.ends["preprocess"] = NerfroError("the masks are empty")
     failed = reconstruct(code=1).error
     assert failed.startswith("nerfro: error: preprocess failed: the masks are empty; correct the input, ")
@@ -266,16 +262,14 @@ def test_a_stage_that_fails_is_named_and_the_others_wait(reconstruct: Reconstruc
     assert pretended.names == ["calibrate", "preprocess", "preprocess"]
 
 
-def test_a_page_that_cannot_be_made_does_not_fail_the_reconstruction(
-    reconstruct: Reconstruct, pretended: Pretended
-) -> None:
+def test_a_page_that_cannot_be_made_does_not_fail_the_reconstruction(reconstruct: Runner, pretended: Pretended) -> None:
     pretended.ends["export"] = NerfroError("the index varies in space")
     done = reconstruct("trial_steps=0")
     assert "nerfro: warning: no page was written: export failed: the index varies in space; " in done.out
     assert done.out.endswith(f"report: {pretended.out}/report/report.html\n")
 
 
-def test_what_was_found_chooses_the_experiment(run_here: Reconstruct, pretended: Pretended, tiny_scene: Path) -> None:
+def test_what_was_found_chooses_the_experiment(run_here: Runner, pretended: Pretended, tiny_scene: Path) -> None:
     asked = "data=blender", f"data.root={tiny_scene}", "outlines={r_0:[1,2,9,9]}", "medium=vessel", "medium.wall=0.1"
     pretended.surroundings, pretended.doubts, pretended.medium = "near", ["shallow"], {"type": "vessel", "wall": 0.1}
     failed = run_here("reconstruct", *asked, f"out={pretended.out}", code=1).error
@@ -303,7 +297,7 @@ def test_what_was_found_chooses_the_experiment(run_here: Reconstruct, pretended:
     ],
 )
 def test_what_contradicts_itself_is_refused(
-    run_here: Reconstruct, pretended: Pretended, photos: Path, overrides: tuple[str, ...], told: str
+    run_here: Runner, pretended: Pretended, photos: Path, overrides: tuple[str, ...], told: str
 ) -> None:
     (photos / "film").mkdir()
     (photos / "film" / "CLIP.mp4").touch()
@@ -322,7 +316,7 @@ def test_sigterm_ends_a_stage_like_ctrl_c() -> None:
     assert signal.getsignal(signal.SIGTERM) == before
 
 
-def test_unknown_surroundings_end_before_training(reconstruct: Reconstruct, pretended: Pretended) -> None:
+def test_unknown_surroundings_end_before_training(reconstruct: Runner, pretended: Pretended) -> None:
     pretended.surroundings = None
     refused = reconstruct("trial_steps=0", code=1).error
     assert "scene.json does not tell whether the surroundings are near" in refused
@@ -331,24 +325,17 @@ def test_unknown_surroundings_end_before_training(reconstruct: Reconstruct, pret
 
 
 def test_posed_photographs_of_a_ball_become_a_scene(
-    run_here: Reconstruct, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run_here: Runner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """All stages but that of poses; each gives the same result alone, and leaves nothing behind."""
     data, out = tmp_path / "ball", tmp_path / "out"
-    save(photographs([1.45]), data)
-    for view, mask in enumerate(soft_masks(mesh())):
-        save_png(data / "masks" / "train" / f"r_{view}.png", mask[..., None].expand(-1, -1, 3))
-
+    save_with_masks(data)
     monkeypatch.setattr(nerfro.train, "prepared_metrics", ImageMetrics)
     short = refinement.RefinementSettings((refinement.Stage(20, 1e-4, (3.0, 1.0)),), 1000)
     monkeypatch.setattr(refinement, "RefinementSettings", lambda: short)
-    train = ["evaluation.split=train", "evaluation.every=0", "evaluation.subdivision.side=1", "logger=none",
-             "trainer.accelerator=cpu", "trainer.max_steps=2", "trainer.max_time=null", "batches.size=64",
-             "boundary.resolutions=[4,8]", "field.num_levels=2", "field.log2_table_size=8",
-             "sampler.points.num_samples=4", "sampler.points.resolution=16",
-             "phase.background.steps=100"]  # fmt: skip
-    asked = ["data=blender", f"data.root={data}", "data.near=0.5", f"out={out}", "medium.resolution=32",
-             "medium.cache=false", "preprocess=resolution=24", f"train={' '.join(train)}", "trial_steps=2"]  # fmt: skip
+    train = [*RECONSTRUCTION_TRAINING, "trainer.max_steps=2", "phase.background.steps=100"]
+    asked = [*RECONSTRUCTION, f"data.root={data}", f"out={out}", "medium.cache=false", "trial_steps=2"]
+    asked.append(f"train={' '.join(train)}")
     before = torch.initial_seed(), signal.getsignal(signal.SIGTERM)
     done = run_here("reconstruct", *asked)
     index = json.loads((out / "surface" / "index.json").read_text())
@@ -369,7 +356,6 @@ def test_posed_photographs_of_a_ball_become_a_scene(
     assert (torch.initial_seed(), signal.getsignal(signal.SIGTERM)) == before
     command = next(line for line in done.out.splitlines() if line.endswith(f"hydra.run.dir={out}/run"))
     run_here("train", *shlex.split(command)[4:], f"hydra.run.dir={tmp_path / 'alone'}")
-    runs = out / "run", tmp_path / "alone"
-    chained, separate = (load_checkpoint(run / LAST_CHECKPOINT)[0]["state_dict"] for run in runs)
+    chained, separate = weights_of(out / "run"), weights_of(tmp_path / "alone")
     assert all(torch.equal(chained[name], separate[name]) for name in chained)
     assert json.loads((out / "run" / "run.json").read_text())["command"].split()[1:3] == ["-m", "nerfro.train"]

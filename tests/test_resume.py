@@ -9,12 +9,10 @@ import signal
 from collections import namedtuple
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 from unittest import mock
 
 import pytest
 import torch
-from omegaconf import OmegaConf
 
 from nerfro.errors import NerfroError
 from nerfro.evaluation import scoring
@@ -23,9 +21,8 @@ from nerfro.training.run_folder import (
     LAST_CHECKPOINT,
     find_checkpoint,
     load_checkpoint,
-    require_same_configuration,
 )
-from tests.conftest import Bomb, refused
+from tests.conftest import Bomb, Runner, refused
 from tests.forked import Command
 
 SCHEDULE = ["checkpoint.every_steps=3", "checkpoint.every_seconds=null", "evaluation.every=5", "trainer.max_steps=12"]
@@ -85,18 +82,16 @@ def interrupted_at_second_picture() -> Iterator[None]:
         yield
 
 
-def test_interrupted_evaluation_says_how_to_go_on(
-    train_here: Callable[..., Any], evaluate_here: Callable[..., Any], tiny_run: list[str], tmp_path: Path
-) -> None:
+def test_interrupted_evaluation_says_how_to_go_on(train_paper: Runner, evaluate_here: Runner, tmp_path: Path) -> None:
     run = tmp_path / "run"
-    training = [*tiny_run, "trainer.max_steps=2", "evaluation.every=0"]
+    training = ["trainer.max_steps=2", "evaluation.every=0"]
     with interrupted_at_second_picture():
-        finished = train_here(*training, f"hydra.run.dir={run}", code=130)
+        finished = train_paper(*training, code=130)
     advice = f"hydra.run.dir={run} ckpt_path=last"
     assert finished.err.splitlines()[-1] == f"nerfro: interrupted; to resume, repeat the command with {advice}"
     assert not (run / "metrics.json").exists()
     # What the message says works.
-    train_here(*training, *advice.split())
+    train_paper(*training, *advice.split())
     assert (run / "metrics.json").exists()
 
     scored = [f"checkpoint={run / LAST_CHECKPOINT}", f"out={tmp_path / 'scores'}"]
@@ -109,7 +104,7 @@ def test_interrupted_evaluation_says_how_to_go_on(
 
 
 def test_resuming_a_finished_run_with_more_steps_trains_the_rest(
-    train: Callable[..., Any], trained_run: Path, tmp_path: Path
+    train: Runner, trained_run: Path, tmp_path: Path
 ) -> None:
     shutil.copytree(trained_run, tmp_path / "run")
     options = ["evaluation.every=0", "trainer.max_steps=5", "ckpt_path=last"]
@@ -136,21 +131,6 @@ def test_last_finds_the_newest_run_beside_a_new_folder(tmp_path: Path) -> None:
         find_checkpoint("last", tmp_path / "elsewhere" / "new")
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"field": {"width": 16}}, "was trained with field.width=8, this run has 16; use the same experiment"),
-        ({"seed": 1}, "was trained with seed=0, this run has 1"),
-        ({"medium": {"ior": 1.3}}, "was trained with medium.ior=1.5, this run has 1.3"),
-        ({"batches": {"batching": "x"}}, "was trained with batches.batching=None, this run has x"),
-    ],
-)
-def test_checkpoint_of_another_configuration_is_refused(change: dict, message: str, tmp_path: Path) -> None:
-    trained = OmegaConf.create({"field": {"width": 8}, "seed": 0, "medium": {"ior": 1.5}, "batches": {"size": 4}})
-    require_same_configuration(tmp_path / "a.ckpt", trained, trained)
-    refused(message, require_same_configuration, tmp_path / "a.ckpt", trained, OmegaConf.merge(trained, change))
-
-
 def test_pickled_code_in_a_checkpoint_is_not_executed(tmp_path: Path) -> None:
     path, traces = tmp_path / "bomb.ckpt", tmp_path / "it_ran"
     torch.save({"nerfro_config": "seed: 0", "state_dict": Bomb(f"touch {traces}")}, path)
@@ -159,9 +139,7 @@ def test_pickled_code_in_a_checkpoint_is_not_executed(tmp_path: Path) -> None:
     assert not traces.exists()
 
 
-def test_full_disk_is_refused_before_training(
-    train: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_full_disk_is_refused_before_training(train: Runner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     usage = namedtuple("usage", "total used free")
     monkeypatch.setattr("shutil.disk_usage", lambda path: usage(100 * 2**20, 99 * 2**20, 2**20))
     assert "has 1 MiB free and this run needs " in train("trainer.max_steps=2", code=1).error

@@ -1,7 +1,6 @@
-"""Rays through parts of pixels, the pixels that need them, and batches that hold them."""
+"""Rays through parts of pixels, the pixels that need them, and batches and renderings that hold them."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -10,17 +9,19 @@ import torch
 
 from nerfro.cameras import Cameras
 from nerfro.data.base import Views
+from nerfro.evaluation.render_view import render_view
 from nerfro.media.analytic import Vacuum
 from nerfro.media.shapes import Ball
 from nerfro.models.refractive import RefractiveModel
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.paths.straight import Straight
 from nerfro.subdivision import Subdivision, contrast, divergence, neighbour_rays, part_rays, pixel_rays
-from nerfro.testing import example_components
+from nerfro.testing import example_batch, example_components
 from nerfro.training.ray_batches import RayBatches
 from nerfro.types import Batch
+from tests.cameras_at import cameras_at, random_poses
 from tests.closed_forms import RoundedBox
-from tests.paper import Hierarchical
+from tests.paper import Hierarchical, NerfField
 
 NUM_VIEWS, HEIGHT, WIDTH = 3, 8, 10
 SIDE, FOCAL = 33, 60.0
@@ -28,10 +29,8 @@ CUBE = RoundedBox(half_side=0.6, edge_radius=0.05, ior=1.5)
 
 
 @pytest.fixture
-def cameras(random_pose: Callable[[int], np.ndarray]) -> Cameras:
-    poses = torch.from_numpy(np.stack([random_pose(view)[:3] for view in range(NUM_VIEWS)])).float()
-    full = torch.ones(NUM_VIEWS)
-    return Cameras(poses, 20 * full, 22 * full, 5 * full, 4 * full, WIDTH, HEIGHT, 2.0, 6.0)
+def cameras() -> Cameras:
+    return cameras_at(random_poses(NUM_VIEWS), WIDTH, HEIGHT, 20.0, 22.0)
 
 
 @pytest.fixture
@@ -39,8 +38,7 @@ def above() -> Cameras:
     """Looks down on the origin from 4 units above."""
     pose = torch.eye(4)[:3].clone()
     pose[2, 3] = 4.0
-    one = torch.ones(1)
-    return Cameras(pose[None], FOCAL * one, FOCAL * one, SIDE / 2 * one, SIDE / 2 * one, SIDE, SIDE, 2.0, 6.0)
+    return cameras_at(pose[None], SIDE, SIDE, FOCAL)
 
 
 @pytest.fixture
@@ -181,3 +179,38 @@ def test_batches_and_renderings_do_not_depend_on_the_process_or_the_chunk(views:
         assert torch.equal(share.rays.directions, whole.rays.directions[rows])
         assert torch.equal(share.path.exit_directions, whole.path.exit_directions[rows])
         torch.testing.assert_close(model.render_path(share.path, share.draws)[-1].samples.s, sampled[rows])
+
+
+def test_straight_rays_part_nowhere_and_need_one_ray_a_pixel() -> None:
+    model, cameras = RefractiveModel(example_components()).eval(), example_batch().cameras
+    once, divided = (render_view(model, cameras, 0, Subdivision(side, 1.5)) for side in (1, 3))
+    assert torch.equal(divided.radiance, once.radiance)
+
+
+def test_pixels_are_divided_at_the_rim_of_a_ball() -> None:
+    parts = replace(example_components(), medium=Ball(), path_sampler=Snell())
+    model, cameras = RefractiveModel(parts).eval(), example_batch().cameras
+    for parameter in model.scene.fields.parameters():
+        torch.nn.init.normal_(parameter, std=0.5)
+    once, divided = (render_view(model, cameras, 0, Subdivision(side, 8.0)).radiance for side in (1, 3))
+    differs = (once != divided).any(-1)
+    assert 0 < differs.float().mean() < 0.5
+
+
+def test_pixels_of_much_contrast_are_divided_where_no_ray_bends() -> None:
+    smooth = replace(example_components(), make_field=lambda: NerfField(width=16, depth=2, skip=1, view_width=8))
+    model, cameras = RefractiveModel(smooth).eval(), example_batch().cameras
+    for parameter in model.scene.fields.parameters():
+        torch.nn.init.normal_(parameter, std=0.5)
+    once = render_view(model, cameras, 0, Subdivision(1))
+    shown = model.scene.colour_space.to_srgb(once.radiance).clamp(0, 1).view(cameras.height, cameras.width, 3)
+    threshold = 0.02
+    steps = [(shown.diff(dim=axis).abs().amax(-1) >= threshold) for axis in (0, 1)]
+    expected = torch.zeros(cameras.height, cameras.width, dtype=torch.bool)
+    expected[:-1] |= steps[0]
+    expected[1:] |= steps[0]
+    expected[:, :-1] |= steps[1]
+    expected[:, 1:] |= steps[1]
+    assert 0 < expected.float().mean() < 1
+    divided = render_view(model, cameras, 0, Subdivision(3, 1.5, threshold))
+    assert torch.equal((divided.radiance != once.radiance).any(-1), expected.flatten())

@@ -3,7 +3,6 @@ import json
 import os
 import re
 import statistics
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -17,7 +16,7 @@ from nerfro.files.images import save_png
 from nerfro.report.comparison import compare, find_metrics, to_table
 from nerfro.report.runs import find_runs
 from nerfro.training.run_folder import LAST_CHECKPOINT, record
-from tests.conftest import Finished, refused
+from tests.conftest import Runner, refused
 
 PAPER = find_metrics(["psnr", "ssim", "lpips"])
 FIELD = {"_target_": "nerfro.fields.nerf.NerfField", "width": 64, "scale": 1.0}
@@ -195,14 +194,12 @@ def test_run_without_scores_has_those_of_its_later_evaluation(tmp_path: Path) ->
 
 
 @pytest.fixture
-def summarise(run_here: Callable) -> Callable[..., Finished]:
+def summarise(run_here: Runner) -> Runner:
     """Run `python -m nerfro.summary` in this process."""
     return functools.partial(run_here, "summary")
 
 
-def test_command_prints_writes_all_forms_and_refuses_to_overwrite(
-    tmp_path: Path, summarise: Callable[..., Finished]
-) -> None:
+def test_command_prints_writes_all_forms_and_refuses_to_overwrite(tmp_path: Path, summarise: Runner) -> None:
     write_run(tmp_path / "runs" / "a", "refractive", 25.0)
     write_run(tmp_path / "runs" / "b", "mine", 22.0, max_time=None, max_steps=100)
     runs, out = f"runs={tmp_path / 'runs'}", tmp_path / "out"
@@ -226,8 +223,6 @@ def test_command_prints_writes_all_forms_and_refuses_to_overwrite(
         ("region=x", "choose 'full', 'mask', 'crop'"),
     ],
 )
-def test_mistakes_are_told_in_one_line(
-    tmp_path: Path, summarise: Callable[..., Finished], override: str, said: str
-) -> None:
+def test_mistakes_are_told_in_one_line(tmp_path: Path, summarise: Runner, override: str, said: str) -> None:
     write_run(tmp_path / "a", "refractive", 25.0)
     assert said in summarise(f"runs=[{tmp_path}]", override, code=1).error

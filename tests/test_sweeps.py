@@ -3,11 +3,8 @@
 import functools
 import importlib
 import json
-import os
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -21,17 +18,15 @@ from nerfro.allowed import check_settings
 from nerfro.paths import CONF_DIR, scene_name
 from nerfro.training.config import TrainConfig
 from nerfro.training.sweeps import identity_of
-from tests.conftest import composed
+from tests.conftest import Runner, composed
 from tests.forked import Command
+from tests.processes import OFFLINE, python
 
 SWEEPS = sorted(path.stem for path in (CONF_DIR / "sweep").glob("*.yaml"))
 
-# Nobody listens at that proxy: the search for LPIPS weights ends at once.
-_OFFLINE = {"OMP_NUM_THREADS": "1", "https_proxy": "http://127.0.0.1:9"}
-
 
 @pytest.fixture
-def sweep(train_here: Callable[..., Any], tiny_run: list[str], tmp_path: Path) -> Callable[..., Any]:
+def sweep(train_here: Runner, tiny_run: list[str], tmp_path: Path) -> Runner:
     """`python -m nerfro.train -m` in this process, with tiny cells in tmp_path/sweep."""
     steps = ["trainer.max_steps=2", "evaluation.every=0", f"hydra.sweep.dir={tmp_path / 'sweep'}"]
     return functools.partial(train_here, "-m", *tiny_run, *steps)
@@ -42,7 +37,7 @@ def start(tmp_path: Path, waiting_plugins: str, tiny_run: list[str]) -> Callable
     """Start a sweep with a loss that waits in a process, in tmp_path/sweep; what it prints goes to tmp_path/<name>."""
     options = [*tiny_run, "evaluation.every=0", "+loss.waiting.weight=1", f"hydra.sweep.dir={tmp_path / 'sweep'}"]
     options += ["trainer.max_steps=20", "checkpoint.every_steps=4", "checkpoint.every_seconds=null"]
-    environment = {**_OFFLINE, "TORCH_HOME": str(tmp_path), "NERFRO_PLUGINS": waiting_plugins}
+    environment = {**OFFLINE, "TORCH_HOME": str(tmp_path), "NERFRO_PLUGINS": waiting_plugins}
     return lambda overrides, name: Command("train", ["-m", *options, *overrides], tmp_path / name, **environment)
 
 
@@ -51,7 +46,7 @@ def written(folder: Path) -> dict[str, int]:
     return {path.parent.name: path.stat().st_mtime_ns for path in folder.glob("*/metrics.json")}
 
 
-def test_finished_cells_are_skipped_and_new_ones_added(sweep: Callable[..., Any], tmp_path: Path) -> None:
+def test_finished_cells_are_skipped_and_new_ones_added(sweep: Runner, tmp_path: Path) -> None:
     sweep("seed=0,1")
     before = written(tmp_path / "sweep")
     scene = scene_name(OmegaConf.load(next((tmp_path / "sweep").glob("*/config.yaml"))).data.root)
@@ -65,7 +60,7 @@ def test_finished_cells_are_skipped_and_new_ones_added(sweep: Callable[..., Any]
     assert {name: after[name] for name in before} == before
 
 
-def test_failing_cell_stops_no_other(sweep: Callable[..., Any], tiny_scene: Path, tmp_path: Path) -> None:
+def test_failing_cell_stops_no_other(sweep: Runner, tiny_scene: Path, tmp_path: Path) -> None:
     late = tmp_path / "late.ply"
     swept = f"medium.mesh={late},{tiny_scene / 'mesh.ply'}"
     first = sweep(swept, code=1)
@@ -81,7 +76,7 @@ def test_failing_cell_stops_no_other(sweep: Callable[..., Any], tiny_scene: Path
 
 
 def test_cell_of_another_configuration_or_other_data_is_never_replaced(
-    sweep: Callable[..., Any], tiny_scene: Path, tmp_path: Path
+    sweep: Runner, tiny_scene: Path, tmp_path: Path
 ) -> None:
     scene = tmp_path / "scene"
     shutil.copytree(tiny_scene, scene)
@@ -96,7 +91,7 @@ def test_cell_of_another_configuration_or_other_data_is_never_replaced(
     assert written(tmp_path / "sweep") == before
 
 
-def test_missing_data_are_rendered_by_a_command_that_is_named(sweep: Callable[..., Any], tmp_path: Path) -> None:
+def test_missing_data_are_rendered_by_a_command_that_is_named(sweep: Runner, tmp_path: Path) -> None:
     finished = sweep(f"data.root={tmp_path / 'ship'}", code=1)
     assert f"python -m nerfro.synthesize scene=ship out={tmp_path / 'ship'}" in finished.err
 
@@ -124,7 +119,7 @@ class RecordingSweeper(BasicSweeper):
 
 
 def test_sweepers_of_other_packages_receive_the_metric_to_optimize(
-    sweep: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    sweep: Runner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "site" / "hydra_plugins").mkdir(parents=True)
     (tmp_path / "site" / "hydra_plugins" / "recording.py").write_text(SWEEPER)
@@ -143,7 +138,7 @@ def test_sweepers_of_other_packages_receive_the_metric_to_optimize(
     assert "no metric is called 'beauty'; known: flip, lpips" in unknown.err
 
 
-def test_optuna_searches_and_repeats_its_search(sweep: Callable[..., Any], tmp_path: Path) -> None:
+def test_optuna_searches_and_repeats_its_search(sweep: Runner, tmp_path: Path) -> None:
     pytest.importorskip("hydra_plugins.hydra_optuna_sweeper", reason="needs pip install 'nerfro[optuna]'")
     search = [
         "hydra/sweeper=optuna",
@@ -214,29 +209,22 @@ def test_stopped_sweep_goes_on_where_it_was(
 @pytest.mark.slow
 @pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
 def test_launchers_run_cells_in_other_processes(
-    launcher: str, sweep: Callable[..., Any], tiny_run: list[str], tmp_path: Path
+    launcher: str, sweep: Runner, tiny_run: list[str], tmp_path: Path
 ) -> None:
     pytest.importorskip(f"hydra_plugins.hydra_{launcher.split('_')[0]}_launcher")
     overrides = [f"medium.mesh={tmp_path / 'nowhere.ply'},{'${data.root}/mesh.ply'}", "trainer.max_steps=2"]
     overrides.append(f"hydra/launcher={launcher}")
-    command = [sys.executable, "-m", "nerfro.train", "-m", *tiny_run, "evaluation.every=0", *overrides]
-    done = subprocess.run(
-        [*command, f"hydra.sweep.dir={tmp_path / 'sweep'}"],
-        cwd=tmp_path,
-        env={**os.environ, **_OFFLINE, "TORCH_HOME": str(tmp_path)},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        timeout=600,
-    )
-    log = done.stdout
+    overrides += ["evaluation.every=0", f"hydra.sweep.dir={tmp_path / 'sweep'}"]
+    environment = {**OFFLINE, "TORCH_HOME": str(tmp_path)}
+    done = python("-m", "nerfro.train", "-m", *tiny_run, *overrides, folder=tmp_path, **environment)
+    log = done.stdout + done.stderr
     assert done.returncode == 1, log
     assert f"{tmp_path / 'nowhere.ply'} does not exist" in log
     (run,) = (tmp_path / "sweep").glob("*/run.json")
     assert json.loads(run.read_text())["command"].startswith("python -m nerfro.train data.root=")
 
 
-def test_damaged_record_costs_its_own_cell_alone(sweep: Callable[..., Any], tmp_path: Path) -> None:
+def test_damaged_record_costs_its_own_cell_alone(sweep: Runner, tmp_path: Path) -> None:
     sweep("seed=0,1")
     record = sorted((tmp_path / "sweep").glob("*/cell.json"))[0]
     record.write_text(record.read_text()[:40])
@@ -254,6 +242,6 @@ def test_damaged_record_costs_its_own_cell_alone(sweep: Callable[..., Any], tmp_
         ("hydra.sweep.subdir=/", "hydra.sweep.dir=/ is a whole file system"),
     ],
 )
-def test_settings_of_cells_are_checked(override: str, words: str, sweep: Callable[..., Any], tmp_path: Path) -> None:
+def test_settings_of_cells_are_checked(override: str, words: str, sweep: Runner, tmp_path: Path) -> None:
     assert words in sweep("seed=0,1", override, code=1).err
     assert not list((tmp_path / "sweep").rglob("*.ckpt"))

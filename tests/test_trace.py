@@ -5,13 +5,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 
-from tests.conftest import UTM, moved_mesh
+from tests.closed_forms import ball_exits, beam
+from tests.conftest import UTM, Runner, moved_mesh
 
 
 @pytest.fixture
-def trace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run_here: Callable) -> Callable[..., str]:
+def trace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run_here: Runner) -> Callable[..., str]:
     """Run the entry point in this process on a glass ball; returns what it printed."""
     trimesh.creation.icosphere(4, 0.8).export(tmp_path / "ball.ply")
     monkeypatch.chdir(tmp_path)
@@ -27,11 +29,9 @@ def trace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run_here: Callable) -
 def _write_rays(file: Path, place: Sequence[float] = (0, 0, 0), num: int = 40) -> tuple[np.ndarray, np.ndarray]:
     """A beam along +x that the ball covers in part; returns heights and exact exit directions for n = 1.5."""
     heights = np.linspace(-0.95, 0.95, num)
-    origins = np.stack([0 * heights - 4, heights, 0 * heights], -1)
-    np.savez(file, origins=origins + place, directions=np.tile([[1.0, 0.0, 0.0]], (num, 1)))
-    share = np.clip(heights / 0.8, -1, 1)
-    deviation = np.where(np.abs(heights) < 0.8, 2 * (np.arcsin(share) - np.arcsin(share / 1.5)), 0)
-    return heights, np.stack([np.cos(deviation), -np.sin(deviation), 0 * heights], -1)
+    rays = beam(torch.from_numpy(heights))
+    np.savez(file, origins=rays.origins.numpy() - [1, 0, 0] + place, directions=rays.directions.numpy())
+    return heights, ball_exits(rays, 0.8, 1.5).numpy()
 
 
 BOX = ["medium.box_min=[-1.5,-1.5,-1.5]", "medium.box_max=[1.5,1.5,1.5]"]

@@ -2,9 +2,7 @@
 
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,8 +12,7 @@ from omegaconf import OmegaConf
 from PIL import Image
 
 from nerfro.data.blender import BlenderData
-from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
-from tests.conftest import UTM, moved_mesh, train_in
+from tests.conftest import UTM, Runner, moved_mesh, train_in, weights_of
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +63,7 @@ def test_run_writes_metrics_pictures_and_what_repeats_it(run: Path, overrides: l
 
 
 def test_georeferenced_data_train_as_at_the_origin(
-    run: Path, train_here: Callable[..., Any], overrides: list[str], tiny_scene: Path, tmp_path: Path
+    run: Path, train_here: Runner, overrides: list[str], tiny_scene: Path, tmp_path: Path
 ) -> None:
     root = tmp_path / "utm"
     shutil.copytree(tiny_scene, root)
@@ -110,28 +107,28 @@ def test_log_holds_every_loss_and_weight_of_every_second_step_and_images(run: Pa
 
 
 def test_weights_depend_on_the_seed_and_not_on_validation(
-    run: Path, train_here: Callable[..., Any], overrides: list[str], tmp_path: Path
+    run: Path, train_here: Runner, overrides: list[str], tmp_path: Path
 ) -> None:
-    weights = [load_checkpoint(run / LAST_CHECKPOINT)[0]["state_dict"]]
+    weights = [weights_of(run)]
     for seed in (0, 1):
         folder = tmp_path / str(seed)
         train_here(*overrides, f"hydra.run.dir={folder}", f"seed={seed}", "evaluation.every=0")
-        weights.append(load_checkpoint(folder / LAST_CHECKPOINT)[0]["state_dict"])
+        weights.append(weights_of(folder))
     assert all(torch.equal(weights[0][key], weights[1][key]) for key in weights[0])
     assert not all(torch.equal(weights[0][key], weights[2][key]) for key in weights[0])
 
 
-def test_training_learns_the_scene(train_here: Callable[..., Any], tiny_run: list[str], tmp_path: Path) -> None:
+def test_training_learns_the_scene(train_paper: Runner, tmp_path: Path) -> None:
     psnr = []
     quick = ["evaluation.every=0", "optimizer.warmup_steps=0", "optimizer.learning_rate=1e-2", "batches.size=128"]
     for steps in (1, 150):
         folder = tmp_path / str(steps)
-        train_here(*tiny_run, *quick, f"trainer.max_steps={steps}", f"hydra.run.dir={folder}")
+        train_paper(*quick, f"trainer.max_steps={steps}", f"hydra.run.dir={folder}")
         psnr.append(json.loads((folder / "metrics.json").read_text())["test"]["psnr"])
     assert psnr[1] > psnr[0] + 3
 
 
-def test_evaluation_of_the_checkpoint_repeats_the_runs_own(run: Path, evaluate_here: Callable[..., Any]) -> None:
+def test_evaluation_of_the_checkpoint_repeats_the_runs_own(run: Path, evaluate_here: Runner) -> None:
     evaluate_here(f"checkpoint={run}")
     again = run / "evaluate_test"
     first, second = (json.loads((folder / "metrics.json").read_text()) for folder in (run, again))

@@ -2,7 +2,6 @@
 
 import pickle
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -15,6 +14,7 @@ from nerfro.registry import discover
 from nerfro.training.config import TrainConfig
 from nerfro.trust import GuardedConfigLoader, command_of_module
 from tests.conftest import Bomb
+from tests.processes import python
 
 discover()
 
@@ -34,14 +34,14 @@ def executed(folder: Path) -> list[Path]:
     return list(folder.rglob("executed"))
 
 
-def run(folder: Path, *command: str) -> subprocess.CompletedProcess:
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120)
+def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess:
+    done = python(*arguments, folder=folder)
     assert not executed(folder), done.stderr
     return done
 
 
 def test_plugins_of_hydra_in_the_current_directory_are_not_imported(folder: Path) -> None:
-    for command in ([sys.executable, "-m", "nerfro.train"], command_of_module("nerfro.train")):
+    for command in (["-m", "nerfro.train"], command_of_module("nerfro.train")[1:]):
         done = run(folder, *command, "--cfg", "job")
         assert done.returncode == 0, done.stderr
 
@@ -49,7 +49,7 @@ def test_plugins_of_hydra_in_the_current_directory_are_not_imported(folder: Path
 def test_a_stage_imports_nothing_from_the_current_directory(folder: Path) -> None:
     (folder / "hydra").mkdir()
     (folder / "hydra" / "__init__.py").write_text((folder / "hydra_plugins" / "evil.py").read_text())
-    assert run(folder, *command_of_module("nerfro.train"), "--cfg", "job").returncode == 0
+    assert run(folder, *command_of_module("nerfro.train")[1:], "--cfg", "job").returncode == 0
 
 
 @pytest.mark.parametrize(
@@ -85,7 +85,7 @@ def test_configuration_files_name_no_foreign_code(hydra: str, folder: Path, monk
 def test_no_foreign_code_is_executed_before_it_is_refused(flags: tuple[str, ...], folder: Path) -> None:
     write_experiment(folder, "callbacks: {a: {_target_: evil.run}}")
     options = ("--config-dir", str(folder / "conf"), *flags, "+experiment=other", "trainer.max_steps=1")
-    done = run(folder, sys.executable, "-m", "nerfro.train", *options)
+    done = run(folder, "-m", "nerfro.train", *options)
     assert done.returncode == 1
     assert done.stderr.startswith("nerfro: error: hydra.callbacks.a._target_=evil.run is not allowed")
     assert len(done.stderr.splitlines()) == 1
@@ -100,6 +100,6 @@ def write_experiment(folder: Path, hydra: str) -> None:
 
 def test_a_pickled_configuration_is_not_read(folder: Path) -> None:
     (folder / "config.pickle").write_bytes(pickle.dumps(Bomb("touch executed")))
-    done = run(folder, sys.executable, "-m", "nerfro.train", "--experimental-rerun", "config.pickle")
+    done = run(folder, "-m", "nerfro.train", "--experimental-rerun", "config.pickle")
     assert done.returncode == 1
     assert "--experimental-rerun executes code" in done.stderr

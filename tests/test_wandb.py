@@ -4,7 +4,7 @@ import csv
 import json
 import struct
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+
+from tests.conftest import Runner
 
 PICTURES = {"val/prediction_reference_error", "val/depth_opacity", "val/sky", "val/paths"}
 _BLOCK = 32768  # records are split at multiples of it, as in LevelDB's logs
@@ -55,17 +57,17 @@ def read(file: Path) -> tuple[dict[str, Any], dict[str, dict[int, Any]]]:
 
 @pytest.mark.slow
 def test_offline_run_needs_no_account_and_holds_what_tensorboard_and_the_csv_hold(
-    train_here: Callable[..., Any], tiny_run: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    train_paper: Runner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     monkeypatch.setenv("WANDB_SILENT", "true")
     monkeypatch.delenv("WANDB_API_KEY", raising=False)
-    folder = tmp_path / "run"
-    train_here(
-        *tiny_run, "logger=wandb", "logger.wandb.offline=true", "trainer.max_steps=4", "evaluation.every=2",
-        "trainer.log_every_n_steps=1", "loss.boundary.start=0", "loss.smoothness.start=0", f"hydra.run.dir={folder}",
+    train_paper(
+        "logger=wandb", "logger.wandb.offline=true", "trainer.max_steps=4", "evaluation.every=2",
+        "trainer.log_every_n_steps=1", "loss.boundary.start=0", "loss.smoothness.start=0",
     )  # fmt: skip
+    folder = tmp_path / "run"
     (log,) = folder.glob("wandb/offline-run-*/run-*.wandb")
     settings, logged = read(log)
     assert (settings["trainer"]["max_steps"], settings["loss"]["boundary"]["start"]) == (4, 0)

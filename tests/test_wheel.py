@@ -1,14 +1,13 @@
 """The wheel carries conf/, plugins/ and the embedded scene, and works from any folder."""
 
-import os
-import subprocess
-import sys
+import functools
 import zipfile
 from pathlib import Path
 
 import pytest
 
 from nerfro.paths import PACKAGE_DIR
+from tests.processes import printed_by
 
 PROJECT = PACKAGE_DIR.parent
 
@@ -46,18 +45,7 @@ def test_installed_wheel_composes_and_lists_its_plugins_from_a_foreign_folder(wh
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(site)
 
-    def python(*arguments: str) -> str:
-        done = subprocess.run(
-            [sys.executable, *arguments],
-            cwd=elsewhere,
-            env={**os.environ, "PYTHONPATH": str(site), "COLUMNS": "200"},
-            capture_output=True,
-            text=True,
-            timeout=120,
-        )
-        assert done.returncode == 0, done.stderr
-        return done.stdout
-
+    python = functools.partial(printed_by, folder=elsewhere, PYTHONPATH=str(site), COLUMNS="200")
     assert python("-c", "import nerfro; print(nerfro.__file__)").strip().startswith(str(site))
     listed = python("-m", "nerfro.plugins")
     assert "boundary=skybox" in listed

@@ -15,6 +15,7 @@ from nerfro.files.images import save_png
 from nerfro.light import to_srgb
 from nerfro.types import Exits
 from tests.conftest import refused
+from tests.gradients import require_equal_gradients
 
 
 def random_directions(num: int, seed: int = 0) -> torch.Tensor:
@@ -204,7 +205,4 @@ def test_kernels_match_the_reference_forward_and_backward(num: int) -> None:
     inputs = (coordinates.requires_grad_(), random_texels().requires_grad_())
     found, expected = (look(face, *inputs, PADDED, LEVELS) for look in (kernels.lookup, cube_map.lookup))
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
-    upstream = torch.randn(expected.shape, generator=torch.Generator().manual_seed(2))
-    gradients = (torch.autograd.grad(output, inputs, upstream) for output in (found, expected))
-    for ours, reference in zip(*gradients, strict=True):
-        torch.testing.assert_close(ours, reference, rtol=1e-5, atol=1e-5 * float(reference.abs().max()))
+    require_equal_gradients(found, expected, inputs)

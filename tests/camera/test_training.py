@@ -3,11 +3,9 @@
 import json
 import math
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -24,6 +22,7 @@ from nerfro.silhouettes.silhouettes import mesh_silhouettes
 from nerfro.training.load import load
 from nerfro.training.run_folder import load_checkpoint
 from tests.ball_photographs import TRAINING, photographs, save
+from tests.conftest import Runner, weights_of
 
 discover()
 NerfstudioData = import_module("nerfro_plugins.data_formats.nerfstudio").NerfstudioData
@@ -38,7 +37,7 @@ def poses_in(file: Path) -> torch.Tensor:
 
 
 @pytest.mark.slow
-def test_disturbed_poses_come_back(train_here: Callable[..., Any], tmp_path: Path) -> None:
+def test_disturbed_poses_come_back(train_here: Runner, tmp_path: Path) -> None:
     views = photographs([1.45])
     true = views.cameras
     moved = disturbed(true, math.radians(0.5), 0.01, 0)
@@ -53,7 +52,7 @@ def test_disturbed_poses_come_back(train_here: Callable[..., Any], tmp_path: Pat
 
 
 @pytest.mark.slow
-def test_the_gains_of_disturbed_exposures_come_back(train_here: Callable[..., Any], tmp_path: Path) -> None:
+def test_the_gains_of_disturbed_exposures_come_back(train_here: Runner, tmp_path: Path) -> None:
     views = photographs([1.45])
     logarithm = 0.3 * torch.randn(len(views), 3).clamp(-2, 0)  # darker, so that nothing saturates
     images = to_srgb(to_linear(views.images) * logarithm.exp()[:, None, None])
@@ -70,7 +69,7 @@ def test_the_gains_of_disturbed_exposures_come_back(train_here: Callable[..., An
     assert metrics.treatments["exposed"].mean("psnr") > metrics.result.mean("psnr") + 3
 
 
-def test_each_treatment_of_test_views_is_told_by_its_name(train: Callable[..., Any], tmp_path: Path) -> None:
+def test_each_treatment_of_test_views_is_told_by_its_name(train: Runner, tmp_path: Path) -> None:
     options = ["camera=refined", "camera.lens=true", "camera.exposure=true", "phase.cameras={start: 0, every: 1}"]
     train(*options, *LEARNED_SKY, "trainer.max_steps=3")
     document = json.loads((tmp_path / "run" / "metrics.json").read_text("utf-8"))
@@ -98,7 +97,7 @@ def test_each_treatment_of_test_views_is_told_by_its_name(train: Callable[..., A
             torch.testing.assert_close(poses[Path(frame["file_path"]).name], expected)
 
 
-def test_a_run_whose_cameras_learn_goes_on_as_if_it_had_not_stopped(train: Callable[..., Any], tmp_path: Path) -> None:
+def test_a_run_whose_cameras_learn_goes_on_as_if_it_had_not_stopped(train: Runner, tmp_path: Path) -> None:
     options = ["camera=refined", "camera.lens=true", "camera.exposure=true", "phase.cameras={start: 2, every: 2}"]
     options += ["evaluation=none", "optimizer.final_learning_rate=1e-2"]
     states = []
@@ -106,7 +105,7 @@ def test_a_run_whose_cameras_learn_goes_on_as_if_it_had_not_stopped(train: Calla
         for i, steps in enumerate(parts):
             again = ["ckpt_path=last"] if i else []
             train(*options, *again, f"trainer.max_steps={steps}", f"hydra.run.dir={tmp_path / name}")
-        states.append(load_checkpoint(tmp_path / name / "checkpoints" / "last.ckpt")[0]["state_dict"])
+        states.append(weights_of(tmp_path / name))
     assert states[0].keys() == states[1].keys()
     assert all(torch.equal(states[0][name], states[1][name]) for name in states[0])
     assert float(states[0]["renderer.scene.camera.motions.motion"].abs().max()) > 0
@@ -115,7 +114,7 @@ def test_a_run_whose_cameras_learn_goes_on_as_if_it_had_not_stopped(train: Calla
 
 
 def test_cameras_move_by_sky_and_masks_before_training_and_their_priors_are_kept(
-    train: Callable[..., Any], tiny_scene: Path, tmp_path: Path
+    train: Runner, tiny_scene: Path, tmp_path: Path
 ) -> None:
     options = ["camera=refined", "evaluation=none", "trainer.max_steps=1"]
     kept, cameras = [], []
@@ -143,6 +142,6 @@ def test_cameras_move_by_sky_and_masks_before_training_and_their_priors_are_kept
         assert told["information"].shape == (camera.numbers().numel(),) * 2
 
 
-def test_a_gain_for_each_view_needs_linear_radiance(train: Callable[..., Any]) -> None:
+def test_a_gain_for_each_view_needs_linear_radiance(train: Runner) -> None:
     refused = train("camera.exposure=true", "model.colour=srgb", "trainer.max_steps=1", code=1).error
     assert "model.colour=linear" in refused

@@ -26,6 +26,7 @@ from nerfro.silhouettes.visual_hull import Silhouettes
 from nerfro.types import Exits
 from tests.ball_photographs import BOX, RADIUS, cameras, mesh, photographs_of, save, sky, solid
 from tests.closed_forms import grid_points
+from tests.conftest import Runner
 
 DEPTH, WIDTH, AXIS = 0.05, 0.12, torch.tensor([0.6, 0.0, 0.8])
 
@@ -135,7 +136,7 @@ def test_a_backdrop_is_the_room_along_every_line() -> None:
 
 
 @pytest.fixture
-def preprocess(tmp_path: Path, run_here: Callable) -> Callable:
+def preprocess(tmp_path: Path, run_here: Runner) -> Callable:
     """Refine the ball's mesh by photographs of another medium; returns the folder, and what was printed."""
 
     def run(*overrides: str, medium: SdfGrid | None = None, ior: float | None = 1.5) -> tuple[Path, str]:

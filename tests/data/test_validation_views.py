@@ -1,6 +1,5 @@
 """Views that are held back: which, and that nobody trains on them."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ from nerfro.data.base import Views
 from nerfro.data.blender import BlenderData
 from nerfro.data.validation_views import WithValidationViews, spread
 from nerfro.training.ray_batches import RayBatches
+from tests.conftest import Runner
 
 
 def test_places_are_spread_and_the_outermost_are_left() -> None:
@@ -46,9 +46,7 @@ def test_held_back_views_are_val_and_the_others_train(tiny_scene: Path) -> None:
     assert many.load("val").names == train.names
 
 
-def test_a_run_never_draws_what_it_holds_back(
-    train: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_never_draws_what_it_holds_back(train: Runner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: list[Views] = []
     make = RayBatches.__init__
 
@@ -64,6 +62,6 @@ def test_a_run_never_draws_what_it_holds_back(
     assert not {frame.image for frame in drawn[0].frames} & {frame.image for frame in val.frames}
 
 
-def test_views_that_leave_none_to_train_on_are_refused(train: Callable[..., Any]) -> None:
+def test_views_that_leave_none_to_train_on_are_refused(train: Runner) -> None:
     refused = train("trainer.max_steps=1", "batches.num_validation_views=3", code=1).error
     assert "=3 leaves no view to train on: there are 3 training views; take at most 2" in refused

@@ -1,5 +1,3 @@
-import subprocess
-import sys
 from importlib import import_module
 from pathlib import Path
 from typing import NamedTuple
@@ -10,6 +8,7 @@ from torch import Tensor
 
 from nerfro.registry import discover
 from tests.conftest import refused
+from tests.processes import printed_by
 
 discover()
 pretrained, lpips = (import_module(f"nerfro_plugins.perceptual_metrics.{name}") for name in ("pretrained", "lpips"))
@@ -45,10 +44,8 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> Reference:
     """The values of torchmetrics, and our network with the same backbone and the published heads."""
     folder = tmp_path_factory.mktemp("published")
     torch.save(pictures(), folder / "pictures.pt")
-    program = [sys.executable, str(Path(__file__).with_name("reference_lpips.py"))]
-    command = [*program, str(folder / "pictures.pt"), str(folder / "results.pt")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
+    program = Path(__file__).with_name("reference_lpips.py")
+    printed_by(str(program), str(folder / "pictures.pt"), str(folder / "results.pt"))
     results = torch.load(folder / "results.pt", weights_only=True)
     predictions, targets = (images.movedim(1, -1) for images in pictures())
     return Reference(load_lpips_network(results["backbone"]), predictions, targets, results)

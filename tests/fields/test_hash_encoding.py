@@ -6,6 +6,7 @@ import torch
 from nerfro.fields import hash_encoding
 from nerfro.fields import hash_encoding_cpu as kernels
 from nerfro.kernels.constants import constant
+from tests.gradients import require_equal_gradients
 
 # Two dense levels and three hashed ones, the last of them much finer than its table.
 LEVELS = hash_encoding.grid_levels(num_levels=5, base_resolution=4, finest_resolution=64, log2_table_size=10)
@@ -64,10 +65,7 @@ def test_kernels_match_the_reference_forward_and_backward(num_points: int) -> No
     inputs = (random_positions(num_points).requires_grad_(), random_table().requires_grad_())
     encoded, expected = kernels.hash_encode(*inputs, LEVELS), hash_encoding.hash_encode(*inputs, LEVELS)
     torch.testing.assert_close(encoded, expected, rtol=1e-5, atol=1e-5)
-    upstream = torch.randn(expected.shape, generator=torch.Generator().manual_seed(3))
-    gradients = (torch.autograd.grad(output, inputs, upstream) for output in (encoded, expected))
-    for ours, reference in zip(*gradients, strict=True):
-        torch.testing.assert_close(ours, reference, rtol=1e-5, atol=1e-5 * float(reference.abs().max()))
+    require_equal_gradients(encoded, expected, inputs)
 
 
 def test_positions_learn_after_a_picture_was_rendered() -> None:

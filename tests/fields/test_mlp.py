@@ -9,6 +9,7 @@ from nerfro.fields.networks import compile_networks, radiance
 from nerfro.light import to_srgb
 from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import example_path, example_samples
+from tests.gradients import require_equal_gradients
 from tests.paper import RGB_PADDING, MipNerfField, NerfField, RadianceMLP, SkipMLP, padded_sigmoid
 
 
@@ -33,8 +34,7 @@ def test_bottleneck_and_view_layer_equal_two_layers_with_their_gradients() -> No
     colours = mlp(position, direction)[1], padded_sigmoid(mlp.rgb(two_layers))
     torch.testing.assert_close(*colours)
     layers = [*mlp.trunk.parameters(), *mlp.bottleneck.parameters(), *mlp.view.parameters()]
-    for fused, separate in zip(*(torch.autograd.grad(rgb.square().sum(), layers) for rgb in colours), strict=True):
-        torch.testing.assert_close(fused, separate)
+    require_equal_gradients(*colours, layers, atol=1e-5)
 
 
 def test_published_nerf_has_its_number_of_weights() -> None:
@@ -79,8 +79,7 @@ def test_points_evaluated_in_blocks_equal_points_evaluated_together_with_their_g
     whole = field.decode(positions, directions)
     density, rgb = (torch.stack(each) for each in zip(*map(field.decode, positions, directions), strict=True))
     torch.testing.assert_close(whole, (density, rgb))
-    grads = [torch.autograd.grad(colours.sum(), [*field.mlp.trunk.parameters()]) for colours in (whole[1], rgb)]
-    torch.testing.assert_close(*grads)
+    require_equal_gradients(whole[1], rgb, [*field.mlp.trunk.parameters()], atol=1e-5)
 
 
 def test_nerf_field_with_a_box_equals_one_without_inside_and_is_empty_outside() -> None:

@@ -1,10 +1,14 @@
+"""Files and checkpoints are written whole, or not at all."""
+
 import errno
 import os
 import stat
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
 
 from nerfro.files.atomic import atomic_file, write_atomically
 from nerfro.training.checkpoint_files import CheckpointFiles
@@ -67,3 +71,13 @@ def test_writing_that_is_broken_off_leaves_the_old_file_and_nothing_beside_it(tm
         write_half()
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_checkpoint_is_written_beside_the_old_one_and_not_elsewhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "missing"))
+    for number in (1, 2):
+        CheckpointFiles().save_checkpoint({"step": number}, tmp_path / "run" / "last.ckpt")
+        assert torch.load(tmp_path / "run" / "last.ckpt", weights_only=True) == {"step": number}
+    assert [path.name for path in (tmp_path / "run").iterdir()] == ["last.ckpt"]

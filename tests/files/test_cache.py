@@ -1,16 +1,25 @@
-"""The disk cache never gives stale or damaged arrays, and never fails a run."""
+"""The disk cache never gives stale or damaged arrays, never fails a run, and does not grow without end."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from nerfro.errors import NerfroError
 from nerfro.files import cache
 from nerfro.files.cache import cached_arrays, content_hash, save_arrays
+from nerfro.files.mapped import mapped_array
 from nerfro.files.reading import load_arrays
 from tests.conftest import refused
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of the cache, which is empty."""
+    monkeypatch.setenv("NERFRO_CACHE", str(tmp_path))
+    return tmp_path
 
 
 class _Counter:
@@ -21,8 +30,7 @@ class _Counter:
         return {"values": np.arange(5.0)}
 
 
-def test_arrays_are_computed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("NERFRO_CACHE", str(tmp_path))
+def test_arrays_are_computed_once() -> None:
     counter = _Counter()
     for _ in range(3):
         np.testing.assert_array_equal(cached_arrays("distance_entry", counter.compute)["values"], np.arange(5.0))
@@ -47,11 +55,8 @@ def replaced(**arrays: np.ndarray) -> Callable[[Path], None]:
         lambda file: (save_arrays(file, {"values": np.arange(5.0)}), os.truncate(file, 50)),
     ],
 )
-def test_what_does_not_match_its_checksum_is_made_again(
-    damage: Callable[[Path], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("NERFRO_CACHE", str(tmp_path))
-    damage(tmp_path / "distance_entry.npz")
+def test_what_does_not_match_its_checksum_is_made_again(damage: Callable[[Path], None], folder: Path) -> None:
+    damage(folder / "distance_entry.npz")
     counter = _Counter()
     for _ in range(2):
         (arrays,) = cached_arrays("distance_entry", counter.compute).items()
@@ -61,7 +66,6 @@ def test_what_does_not_match_its_checksum_is_made_again(
 
 
 def test_cache_does_not_grow_without_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("NERFRO_CACHE", str(tmp_path))
     monkeypatch.setattr(cache, "LIMIT", 1000)
     (tmp_path / "mine.npz").write_bytes(bytes(2000))
     for number in range(5):
@@ -113,3 +117,65 @@ def test_hash_depends_on_values_shapes_types_and_order() -> None:
 def test_pickled_code_is_not_executed(tmp_path: Path) -> None:
     np.savez(tmp_path / "evil.npz", values=np.array([{"a": 1}], dtype=object))
     refused("plain arrays", load_arrays, tmp_path / "evil.npz")
+
+
+# --- mapped arrays, which are whole or not there ---
+
+
+SHAPE, TYPE = (4, 1000), np.dtype(np.uint16)
+
+
+def rows() -> Iterator[np.ndarray]:
+    return iter(np.arange(4000, dtype=np.uint16).reshape(SHAPE))
+
+
+def broken() -> Iterator[np.ndarray]:
+    yield np.zeros(1000, np.uint16)
+    raise NerfroError("a picture cannot be read")
+
+
+def test_what_is_written_to_an_array_stays_in_the_process() -> None:
+    array = mapped_array("a", SHAPE, TYPE, rows)
+    assert np.array_equal(array, np.arange(4000).reshape(SHAPE))
+    array[0] = 7
+    assert np.array_equal(mapped_array("a", SHAPE, TYPE, rows), np.arange(4000).reshape(SHAPE))
+
+
+def test_nothing_is_left_of_an_array_that_could_not_be_made(folder: Path) -> None:
+    refused("a picture cannot be read", mapped_array, "a", SHAPE, TYPE, broken)
+    assert list(folder.iterdir()) == []
+
+
+def test_arrays_used_longest_ago_go_first(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cache, "LIMIT", 2.5 * 8200)
+    for age, key in ((300, "a"), (200, "b")):
+        mapped_array(key, SHAPE, TYPE, rows)
+        os.utime(folder / f"mapped_{key}.npy", (1e9 - age, 1e9 - age))
+    used = mapped_array("a", SHAPE, TYPE, broken)  # which is there, so that nothing is made
+    mapped_array("c", SHAPE, TYPE, rows)
+    assert sorted(path.name for path in folder.iterdir()) == ["mapped_a.npy", "mapped_c.npy"]
+    mapped_array("d", SHAPE, TYPE, rows)
+    mapped_array("e", SHAPE, TYPE, rows)
+    assert np.array_equal(used, np.arange(4000).reshape(SHAPE))  # removed, but still mapped here
+
+
+def test_what_a_killed_process_left_goes_after_a_day(folder: Path) -> None:
+    for name, age in ((".mapped_old.npy.x.partial", 1e9), (".mapped_new.npy.x.partial", 2e9), (".mine.partial", 1e9)):
+        (folder / name).touch()
+        os.utime(folder / name, (age, age))
+    mapped_array("a", SHAPE, TYPE, rows)
+    assert sorted(path.name for path in folder.iterdir()) == [
+        ".mapped_new.npy.x.partial",
+        ".mine.partial",
+        "mapped_a.npy",
+    ]
+
+
+@pytest.mark.parametrize("place", [-1, -500, 200])
+def test_array_that_does_not_match_its_checksum_is_made_again(place: int, folder: Path) -> None:
+    mapped_array("a", SHAPE, TYPE, rows)
+    content = bytearray((folder / "mapped_a.npy").read_bytes())
+    content[place] ^= 1
+    (folder / "mapped_a.npy").write_bytes(content)
+    assert np.array_equal(mapped_array("a", SHAPE, TYPE, rows), np.arange(4000).reshape(SHAPE))
+    assert np.array_equal(mapped_array("a", SHAPE, TYPE, broken), np.arange(4000).reshape(SHAPE))

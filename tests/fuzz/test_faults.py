@@ -17,6 +17,7 @@ from filelock import FileLock
 from nerfro.evaluation.request import REQUEST_FILE
 from nerfro.training.run_folder import CONFIG_FILE, LAST_CHECKPOINT, load_checkpoint
 from tests import forked
+from tests.fuzz.cases import rays_through_ball
 from tests.fuzz.world import World
 
 LONG = "NERFRO_LONG_CAMPAIGN" in os.environ
@@ -155,7 +156,7 @@ def arguments(command: str, world: World, out: Path) -> list[str]:
     """The command line of a command that writes to a folder."""
     rays = world.root / "rays.npz"
     if not rays.exists():
-        np.savez(rays, origins=np.tile([[0, 0, 4.0]], (9, 1)), directions=np.tile([[0, 0, -1.0]], (9, 1)))
+        np.savez(rays, **rays_through_ball())
     places = {"out": out, "run": world.root / "run", "data": world.root / "data", "rays": rays}
     given = [option.format(**places) for option in COMMANDS[command]]
     return [*world.train_options(world.root / "data"), *given] if command == "train" else given

@@ -22,18 +22,7 @@ def test_any_format_gives_the_same_closed_mesh(tmp_path: Path, extension: str) -
     np.testing.assert_allclose(np.linalg.norm(mesh.vertices, axis=1), 0.7, rtol=1e-5)
 
 
-def test_open_meshes_are_refused_unless_accepted(tmp_path: Path) -> None:
-    shape = trimesh.creation.icosphere(2)
-    shape.update_faces(np.arange(len(shape.faces)) > 3)
-    shape.export(tmp_path / "open.ply")
-    refused(r"not watertight.*medium\.accept_open_mesh=true", load_mesh, tmp_path / "open.ply")
-    assert not load_mesh(tmp_path / "open.ply", accept_open_mesh=True).is_closed
-
-
-def test_missing_garbled_and_empty_files_are_named(tmp_path: Path) -> None:
-    refused(r"none\.ply does not exist", load_mesh, tmp_path / "none.ply")
-    (tmp_path / "bad.ply").write_bytes(b"ply\nformat nonsense")
-    refused(r"bad\.ply", load_mesh, tmp_path / "bad.ply")
+def test_files_without_triangles_or_with_nan_are_named(tmp_path: Path) -> None:
     (tmp_path / "points.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n")
     refused(r"points\.obj", load_mesh, tmp_path / "points.obj")
     (tmp_path / "nan.obj").write_text("v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
@@ -50,11 +39,3 @@ def test_triangles_of_vertices_that_are_not_there_are_refused(index: int, tmp_pa
     (tmp_path / "bad.ply").write_text("\n".join([*header, *lines]) + "\n")
     with pytest.raises(NerfroError, match=r"bad\.ply (has triangles with indices of missing vertices|cannot be read)"):
         load_mesh(tmp_path / "bad.ply", accept_open_mesh=True)
-
-
-@pytest.mark.parametrize("extents", [(1, 1, 0), (1e-5, 1e-5, 1e-5), (0, 0, 0)])
-def test_meshes_without_an_inside_are_refused(extents: tuple[float, float, float], tmp_path: Path) -> None:
-    trimesh.Trimesh(trimesh.creation.box().vertices * extents, trimesh.creation.box().faces, process=False).export(
-        tmp_path / "flat.ply"
-    )
-    refused(r"flat\.ply is \S+ world units thin, so it has no inside", load_mesh, tmp_path / "flat.ply")

@@ -1,9 +1,10 @@
 """The allocator's settings, in a process of its own so that other tests keep theirs."""
 
-import subprocess
 import sys
 
 import pytest
+
+from tests.processes import printed_by
 
 SCRIPT = """
 import resource, torch
@@ -24,8 +25,7 @@ print(faults())
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="a setting of Linux's C library")
 def test_repeated_tensors_reuse_memory_without_page_faults() -> None:
-    result = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=True)
-    accepted, faults = result.stdout.split()
+    accepted, faults = printed_by("-c", SCRIPT).split()
     if accepted != "True":
         pytest.skip("the C library is not glibc")
     assert int(faults) < 20 * 8192 / 10

@@ -1,7 +1,6 @@
 """Kernels compile wherever nerfro is installed, and again whenever a source of theirs changes."""
 
 import os
-import subprocess
 import sys
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import pytest
 import nerfro.fields.hash_encoding_cpu  # noqa: F401  # whose sources are listed
 from nerfro.kernels import compilation
 from nerfro.kernels.compilation import compiled, compiled_parallel
+from tests.processes import printed_by
 
 
 def _square(x: float) -> float:
@@ -51,14 +51,10 @@ def test_a_kernel_is_compiled_again_where_a_constant_of_another_file_has_changed
         "from plugin.middle import FACTOR\n\n\n"
         "@compiled\ndef scaled(x):\n    return FACTOR * x\n"
     )
-    environment = {
-        **os.environ,
-        "NERFRO_CACHE": str(tmp_path),
-        "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path]),
-    }
+    environment = {"NERFRO_CACHE": str(tmp_path), "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
     environment["PYTHONDONTWRITEBYTECODE"] = "1"  # two files of the same second look the same to Python
-    command = [sys.executable, "-c", "from plugin.kernel import scaled; print(scaled(3))"]
     for factor in (2, 5):
         (package / "numbers.py").write_text(f"FACTOR = {factor}\n")
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=100)
-        assert done.stdout == f"{3 * factor}\n", done.stderr
+        assert (
+            printed_by("-c", "from plugin.kernel import scaled; print(scaled(3))", **environment) == f"{3 * factor}\n"
+        )

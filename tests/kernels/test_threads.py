@@ -1,8 +1,5 @@
 """Kernels share a process with other threads and with other users of Numba."""
 
-import os
-import subprocess
-import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
@@ -10,6 +7,7 @@ import pytest
 import torch
 
 from nerfro.kernels import threads
+from tests.processes import printed_by
 
 IMPORTS_ONLY = """
 import numba
@@ -51,20 +49,14 @@ print(len(same), all(same), numba.threading_layer(), numba.config.THREADING_LAYE
 """
 
 
-def run(source: str, **environment: str) -> list[str]:
-    variables = {**os.environ, "NUMBA_NUM_THREADS": "2", **environment}
-    done = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True, timeout=300, env=variables)
-    assert done.returncode == 0, done.stderr
-    return done.stdout.split("\n")[:-1]
-
-
 def test_importing_kernels_changes_nothing_for_other_users_of_numba() -> None:
-    assert run(IMPORTS_ONLY) == ["{}", "no threads"]
+    assert printed_by("-c", IMPORTS_ONLY, NUMBA_NUM_THREADS="2") == "{}\nno threads\n"
 
 
 @pytest.mark.parametrize(("chosen", "used"), [("default", "workqueue"), ("omp", "omp")])
 def test_two_threads_may_trace_at_once_on_the_threading_layer_that_is_chosen(chosen: str, used: str) -> None:
-    assert run(TWO_THREADS, NUMBA_THREADING_LAYER=chosen) == [f"400 True {used} {chosen}"]
+    printed = printed_by("-c", TWO_THREADS, NUMBA_NUM_THREADS="2", NUMBA_THREADING_LAYER=chosen)
+    assert printed == f"400 True {used} {chosen}\n"
 
 
 @pytest.mark.parametrize("busy", [True, False])

@@ -16,24 +16,16 @@ from nerfro.losses.photometric import Photometric
 from nerfro.losses.total_variation import TotalVariation, direction_pairs
 from nerfro.models.refractive import RefractiveModel
 from nerfro.registry import create, find
-from nerfro.rendering import ColourSpace, Components, Renderer, Scene
+from nerfro.rendering import ColourSpace, Renderer, Scene
 from nerfro.samplers.points.stratified import point_samples
 from nerfro.testing import NUM_RAYS, example_batch, example_components, example_draws, example_path, example_rendering
 from nerfro.types import Batch, Rendering
-from tests.closed_forms import Luneburg
-from tests.paper import Eikonal, Hierarchical, NerfField, Skybox, Smoothness, tile_roughness
+from tests.paper import Smoothness, small_components, tile_roughness
 
 
 @pytest.fixture(scope="module")
 def model() -> Renderer:
-    parts = Components(
-        medium=Luneburg(),
-        path_sampler=Eikonal("euler", 32),
-        point_sampler=Hierarchical(8, 8),
-        make_field=lambda: NerfField(width=16, depth=2, skip=1, view_width=8),
-        boundary=Skybox(width=8),
-    )
-    return RefractiveModel(parts, colour="srgb")
+    return RefractiveModel(small_components(), colour="srgb")
 
 
 def gradient_norms(model: Renderer, value: Tensor) -> dict[str, float]:

@@ -16,7 +16,7 @@ from nerfro.media.sdf_grid import SdfGrid
 from nerfro.samplers.paths.snell import Snell, trace_interfaces
 from nerfro.types import Path as RayPath
 from nerfro.types import Rays
-from tests.closed_forms import angle, make_rays
+from tests.closed_forms import angle, ball_exits, make_rays
 from tests.conftest import refused
 from tests.paper import Eikonal
 
@@ -43,15 +43,6 @@ def _rays_at(centre: tuple[float, ...], num: int = 300) -> Rays:
     return make_rays(origins + torch.tensor(centre), [[0.0, 0.0, -1.0]] * num, 0.5, 8.0)
 
 
-def _through(rays: Rays, centre: tuple[float, ...], ior: float | Tensor) -> Tensor:
-    """Exit directions behind a ball in closed form."""
-    offset = rays.origins - torch.tensor(centre, dtype=torch.float64)
-    across = offset - (offset * rays.directions).sum(-1, keepdim=True) * rays.directions
-    sine = across.norm(dim=-1, keepdim=True)
-    turn = 2 * (torch.asin(sine) - torch.asin(sine / ior))
-    return turn.cos() * rays.directions - turn.sin() * across / sine
-
-
 @pytest.mark.parametrize("tracer", ["kernel", "reference", "triangles", "eikonal"])
 def test_two_balls_far_apart_are_as_exact_as_each_alone(tracer: str, tmp_path: Path) -> None:
     files = [_ball(tmp_path, centre) for centre in CENTRES]
@@ -65,7 +56,7 @@ def test_two_balls_far_apart_are_as_exact_as_each_alone(tracer: str, tmp_path: P
 
     for file, centre, ior in zip(files, CENTRES, (1.5, 1.33), strict=True):
         rays, alone = _rays_at(centre), SdfGrid(file, ior, resolution=48, cache=False)
-        expected = _through(rays, centre, ior)
+        expected = ball_exits(rays, 1.0, ior, centre)
         errors = [angle(exits(rays, medium), expected) for medium in (both, alone)]
         assert errors[0].median() < (0.1 if tracer == "eikonal" else 0.03)
         torch.testing.assert_close(*errors, atol=1e-4 if tracer == "eikonal" else 1e-9, rtol=1e-3)
@@ -130,7 +121,7 @@ def test_the_index_of_one_body_and_the_absorption_of_the_other_are_learned_toget
     parameters = medium.parameters_by_name()
     assert list(parameters) == [ior, absorption]
     clear, tinted = (_rays_at(centre, 100) for centre in CENTRES)
-    expected = _through(clear, CENTRES[0], 1.5)
+    expected = ball_exits(clear, 1.0, 1.5, CENTRES[0])
     sigma = torch.tensor([0.5, 0.1, 0.3], dtype=torch.float64)
     groups = [{"params": [parameters[name]], "lr": rate} for name, rate in ((ior, 0.02), (absorption, 0.1))]
     sampler, optimizer = Snell(), torch.optim.Adam(groups)

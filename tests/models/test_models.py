@@ -12,8 +12,7 @@ from nerfro.rendering import Components
 from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import example_rays
 from nerfro.types import Exits
-from tests.closed_forms import Luneburg
-from tests.paper import Eikonal, Hierarchical, MipNerfModel, NerfField, Skybox
+from tests.paper import MipNerfModel, small_components
 
 
 class Compass(Boundary):
@@ -25,14 +24,7 @@ class Compass(Boundary):
 
 @pytest.fixture
 def parts() -> Components:
-    return Components(
-        medium=Luneburg(),
-        path_sampler=Eikonal("euler", 64),
-        point_sampler=Hierarchical(8, 8),
-        make_field=lambda: NerfField(width=16, depth=2, skip=1, view_width=8),
-        boundary=Skybox(width=8),
-        chunk_size=7,
-    )
+    return replace(small_components(), chunk_size=7)
 
 
 def test_refractive_model_has_a_field_for_each_level_and_mip_nerf_one_for_all(parts: Components) -> None:

@@ -6,7 +6,6 @@ from torch.nn.functional import normalize
 from nerfro.boundaries.base import Boundary
 from nerfro.boundaries.constant import ConstantBoundary
 from nerfro.boundaries.envmap import EnvironmentMap
-from nerfro.cameras import Cameras
 from nerfro.draws import Draws
 from nerfro.fields.hash_grid import HashGridField
 from nerfro.media.shapes import Ball
@@ -14,6 +13,7 @@ from nerfro.rendering import composite
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.types import Path
+from tests.cameras_at import cameras_at
 
 WALL = 3.0  # half side of the room
 TOY, SIZE = torch.tensor([0.3, 1.2, 0.2]), 0.3
@@ -48,8 +48,7 @@ def photographs(num_views: int, seed: int) -> tuple[Path, torch.Tensor, torch.Te
     back = normalize(torch.randn(num_views, 3, generator=generator), dim=-1)
     right = normalize(torch.linalg.cross(torch.randn(num_views, 3, generator=generator), back), dim=-1)
     pose = torch.stack([right, torch.linalg.cross(back, right), back, 2.2 * back], -1)
-    focal, centre = torch.full((num_views,), 17.5), torch.full((num_views,), 12.0)
-    cameras = Cameras(pose, focal, focal, centre, centre, 24, 24, 0.1, 5.0)
+    cameras = cameras_at(pose, 24, 24, 17.5, near=0.1, far=5.0)
     view, row, column = torch.cartesian_prod(torch.arange(num_views), torch.arange(24), torch.arange(24)).unbind(-1)
     path = Snell()(cameras.rays(view, row, column), Ball(radius=0.8))
     return path, *seen(path)

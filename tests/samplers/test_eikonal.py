@@ -8,7 +8,7 @@ import torch
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball
-from tests.closed_forms import Luneburg, RoundedBox, Slab, angle, grid_points, make_rays, random_rays
+from tests.closed_forms import Luneburg, RoundedBox, Slab, angle, ball_exits, beam, grid_points, make_rays, random_rays
 from tests.paper import Eikonal, VoxelGrid, euler, march_adaptive, march_uniform
 
 BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
@@ -19,8 +19,7 @@ BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
 
 def test_adaptive_luneburg_lens_focuses_on_its_rim() -> None:
     heights = torch.linspace(-0.9, 0.9, 13, dtype=torch.float64)
-    origins = torch.stack([torch.full_like(heights, -3), heights, 0 * heights], -1)
-    path = Eikonal(tolerance=1e-6)(make_rays(origins, [[1, 0, 0]] * 13, 0.5, 6), Luneburg().double())
+    path = Eikonal(tolerance=1e-6)(beam(heights, far=6), Luneburg().double())
     assert path.refracted.all()
     # Behind the focus rays go straight: their line passes through (R, 0, 0).
     to_focus = torch.tensor([1.0, 0, 0], dtype=torch.float64) - path.exit_positions
@@ -43,10 +42,8 @@ def test_adaptive_steps_refract_exactly_at_a_flat_shell() -> None:
 def test_adaptive_ball_obeys_snell_as_its_shell_thins() -> None:
     radius, n = 0.8, 1.5
     b = torch.linspace(0, 0.9, 40, dtype=torch.float64) * radius
-    origins = torch.stack([torch.full_like(b, -3), b, 0 * b], -1)
-    rays = make_rays(origins, [[1, 0, 0]] * 40, 0.5, 6)
-    deviation = 2 * (torch.asin(b / radius) - torch.asin(b / (n * radius)))
-    exact = torch.stack([deviation.cos(), -deviation.sin(), 0 * b], -1)
+    rays = beam(b, far=6)
+    exact = ball_exits(rays, radius, n)
 
     def error(shell: float) -> float:
         path = Eikonal()(rays, Ball(radius, n, shell).double())

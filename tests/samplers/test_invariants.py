@@ -13,7 +13,7 @@ from nerfro.samplers.base import PathSampler, PointSampler
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.paths.straight import Straight
 from nerfro.samplers.points.stratified import Stratified
-from nerfro.testing import example_path, example_rays
+from nerfro.testing import example_rays
 from nerfro.types import Path, Radiance, Rendering
 from tests.closed_forms import (
     FunctionMedium,
@@ -140,12 +140,3 @@ def test_samples_are_those_of_straight_rays_bit_for_bit(name: str, points: Point
     for expected, found in zip(_levels(points, plain), _levels(points, path), strict=True):
         for field in ("s", "positions", "directions", "edges"):
             assert torch.equal(getattr(found.samples, field), getattr(expected.samples, field))
-
-
-@POINTS
-def test_weights_and_transmittance_sum_to_one_however_a_path_is_sampled(points: PointSampler) -> None:
-    path, points = example_path(200), points.train()
-    for _ in range(3):
-        for rendering in _levels(points, path):
-            total = rendering.weights.sum(-1) + rendering.transmittance
-            torch.testing.assert_close(total, torch.ones(200), atol=1e-5, rtol=0)

@@ -16,7 +16,7 @@ from nerfro.media.shapes import Ball
 from nerfro.samplers.paths.snell import Snell, trace_interfaces
 from nerfro.samplers.paths.snell_law import refract
 from nerfro.types import Rays
-from tests.closed_forms import Luneburg, RoundedBox, Slab, angle, beam, grid_points, make_rays, random_rays
+from tests.closed_forms import Luneburg, RoundedBox, Slab, angle, ball_exits, beam, grid_points, make_rays, random_rays
 from tests.conftest import refused
 
 BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
@@ -24,12 +24,6 @@ BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
 
 def _rays(origins: list | Tensor, directions: list | Tensor, near: float = 0.5, far: float = 9.0) -> Rays:
     return make_rays(origins, directions, near, far)
-
-
-def _ball_exit(heights: Tensor, radius: float, n: float) -> Tensor:
-    """Exit directions of the beam: deviation 2 (i - t) with sin i = b / R, sin t = b / (n R)."""
-    deviation = 2 * (torch.asin(heights / radius) - torch.asin(heights / (n * radius)))
-    return torch.stack([deviation.cos(), -deviation.sin(), 0 * heights], -1)
 
 
 def _grid(values: Tensor, iors: list[float]) -> SdfGrid:
@@ -65,7 +59,7 @@ def test_refraction_keeps_n_times_sine_and_the_plane_of_incidence() -> None:
 def test_ball_deviates_by_twice_the_difference_of_its_angles() -> None:
     heights = torch.linspace(-0.99, 0.99, 101, dtype=torch.float64) * 0.8
     trace = Snell().trace(beam(heights), Ball(0.8, 1.5).double())
-    assert angle(trace.path.exit_directions, _ball_exit(heights, 0.8, 1.5)).max() < 1e-7
+    assert angle(trace.path.exit_directions, ball_exits(beam(heights), 0.8, 1.5)).max() < 1e-7
     assert (trace.num_events == 2).all()
     assert trace.path.s.shape[1] == 4
     # The chord inside is 2 R cos t.
@@ -163,7 +157,7 @@ def test_smooth_mesh_refracts_as_the_ball_that_it_stands_for(tmp_path: FilePath,
     heights = torch.linspace(-0.95, 0.95, 60, dtype=torch.float64) * 0.8
     medium = _mesh_medium(trimesh.creation.icosphere(4, 0.8), tmp_path, resolution=64)
     path = Snell(interface)(beam(heights), medium)  # type: ignore[arg-type]
-    error = angle(path.exit_directions, _ball_exit(heights, 0.8, 1.5))
+    error = angle(path.exit_directions, ball_exits(beam(heights), 0.8, 1.5))
     impact = (heights / 0.8).abs()
     # Facets of this mesh are 5 degrees wide; with their flat normals errors would be of that order.
     assert error[impact < 0.5].median() < 0.02

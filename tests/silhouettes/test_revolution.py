@@ -12,6 +12,8 @@ from nerfro.silhouettes.revolution import fit_revolution
 from nerfro.silhouettes.silhouettes import mesh_silhouettes
 from nerfro.silhouettes.surface import make_mesh
 from nerfro.silhouettes.visual_hull import Silhouettes
+from tests.cameras_at import cameras_at
+from tests.exact_silhouettes import volume
 
 SIZE, VIEWS, SHIFT = 160, 16, np.array([0.05, -0.03, -0.6])
 TURN = trimesh.transformations.rotation_matrix(0.6, [0.5, -0.8, 0.2])[:3, :3]  # of the axis
@@ -25,9 +27,7 @@ def _cameras() -> Cameras:
         back = np.array([np.cos(raised) * np.cos(azimuth), np.cos(raised) * np.sin(azimuth), np.sin(raised)])
         right = np.cross([0, 0, 1], back) / np.cos(raised)
         poses.append(TURN @ np.stack([right, np.cross(back, right), back, 4 * back], 1))
-    ones = torch.ones(VIEWS)
-    to_world = torch.from_numpy(np.stack(poses)).float()
-    return Cameras(to_world, 2 * SIZE * ones, 2 * SIZE * ones, SIZE / 2 * ones, SIZE / 2 * ones, SIZE, SIZE, 0.1, 9.0)
+    return cameras_at(np.stack(poses), SIZE, SIZE, 2 * SIZE, near=0.1, far=9.0)
 
 
 def _body(outline: list[list[float]]) -> TriangleMesh:
@@ -54,6 +54,8 @@ def test_a_glass_is_found_whose_foot_is_hidden_in_some_masks() -> None:
     inside = mesh_silhouettes(found, cameras, 1)
     overlap = ((inside & (masks > 0)).sum((1, 2)) / (inside | (masks > 0)).sum((1, 2))).numpy()
     assert overlap.min() > 0.97
+    assert found.is_closed
+    assert volume(found) > 0, "faces look outwards"
     # As wide as it is, at the brim and around the foot, and as high.
     points = found.vertices @ TURN - SHIFT
     radius = np.linalg.norm(points[:, :2], axis=1)
@@ -61,22 +63,6 @@ def test_a_glass_is_found_whose_foot_is_hidden_in_some_masks() -> None:
     assert points[:, 2].max() == pytest.approx(1.2, abs=0.04)
     assert radius[np.abs(points[:, 2] - 0.7) < 0.03].max() == pytest.approx(0.322, abs=0.015)
     assert radius.max() == pytest.approx(0.45, abs=0.02)
-
-
-def test_faces_look_outwards_and_close_the_body() -> None:
-    cameras = _cameras()
-    silhouettes = Silhouettes.of(cameras, _masks(_glass(), cameras))
-    found = fit_revolution(_glass_of_triangles(), silhouettes)
-    body = trimesh.Trimesh(found.vertices, found.faces)
-    assert body.is_watertight
-    assert body.volume > 0
-
-
-def _glass_of_triangles() -> TriangleMesh:
-    """Of triangles of about one size, as hulls have them."""
-    glass = _glass()
-    body = trimesh.Trimesh(glass.vertices, glass.faces).subdivide_to_size(0.06)
-    return TriangleMesh(body.vertices, np.asarray(body.faces))
 
 
 def test_a_box_is_no_body_of_revolution(capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-import torch
 import trimesh
 
 from nerfro.cameras import Cameras
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.silhouettes.upright import body_axis, camera_up, find_up
+from tests.cameras_at import cameras_at
 
 TURN = trimesh.transformations.rotation_matrix(1.1, [0.3, -0.9, 0.4])[:3, :3]  # of the world
 UP = TURN[:, 2]
@@ -24,9 +24,7 @@ def _cameras(roll: float = 0.05, level: bool = True) -> Cameras:
         above = np.cross(back, right)
         right, above = np.cos(angle) * right + np.sin(angle) * above, np.cos(angle) * above - np.sin(angle) * right
         poses.append(TURN @ np.stack([right, above, back, 4 * back], 1))
-    ones = torch.ones(24)
-    to_world = torch.from_numpy(np.stack(poses)).float()
-    return Cameras(to_world, 50 * ones, 50 * ones, 20 * ones, 20 * ones, 40, 40, 0.1, 9.0)
+    return cameras_at(np.stack(poses), 40, 40, 50.0)
 
 
 def _glass(tilt: float = 0.0) -> TriangleMesh:

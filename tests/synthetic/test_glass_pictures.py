@@ -7,7 +7,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfro.cameras import Cameras
 from nerfro.evaluation.image_metrics import psnr
 from nerfro.light import to_srgb
 from nerfro.media.sdf_grid import SdfGrid
@@ -15,6 +14,7 @@ from nerfro.media.shapes import Ball
 from nerfro.samplers.paths.snell import Snell
 from nerfro.subdivision import part_rays
 from nerfro.types import Path, Rays
+from tests.cameras_at import cameras_at
 from tests.closed_forms import RoundedBox, grid_points
 from tests.synthetic.empty_glass import empty_glass
 from tests.synthetic.renderer import PathTracer, Pinhole, Surface, look_at_origin, path_tracer, rounded_box, sphere
@@ -70,10 +70,7 @@ def on_grid(what: str, **glass: list[float] | bool) -> SdfGrid:
 
 
 def rays_of_picture(parts: int = PARTS) -> Rays:
-    focal = torch.tensor([float(Pinhole.square(ANGLE, SIDE).focal)])
-    middle = torch.tensor([0.5 * SIDE])
-    pose = torch.from_numpy(POSE[None, :3]).float()
-    cameras = Cameras(pose, focal, focal, middle, middle, SIDE, SIDE, 1.0, 6.0)
+    cameras = cameras_at(POSE[None, :3], SIDE, SIDE, Pinhole.square(ANGLE, SIDE).focal, near=1.0)
     return part_rays(cameras, torch.arange(SIDE**2), parts)
 
 

@@ -1,12 +1,10 @@
 """Which LLVM library Dr.Jit loads, and that an old one, or none, costs time but does not end the process."""
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
+from tests.processes import python
 from tests.synthetic.renderer import llvm
 
 newest, version_in_name = llvm.newest, llvm.version_in_name
@@ -51,8 +49,7 @@ def test_without_a_usable_library_a_scene_is_rendered_by_the_scalar_variant(libr
     """In a process of its own, because Dr.Jit loads a library only once."""
     llvm.select_llvm()  # before Mitsuba is imported, which loads the library at once
     pytest.importorskip("mitsuba")
-    environment = {**os.environ, "DRJIT_LIBLLVM_PATH": library, "CUDA_VISIBLE_DEVICES": ""}
-    result = subprocess.run([sys.executable, "-c", RENDER], capture_output=True, text=True, env=environment)
+    result = python("-c", RENDER, DRJIT_LIBLLVM_PATH=library, CUDA_VISIBLE_DEVICES="")
     assert result.stdout.split() == ["scalar_rgb", "True"], result.stderr
     (line,) = (line for line in result.stderr.splitlines() if line.startswith("nerfro:"))
     assert "seventy times slower, because Dr.Jit" in line

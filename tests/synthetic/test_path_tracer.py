@@ -1,13 +1,12 @@
 """The path tracer against closed forms: furnace, Snell's law, total reflection, camera and sky conventions."""
 
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from nerfro.errors import NerfroError
+from tests.processes import python
 from tests.synthetic.renderer import (
     CAMERA_ANGLE_X,
     CAMERA_DISTANCE,
@@ -138,9 +137,9 @@ def test_a_missing_mitsuba_is_told_with_the_extra_to_install():
     """In a process of its own, which has not imported Mitsuba before."""
     code = "import sys; sys.modules['mitsuba'] = None; from nerfro.registry import discover; discover()\n"
     code += "import nerfro_plugins.synthetic_scenes.path_tracer as t; t.load_mitsuba()"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert "NerfroError" in result.stderr
-    assert "pip install 'nerfro[synthesize]'" in result.stderr
+    errors = python("-c", code).stderr
+    assert "NerfroError" in errors
+    assert "pip install 'nerfro[synthesize]'" in errors
 
 
 def test_an_unknown_variant_names_the_known_ones():

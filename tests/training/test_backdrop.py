@@ -1,8 +1,6 @@
 """Photographs that are cut out on one colour are found, and that colour is beyond the volume then."""
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +8,7 @@ import torch
 from omegaconf import OmegaConf
 
 from nerfro.training.backdrop import find_backdrop
-from tests.conftest import QUIET, repaint
+from tests.conftest import QUIET, Runner, repaint
 
 GREY = 102 / 255
 
@@ -60,7 +58,7 @@ def cut_out(tiny_scene: Path, tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize(("options", "told"), [([], True), (["loss.backdrop.weight=0"], False)])
 def test_straight_rays_end_on_the_backdrop(
-    train_here: Callable[..., Any], cut_out: Path, tmp_path: Path, options: list[str], told: bool
+    train_here: Runner, cut_out: Path, tmp_path: Path, options: list[str], told: bool
 ) -> None:
     run = tmp_path / "run"
     few = ["+experiment=straight", f"data.root={cut_out}", "trainer.max_steps=2", "batches.size=64", *QUIET]

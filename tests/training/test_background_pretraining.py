@@ -26,16 +26,17 @@ from nerfro.training.phases.base import Run
 from nerfro.training.ray_batches import RayBatches
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
 from nerfro.types import Exits
+from tests.conftest import Runner, weights_of
 
 
 @pytest.fixture
-def weights(train: Callable[..., Any], tmp_path: Path) -> Callable[..., dict[str, Tensor]]:
+def weights(train: Runner, tmp_path: Path) -> Callable[..., dict[str, Tensor]]:
     """Weights after a run whose rates are too small to move anything after its first steps."""
     still = ["trainer.max_steps=1", "evaluation.every=0", "optimizer.warmup_factor=0", "optimizer.warmup_steps=1000"]
 
     def run(name: str, *overrides: str) -> dict[str, Tensor]:
         train(*still, f"hydra.run.dir={tmp_path / name}", *overrides)
-        return load_checkpoint(tmp_path / name / LAST_CHECKPOINT)[0]["state_dict"]
+        return weights_of(tmp_path / name)
 
     return run
 

@@ -1,4 +1,4 @@
-"""Which space a run covers: from Eikonal Fields' file, or found from cameras."""
+"""Which space a run covers, and how fine its background is."""
 
 import numpy as np
 import pytest
@@ -7,22 +7,20 @@ from omegaconf import DictConfig, OmegaConf
 
 from nerfro.cameras import Cameras
 from nerfro.media.analytic import Vacuum
+from nerfro.registry import discover, find
+from nerfro.training.angular_resolution import settle_angular_resolution
 from nerfro.training.config import TrainConfig
 from nerfro.training.content import common_target, describe, settle_content
+from tests.exact_silhouettes import cameras_around
 
 MIDDLE = np.array([0.4, -2.0, 1.0])
 
 
-def around(num: int, distance: float = 3.0) -> Cameras:
-    """Cameras on a sphere that look at one place, with 40 pixels of focal length."""
-    generator = np.random.default_rng(2)
-    back = generator.normal(size=(num, 3))
-    back /= np.linalg.norm(back, axis=1, keepdims=True)
-    right = np.cross(generator.normal(size=(num, 3)), back)
-    right /= np.linalg.norm(right, axis=1, keepdims=True)
-    pose = np.stack([right, np.cross(back, right), back, MIDDLE + distance * back], -1)
-    focal, centre = torch.full((num,), 40.0), torch.full((num,), 8.0)
-    return Cameras(torch.tensor(pose).float(), focal, focal, centre, centre, 16, 16, 0.5, 5.0)
+def around(num: int) -> Cameras:
+    """Cameras that look at one place from a distance of 3, with 40 pixels of focal length."""
+    cameras = cameras_around(num, 16, distance=3.0, focal=2.5)
+    cameras.camera_to_world[..., 3] += torch.from_numpy(MIDDLE)
+    return cameras
 
 
 def of_all_space(**content: object) -> DictConfig:
@@ -64,3 +62,36 @@ def test_a_box_covers_nothing_else_and_needs_no_cameras() -> None:
     settle_content(config, Vacuum())
     assert config.content.radius is None
     assert describe(config.content) == ""
+
+
+@pytest.mark.parametrize(
+    ("side", "fits", "given", "descent", "finest"),
+    [
+        (64, True, None, 128, 128),
+        (128, True, None, 256, 256),
+        (256, True, None, 256, 512),
+        (256, False, None, 512, 512),
+        (4000, True, None, 256, 1024),
+        (4000, False, None, 512, 512),
+        (256, True, [4, 32], 32, 32),
+    ],
+)
+def test_finest_texel_follows_the_pixel(
+    side: int, fits: bool, given: list[int] | None, descent: int, finest: int
+) -> None:
+    discover()
+    cameras = cameras_around(3, side, focal=1.4)
+    boundary = {"_target_": find("boundary", "envmap").target, "resolutions": given, "fitted_resolutions": None}
+    config = OmegaConf.create({
+        "boundary": boundary,
+        "content": {"space": "box"},
+        "loss": {"total_variation": {"weight": 1.0, "angle": None}},
+        "phase": {"background": {"steps": 10 if fits else 0}},
+    })  # fmt: skip
+    settle_angular_resolution(config, cameras)
+    assert max(config.boundary.resolutions) == descent
+    assert max([*config.boundary.resolutions, *(config.boundary.fitted_resolutions or ())]) == finest
+    if given is None and side < 4000 and fits:
+        pixel = 57.3 / (1.4 * side)
+        assert 2**-0.5 < (90 / finest) / pixel < 2**0.5
+    assert config.loss.total_variation.angle == pytest.approx(2 * 90 / descent)

@@ -4,7 +4,6 @@ import gc
 import threading
 import time
 import weakref
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -22,9 +21,9 @@ from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.training.data_module import Prefetcher, RayDataModule, can_prefetch, multiplies_large_matrices
 from nerfro.training.module import TrainingModule
 from nerfro.training.ray_batches import RayBatches
-from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
 from nerfro.types import Batch
 from tests.closed_forms import grid_points, random_rays
+from tests.conftest import Runner, weights_of
 from tests.paper import Eikonal
 from tests.pretended_gpu import GPU, PretendedGpu
 
@@ -121,7 +120,7 @@ def test_nothing_is_traced_ahead_where_paths_learn_or_python_is_needed(ball: Sdf
 
 
 def test_weights_depend_neither_on_the_thread_nor_on_an_interruption(
-    train: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    train: Runner, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """The thread chooses samples by the density grid, which changes in every second step here."""
 
@@ -132,7 +131,7 @@ def test_weights_depend_neither_on_the_thread_nor_on_an_interruption(
         even = ["optimizer.learning_rate=1e-2", "optimizer.final_learning_rate=1e-2"]
         options = [*even, "evaluation=none", "trainer.max_steps=7", "sampler.points.update_every=2", *overrides]
         train(*options, f"hydra.run.dir={tmp_path / name}")
-        return load_checkpoint(tmp_path / name / LAST_CHECKPOINT)[0]["state_dict"]
+        return weights_of(tmp_path / name)
 
     update = DensityGridSampler.after_step
     expected = weights("one core", {0})
@@ -172,7 +171,7 @@ def test_a_batch_is_made_when_its_step_begins_if_paths_learn(
     assert not running()
 
 
-def test_there_is_one_copy_of_the_training_pixels(train: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_there_is_one_copy_of_the_training_pixels(train: Runner, monkeypatch: pytest.MonkeyPatch) -> None:
     """They move to the training device once, and steps of the cameras and of the background use them there."""
     moves, move = [], PixelStore.to
     monkeypatch.setattr(PixelStore, "to", lambda self, device: moves.append(device) or move(self, device))

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from nerfro.cameras import Cameras
 from nerfro.data.base import Views
 from nerfro.media.shapes import Ball
 from nerfro.samplers.paths.snell import Snell
 from nerfro.subdivision import Subdivision
 from nerfro.training.ray_batches import RayBatches
+from tests.cameras_at import cameras_at, random_poses
 from tests.conftest import refused
 
 NUM_VIEWS, HEIGHT, WIDTH = 5, 12, 16
@@ -21,11 +21,7 @@ NUM_VIEWS, HEIGHT, WIDTH = 5, 12, 16
 @pytest.fixture
 def views() -> Views:
     """Views whose colours name the pixel: view, row and column."""
-    generator = torch.Generator().manual_seed(0)
-    poses = torch.linalg.qr(torch.randn(NUM_VIEWS, 3, 3, generator=generator)).Q
-    poses = torch.cat([poses, torch.randn(NUM_VIEWS, 3, 1, generator=generator)], -1)
-    full = torch.ones(NUM_VIEWS)
-    cameras = Cameras(poses, 20 * full, 20 * full, 8 * full, 6 * full, WIDTH, HEIGHT, 2.0, 6.0)
+    cameras = cameras_at(random_poses(NUM_VIEWS), WIDTH, HEIGHT, 20.0)
     index = torch.meshgrid(*(torch.arange(n) for n in (NUM_VIEWS, HEIGHT, WIDTH)), indexing="ij")
     return Views(cameras, torch.stack(index, -1).float() / 16, None, [f"r_{i}" for i in range(NUM_VIEWS)])
 

@@ -16,7 +16,7 @@ from nerfro.files.folder_lock import hold
 from nerfro.training.config import TrainConfig
 from nerfro.training.data_module import RayDataModule
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
-from tests.conftest import Finished, refused
+from tests.conftest import Runner, refused, weights_of
 
 
 def content(folder: Path) -> dict[Path, bytes]:
@@ -24,7 +24,7 @@ def content(folder: Path) -> dict[Path, bytes]:
 
 
 @pytest.fixture
-def train(train: Callable[..., Finished]) -> Callable[..., Finished]:
+def train(train: Runner) -> Runner:
     """Two steps in tmp_path/run."""
     return functools.partial(train, "trainer.max_steps=2", "evaluation.every=0")
 
@@ -36,7 +36,7 @@ def begun(trained_run: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def evaluate(begun: Path, evaluate_here: Callable[..., Finished]) -> Callable[..., Finished]:
+def evaluate(begun: Path, evaluate_here: Runner) -> Runner:
     """Evaluate the run in tmp_path/run."""
     return functools.partial(evaluate_here, f"checkpoint={begun / LAST_CHECKPOINT}")
 
@@ -44,7 +44,7 @@ def evaluate(begun: Path, evaluate_here: Callable[..., Finished]) -> Callable[..
 @pytest.mark.parametrize("file", ["config.yaml", "notes/mine.txt"])
 @pytest.mark.parametrize("going_on", ["null", "last", "elsewhere"])
 def test_what_the_run_did_not_make_stays(
-    file: str, going_on: str, train: Callable[..., Finished], trained_run: Path, tmp_path: Path
+    file: str, going_on: str, train: Runner, trained_run: Path, tmp_path: Path
 ) -> None:
     folder = tmp_path / "run"
     (folder / file).parent.mkdir(parents=True)
@@ -56,10 +56,8 @@ def test_what_the_run_did_not_make_stays(
     assert (folder / file).read_text() == "foreign"
 
 
-def test_run_without_checkpoints_is_not_replaced_and_begins_again_on_request(
-    train: Callable[..., Finished], begun: Path
-) -> None:
-    weights = load_checkpoint(begun / LAST_CHECKPOINT)[0]["state_dict"]
+def test_run_without_checkpoints_is_not_replaced_and_begins_again_on_request(train: Runner, begun: Path) -> None:
+    weights = weights_of(begun)
     shutil.rmtree(begun / "checkpoints")
     before = content(begun)
     refused = train("seed=9", code=1).error
@@ -68,12 +66,12 @@ def test_run_without_checkpoints_is_not_replaced_and_begins_again_on_request(
     assert content(begun) == before
     assert "was trained with seed=0, this run has 1" in train("ckpt_path=last", "seed=1", code=1).error
     train("ckpt_path=last")
-    again = load_checkpoint(begun / LAST_CHECKPOINT)[0]["state_dict"]
+    again = weights_of(begun)
     assert all(weights[name].equal(again[name]) for name in weights)
 
 
 def test_checkpoint_in_a_removed_folder_is_not_made_again(
-    train: Callable[..., Finished], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    train: Runner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fit = RayDataModule.train_dataloader
 
@@ -86,7 +84,7 @@ def test_checkpoint_in_a_removed_folder_is_not_made_again(
     assert not (tmp_path / "run").exists()
 
 
-def test_evaluation_replaces_only_what_an_evaluation_wrote(evaluate: Callable[..., Finished], tmp_path: Path) -> None:
+def test_evaluation_replaces_only_what_an_evaluation_wrote(evaluate: Runner, tmp_path: Path) -> None:
     mine = tmp_path / "mine"
     (mine / "images").mkdir(parents=True)
     (mine / "images" / "test_000.png").write_text("mine")
@@ -103,22 +101,20 @@ def test_evaluation_replaces_only_what_an_evaluation_wrote(evaluate: Callable[..
     evaluate(f"out={scores}", "overwrite=true")
 
 
-def test_refused_evaluation_leaves_no_folder(evaluate: Callable[..., Finished], tmp_path: Path) -> None:
+def test_refused_evaluation_leaves_no_folder(evaluate: Runner, tmp_path: Path) -> None:
     evaluate(f"out={tmp_path / 'a' / 'b'}", "split=night", code=1)
     assert not (tmp_path / "a").exists()
 
 
 @pytest.mark.parametrize("below", ["", "run"])
-def test_file_in_place_of_the_run_folder_is_told(below: str, train: Callable[..., Finished], tmp_path: Path) -> None:
+def test_file_in_place_of_the_run_folder_is_told(below: str, train: Runner, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("mine")
     refused = train(f"hydra.run.dir={tmp_path / 'file' / below}", code=1).error
     assert "choose another hydra.run.dir" in refused
     assert (tmp_path / "file").read_text() == "mine"
 
 
-def test_what_killed_processes_were_writing_goes_and_what_others_write_stays(
-    train: Callable[..., Finished], begun: Path
-) -> None:
+def test_what_killed_processes_were_writing_goes_and_what_others_write_stays(train: Runner, begun: Path) -> None:
     killed, written = (begun / "images" / f".{name}.png.{'a1' * 8}.partial" for name in ("killed", "written"))
     foreign = begun / "images" / ".foreign.partial"
     for path in (killed, written, foreign):
@@ -221,7 +217,7 @@ def test_damaged_checkpoints_are_refused_in_one_line(damage: str, trained_run: P
     ],
 )
 def test_checkpoints_that_cannot_be_resumed_are_refused_in_one_line(
-    change: Callable[[dict[str, Any]], object], message: str, train: Callable[..., Finished], begun: Path
+    change: Callable[[dict[str, Any]], object], message: str, train: Runner, begun: Path
 ) -> None:
     path = begun / LAST_CHECKPOINT
     content = torch.load(path, weights_only=True)

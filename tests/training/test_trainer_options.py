@@ -4,7 +4,6 @@ import inspect
 import json
 import re
 import sys
-from collections.abc import Callable
 from datetime import timedelta
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
@@ -23,7 +22,7 @@ from nerfro.testing import check
 from nerfro.training.config import TrainConfig, TrainerConfig, clock_time, settle_trainer
 from nerfro.training.ray_batches import RayBatches
 from nerfro.training.trainer import _OWN
-from tests.conftest import refused
+from tests.conftest import Runner, refused
 
 REFUSED = {
     name: reason
@@ -67,9 +66,7 @@ def test_every_argument_of_lightnings_trainer_is_known() -> None:
         "optimized_metric=beauty",
     ],
 )
-def test_cfg_refuses_what_training_refuses_in_the_same_line(
-    override: str, train: Callable[..., Any], tmp_path: Path
-) -> None:
+def test_cfg_refuses_what_training_refuses_in_the_same_line(override: str, train: Runner, tmp_path: Path) -> None:
     printed, trained = train(override, "--cfg", "job", code=1), train(override, code=1)
     assert printed.out == ""
     assert printed.error == trained.error
@@ -77,7 +74,7 @@ def test_cfg_refuses_what_training_refuses_in_the_same_line(
 
 
 @pytest.mark.parametrize("key", ["runtime.cwd", "runtime.output_dir", "job.name"])
-def test_settings_may_refer_to_hydra(key: str, train: Callable[..., Any]) -> None:
+def test_settings_may_refer_to_hydra(key: str, train: Runner) -> None:
     printed = train("trainer.max_steps=1", f"data.root=${{hydra:{key}}}/data", "--cfg", "job")
     assert f"root: ${{hydra:{key}}}/data" in printed.out
 
@@ -100,7 +97,7 @@ PASSED = {
 }  # fmt: skip
 
 
-def test_other_arguments_reach_lightnings_trainer(train: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_arguments_reach_lightnings_trainer(train: Runner, monkeypatch: pytest.MonkeyPatch) -> None:
     arguments: dict[str, Any] = {}
 
     def record(node: Any, **ours: Any) -> None:
@@ -113,7 +110,7 @@ def test_other_arguments_reach_lightnings_trainer(train: Callable[..., Any], mon
     assert PASSED.keys() == TrainerConfig.__dataclass_fields__.keys() - {"_target_", *REFUSED, *_OWN}
 
 
-def test_short_runs_score_one_view(train: Callable[..., Any], tmp_path: Path) -> None:
+def test_short_runs_score_one_view(train: Runner, tmp_path: Path) -> None:
     train("trainer.fast_dev_run=3")
     scores = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert scores["steps"] == 3
@@ -143,7 +140,7 @@ def test_durations_with_a_unit_equal_those_of_lightning(duration: str, length: t
     assert Timer(clock_time(duration)).time_remaining() == length.total_seconds()
 
 
-def test_training_without_evaluation_ends_after_its_time(train: Callable[..., Any], tmp_path: Path) -> None:
+def test_training_without_evaluation_ends_after_its_time(train: Runner, tmp_path: Path) -> None:
     finished = train("trainer.max_time=1s", "evaluation=none", "experiment=refractive", "name=mine")
     assert "page: python -m nerfro.view checkpoint=" in finished.out
     assert "max_time: 00:00:00:01\n" in (tmp_path / "run" / "config.yaml").read_text()
@@ -151,7 +148,7 @@ def test_training_without_evaluation_ends_after_its_time(train: Callable[..., An
     assert not (tmp_path / "run" / "metrics.json").exists()
 
 
-def test_training_ends_with_the_table_of_means_and_the_files(train: Callable[..., Any], tmp_path: Path) -> None:
+def test_training_ends_with_the_table_of_means_and_the_files(train: Runner, tmp_path: Path) -> None:
     finished = train("trainer.max_steps=2")
     scores = json.loads((tmp_path / "run" / "metrics.json").read_text())
     table = finished.out.partition("2 steps in ")[2]
@@ -164,7 +161,7 @@ def test_training_ends_with_the_table_of_means_and_the_files(train: Callable[...
     assert Path(tables.partition(",")[0]).is_file()
 
 
-def test_overfitting_repeats_batches(train: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_overfitting_repeats_batches(train: Runner, monkeypatch: pytest.MonkeyPatch) -> None:
     drawn, batch, updated = [], RayBatches.batch, []
 
     def recorded(self: RayBatches, step: int) -> Any:
@@ -179,9 +176,7 @@ def test_overfitting_repeats_batches(train: Callable[..., Any], monkeypatch: pyt
     assert re.search(r"100%.*step 6,.*train PSNR", finished.err), "a log ends with the last step"
 
 
-def test_a_run_is_profiled_and_has_neither_bar_nor_checkpoints_on_its_way(
-    train: Callable[..., Any], tmp_path: Path
-) -> None:
+def test_a_run_is_profiled_and_has_neither_bar_nor_checkpoints_on_its_way(train: Runner, tmp_path: Path) -> None:
     quiet = ["trainer.enable_progress_bar=false", "trainer.enable_checkpointing=false"]
     finished = train("trainer.max_steps=2", "trainer.profiler=simple", *quiet)
     assert "train PSNR" not in finished.err
@@ -202,20 +197,20 @@ def step_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, restored_registry
 
 
 @pytest.mark.usefixtures("step_file")
-def test_callbacks_are_chosen_by_name(train: Callable[..., Any], tmp_path: Path) -> None:
+def test_callbacks_are_chosen_by_name(train: Runner, tmp_path: Path) -> None:
     options = (f"callbacks.step_file.file={tmp_path / 'steps'}", "callbacks.step_file.every=2", "logger=tensorboard")
     train("trainer.max_steps=4", "+callbacks=[step_file,learning_rate_monitor]", *options)
     assert (tmp_path / "steps").read_text() == "2 4 "
     check(find("callbacks", "step_file"), {"file": "steps"})
 
 
-def test_early_stopping_prints_its_step_and_reason(train: Callable[..., Any]) -> None:
+def test_early_stopping_prints_its_step_and_reason(train: Runner) -> None:
     stopping = "{monitor: val/psnr, mode: max, patience: 1, min_delta: 1000}"
     finished = train("trainer.max_steps=9", "evaluation.every=5", f"+callbacks.early_stopping={stopping}")
     assert "stopped by early stopping at step 2: Monitored metric val/psnr did not improve" in finished.out
 
 
-def test_errors_of_a_plugin_name_its_file_and_line(train: Callable[..., Any], step_file: Path, tmp_path: Path) -> None:
+def test_errors_of_a_plugin_name_its_file_and_line(train: Runner, step_file: Path, tmp_path: Path) -> None:
     step_file.write_text(CALLBACK.replace("77", "1"))
     options = ("trainer.max_steps=2", "+callbacks=step_file", f"callbacks.step_file.file={tmp_path / 'steps'}")
     finished = train(*options, code=1)

@@ -2,7 +2,6 @@
 
 import csv
 import functools
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,7 @@ from nerfro.training.data_module import NO_IMAGE, RayDataModule, RotatingView, v
 from nerfro.training.ray_batches import RayBatches
 from nerfro.training.validation import OverfittingWarning, ValidationPixels
 from nerfro.types import Rays, mean_per_pixel
-from tests.conftest import repaint
+from tests.conftest import Runner, repaint
 
 LINE = "the model overfits"
 
@@ -42,7 +41,7 @@ def noise(tiny_scene: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def learn(train: Callable[..., Any]) -> Callable[..., Any]:
+def learn(train: Runner) -> Runner:
     """Trains along straight rays through a fine grid, long enough to know few photographs by heart."""
     box = ["content.box_min=[-1.6,-1.6,-1.6]", "content.box_max=[1.6,1.6,1.6]"]
     quick = ["batches.size=256", "optimizer.learning_rate=3e-2", "phase.background.steps=0", "evaluation.every=50"]
@@ -56,7 +55,7 @@ def learn(train: Callable[..., Any]) -> Callable[..., Any]:
     return functools.partial(train, *box, *quick, *parts, *steps)
 
 
-def test_photographs_known_by_heart_are_told_once(learn: Callable[..., Any], noise: Path, tmp_path: Path) -> None:
+def test_photographs_known_by_heart_are_told_once(learn: Runner, noise: Path, tmp_path: Path) -> None:
     finished = learn(f"data.root={noise}", "logger=tensorboard", "trainer.log_every_n_steps=1")
     told = [line for line in finished.out.splitlines() if LINE in line]
     assert len(told) == 1

@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from nerfro.boundaries.envmap import EnvironmentMap
-from nerfro.cameras import Cameras
 from nerfro.data.base import DataSource, Views
 from nerfro.fields.base import Field
 from nerfro.files import lat_long
@@ -22,6 +21,7 @@ from nerfro.samplers.points.stratified import Stratified
 from nerfro.types import Radiance, Samples
 from nerfro.viewing.server import PageServer
 from nerfro.viewing.trained_scene import TrainedScene
+from tests.cameras_at import cameras_at
 
 RADIUS, INSIDE_RADIUS, INSIDE_CENTRE, IOR = 0.8, 0.3, (0.1, 0.0, 0.05), 1.3
 
@@ -54,9 +54,7 @@ class Photographs(DataSource):
         look_at_origin = import_module("nerfro_plugins.synthetic_scenes.viewpoints").look_at_origin
         poses = np.stack([look_at_origin(np.array(place, float))[:3] for place in places])
         size = 32
-        focal = torch.full((len(places),), 0.5 * size / math.tan(0.5 * 0.7))
-        middle = torch.full_like(focal, 0.5 * size)
-        cameras = Cameras(torch.from_numpy(poses).float(), focal, focal, middle, middle, size, size, near=2.0, far=6.0)
+        cameras = cameras_at(poses, size, size, 0.5 * size / math.tan(0.5 * 0.7))
         return Views(cameras, torch.zeros(len(places), size, size, 3), None, [f"r_{i}" for i in range(len(places))])
 
 

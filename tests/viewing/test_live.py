@@ -2,7 +2,6 @@
 
 import json
 import re
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -11,6 +10,7 @@ from nerfro.viewing import live
 from nerfro.viewing.live import LivePage
 from nerfro.viewing.server import PageServer
 from nerfro.viewing.trained_scene import TrainedScene
+from tests.conftest import Runner
 from tests.viewing.browser import Browser, needs_chromium
 
 
@@ -70,9 +70,7 @@ def test_browser_shows_news_and_losses(scene: TrainedScene, server: PageServer, 
     assert server.watched
 
 
-def test_training_serves_its_model(
-    train_here: Callable, tiny_run: list[str], server: PageServer, tmp_path: Path
-) -> None:
+def test_training_serves_its_model(train_here: Runner, tiny_run: list[str], server: PageServer, tmp_path: Path) -> None:
     options = [option for option in tiny_run if "smoothing" not in option] + ["medium=sdf_grid"]
     options += ["trainer.max_steps=2", "viewer=true", f"hydra.run.dir={tmp_path / 'run'}"]
     done = train_here(*options, "viewer_port=0")

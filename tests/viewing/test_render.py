@@ -2,7 +2,6 @@
 
 import functools
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -16,13 +15,11 @@ import nerfro.render
 from nerfro.files.lat_long import save_lat_long
 from nerfro.subdivision import Subdivision
 from nerfro.viewing.trained_scene import TrainedScene
-from tests.conftest import Finished
+from tests.conftest import Runner
 
 
 @pytest.fixture
-def render(
-    scene: TrainedScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run_here: Callable
-) -> Callable[..., Finished]:
+def render(scene: TrainedScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run_here: Runner) -> Runner:
     """The entry point in this process, on the scene in closed form."""
     (tmp_path / "a.ckpt").write_bytes(b"scene")
     monkeypatch.setattr(nerfro.render, "load", lambda run, device, root: scene)
@@ -49,7 +46,7 @@ def psnr(one: np.ndarray, other: np.ndarray) -> float:
     return float(-10 * np.log10(((one - other) / 255).__pow__(2).mean()))
 
 
-def test_an_orbit_becomes_frames_and_films(render: Callable[..., Finished]) -> None:
+def test_an_orbit_becomes_frames_and_films(render: Runner) -> None:
     render("path=orbit", "frames=4", "seconds=2", "film=[mp4,gif]", "resolution=[34,25]")
     stills = [read(f"O/frame_{number:04d}.png") for number in range(4)]
     assert {still.shape for still in stills} == {(25, 34, 3)}
@@ -64,7 +61,7 @@ def test_an_orbit_becomes_frames_and_films(render: Callable[..., Finished]) -> N
         assert psnr(np.asarray(gif.convert("RGB"), float), stills[3]) > 25
 
 
-def test_an_interrupted_rendering_goes_on_and_another_is_not_mixed_in(render: Callable[..., Finished]) -> None:
+def test_an_interrupted_rendering_goes_on_and_another_is_not_mixed_in(render: Runner) -> None:
     render("path=arc", "frames=3")
     whole = read("O/frame_0001.png")
     Path("O/frame_0001.png").unlink()
@@ -81,7 +78,7 @@ def test_an_interrupted_rendering_goes_on_and_another_is_not_mixed_in(render: Ca
     assert not np.array_equal(read("O/frame_0001.png"), whole)
 
 
-def test_a_still_from_numbers_shows_what_lies_there(render: Callable[..., Finished]) -> None:
+def test_a_still_from_numbers_shows_what_lies_there(render: Runner) -> None:
     render("position=[0,0,5]", "target=[0,0,0]", "fov=10", "what=inside", "resolution=8")
     # The ball's top is at z = 0.35, and its colour is 0.4 + 0.5 of the place.
     linear = np.array([0.4, 0.4, 0.4 + 0.5 * 0.34])
@@ -90,7 +87,7 @@ def test_a_still_from_numbers_shows_what_lies_there(render: Callable[..., Finish
 
 
 @pytest.mark.parametrize("what", ["depth", "normals", "opacity", "exits", "glass", "inside", "sky"])
-def test_every_layer_is_drawn_and_written_as_it_is(what: str, render: Callable, scene: TrainedScene) -> None:
+def test_every_layer_is_drawn_and_written_as_it_is(what: str, render: Runner, scene: TrainedScene) -> None:
     for form in ("png", "exr"):
         render("views=test:1", f"what={what}", f"format={form}")
     values = OpenImageIO.ImageBuf("O/test_001.exr").get_pixels().squeeze()
@@ -104,7 +101,7 @@ def test_every_layer_is_drawn_and_written_as_it_is(what: str, render: Callable, 
     assert shown.std() > 5
 
 
-def test_another_sky_replaces_the_scenes(render: Callable[..., Finished]) -> None:
+def test_another_sky_replaces_the_scenes(render: Runner) -> None:
     save_lat_long("light.hdr", torch.full((16, 32, 3), 0.5))
     render("views=test:0", "what=sky", "sky=light.hdr")
     np.testing.assert_allclose(read("O/test_000.png"), 255 * (1.055 * 0.5 ** (1 / 2.4) - 0.055), atol=2)
@@ -129,15 +126,13 @@ def test_another_sky_replaces_the_scenes(render: Callable[..., Finished]) -> Non
         (["path=orbit", "fov=190"], "fov=190.0 is not allowed; take more than 0 and less than 180"),
     ],
 )
-def test_what_cannot_be_rendered_is_refused_in_one_line(
-    arguments: list[str], message: str, render: Callable[..., Finished]
-) -> None:
+def test_what_cannot_be_rendered_is_refused_in_one_line(arguments: list[str], message: str, render: Runner) -> None:
     assert message in render(*arguments, code=1).error
     assert not Path("O").exists()
 
 
 def test_a_missing_ffmpeg_is_reported_before_frames_are_rendered(
-    render: Callable[..., Finished], monkeypatch: pytest.MonkeyPatch
+    render: Runner, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("shutil.which", lambda name: None)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)

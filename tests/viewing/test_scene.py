@@ -10,6 +10,7 @@ from nerfro.samplers.paths.snell import Snell
 from nerfro.variants import variant
 from nerfro.viewing.changes import with_changed_scene
 from nerfro.viewing.trained_scene import TrainedScene
+from tests.closed_forms import ball_exits
 from tests.conftest import refused
 from tests.viewing.conftest import INSIDE_CENTRE, INSIDE_RADIUS, IOR, RADIUS, SolidBall, colour, sky_of
 
@@ -19,20 +20,10 @@ def rays_of(scene: TrainedScene) -> tuple[torch.Tensor, torch.Tensor]:
     return rays.origins, rays.directions
 
 
-def exact_exits(origins: torch.Tensor, directions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Impact parameter of rays at the ball, and the direction in which they leave it, by Snell's law twice."""
-    towards = -(origins * directions).sum(-1, keepdim=True)
-    nearest = origins + towards * directions
-    impact = nearest.norm(dim=-1)
-    sine = (impact / RADIUS).clamp(max=1)
-    deviation = 2 * (torch.asin(sine) - torch.asin(sine / IOR))[:, None]
-    inwards = -nearest / impact[:, None].clamp(min=1e-9)
-    return impact, torch.cos(deviation) * directions + torch.sin(deviation) * inwards
-
-
 def test_glass_bends_as_in_closed_form_and_shows_the_sky_behind(scene: TrainedScene) -> None:
-    origins, directions = rays_of(scene)
-    impact, exits = exact_exits(origins, directions)
+    rays = scene.cameras().image_rays(0)
+    directions, exits = rays.directions, ball_exits(rays, RADIUS, IOR)
+    impact = torch.linalg.cross(rays.origins, directions).norm(dim=-1)
     rendered = scene.with_(inside=False).render(scene.cameras().select([0]))
     assert rendered.rgb.shape == (1, 32, 32, 3)
     hit = (impact < 0.95 * RADIUS).view(32, 32)

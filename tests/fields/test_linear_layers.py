@@ -1,4 +1,6 @@
-"""The MLP with its gradient written out, against torch.nn.Sequential."""
+"""Linear layers and MLPs with gradients written out, against those of PyTorch."""
+
+from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -10,6 +12,8 @@ from torch import Tensor, nn
 
 from nerfro.fields.relu_mlp import relu_mlp
 from nerfro.kernels import threads
+from tests.gradients import require_equal_gradients
+from tests.paper import Linear
 
 
 def layers(*widths: int) -> nn.Sequential:
@@ -26,19 +30,13 @@ def weights(mlp: nn.Sequential) -> list[Tensor]:
 def test_equals_a_sequential_forward_and_backward(widths: tuple[int, ...], dtype: torch.dtype) -> None:
     mlp = layers(*widths)
     inputs = torch.randn(300, widths[0], requires_grad=True)
-    upstream = torch.randn(300, widths[-1]).to(dtype)
     with torch.autocast("cpu", torch.bfloat16, enabled=dtype == torch.bfloat16):
         expected = mlp(inputs)
     result = relu_mlp(inputs, weights(mlp), dtype)
     assert result.dtype == dtype
     torch.testing.assert_close(result, expected)
-    for mine, theirs in zip(
-        torch.autograd.grad(result, [inputs, *weights(mlp)], upstream),
-        torch.autograd.grad(expected, [inputs, *weights(mlp)], upstream),
-        strict=True,
-    ):
-        assert mine.dtype == theirs.dtype
-        torch.testing.assert_close(mine, theirs, rtol=1e-2 if dtype == torch.bfloat16 else 1e-5, atol=1e-5)
+    tolerance = 1e-2 if dtype == torch.bfloat16 else 1e-5
+    require_equal_gradients(result, expected, [inputs, *weights(mlp)], tolerance, atol=1e-5)
 
 
 def test_inputs_side_by_side_of_which_one_learns() -> None:
@@ -47,8 +45,7 @@ def test_inputs_side_by_side_of_which_one_learns() -> None:
     result = relu_mlp([first, second], weights(mlp), torch.float32)
     expected = mlp(torch.cat([first, second], dim=-1))
     torch.testing.assert_close(result, expected)
-    (mine,), (theirs,) = (torch.autograd.grad(x.square().sum(), first) for x in (result, expected))
-    torch.testing.assert_close(mine, theirs)
+    require_equal_gradients(result, expected, [first], atol=1e-5)
 
 
 def test_points_of_several_blocks_equal_a_sequential_in_one_thread_and_in_two(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -66,3 +63,12 @@ def test_points_of_several_blocks_equal_a_sequential_in_one_thread_and_in_two(mo
         monkeypatch.setattr(threads, "HELPERS", [helper])
         helped = evaluated(lambda x: relu_mlp(x, weights(mlp), torch.float32))
     assert all(torch.equal(mine, theirs) for mine, theirs in zip(alone, helped, strict=True))
+
+
+@pytest.mark.parametrize("batch", [(1024,), (2, 1024), (700,), (0,)])
+def test_values_and_gradients_equal_a_layer_of_torch_on_concatenated_inputs(batch: tuple[int, ...]) -> None:
+    layer = Linear(8, 7)
+    inputs = [torch.randn(*batch, width, requires_grad=True) for width in (5, 3)]
+    result, expected = layer(*inputs), nn.functional.linear(torch.cat(inputs, -1), layer.weight, layer.bias)
+    torch.testing.assert_close(result, expected)
+    require_equal_gradients(result, expected, [*inputs, layer.weight, layer.bias], 1e-4, atol=1e-4)

@@ -1,0 +1,232 @@
+"""Cameras, and the lens that they share, are moved until they agree with a known scene, its sky and its masks."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+import trimesh
+from torch import Tensor
+
+from benchmarks.cameras import disturbed
+from nerfro.camera.similarity import motion_between
+from nerfro.cameras import Cameras
+from nerfro.geometry.interpolation import misses
+from nerfro.geometry.mesh import TriangleMesh
+from nerfro.light import to_linear, to_srgb
+from nerfro.rays import Rays
+from nerfro.samplers.paths.snell import Snell
+from nerfro.silhouettes.visual_hull import Silhouettes
+from tests.ball_photographs import BOX, NUM_VIEWS, RADIUS, SIZE, cameras, photographs, sky, soft_masks, solid
+from tests.camera.refined_cameras import PriorInformation, RefinedCamera, align, align_to_outlines, gauss_newton
+from tests.conftest import refused
+from tests.pretended_gpu import GPU, PretendedGpu
+
+MEDIUM = solid([1.45])
+PHOTOGRAPHS = photographs([1.45]).images.reshape(-1, 3)
+TRUE = cameras()
+# By half a degree, which is a quarter of a pixel, and 1 % of the distance.
+DISTURBED = replace(TRUE, camera_to_world=disturbed(TRUE, math.radians(0.5), 0.01, 0).float())
+
+
+def shown(rays: Rays, view: Tensor) -> Tensor:
+    """A ball of glass before a smooth sky."""
+    return to_srgb(sky(Snell()(rays, MEDIUM).exit_directions))
+
+
+def photographed(pixels: Tensor) -> Tensor:
+    return PHOTOGRAPHS[pixels]
+
+
+def looked_at(step: int, num: int = 300) -> Tensor:
+    generator = torch.Generator().manual_seed(step)
+    drawn = torch.randint(SIZE * SIZE, (NUM_VIEWS, 2 * num), generator=generator)
+    pixels = drawn + SIZE * SIZE * torch.arange(NUM_VIEWS)[:, None]
+    return gauss_newton.informative_pixels(pixels, num, photographed, TRUE)
+
+
+def steps(camera: RefinedCamera, given: Cameras, num: int) -> None:
+    camera.begin(given)
+    how = gauss_newton.Step(difference_pixels=0.5, scale=0.3, max_pixels=3.0)
+    for step in range(num):
+        gauss_newton.gauss_newton_step(camera, given, looked_at(step), photographed, shown, how)
+
+
+def test_disturbed_cameras_find_back_by_what_is_seen_through_the_ball() -> None:
+    camera = RefinedCamera(fix_gauge=False)
+    steps(camera, DISTURBED, 6)
+    before = motion_between(TRUE.camera_to_world, DISTURBED.camera_to_world)
+    after = motion_between(TRUE.camera_to_world, camera.estimated(DISTURBED).camera_to_world)
+    for old, new in zip(before, after, strict=True):
+        assert float(new.median()) < 0.06 * float(old.median())
+
+
+def test_the_lens_that_all_share_is_found_with_them() -> None:
+    given = replace(TRUE, fx=1.02 * TRUE.fx, fy=1.02 * TRUE.fy, cx=TRUE.cx + 0.5, cy=TRUE.cy - 0.3)
+    camera = RefinedCamera(lens=True, fix_gauge=False)
+    steps(camera, given, 8)
+    found = camera.estimated(given)
+    assert float(found.fx[0]) == pytest.approx(float(TRUE.fx[0]), rel=2e-3)
+    assert float(found.cx[0]) == pytest.approx(float(TRUE.cx[0]), abs=0.1)
+    assert float(found.cy[0]) == pytest.approx(float(TRUE.cy[0]), abs=0.1)
+
+
+def test_steps_vanish_at_the_truth_and_have_a_limit() -> None:
+    camera = RefinedCamera(fix_gauge=False)
+    camera.begin(TRUE)
+    wrong = 1 - PHOTOGRAPHS
+
+    def inverted(pixels: Tensor) -> Tensor:
+        return wrong[pixels]
+
+    far = gauss_newton.Step(difference_pixels=0.5, scale=10.0, max_pixels=0.25)
+    gauss_newton.gauss_newton_step(camera, TRUE, looked_at(0), inverted, shown, far)
+    assert float(camera.motions.motion.norm(dim=-1).max()) == pytest.approx(0.25, rel=1e-4)
+    camera.begin(TRUE)
+    gauss_newton.gauss_newton_step(camera, TRUE, looked_at(0), photographed, shown, gauss_newton.Step(0.5, 0.3, 3.0))
+    assert float(camera.motions.motion.abs().max()) < 1e-4
+
+
+def test_pixels_with_contrast_are_looked_at_first() -> None:
+    pictures = PHOTOGRAPHS.view(NUM_VIEWS, SIZE, SIZE, 3).clone()
+    pictures[:, :, : SIZE // 2] = 0.5
+    flat = pictures.view(-1, 3)
+    drawn = torch.randint(SIZE * SIZE, (NUM_VIEWS, 400)) + SIZE * SIZE * torch.arange(NUM_VIEWS)[:, None]
+    chosen = gauss_newton.informative_pixels(drawn, 50, lambda pixels: flat[pixels], TRUE)
+    assert chosen.shape == (50 * NUM_VIEWS,)
+    assert (chosen.view(NUM_VIEWS, 50) // SIZE**2 == torch.arange(NUM_VIEWS)[:, None]).all()
+    assert float((chosen % SIZE >= SIZE // 2 - 1).float().mean()) > 0.95
+
+
+def test_a_resumed_step_on_a_gpu_uses_what_the_checkpoint_holds_on_the_cpu() -> None:
+    """A camera whose prior is certain stays."""
+    camera = RefinedCamera(fix_gauge=False)
+    camera.begin(TRUE)
+    size = camera.numbers().numel()
+    prior = PriorInformation(torch.zeros(size), 1e12 * torch.eye(size).double())
+    with PretendedGpu():
+        camera, given = camera.to(GPU), TRUE.to(GPU)
+        pixels, pictures = looked_at(0, 20).to(GPU), 1 - PHOTOGRAPHS.to(GPU)
+        sky_alone = lambda rays, view: to_srgb(sky(rays.directions))  # noqa: E731
+        step = gauss_newton.Step(difference_pixels=0.5, scale=10.0, max_pixels=0.25)
+        gauss_newton.gauss_newton_step(camera, given, pixels, lambda chosen: pictures[chosen], sky_alone, step, [prior])
+        assert float(camera.motions.motion.abs().max()) < 1e-4
+
+
+def panorama(
+    camera: RefinedCamera, given: Cameras, box: Tensor = BOX, gains: Tensor | None = None
+) -> PriorInformation | None:
+    def photographed(pixels: Tensor) -> Tensor:
+        colours = PHOTOGRAPHS[pixels]
+        view = pixels // (TRUE.height * TRUE.width)
+        return colours if gains is None else to_srgb(to_linear(colours) * gains[view, None])
+
+    camera.begin(given)
+    return align(camera, given, photographed, lambda rays: misses(box, rays))
+
+
+def turned(camera: RefinedCamera) -> Tensor:
+    """By how many degrees each camera is off, after the turn of all that fits best."""
+    axes, true = (poses[..., :3].double() for poses in (camera.motions.moved(), TRUE.camera_to_world))
+    u, _, vt = torch.linalg.svd((axes @ true.mT).mean(0))
+    between = (u @ vt).T @ axes @ true.mT
+    cosine = 0.5 * (between.diagonal(dim1=1, dim2=2).sum(-1) - 1)
+    return torch.rad2deg(torch.arccos(cosine.clamp(max=1)))
+
+
+@pytest.mark.parametrize("brightness", [0.0, 0.15])
+def test_cameras_turn_until_their_skies_agree(brightness: float) -> None:
+    """Half a degree is a quarter of a pixel. Shifts of cameras and other exposures do not disturb."""
+    gains = 0.6 * torch.exp(brightness * torch.randn(NUM_VIEWS, generator=torch.Generator().manual_seed(0)))
+    camera = RefinedCamera(exposure=brightness > 0)
+    assert panorama(camera, DISTURBED, gains=gains) is not None
+    assert not bool(camera.motions.motion[:, 3:].any())
+    assert float(turned(camera).median()) < (0.03 if brightness == 0 else 0.06)
+
+
+def test_the_shared_lens_is_found_with_them() -> None:
+    given = replace(TRUE, fx=1.02 * TRUE.fx, fy=1.02 * TRUE.fy)
+    camera = RefinedCamera(lens=True)
+    assert panorama(camera, given) is not None
+    assert float(camera.estimated(given).fx[0]) == pytest.approx(float(TRUE.fx[0]), rel=2e-3)
+
+
+def test_without_a_sky_nothing_is_known() -> None:
+    camera = RefinedCamera()
+    assert panorama(camera, TRUE, box=10 * BOX) is None
+    assert not bool(camera.motions.motion.any())
+
+
+def ellipsoid() -> TriangleMesh:
+    made = trimesh.creation.icosphere(4, RADIUS)
+    return TriangleMesh(made.vertices * [1.0, 0.75, 0.55], made.faces)
+
+
+def silhouettes() -> Silhouettes:
+    return Silhouettes.of(TRUE, soft_masks(ellipsoid()))
+
+
+def met(camera: RefinedCamera, given: Cameras, seen: Silhouettes, sure: list[int] | None = None) -> PriorInformation:
+    """Move cameras; some of the six numbers of each are known to be right."""
+    camera.begin(given)
+    surely = torch.zeros_like(camera.motions.motion)
+    surely[:, sure or []] = 1e6
+    information = torch.nn.functional.pad(surely.flatten(), (0, len(camera.numbers()) - surely.numel())).diag()
+    known = [PriorInformation(camera.numbers(), information)]
+    told = align_to_outlines(camera, given, lambda cameras: cameras, seen, ellipsoid(), known)
+    assert told is not None
+    return told
+
+
+def pixels_off(given: Cameras) -> float:
+    """How far from their right places points of the surface are seen, median."""
+    points = torch.from_numpy(ellipsoid().vertices[::20]).float()
+    return float((given.project(points)[0] - TRUE.project(points)[0]).norm(dim=-1).median())
+
+
+@pytest.mark.parametrize("too_wide", [0.0, 0.4])
+def test_disturbed_cameras_see_the_surface_where_it_is(too_wide: float) -> None:
+    """From half a degree and 1 %, also where all masks are too wide by less than half a pixel."""
+    camera, seen = RefinedCamera(), silhouettes()
+    met(camera, DISTURBED, replace(seen, distances=seen.distances + too_wide))
+    assert pixels_off(camera.estimated(DISTURBED)) < 0.15 * pixels_off(DISTURBED)
+
+
+def test_cameras_stay_where_the_surface_is_another(capsys: pytest.CaptureFixture[str]) -> None:
+    camera = RefinedCamera()
+    camera.begin(TRUE)
+    other = TriangleMesh(ellipsoid().vertices[:, [1, 0, 2]], ellipsoid().faces[:, ::-1])
+    assert align_to_outlines(camera, TRUE, lambda cameras: cameras, silhouettes(), other) is None
+    assert not bool(camera.motions.motion.any())
+    assert "pixels off its masks" in capsys.readouterr().out
+
+
+def test_masks_of_nothing_are_refused() -> None:
+    camera = RefinedCamera()
+    camera.begin(TRUE)
+    nothing = Silhouettes.of(TRUE, torch.zeros(NUM_VIEWS, SIZE, SIZE))
+    refused("belong together", align_to_outlines, camera, TRUE, lambda cameras: cameras, nothing, ellipsoid())
+
+
+def test_the_shared_lens_is_found_where_cameras_are_known() -> None:
+    given = replace(TRUE, cx=TRUE.cx + 0.4, cy=TRUE.cy - 0.3)
+    camera = RefinedCamera(lens=True)
+    met(camera, given, silhouettes(), [0, 1, 2, 3, 4, 5])
+    found = camera.estimated(given)
+    assert float(found.cx[0]) == pytest.approx(float(TRUE.cx[0]), abs=0.03)
+    assert float(found.cy[0]) == pytest.approx(float(TRUE.cy[0]), abs=0.03)
+
+
+def test_shifts_are_told_apart_from_turns_hardly() -> None:
+    """A pixel to the side is known to hundredths; a turn that undoes it leaves little to see."""
+    camera = RefinedCamera()
+    told = met(camera, TRUE, silhouettes())
+    assert pixels_off(camera.estimated(TRUE)) < 0.05
+    of_view = torch.stack([told.information[6 * v : 6 * v + 6, 6 * v : 6 * v + 6] for v in range(NUM_VIEWS)])
+    assert torch.equal(of_view, of_view.mT) or torch.allclose(of_view, of_view.mT, rtol=1e-3)
+    # About y a turn to the left, along x a shift to the right.
+    aside, undone = torch.tensor([0.0, 0, 0, 1, 0, 0]), torch.tensor([0.0, 1, 0, 1, 0, 0])
+    other = torch.tensor([0.0, -1, 0, 1, 0, 0])
+    known = of_view @ aside @ aside
+    assert float(known.median()) > 1 / 0.05**2
+    assert float((torch.minimum(*(of_view @ motion @ motion for motion in (undone, other))) / known).max()) < 0.1
