@@ -18,7 +18,6 @@ from lightning.pytorch.callbacks import timer
 import nerfro.train
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.poses.video import extract_frames
-from nerfro.viewing import server
 from tests import ball_photographs
 from tests.viewing.test_exports import write
 
@@ -58,12 +57,7 @@ def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> R
         monkeypatch.setattr(nerfro.train, "prepared_metrics", ImageMetrics)
         monkeypatch.setattr(sys, "argv", [name, *map(str, arguments)])
         # Benchmarks replace these.
-        for module, attribute in (
-            (timer, "time"),
-            (nerfro.train, "Viewer"),
-            (server, "_WATCHED_SECONDS"),
-            (ball_photographs, "SIZE"),
-        ):
+        for module, attribute in ((timer, "time"), (ball_photographs, "SIZE")):
             monkeypatch.setattr(module, attribute, getattr(module, attribute))
         capfd.readouterr()
         threads, gradients = torch.get_num_threads(), torch.is_grad_enabled()
@@ -131,13 +125,10 @@ def test_comparison_keeps_finished_rows_and_repeats_interrupted_ones(
 @pytest.mark.parametrize(
     ("arguments", "num_rows"),
     [
-        (("hash_grid", "--rays", 8, "--samples", 4, "--threads", 1, "--rounds", 1), 19),
         (("tracing", "--resolution", 48, "--euler-resolution", 48, "--side", 16, "--rays", 16), 34),
-        (("footprints", "--views", 1, "--size", 8, "--resolution", 24, "--texture", 64), 12),
         (("vessel", "--rays", 200, "--resolution", 32), 0),
         (("peers", "--turns", 1, "--steps", 2, "--paper-steps", 2, "--paper-options", *PAPER, "--options", *SMALL), 6),
         (("installation", "--turns", 1, "--starts", "import nerfro", "--least", 1e4), 6),
-        pytest.param(("two_bodies", "--size", 16), 5, marks=pytest.mark.slow),
     ],
     ids=lambda arguments: arguments[0] if isinstance(arguments, tuple) else None,
 )
@@ -154,12 +145,10 @@ def test_pictures_of_optics_are_drawn(run: Run, tmp_path: Path) -> None:
 
 def test_errors_of_a_run_are_put_into_classes(run: Run, trained_run: Path) -> None:
     assert len(run("error_budget", trained_run, "--views", 1)) == 6
-    assert len(run("footprints", "--run", trained_run, "--views", 1)) == 3
 
 
-def test_hulls_and_indices_are_measured(run: Run, tiny_scene: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_hulls_are_measured(run: Run, tiny_scene: Path) -> None:
     run("hull", tiny_scene, tiny_scene / "mesh.ply")
-    run("index", tiny_scene, tiny_scene / "mesh.ply", "--errors", 0, "--resolution", 24)
 
 
 def test_cameras_come_back(run: Run, tiny_default_run: list[str], tiny_scene: Path, tmp_path: Path) -> None:
@@ -182,15 +171,10 @@ def test_growth_of_the_costs_is_measured(run: Run, tiny_default_run: list[str], 
     assert (tmp_path / "scaling.png").stat().st_size > 0
 
 
-def test_the_cost_of_a_viewer_is_measured(run: Run, tiny_default_run: list[str]) -> None:
-    run("viewer", "--seconds", 6, "--warm-up", 0, "--window", 2, "--options", *tiny_default_run)
-
-
 @pytest.mark.usefixtures("mitsuba")
 def test_mitsuba_renders_beside_a_run(run: Run, trained_run: Path, tmp_path: Path) -> None:
     write(nerfro.load(trained_run), "mitsuba", tmp_path / "scene.xml")
     assert len(run("mitsuba_export", trained_run, tmp_path / "scene.xml", "--views", 0, "--samples", 1)) == 3
-    assert len(run("new_sky", trained_run, "--views", 1, "--spp", 1, "--texture", 16)) == 5
 
 
 @pytest.mark.usefixtures("mitsuba")
