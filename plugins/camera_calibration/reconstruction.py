@@ -26,8 +26,9 @@ from nerfro.data.lenses import Lens, check_lenses
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import refuse_existing, require_room, write_atomically
 from nerfro.paths import user_path
-from nerfro.poses.calibration import Calibration, Intrinsics, LensModel, Pose
 from nerfro.progress import progress_bar, track
+
+from .calibration import Calibration, Intrinsics, LensModel, Pose
 
 Pairs = Literal["sequential", "all"]
 
