@@ -63,7 +63,7 @@ def pytest_configure(config: pytest.Config) -> None:
     # The option --jaxtyping-packages takes one package beside this checker.
     checker = (config.option.jaxtyping_packages or "").partition(",")[2]
     if checker:
-        checked = [f"nerfro_plugins.{name}" for name in ("camera_calibration", "object_masks", "paper")]
+        checked = [f"nerfro_plugins.{name}" for name in ("camera_calibration", "data_formats", "object_masks", "paper")]
         jaxtyping.install_import_hook(checked, checker)
     worker = hasattr(config, "workerinput")  # of pytest-xdist
     if not worker and not config.option.collectonly and config.cache is not None:
