@@ -30,12 +30,12 @@ from skimage.measure import approximate_polygon, find_contours
 
 from nerfro.evaluation.results import FULL, read_metrics_json
 from nerfro.light import to_srgb
-from nerfro.opencv import opencv
 from nerfro.progress import track
-from nerfro.registry import discover
-from nerfro.viewing.film import write_film
+from nerfro.registry import discover, plugin_module
 
 discover()
+opencv = plugin_module("camera_calibration.opencv").opencv
+write_film = plugin_module("film_encoding.film").write_film
 dataset = import_module("nerfro_plugins.synthetic_scenes.dataset")
 PlannedImage, write_image = dataset.PlannedImage, dataset.write_image
 path_tracer = import_module("nerfro_plugins.synthetic_scenes.path_tracer")

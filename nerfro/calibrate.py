@@ -7,96 +7,67 @@ Examples:
 
 from __future__ import annotations
 
-from pathlib import Path
+from dataclasses import dataclass
+from typing import Annotated, Literal, Optional
 
-import numpy as np
 from omegaconf import DictConfig
 
 import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
+from nerfro.allowed import Count, Natural, Positive, Range
 from nerfro.cli import entry_point
-from nerfro.data.masks import find_mask, require_used
-from nerfro.errors import NerfroError, warn
-from nerfro.files.atomic import refuse_existing
-from nerfro.files.folder_lock import lock_folder
-from nerfro.overrides import print_next
-from nerfro.paths import user_path
-from nerfro.poses.boards import TagBoard, print_sheets
-from nerfro.poses.calibrate_options import CalibrateConfig, check_options, make_board
-from nerfro.poses.calibrated_data import FILES, ray_range, relative, split_views, write_calibrated
-from nerfro.poses.calibration import Calibration, calibrate
-from nerfro.poses.photographs import list_photographs, luminance, outside
-from nerfro.poses.reconstruction import SfmSettings, find_model, import_model
-from nerfro.progress import track
+from nerfro.data.frames import Every
+from nerfro.registry import plugin_module
 
-# Limits above which a warning is printed: reprojection error in pixels, and relative deviation of the focal length.
-_MAX_ERROR, _MAX_FOCAL_DEVIATION = 0.7, 0.02
+Squares = Annotated[int, Range(at_least=1, at_most=100)]  # along a side of a board
+
+
+@dataclass
+class CalibrateConfig:
+    """Options of `python -m nerfro.calibrate`.
+
+    Attributes:
+        images: folder of the photographs, all with one lens and size; the folder may also contain masks (`mask_*`).
+        out: output folder for transforms_{train,val,test}.json, calibration.json and cameras.png.
+        target: `apriltag` for a board of AprilTags in the scene, or `colmap` for structure from motion.
+        board: layout of the tags: `twelve_faces` (the paper's board, of tagStandard41h12) or `grid`, one sheet of
+            tag36h11.
+        columns, rows: number of tags of a grid; by default 5 and 7.
+        size: side of a tag between its detected corners (in a grid: up to the outer borders), in the unit of the poses;
+            metres for printing.
+        write_board: write the board for printing, board.pdf and board_*.png, to `out`. Without `images` the command
+            ends there.
+        reconstruction: folder of a COLMAP model; by default `images`/../sparse/0 or /sparse, else a new model.
+        pairs: image pairs that COLMAP matches: `sequential` (each image with the ten next ones, and with fewer distant
+            ones) or `all`; by default sequential if the file names are numbered.
+        threads: number of threads of COLMAP; by default one per core.
+        lens: distortion coefficients to estimate beside focal lengths and principal point: `pinhole` none, as in the
+            paper; `radial` k1 and k2; `opencv` k1, k2, p1 and p2.
+        mask_labels: labels of the object in the masks, as `data.mask_labels`; by default all but the background.
+        test_every: every such image by name is a test image, and as many are validation images.
+        overwrite: allow replacing existing files.
+    """
+
+    images: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
+    out: Optional[str] = None  # noqa: UP045
+    target: Annotated[str, Literal["apriltag", "colmap"]] = "apriltag"
+    board: Annotated[str, Literal["twelve_faces", "grid"]] = "twelve_faces"
+    columns: Optional[Squares] = None  # noqa: UP045
+    rows: Optional[Squares] = None  # noqa: UP045
+    size: Positive = 0.05
+    write_board: bool = False
+    reconstruction: Optional[str] = None  # noqa: UP045
+    pairs: Annotated[Optional[str], Literal["sequential", "all"]] = None  # noqa: UP045
+    threads: Optional[Count] = None  # noqa: UP045
+    lens: Annotated[str, Literal["pinhole", "radial", "opencv"]] = "pinhole"
+    mask_labels: Optional[list[Natural]] = None  # noqa: UP045
+    test_every: Every = 8
+    overwrite: bool = False
 
 
 @entry_point("calibrate", CalibrateConfig)
 def main(config: DictConfig) -> None:
     """Detect the board, estimate lens and poses, write the data set, and print the next command."""
-    check_options(config)
-    out = user_path(config.out)
-    with lock_folder(out, "out"):
-        _calibrate(config, out)
-
-
-def _calibrate(config: DictConfig, out: Path) -> None:
-    board = None if config.target == "colmap" else make_board(config)
-    if config.write_board:
-        _write_board(board, out, config.overwrite)
-        if config.images is None:
-            return
-    images, size = list_photographs(user_path(config.images))
-    # Masks lie where the loader of the data set will look for them.
-    masks = [find_mask(out, out / relative(image, out)) for image in images]
-    require_used(out, [out / relative(image, out) for image in images], masks)
-    refuse_existing([out / name for name in FILES], config.overwrite)
-    if board is None:
-        settings = SfmSettings(config.lens, config.pairs, config.threads, config.mask_labels)
-        model = find_model(config.reconstruction, images, masks, out / "sparse", settings, config.overwrite)
-        calibration, points = import_model(model, images, size)
-        quads, seen = [], points
-    else:
-        sightings = {
-            image.name: outside(board.find(luminance(image)), mask, config.mask_labels)
-            for image, mask in zip(track("detecting tags", images), masks, strict=True)
-        }
-        calibration = calibrate(sightings, size, config.lens)
-        quads, points = [sheet.corners for sheet in board.sheets()], np.empty((0, 3))
-        seen = np.concatenate(quads)
-    # With an existing model, the option has no effect.
-    may_distort = config.lens == "pinhole" and (board is not None or model.is_relative_to(out / "sparse"))
-    _report(calibration, "points" if board is None else "tags", may_distort, out)
-    splits = split_views([image.name for image in images if image.name in calibration.poses], config.test_every)
-    reach = ray_range(calibration, seen)
-    written = write_calibrated(out, images, size, calibration, splits, config.target, (quads, points), reach)
-    print(f"wrote {', '.join(written)}")
-    options = ["data=opencv", f"data.root={out}"]
-    if any(masks):
-        print_next("next", "preprocess", [*options, "medium.ior=1.33"])
-    else:
-        print_next("next", "mask", [*options, "view=true"])
-
-
-def _write_board(board: TagBoard | None, out: Path, overwrite: bool) -> None:
-    if board is None:
-        raise NerfroError("target=colmap has no board to write; choose target=apriltag")
-    refuse_existing([out / "board.pdf"], overwrite)
-    files = print_sheets(board.sheets(), out)
-    print(f"wrote {files[0]} ({len(files) - 1} pages, in true size if the unit is a metre) and the pages as PNG")
-
-
-def _report(calibration: Calibration, feature: str, may_distort: bool, out: Path) -> None:
-    print("\n".join(calibration.lines(feature)))
-    lens = calibration.intrinsics
-    if calibration.mean_error > _MAX_ERROR and may_distort and not lens.distortion:
-        warn(
-            "the reprojection error is large; for a lens with distortion set lens=radial or lens=opencv, and delete "
-            f"{out / 'sparse'} if it exists"
-        )
-    if lens.focal_deviation is not None and lens.focal_deviation > _MAX_FOCAL_DEVIATION * lens.matrix[0, 0]:
-        warn("the focal length is uncertain; photograph the board also at a slant, and from near and far")
+    plugin_module("camera_calibration.command").run(config)
 
 
 if __name__ == "__main__":

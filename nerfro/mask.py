@@ -7,66 +7,59 @@ Examples:
 
 from __future__ import annotations
 
-import json
+from dataclasses import dataclass
+from typing import Annotated, Any, Optional
 
-import torch
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
+from omegaconf import MISSING, DictConfig
 
 import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
+from nerfro.allowed import Range
 from nerfro.cli import entry_point
-from nerfro.data.base import DataSource
-from nerfro.data.frames import require_root
-from nerfro.errors import NerfroError
-from nerfro.files.atomic import write_atomically
-from nerfro.files.folder_lock import lock_folder
-from nerfro.masks.mask_files import MaskConfig, MaskTask, read_outlines
-from nerfro.masks.masking import Segmentation
 from nerfro.overrides import is_given, of_groups, print_next
-from nerfro.paths import EMBEDDED_PREFIX
-from nerfro.progress import progress_bar
-from nerfro.registry import build
+from nerfro.registry import plugin_module
 from nerfro.rendering.scene_file import with_scene
-from nerfro.viewing.outline_page import OutlinePage
 
-_OUTLINES = "outlines.json"
+
+@dataclass
+class MaskConfig:
+    """Options of `python -m nerfro.mask`.
+
+    Attributes:
+        data: data set (options of the group `data`); the views of all splits get masks.
+        outlines: by image name, a box [left, top, right, bottom] around the object, or a polygon [[column, row], ...],
+            which is the mask, in pixels; or a JSON file with such a mapping.
+        sam2: folder of a Segment Anything 2 network in the format of transformers, which follows the object from the
+            outlines and existing masks through the photographs in the order of their names; needs the extra `sam2`.
+        hull_only: project the visual hull of at least three existing masks into all other views, without segmentation
+            by colour.
+        overwrite: replace existing masks, starting from the outlines alone. Otherwise existing masks are kept and used,
+            except projections of a hull, which are made again.
+        view: serve a page on which you draw outlines in two to five views and see the projections of the hull in all
+            others; saving writes `outlines.json` to the data folder, and the masks.
+        host: address of the server of this page; 0.0.0.0 accepts connections from other machines.
+        port: port of the server; 0 for any free port.
+        open: open a browser.
+    """
+
+    data: Any = MISSING
+    outlines: Any = None
+    sam2: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
+    hull_only: bool = False
+    overwrite: bool = False
+    view: bool = False
+    host: str = "localhost"
+    port: Annotated[int, Range(at_least=0, at_most=65535)] = 8008
+    open: bool = True
 
 
 @entry_point("mask", MaskConfig, expand=with_scene)
-@torch.no_grad()
 def main(config: DictConfig) -> None:
     """Segment the outlined views, then all other views, and write the missing masks."""
-    if str(config.data.root).startswith(EMBEDDED_PREFIX):
-        raise NerfroError(f"data.root={config.data.root} is part of nerfro and has masks; set data.root to your folder")
-    source = build(config.data)
-    require_root(source.root)
-    with lock_folder(source.root, "data.root"):
-        _mask(config, source)
+    plugin_module("object_masks.command").run(config)
     given = of_groups(("data",), HydraConfig.get().overrides.task)
     given = given if is_given("data", given) else ["data=opencv", *given]
     print_next("next", "preprocess", [*given, "medium.ior=1.33"])
-
-
-def _mask(config: DictConfig, source: DataSource) -> None:
-    drawn = source.root / _OUTLINES
-    continues = config.view and config.outlines is None and drawn.is_file()
-    outlines = read_outlines(str(drawn) if continues else config.outlines)
-    task = MaskTask.load(source, config, outlines)
-    if config.view:
-
-        def save(outlines: dict[str, list], found: Segmentation) -> str:
-            write_atomically(drawn, json.dumps(outlines) + "\n")
-            return f"{task.save(outlines, found)}; the outlines are in {drawn}"
-
-        page = OutlinePage(task.images, task.frames, outlines, task.segment, save)
-        page.serve(source.root.name, config.host, config.port, config.open)
-    else:
-        missing = len(task.frames) - len(task.kept) - len(outlines)
-        print(f"{len(task.kept)} existing masks, {len(outlines)} outlines; segmenting {missing} further views")
-        with progress_bar("segmenting", missing) as progress:
-            found = task.segment(outlines, progress.update)
-        print(task.save(outlines, found))
-        print("correct wrong masks in a paint program; or delete them, outline one of these views, and repeat")
 
 
 if __name__ == "__main__":

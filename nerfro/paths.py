@@ -37,6 +37,14 @@ def refuse_root(path: Path, option: str) -> None:
         raise NerfroError(f"{option}={path} is a whole file system; give a folder below it")
 
 
+def relative_path(file: Path, folder: Path) -> str:
+    """Return the path of a file relative to a folder; links inside the folder are kept, since masks lie beside them."""
+    file, folder = Path(os.path.abspath(file)), Path(os.path.abspath(folder))
+    if not file.is_relative_to(folder):
+        file, folder = file.resolve(), folder.resolve()
+    return Path(os.path.relpath(file, folder)).as_posix()
+
+
 def scene_name(root: str | Path) -> str:
     """Return the name of the scene in a data folder: the last component of its path."""
     return Path(str(root).removeprefix(EMBEDDED_PREFIX)).name

@@ -372,6 +372,12 @@ def discover(plugins_dir: Path = PLUGINS_DIR) -> None:
         _import_folder(folder)
 
 
+def plugin_module(name: str) -> types.ModuleType:
+    """Import a module of a local plugin by its place in `plugins/`, such as `synthetic_scenes.synthesis`."""
+    discover()
+    return importlib.import_module(f"{_LOCAL_PACKAGE}.{name}")
+
+
 def plugin_folders(plugins_dir: Path = PLUGINS_DIR) -> list[Path]:
     """Return the folders of local plugins; see `discover`."""
     folders = os.environ.get("NERFRO_PLUGINS")

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Optional
 
 from omegaconf import MISSING, DictConfig
 
 from nerfro.allowed import Count, Names, Natural, NotNegative, Positive, Range
-from nerfro.registry import discover
+from nerfro.registry import plugin_module
 
 SCENES: dict[str, str] = {}
 """Module of each scene, by name; plugins add scenes. `build(spacing)` of the module returns the `Scene`."""
@@ -60,5 +59,4 @@ def synthesize(config: DictConfig) -> Any:
     Raises:
         NerfroError: Mitsuba is missing, or `out` contains another data set or other files.
     """
-    discover()
-    return importlib.import_module("nerfro_plugins.synthetic_scenes.synthesis").synthesize(config)
+    return plugin_module("synthetic_scenes.synthesis").synthesize(config)

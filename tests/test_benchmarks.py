@@ -17,8 +17,8 @@ from lightning.pytorch.callbacks import timer
 
 import nerfro.train
 from nerfro.evaluation.metrics import ImageMetrics
-from nerfro.poses.video import extract_frames
 from tests import ball_photographs
+from tests.poses.camera_calibration import extract_frames
 from tests.viewing.test_exports import write
 
 FOLDER = Path(__file__).resolve().parent.parent / "benchmarks"

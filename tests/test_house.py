@@ -2,6 +2,7 @@
 
 import ast
 import re
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from tests.size import count_by_component, count_code_lines
 # From above to below: a package imports what follows it, and itself.
 ORDER = (
     "commands", "testing", "pipeline", "report", "training", "viewing", "evaluation", "capture", "models",
-    "losses", "rendering", "masks", "poses", "silhouettes", "boundaries", "camera", "samplers", "fields", "media",
+    "losses", "rendering", "silhouettes", "boundaries", "camera", "samplers", "fields", "media",
     "data", "geometry", "kernels", "files", "core",
 )  # fmt: skip
 FILES = {
@@ -74,6 +75,34 @@ def test_only_training_imports_lightning() -> None:
         if re.search(r"^\s*(import|from) lightning", file.read_text("utf-8"), re.M)
     }
     assert {room(module) for module in users} == {"training"}
+
+
+# Requirement that provides an imported package with another name.
+PROVIDED_BY = {
+    "PIL": "pillow", "OpenImageIO": "openimageio", "hydra": "hydra-core", "markupsafe": "jinja2",
+    "omegaconf": "hydra-core", "skimage": "scikit-image", "yaml": "hydra-core",
+}  # fmt: skip
+
+
+def test_the_package_imports_only_what_it_requires() -> None:
+    """A component that needs an extra is a plugin."""
+    project = PACKAGE_DIR.parent / "pyproject.toml"
+    if not project.is_file():
+        pytest.skip("there is no checkout with pyproject.toml")
+    block = re.search(r"^dependencies = \[\n(.*?)^\]", project.read_text(encoding="utf-8"), re.M | re.S)[1]
+    required = {*re.findall(r'^  "([\w-]+)', block, re.M)}
+    assert {"torch", "hydra-core"} <= required
+    found = {}
+    for module, file in FILES.items():
+        names = set()
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                names |= {alias.name.partition(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom):
+                names.add(node.module.partition(".")[0])
+        names -= {"nerfro", *sys.stdlib_module_names}
+        found[module] = {name for name in names if PROVIDED_BY.get(name, name) not in required}
+    assert {module: names for module, names in found.items() if names} == {}
 
 
 @pytest.mark.parametrize("module", sorted(filter(is_command, FILES)))

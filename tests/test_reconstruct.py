@@ -27,6 +27,7 @@ from nerfro.pipeline.hypotheses import Hypothesis
 from nerfro.pipeline.stages import terminated_in_one_line
 from tests.ball_photographs import RECONSTRUCTION, RECONSTRUCTION_TRAINING, save_with_masks
 from tests.conftest import Runner, weights_of
+from tests.poses.camera_calibration import collection
 
 
 @pytest.fixture
@@ -41,9 +42,9 @@ def photos(tmp_path: Path) -> Path:
 
 
 def test_links_to_deleted_photographs_are_removed(photos: Path, tmp_path: Path) -> None:
-    stages.link_photographs(photos, photos.parent / "silhouettes", tmp_path / "out")
+    collection.link_photographs(photos, photos.parent / "silhouettes", tmp_path / "out")
     (photos / "IMG_1.png").unlink()
-    stages.link_photographs(photos, photos.parent / "silhouettes", tmp_path / "out")
+    collection.link_photographs(photos, photos.parent / "silhouettes", tmp_path / "out")
     assert sorted(file.name for file in (tmp_path / "out" / "images").iterdir()) == ["IMG_0.png", "IMG_2.png"]
     assert len(list((tmp_path / "out" / "masks").iterdir())) == 3
 
@@ -60,7 +61,7 @@ def test_photographs_of_a_telephone_become_upright_and_keep_their_masks(suffix: 
     lying.save(tmp_path / "photos" / f"IMG_1{suffix}", exif=exif.tobytes())
     (tmp_path / "masks").mkdir()
     Image.new("L", (64, 96)).save(tmp_path / "masks" / f"IMG_1{suffix}.png")  # as COLMAP names masks
-    stages.link_photographs(tmp_path / "photos", tmp_path / "masks", tmp_path / "out")
+    collection.link_photographs(tmp_path / "photos", tmp_path / "masks", tmp_path / "out")
     assert find_mask(tmp_path / "out", tmp_path / "out" / "images" / "IMG_1.jpg") is not None
     with open_image(tmp_path / "out" / "images" / "IMG_1.jpg") as (upright, _):
         assert upright.size == (64, 96)

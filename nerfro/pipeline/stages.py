@@ -16,13 +16,9 @@ from types import FrameType
 import torch
 
 from nerfro.cli import call
-from nerfro.data.frames import list_images
-from nerfro.data.image_files import IMAGE_SUFFIXES
 from nerfro.errors import Interrupted, NerfroError
 from nerfro.failures import EXIT_INTERRUPTED, in_one_line
 from nerfro.overrides import without_hints
-from nerfro.poses.photographs import PHOTOGRAPH_SUFFIXES, place_photograph
-from nerfro.progress import track
 
 _SEED = 67280421310721  # of torch in a new process
 
@@ -113,36 +109,3 @@ def move_aside(folder: Path) -> Path:
     """Rename a folder to the first free name with a number, and return the new path."""
     free = next(path for n in itertools.count(1) if not (path := folder.with_name(f"{folder.name}_{n}")).exists())
     return folder.rename(free)
-
-
-def link_photographs(photographs: Path, masks: Path | None, out: Path) -> None:
-    """Link photographs into `out`/images and masks into `out`/masks, so that no result lies among the originals.
-
-    Existing links and files are kept, except links to deleted files. Photographs in HEIC format and those with an EXIF
-    orientation are converted.
-
-    Args:
-        photographs: folder of the photographs, which may also contain masks (`mask_*`).
-        masks: folder of the masks, `<name>.png`, `<name>.<extension of the photograph>.png` or `mask_<name>.png`.
-        out: folder of the data set.
-    """
-    list_images(photographs, PHOTOGRAPH_SUFFIXES)  # raises an error for a folder without photographs
-    for link in (*out.glob("images/*"), *out.glob("masks/*")):
-        if not link.exists():
-            link.unlink()
-    for folder in (photographs, *([] if masks is None else [masks])):
-        if not folder.is_dir():
-            raise NerfroError(f"masks={folder} is not a folder; give the folder of the masks of the photographs")
-        suffixes = PHOTOGRAPH_SUFFIXES if folder == photographs else IMAGE_SUFFIXES
-        files = (file for file in folder.iterdir() if file.suffix.lower() in suffixes)
-        for file in track("linking", sorted(file for file in files if not file.name.startswith("."))):
-            among_images = folder == photographs or file.name.startswith("mask_")
-            place = out / ("images" if among_images else "masks")
-            place.mkdir(parents=True, exist_ok=True)
-            if folder == photographs:
-                place_photograph(file, place)
-                continue
-            # A converted photograph has another extension, so that of the photograph is left out.
-            stem = Path(file.stem).stem if (photographs / file.stem).is_file() else file.stem
-            if not (link := place / f"{stem}{file.suffix}").exists():
-                link.symlink_to(file.resolve())

@@ -10,17 +10,14 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from nerfro.capture.preprocess_options import MESH
-from nerfro.data.frames import list_images
 from nerfro.errors import NerfroError, warn
 from nerfro.evaluation.results import EXPOSED, FULL, read_metrics_json
 from nerfro.files.reading import read_json
 from nerfro.overrides import as_overrides, is_given, not_given
-from nerfro.paths import user_path
 from nerfro.pipeline.hypotheses import Hypothesis, hypotheses
 from nerfro.pipeline.options import common_options
-from nerfro.pipeline.stages import Stage, is_older, link_photographs, move_aside
-from nerfro.poses.calibrated_data import PLOT, REPORT
-from nerfro.poses.video import extract_frames
+from nerfro.pipeline.stages import Stage, is_older, move_aside
+from nerfro.registry import plugin_module
 from nerfro.rendering.scene_file import OLD_SCENE, SCENE, read_scene_file
 from nerfro.silhouettes.overlaps import SHEET
 from nerfro.training.run_folder import CONFIG_FILE
@@ -38,14 +35,7 @@ _MASKS = ("masks/*", "masks/*/*", "mask_*", "*/mask_*")  # where loaders search 
 
 def calibrate(config: DictConfig, data: list[str], out: Path) -> list[str]:
     """Estimate the poses of the photographs, and return the options of the resulting data set."""
-    if config.video is None:
-        photographs = user_path(config.images)
-    else:
-        photographs = out / "frames"
-        if not (out / REPORT).is_file():
-            extract_frames(user_path(config.video), photographs, config.frames)
-    link_photographs(photographs, None if config.masks is None else user_path(config.masks), out)
-    linked = list_images(out / "images")
+    linked = plugin_module("camera_calibration.collection").collect_photographs(config, out)
     if len(linked) < _FEWEST:
         raise NerfroError(
             f"{len(linked)} photographs do not determine poses and shape; take at least {_FEWEST}, better 60, from all "
@@ -57,11 +47,12 @@ def calibrate(config: DictConfig, data: list[str], out: Path) -> list[str]:
             "the photographs have no masks; add mask='view=true' to draw the outline of the object in two to five "
             f"images in the browser, outlines={{{linked[0].stem}:[[COLUMN,ROW],...],...}}, or masks=FOLDER"
         )
+    report = out / "calibration.json"
     options = [*as_overrides({"images": out / "images", "out": out}), "target=colmap", "overwrite=true"]
     options += [text.removeprefix("data.") for text in data if text.startswith("data.mask_labels=")]
-    Stage("calibrate", [*options, *shlex.split(config.calibrate)], out / REPORT, out / PLOT).run()
-    report = read_json(out / REPORT, "delete the file to repeat the stage")
-    bounds = report.get("options", []) if isinstance(report, dict) else []  # bounds of the rays in earlier releases
+    Stage("calibrate", [*options, *shlex.split(config.calibrate)], report, out / "cameras.png").run()
+    content = read_json(report, "delete the file to repeat the stage")
+    bounds = content.get("options", []) if isinstance(content, dict) else []  # bounds of the rays in earlier releases
     return [*as_overrides({"data.root": out}), *bounds, *data]
 
 

@@ -22,7 +22,7 @@ from nerfro.data.lenses import Lens, check_lenses, read_lens
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
 from nerfro.files.reading import is_number, parse_matrix, read_json
-from nerfro.poses.calibrated_data import relative
+from nerfro.paths import relative_path
 from nerfro.types import WORLD_ORIGIN
 from nerfro.viewing.camera_paths import CaptureGeometry
 
@@ -97,7 +97,7 @@ def write_cameras(file: Path, camera: Camera, views: Views, origin: Float[np.nda
     frames = []
     for view, frame in enumerate(views.frames):
         lens = {"fl_x": estimated.fx, "fl_y": estimated.fy, "cx": estimated.cx, "cy": estimated.cy}
-        entry: dict[str, Any] = {"file_path": relative(frame.image, file.parent)}
+        entry: dict[str, Any] = {"file_path": relative_path(frame.image, file.parent)}
         entry |= {name: float(values[view]) for name, values in lens.items()}
         if estimated.distortion is not None:
             entry |= {name: k for name, k in zip(names, estimated.distortion[view].tolist(), strict=False) if name}

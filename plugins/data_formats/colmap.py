@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 
 from nerfro.data.base import Frame
-from nerfro.data.bounds import find_bounds, usable_points
-from nerfro.data.colmap_model import lens_of, read_colmap
 from nerfro.data.frames import Every, FrameSet, PosedImages
 from nerfro.data.image_files import read_size
 from nerfro.data.masks import find_mask
 from nerfro.errors import NerfroError
 from nerfro.registry import register
+
+from .bounds import find_bounds, usable_points
+from .colmap_model import lens_of, read_colmap
 
 _MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "")
 

@@ -10,7 +10,6 @@ from typing import Any, Literal
 import numpy as np
 
 from nerfro.allowed import check
-from nerfro.data.bounds import find_bounds, usable_points
 from nerfro.data.frames import SPLITS, Every, FrameSet, PosedImages
 from nerfro.data.image_files import read_size
 from nerfro.data.masks import find_mask
@@ -18,6 +17,8 @@ from nerfro.data.transforms import Manifest, find_splits, parse_manifest, read_m
 from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import load_points
 from nerfro.registry import register
+
+from .bounds import find_bounds, usable_points
 
 _SINGLE, _MASK_KEY = "transforms.json", "object_mask_path"
 

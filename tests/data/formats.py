@@ -18,7 +18,6 @@ from scipy.spatial.transform import Rotation
 
 from nerfro.data.base import DataSource, Views
 from nerfro.data.blender import BlenderData, OpenCVData
-from nerfro.data.colmap_model import CAMERA_MODELS
 from nerfro.registry import discover
 
 from .photographs import (
@@ -37,9 +36,11 @@ from .photographs import (
 )
 
 discover()
-NAMES = ("colmap", "idr", "llff", "nerfstudio", "refref")
-colmap, idr, llff, nerfstudio, refref = (import_module(f"nerfro_plugins.data_formats.{name}") for name in NAMES)
+NAMES = ("colmap", "colmap_model", "idr", "llff", "nerfstudio", "refref")
+_MODULES = [import_module(f"nerfro_plugins.data_formats.{name}") for name in NAMES]
+colmap, colmap_model, idr, llff, nerfstudio, refref = _MODULES
 ColmapData, NerfstudioData = colmap.ColmapData, nerfstudio.NerfstudioData
+CAMERA_MODELS = colmap_model.CAMERA_MODELS
 
 TRAIN, TEST = (1, 2, 4, 5), (0, 3)
 IDEAL = (FX, FX, WIDTH / 2, HEIGHT / 2)

@@ -14,11 +14,10 @@ import trimesh
 from omegaconf import OmegaConf
 
 from nerfro.data.base import Views
-from nerfro.data.colmap_model import CAMERA_MODELS, read_colmap
 from nerfro.errors import NerfroError
 from tests.conftest import SMALL, refused
 
-from .formats import BROWN, FORMATS, OPENCV, TRAIN, write_colmap
+from .formats import BROWN, CAMERA_MODELS, FORMATS, OPENCV, TRAIN, colmap_model, write_colmap
 from .photographs import CX, CY, FX, FY, HEIGHT, POINTS, WIDTH, camera_to_world, check_views, save_picture
 
 TORCH_POINTS = torch.from_numpy(POINTS).float()
@@ -190,7 +189,7 @@ def test_what_is_missing_is_named(write, tmp_path):
 
 
 def test_model_without_its_images_is_read(write):
-    model = read_colmap(write("text") / "sparse/0")
+    model = colmap_model.read_colmap(write("text") / "sparse/0")
     assert [image.name for image in model.images] == [f"top/v{i}.png" for i in range(6)]
     np.testing.assert_allclose(model.points, POINTS)
     np.testing.assert_allclose(model.images[3].camera_to_world, camera_to_world(3, "opencv")[:3], atol=1e-12)

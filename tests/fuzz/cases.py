@@ -32,7 +32,6 @@ from nerfro.files import lat_long
 from nerfro.files.foreign_config import read_foreign_config
 from nerfro.files.reading import load_array
 from nerfro.geometry.mesh import load_mesh
-from nerfro.masks.mask_files import read_outlines
 from nerfro.rendering.scene_file import with_scene
 from nerfro.samplers.paths.traced_file import read_rays
 from nerfro.training.load import scene_of
@@ -40,6 +39,7 @@ from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
 from nerfro.training.settings import Role, settings
 from tests.data.formats import FORMATS, refref
 from tests.fuzz.world import World
+from tests.masks.object_masks import read_outlines
 
 _number = itertools.count()
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nerfro.poses.boards import draw_tag, tag_grid, twelve_faces
+from tests.poses.camera_calibration import draw_tag, tag_grid, twelve_faces
 
 
 def test_positions_are_those_of_the_authors() -> None:

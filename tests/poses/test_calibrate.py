@@ -13,9 +13,7 @@ pytest.importorskip("cv2")
 pytest.importorskip("pyapriltags")
 
 from nerfro.data.blender import OpenCVData
-from nerfro.poses.boards import Sighting, TagBoard, tag_grid, twelve_faces
-from nerfro.poses.calibration import calibrate
-from nerfro.poses.photographs import luminance
+from tests.poses.camera_calibration import Sighting, TagBoard, calibrate, luminance, tag_grid, twelve_faces
 from tests.sheet_photographs import angle, around, photograph
 
 SIZE = (640, 480)

@@ -19,10 +19,8 @@ pytest.importorskip("pycolmap")
 
 import pycolmap
 
-from nerfro.poses import reconstruction
-from nerfro.poses.boards import Sheet
-from nerfro.poses.reconstruction import numeric_order, sequential_pairs
 from tests.conftest import refused
+from tests.poses.camera_calibration import Sheet, numeric_order, reconstruction, sequential_pairs
 from tests.sheet_photographs import angle, look_at, photograph
 
 
@@ -180,5 +178,5 @@ def test_a_sequence_is_matched_with_its_neighbours_and_ever_fewer_beyond() -> No
 
 def test_pycolmap_leaves_sigterm_alone() -> None:
     program = "import signal; signal.signal(15, lambda *_: exit(130)); "
-    program += "from nerfro.poses.reconstruction import require_pycolmap; require_pycolmap(); signal.raise_signal(15)"
+    program += "import tests.poses.camera_calibration as made; made.require_pycolmap(); signal.raise_signal(15)"
     assert subprocess.run([sys.executable, "-c", program], stderr=subprocess.DEVNULL).returncode == 130

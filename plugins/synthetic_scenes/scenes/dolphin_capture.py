@@ -9,8 +9,7 @@ import functools
 import itertools
 
 import numpy as np
-
-from nerfro.poses.boards import TagBoard, twelve_faces
+from nerfro_plugins.camera_calibration.boards import TagBoard, twelve_faces
 
 from ..scene import Panel, Scene, Vector
 from . import distance, starlamp

@@ -6,16 +6,18 @@ from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, UInt8
-from omegaconf import MISSING, DictConfig, OmegaConf
+from nerfro_plugins.camera_calibration.opencv import opencv
+from nerfro_plugins.camera_calibration.photographs import PHOTOGRAPH_SUFFIXES
+from nerfro_plugins.camera_calibration.reconstruction import numeric_order
+from omegaconf import DictConfig, OmegaConf
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
-from nerfro.allowed import Range
 from nerfro.cameras import Cameras
 from nerfro.data.base import DataSource, Frame
 from nerfro.data.image_files import read_mask, read_size, to_unit
@@ -24,49 +26,15 @@ from nerfro.errors import NerfroError, first_of, warn
 from nerfro.files.drawing import sheet
 from nerfro.files.images import save_image
 from nerfro.files.reading import read_json
-from nerfro.masks.masking import Segmentation, box_region, check_tracked, grab, polygon_mask, propagate
-from nerfro.masks.tracking import load_tracker, track_object
-from nerfro.opencv import opencv
 from nerfro.paths import user_path
-from nerfro.poses.photographs import PHOTOGRAPH_SUFFIXES
-from nerfro.poses.reconstruction import numeric_order
-from nerfro.silhouettes.outline_hull import AGREES, FEWEST_VIEWS
+
+from .masking import Segmentation, box_region, check_tracked, grab, polygon_mask, propagate
+from .outline_hull import AGREES, FEWEST_VIEWS
+from .tracking import load_tracker, track_object
 
 _SHEET = "masks.png"
 _TILE, _COLUMNS = 220, 6  # width of a tile in pixels, tiles per row
 _OUTSIDE = (0.0, 0.0, 90.0)  # 8-bit colour that is added outside the mask
-
-
-@dataclass
-class MaskConfig:
-    """Options of `python -m nerfro.mask`.
-
-    Attributes:
-        data: data set (options of the group `data`); the views of all splits get masks.
-        outlines: by image name, a box [left, top, right, bottom] around the object, or a polygon [[column, row], ...],
-            which is the mask, in pixels; or a JSON file with such a mapping.
-        sam2: folder of a Segment Anything 2 network in the format of transformers, which follows the object from the
-            outlines and existing masks through the photographs in the order of their names; needs the extra `sam2`.
-        hull_only: project the visual hull of at least three existing masks into all other views, without segmentation
-            by colour.
-        overwrite: replace existing masks, starting from the outlines alone. Otherwise existing masks are kept and used,
-            except projections of a hull, which are made again.
-        view: serve a page on which you draw outlines in two to five views and see the projections of the hull in all
-            others; saving writes `outlines.json` to the data folder, and the masks.
-        host: address of the server of this page; 0.0.0.0 accepts connections from other machines.
-        port: port of the server; 0 for any free port.
-        open: open a browser.
-    """
-
-    data: Any = MISSING
-    outlines: Any = None
-    sam2: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
-    hull_only: bool = False
-    overwrite: bool = False
-    view: bool = False
-    host: str = "localhost"
-    port: Annotated[int, Range(at_least=0, at_most=65535)] = 8008
-    open: bool = True
 
 
 def read_outlines(given: object) -> dict[str, list]:

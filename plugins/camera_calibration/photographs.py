@@ -8,44 +8,18 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
-from PIL import ImageOps
 
 from nerfro.data.frames import list_images
 from nerfro.data.image_files import IMAGE_SUFFIXES, read_mask, read_rgb, read_size, to_unit
 from nerfro.errors import NerfroError
-from nerfro.files.atomic import atomic_file
-from nerfro.files.reading import open_image, orientation_of
 from nerfro.light import to_linear
-from nerfro.poses.boards import Sighting
 from nerfro.progress import track
+
+from .boards import Sighting
 
 HEIF_SUFFIXES = (".heic", ".heif")
 PHOTOGRAPH_SUFFIXES = (*IMAGE_SUFFIXES, *HEIF_SUFFIXES)
-_QUALITY = 95  # of converted photographs
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # of linear sRGB (ITU-R BT.709)
-
-
-def place_photograph(file: Path, folder: Path) -> None:
-    """Link a photograph into a folder; one in HEIC format or with an EXIF orientation is converted to an upright JPEG.
-
-    Existing files are kept.
-    """
-    if file.suffix.lower() in HEIF_SUFFIXES:
-        try:
-            import pillow_heif
-        except ImportError as error:
-            raise NerfroError(f"{file} needs pillow-heif; pip install 'nerfro[capture]', or give JPEG files") from error
-        pillow_heif.register_heif_opener()
-    place, converted = folder / file.name, folder / f"{file.stem}.jpg"
-    if place.exists() or converted.exists():
-        return
-    with open_image(file, upright=False) as (image, _):
-        if file.suffix.lower() in HEIF_SUFFIXES or orientation_of(image) in range(2, 9):
-            upright = ImageOps.exif_transpose(image).convert("RGB")
-            with atomic_file(converted) as output:
-                upright.save(output, "JPEG", quality=_QUALITY, exif=upright.getexif())
-            return
-    place.symlink_to(file.resolve())
 
 
 def list_photographs(folder: Path) -> tuple[list[Path], tuple[int, int]]:

@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
+from nerfro_plugins.camera_calibration.opencv import opencv
 from numpy.typing import ArrayLike
 from scipy.ndimage import binary_fill_holes, label
 from skimage.draw import polygon2mask
@@ -15,8 +16,8 @@ from skimage.draw import polygon2mask
 from nerfro.cameras import Cameras
 from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.opencv import opencv
-from nerfro.silhouettes.outline_hull import AGREES, FEWEST_VIEWS, MAX_SIDE, OutlineHull
+
+from .outline_hull import AGREES, FEWEST_VIEWS, MAX_SIDE, OutlineHull
 
 _ITERATIONS = 5
 # Margin around the region that provides the background colours of GrabCut, as a fraction of the longer side.

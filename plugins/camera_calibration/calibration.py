@@ -9,8 +9,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from nerfro.errors import NerfroError
-from nerfro.opencv import opencv
-from nerfro.poses.boards import Sighting
+
+from .boards import Sighting
+from .opencv import opencv
 
 LensModel = Literal["pinhole", "radial", "opencv"]
 

@@ -15,19 +15,20 @@ from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
+from nerfro_plugins.data_formats.colmap_model import lens_of, read_colmap
 from PIL import Image
 from scipy.ndimage import binary_dilation
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from nerfro.data.colmap_model import lens_of, read_colmap
 from nerfro.data.image_files import read_mask, to_unit
 from nerfro.data.lenses import Lens, check_lenses
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import refuse_existing, require_room, write_atomically
 from nerfro.paths import user_path
-from nerfro.poses.calibration import Calibration, Intrinsics, LensModel, Pose
 from nerfro.progress import progress_bar, track
+
+from .calibration import Calibration, Intrinsics, LensModel, Pose
 
 Pairs = Literal["sequential", "all"]
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,7 +14,9 @@ from jaxtyping import Float
 from nerfro.cameras import up_direction
 from nerfro.files.atomic import write_atomically
 from nerfro.geometry.lines import nearest_point
-from nerfro.poses.calibration import Calibration
+from nerfro.paths import relative_path
+
+from .calibration import Calibration
 
 SPLITS = ("train", "val", "test")
 REPORT, PLOT = "calibration.json", "cameras.png"
@@ -71,7 +72,7 @@ def write_calibrated(
         frames = []
         for name in names:
             matrix = [*calibration.poses[name].camera_to_world.tolist(), [0.0, 0.0, 0.0, 1.0]]
-            frames.append({"file_path": relative(files[name], out), "transform_matrix": matrix})
+            frames.append({"file_path": relative_path(files[name], out), "transform_matrix": matrix})
         write_atomically(path, json.dumps(document | {"frames": frames}, indent=1) + "\n")
         written.append(f"{path} ({len(names)} views)")
     report = {
@@ -91,14 +92,6 @@ def write_calibrated(
     matrices, errors = np.stack([pose.camera_to_world for pose in poses]), [pose.error for pose in poses]
     write_atomically(out / PLOT, _plot_cameras(matrices, np.nan_to_num(errors), *shown))
     return [*written, str(out / REPORT), str(out / PLOT)]
-
-
-def relative(file: Path, folder: Path) -> str:
-    """Return the path of a file relative to a folder; links inside the folder are kept, since masks lie beside them."""
-    file, folder = Path(os.path.abspath(file)), Path(os.path.abspath(folder))
-    if not file.is_relative_to(folder):
-        file, folder = file.resolve(), folder.resolve()
-    return Path(os.path.relpath(file, folder)).as_posix()
 
 
 def ray_range(calibration: Calibration, seen: Float[np.ndarray, "P 3"]) -> dict[str, float]:

@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from nerfro_plugins.camera_calibration.opencv import opencv
 
 from nerfro.cameras import Cameras
 from nerfro.geometry.lines import nearest_point
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.opencv import opencv
 from nerfro.silhouettes.pose_conventions import GOOD_OVERLAP, coarse_agreement, overlap
 from nerfro.silhouettes.revolution import fit_revolution
 from nerfro.silhouettes.silhouettes import mesh_silhouettes

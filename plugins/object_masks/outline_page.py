@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,12 +18,12 @@ from nerfro.data.image_files import read_size
 from nerfro.errors import NerfroError
 from nerfro.files.images import data_uri
 from nerfro.files.templates import fill_template
-from nerfro.masks.mask_files import read_outlines
-from nerfro.masks.masking import Segmentation
-from nerfro.paths import ASSETS_DIR
 from nerfro.viewing.server import PageServer, open_page
 
-_TEMPLATE = ASSETS_DIR / "_page" / "outlines.html.jinja"
+from .mask_files import read_outlines
+from .masking import Segmentation
+
+_TEMPLATE = Path(__file__).with_name("outlines.html.jinja")
 _MAX_SIDE = 960  # of a photograph on the page, pixels
 _TOLERANCE = 0.5  # largest distance, in pixels, between a mask and its outline on the page
 

@@ -13,8 +13,9 @@ from jaxtyping import Float, UInt8
 
 from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
-from nerfro.opencv import opencv
 from nerfro.progress import track
+
+from .opencv import opencv
 
 # Sharpness is measured on frames of at most so many pixels per side.
 _SHARPNESS_PIXELS = 480

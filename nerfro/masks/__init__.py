@@ -1,1 +1,0 @@
-"""Masks of the object in photographs: outlines, GrabCut, visual hull, and Segment Anything 2."""
