@@ -15,10 +15,12 @@ import torch
 import trimesh
 
 from nerfro.media.sdf_grid import SdfGrid
-from nerfro.media.vessel import SdfVessel
 from nerfro.rays import Rays
+from nerfro.registry import plugin_module
 from nerfro.samplers.paths.snell import Snell
 from tests.closed_forms import angle, make_rays
+
+SdfVessel = plugin_module("vessels.vessel").SdfVessel
 
 # A drinking glass in millimetres, and the world unit.
 HEIGHT, RADIUS_BELOW, RADIUS_ABOVE, WALL, FOOT, LEVEL = 120.0, 30.0, 38.0, 2.5, 10.0, 80.0

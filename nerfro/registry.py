@@ -84,6 +84,7 @@ MOVED_CLASSES = (
         "nerfro.training.phases.cameras.CameraSteps": f"{_LOCAL_PACKAGE}.refined_cameras.phase.CameraSteps",
         "nerfro.data.opencv.OpenCVData": "nerfro.data.blender.OpenCVData",
         "nerfro.losses.distortion.Distortion": f"{_LOCAL_PACKAGE}.distortion.Distortion",
+        "nerfro.media.vessel.SdfVessel": f"{_LOCAL_PACKAGE}.vessels.vessel.SdfVessel",
         "nerfro.losses.smoothness.Smoothness": f"{_LOCAL_PACKAGE}.paper.smoothness.Smoothness",
     }
 )

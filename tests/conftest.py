@@ -63,8 +63,8 @@ def pytest_configure(config: pytest.Config) -> None:
     # The option --jaxtyping-packages takes one package beside this checker.
     checker = (config.option.jaxtyping_packages or "").partition(",")[2]
     if checker:
-        checked = [f"nerfro_plugins.{name}" for name in ("camera_calibration", "data_formats", "object_masks", "paper")]
-        jaxtyping.install_import_hook(checked, checker)
+        checked = ("camera_calibration", "data_formats", "object_masks", "paper", "vessels")
+        jaxtyping.install_import_hook([f"nerfro_plugins.{name}" for name in checked], checker)
     worker = hasattr(config, "workerinput")  # of pytest-xdist
     if not worker and not config.option.collectonly and config.cache is not None:
         config.pluginmanager.register(SkippedTests(config.cache))

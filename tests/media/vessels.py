@@ -6,8 +6,9 @@ import numpy as np
 import trimesh
 from jaxtyping import Bool, Float
 
-from nerfro.media.vessel import SdfVessel
+from nerfro.registry import plugin_module
 
+SdfVessel = plugin_module("vessels.vessel").SdfVessel
 RADIUS, WALL = 0.8, 0.1
 GLASS, WATER = 1.5, 1.333
 

@@ -10,10 +10,10 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from nerfro.media.solid import Solid
-from nerfro.media.vessel import SdfVessel
 from nerfro.rays import Rays
 from nerfro.samplers.paths.snell import Snell
 from tests.closed_forms import angle, make_rays
+from tests.media.vessels import SdfVessel
 
 RADIUS, HEIGHT, WALL, FOOT, LEVEL = 0.5, 1.6, 0.06, 0.16, 0.8
 GLASS, WATER, AIR = 1.5, 1.33, 1.0

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from nerfro.allowed import Coordinate, NotNegative, Positive, Resolution
 from nerfro.errors import NerfroError
-from nerfro.geometry.lids import find_lid
 from nerfro.geometry.mesh import local_origin
 from nerfro.kernels.available import require_bytes
 from nerfro.media.base import Medium
@@ -22,6 +21,8 @@ from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.surface import Grid, MeshSurface, cached_distances, direction
 from nerfro.registry import register
 from nerfro.variants import variant
+
+from .lids import find_lid
 
 
 @register("medium", "sdf_vessel")

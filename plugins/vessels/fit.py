@@ -20,9 +20,10 @@ from nerfro.capture.surroundings import Observations
 from nerfro.errors import NerfroError, warn
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.media.sdf_grid import SdfGrid
-from nerfro.media.vessel import SdfVessel
 from nerfro.progress import bar
 from nerfro.silhouettes.upright import find_up
+
+from .vessel import SdfVessel
 
 # Lengths of a typical glass, as fractions of its width.
 _TYPICAL = {"wall": 0.02, "foot": 0.06, "fillet": 0.1}
