@@ -167,6 +167,7 @@ def measure(overrides: list[str], steps: int, psnr: float, by_clock: bool, begun
     timed = training.run(STEPS)
     costs["step"] = 1e3 * float(np.median(timed.seconds if by_clock else timed.processor))
     test = build(training.config.data).load("test")
+    del training, timed  # its pixels
     module, data = nerfro.build(overrides=[*overrides, "evaluation.every=0"])
     quality = Quality(ValidationPixels.of(test), psnr, clock)
     quiet = dict.fromkeys(("logger", "enable_checkpointing", "enable_progress_bar", "enable_model_summary"), False)
