@@ -65,7 +65,7 @@ RENDERED = 128  # pixels per side of the view whose rendering is measured
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
     parser.add_argument("axes", nargs="*", metavar="AXIS=VALUE,VALUE")
-    parser.add_argument("--steps", type=int, default=300, help="of the training to a PSNR, at most")
+    parser.add_argument("--steps", type=int, default=300, help="most steps of the training that should reach --psnr")
     parser.add_argument("--psnr", type=float, default=22.0, help="that training has to reach on test views, dB")
     parser.add_argument("--figure", type=Path, default=FIGURE)
     parser.add_argument("--options", nargs="+", default=[], help="of nerfro.train, for all rows")

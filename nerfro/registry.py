@@ -374,9 +374,19 @@ def discover(plugins_dir: Path = PLUGINS_DIR) -> None:
 
 
 def plugin_module(name: str) -> types.ModuleType:
-    """Import a module of a local plugin by its place in `plugins/`, such as `synthetic_scenes.synthesis`."""
+    """Import a module of a local plugin by its place in `plugins/`, such as `synthetic_scenes.synthesis`.
+
+    Raises:
+        NerfroError: the plugin is not installed.
+    """
     discover()
-    return importlib.import_module(f"{_LOCAL_PACKAGE}.{name}")
+    plugin, full_name = name.partition(".")[0], f"{_LOCAL_PACKAGE}.{name}"
+    try:
+        return importlib.import_module(full_name)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{full_name}.".startswith(f"{error.name}."):
+            raise
+        raise NerfroError(f"{PLUGINS_DIR} lacks the plugin {plugin}; install nerfro again") from error
 
 
 def plugin_folders(plugins_dir: Path = PLUGINS_DIR) -> list[Path]:

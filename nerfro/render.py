@@ -39,14 +39,13 @@ def _render(config: DictConfig, folder: Path) -> None:
     inputs = [checkpoint_of(config.checkpoint), *([config.sky] if config.sky else [])]
     request = (config.what, scene.subdivision, *map(file_hash, inputs))
     films = config.film if shots.film and config.format == "png" else []
-    encoding = plugin_module("film_encoding.film")
     if "mp4" in films:
-        encoding.find_ffmpeg()  # a missing ffmpeg is reported before the frames are rendered
+        plugin_module("film_encoding.film").find_ffmpeg()  # a missing ffmpeg is reported before the frames are rendered
     files = render_frames(LAYERS[config.what], scene, shots, folder, f".{config.format}", request, config.overwrite)
     print(f"{len(files)} frames: {files[0]}")
     for form in films:
         film = folder / f"film.{form}"
-        encoding.write_film(film, files, config.seconds)
+        plugin_module("film_encoding.film").write_film(film, files, config.seconds)
         print(f"film: {film}")
 
 

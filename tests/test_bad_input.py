@@ -36,6 +36,11 @@ def tiny_mesh(root: Path) -> None:
     trimesh.creation.icosphere(2, 2e-5).export(root / "mesh.ply")
 
 
+def flat_mesh(root: Path) -> None:
+    box = trimesh.creation.box()
+    trimesh.Trimesh(box.vertices * (1, 1, 0), box.faces, process=False).export(root / "mesh.ply")
+
+
 def large_mesh(root: Path) -> None:
     trimesh.creation.icosphere(2, 1.49).export(root / "mesh.ply")
 
@@ -62,6 +67,7 @@ DAMAGES: dict[str, tuple[Callable[[Path], object], list[str]]] = {
     "no mesh": (lambda root: (root / "mesh.ply").unlink(), ["mesh.ply does not exist"]),
     "unreadable mesh": (lambda root: (root / "mesh.ply").write_bytes(b"ply?"), ["mesh.ply"]),
     "open mesh": (open_mesh, ["not watertight", "medium.accept_open_mesh=true"]),
+    "flat mesh": (flat_mesh, ["0 world units thin, so it has no inside"]),
     "mesh as small as a speck": (tiny_mesh, ["4e-05 world units thin, so it has no inside"]),
     "object outside the box": (large_mesh, ["does not fit into the box", "medium.box_min=[", "medium.box_max=["]),
 }

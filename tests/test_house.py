@@ -4,6 +4,7 @@ import ast
 import re
 import sys
 from collections.abc import Iterator
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -77,6 +78,7 @@ def test_only_training_imports_lightning() -> None:
     assert {room(module) for module in users} == {"training"}
 
 
+PLUGINS = {str(file.relative_to(PLUGINS_DIR)): file for file in PLUGINS_DIR.rglob("*.py")}
 # Requirement that provides an imported package with another name.
 PROVIDED_BY = {
     "PIL": "pillow", "OpenImageIO": "openimageio", "hydra": "hydra-core", "markupsafe": "jinja2",
@@ -105,6 +107,15 @@ def test_the_package_imports_only_what_it_requires() -> None:
     assert {module: names for module, names in found.items() if names} == {}
 
 
+def test_plugins_import_each_other_without_cycles() -> None:
+    imported: dict[str, set[str]] = {}
+    for name, file in PLUGINS.items():
+        folder, source = Path(name).parts[0].removesuffix(".py"), file.read_text(encoding="utf-8")
+        imported.setdefault(folder, set()).update(set(re.findall(r"nerfro_plugins\.(\w+)", source)) - {folder})
+    assert "camera_calibration" in imported["object_masks"]
+    TopologicalSorter(imported).prepare()  # raises CycleError
+
+
 @pytest.mark.parametrize("module", sorted(filter(is_command, FILES)))
 def test_commands_compose_call_and_print(module: str) -> None:
     assert count_code_lines(FILES[module].read_text(encoding="utf-8")) < 90
@@ -116,7 +127,6 @@ def test_no_package_is_large() -> None:
     assert {name: lines for name, lines in sizes.items() if lines > 3000 and name != "(top level)"} == {}
 
 
-PLUGINS = {str(file.relative_to(PLUGINS_DIR)): file for file in PLUGINS_DIR.rglob("*.py")}
 FUNCTIONS = [
     (module, node)
     for module, file in (FILES | PLUGINS).items()

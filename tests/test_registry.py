@@ -10,7 +10,7 @@ from torch import nn
 import nerfro.registry
 import nerfro.training.lightning_callbacks
 from nerfro.errors import NerfroError
-from nerfro.registry import build, configure, discover, find, register
+from nerfro.registry import build, configure, discover, find, plugin_module, register
 from nerfro.training.config import build_each
 from tests.conftest import Runner, refused
 
@@ -136,6 +136,8 @@ def test_wrong_losses_are_refused(losses: dict[str, object], message: str) -> No
     ("experiment", "words"),
     [
         ("nmae: x", ["In 'experiment/of_test'", "nmae is not a setting; did you mean name?"]),
+        ("optimizer: {lerning_rate: 3}", ["optimizer.lerning_rate is not a setting; did you mean learning_rate?"]),
+        ("defaults: [{override /model: nrf}]", ["Could not find 'model/nrf'"]),
         ("trainer: {strategy: {_target_: os.system, command: 'false'}}", ["'os.system' inside lightning"]),
     ],
 )
@@ -149,3 +151,7 @@ def test_mistake_in_an_experiment_file_is_told_in_one_line(
         assert word in refused.error
     assert "nerfro:" not in refused.out, "nothing has started"
     assert not list((tmp_path / "run").rglob("*")), "nothing is written"
+
+
+def test_a_missing_plugin_is_named_in_one_line() -> None:
+    refused("lacks the plugin no_such_plugin; install nerfro again", plugin_module, "no_such_plugin.command")

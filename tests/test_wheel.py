@@ -29,7 +29,7 @@ def test_wheel_holds_every_configuration_plugin_and_asset(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         inside = set(archive.namelist())
     for folder in ("conf", "plugins"):
-        files = [p for p in (PROJECT / folder).rglob("*") if p.suffix in (".yaml", ".py")]
+        files = [p for p in (PROJECT / folder).rglob("*") if p.suffix in (".yaml", ".py", ".jinja")]
         assert files
         assert {f"nerfro/_project/{p.relative_to(PROJECT).as_posix()}" for p in files} <= inside
     assets = [p for p in (PACKAGE_DIR / "assets").rglob("*") if p.is_file()]

@@ -7,5 +7,10 @@ from torch import Tensor
 
 
 def arrays(*tensors: Tensor) -> list[np.ndarray]:
-    """Return tensors as NumPy arrays without gradients; contiguous tensors on the CPU share their memory."""
-    return [tensor.detach().cpu().contiguous().numpy() for tensor in tensors]
+    """Return CPU tensors as NumPy arrays without gradients, sharing memory if the tensors are contiguous."""
+    return [tensor.detach().contiguous().numpy() for tensor in tensors]
+
+
+def input_arrays(*tensors: Tensor) -> list[np.ndarray]:
+    """Return tensors on any device as NumPy arrays that a kernel only reads; see `arrays`."""
+    return arrays(*(tensor.cpu() for tensor in tensors))

@@ -123,8 +123,8 @@ class Prefetcher(Generic[Made]):
 
     Args:
         make: function that makes the batch of a step.
-        spare_core: whether PyTorch has one thread less meanwhile, because its threads spin while they wait for one that
-            has no core, and at most `_MOST_THREADS`.
+        spare_core: whether to reserve a core for the thread: PyTorch then uses one thread less, and at most
+            `_MOST_THREADS`.
     """
 
     def __init__(self, make: Callable[[int], Made], spare_core: bool = True) -> None:

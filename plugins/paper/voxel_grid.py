@@ -18,7 +18,7 @@ from nerfro.geometry.interpolation import neighbours, smooth, trilinear
 from nerfro.geometry.mesh import local_origin, require_inside
 from nerfro.geometry.occupancy import occupancy_fraction
 from nerfro.geometry.signed_distance import distance_to_set
-from nerfro.kernels.arrays import arrays
+from nerfro.kernels.arrays import arrays, input_arrays
 from nerfro.kernels.available import require_bytes
 from nerfro.kernels.constants import constant
 from nerfro.media.base import Medium, Scalars, Vectors
@@ -130,10 +130,16 @@ class VoxelGrid(Medium):
         smoothing = self.smoothing_size, self.smoothing_sigma
         return self.from_occupancy(self.occupancy.cpu(), self.box.cpu(), float(indices), *smoothing).to(self.box.device)
 
-    @cached_property
+    @property
     def host_arrays(self) -> list[np.ndarray]:
         """Table and clearance grid in the memory of the host."""
-        return arrays(self.table, self.clearance_grid)
+        on_cpu = self.table.device.type == "cpu"
+        return arrays(self.table, self.clearance_grid) if on_cpu else self._copied
+
+    @cached_property
+    def _copied(self) -> list[np.ndarray]:
+        # The arrays of 256^3 vertices have 340 MB, so a copy for each batch would be slow.
+        return input_arrays(self.table, self.clearance_grid)
 
     @property
     def spacing(self) -> Float[Tensor, "3"]:

@@ -64,7 +64,8 @@ def test_run_without_checkpoints_is_not_replaced_and_begins_again_on_request(tra
     assert "already holds config.yaml" in refused
     assert "resume a run (ckpt_path=last) or choose another folder (hydra.run.dir=...)" in refused
     assert content(begun) == before
-    assert "was trained with seed=0, this run has 1" in train("ckpt_path=last", "seed=1", code=1).error
+    for change, trained in (("seed=1", "seed=0, this run has 1"), ("medium.ior=1.3", "medium.ior=")):
+        assert f"was trained with {trained}" in train("ckpt_path=last", change, code=1).error
     train("ckpt_path=last")
     again = weights_of(begun)
     assert all(weights[name].equal(again[name]) for name in weights)

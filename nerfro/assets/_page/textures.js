@@ -1,5 +1,5 @@
 // Arrays travel as pictures, so that the browser's own decoder unpacks them: the slices of an array along its last axis
-// lie side by side, see nerfro/page/packing.py.
+// lie side by side, see nerfro/viewing/packing.py.
 
 // Red, green and blue of every voxel, x fastest; the fourth byte is 255.
 function voxelsOf(image, [width, height, depth]) {

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import Int
 
-from nerfro.kernels.arrays import arrays
+from nerfro.kernels.arrays import input_arrays
 from nerfro.samplers.paths.branching import Branching
 from nerfro.samplers.paths.polylines import SnellTrace
 from nerfro.types import Path, Rays
@@ -72,5 +72,5 @@ def _polylines(rows: TracedRows, counts: Int[np.ndarray, "R"], width: int) -> tu
 
 
 def ray_arrays(rays: Rays) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    origins, directions, near, far = arrays(rays.origins, rays.directions, rays.near, rays.far)
+    origins, directions, near, far = input_arrays(rays.origins, rays.directions, rays.near, rays.far)
     return origins, directions, near, far
