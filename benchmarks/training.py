@@ -7,7 +7,6 @@
     python benchmarks/training.py branches                    # what light that splits costs of a step
     python benchmarks/training.py budget 00:00:05:00          # default preset and paper's recipe, given the same time
     python benchmarks/training.py view RUN/checkpoints/last.ckpt   # rendering a 400x400 view
-    python benchmarks/training.py devices refractive glass         # a step and a view on the CPU and on a GPU
 
 The embedded scene, all cores unless OMP_NUM_THREADS and NUMBA_NUM_THREADS say otherwise.
 """
@@ -83,10 +82,6 @@ def main() -> None:
     view.add_argument("checkpoint", type=Path)
     view.add_argument("--side", type=int, default=400, help="pixels")
     view.add_argument("--turns", type=int, default=5)
-    devices = parts.add_parser("devices")
-    devices.add_argument("experiments", nargs="+")
-    devices.add_argument("--steps", type=int, default=20)
-    devices.add_argument("--names", nargs="+", default=["cpu", "cuda"])
     arguments = parser.parse_args()
     keep_freed_memory()
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
@@ -100,7 +95,6 @@ def main() -> None:
         "branches": report_branches,
         "budget": report_budget,
         "view": report_view,
-        "devices": report_devices,
     }
     settings = vars(arguments)
     reports[settings.pop("part")](**settings)
@@ -134,8 +128,7 @@ class Training:
         overrides: Hydra overrides of conf/train.yaml.
     """
 
-    def __init__(self, *overrides: str, accelerator: str = "cpu") -> None:
-        self.accelerator = accelerator
+    def __init__(self, *overrides: str) -> None:
         ConfigStore.instance().store(name="train_schema", node=TrainConfig, provider="nerfro")
         discover()
         with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
@@ -153,7 +146,7 @@ class Training:
         steps = Steps()
         trainer = pl.Trainer(
             max_steps=num_steps,
-            accelerator=self.accelerator,
+            accelerator="cpu",
             callbacks=[steps, *callbacks],
             precision=lightning_precision(self.config),
             logger=False,
@@ -528,34 +521,6 @@ def report_view(checkpoint: Path, side: int, turns: int) -> None:
     print("\n| one ray a pixel | processor, s |\n|---|---|")
     for name, value in (of_parts | {"the rest": fastest - sum(of_parts.values())}).items():
         print(f"| {name} | {value:.2f} |")
-
-
-def report_devices(experiments: Sequence[str], steps: int, names: Sequence[str]) -> None:
-    """Clock time of a step and of rendering a 128x128 view with one ray per pixel on each device."""
-    print(f"| {' | '.join(['experiment', 'device', 'ms per step', 's per view', 'peak GPU memory, GB'])} |")
-    print("|---|---|---|---|---|")
-    for experiment in experiments:
-        for name in names:
-            if name == "cuda":
-                torch.cuda.reset_peak_memory_stats()
-            training = step_recipe(experiment, "gpu" if name == "cuda" else "cpu")
-            measured = training.run(steps).seconds[3:]
-            model = training.renderer.to(name)
-            cameras = build(training.config.data).load("test").cameras.resized(128, 128).to(name)
-            # The copy to the host waits for the GPU.
-            views = [
-                timed(lambda: render_view(model, cameras, 0, Subdivision()).radiance.cpu())  # noqa: B023
-                for _ in range(3)
-            ]
-            memory = f"{torch.cuda.max_memory_allocated() / 1e9:.1f}" if name == "cuda" else ""
-            row = [f"`{experiment}`", name, f"{1e3 * np.median(measured):.0f}", f"{min(views):.2f}", memory]
-            print(f"| {' | '.join(row)} |", flush=True)
-
-
-def step_recipe(experiment: str, accelerator: str) -> Training:
-    """An experiment on the embedded scene; the index grid of the paper has 256 vertices per side."""
-    small = [MESH, "medium.resolution=256"] if experiment.startswith("paper_") else []
-    return Training(*EMBEDDED, f"+experiment={experiment}", *small, accelerator=accelerator)
 
 
 def spent(task: Callable[[], object]) -> tuple[float, float]:

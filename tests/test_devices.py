@@ -21,13 +21,17 @@ from tests.test_experiments import SMALL, shrunk
 STEP = 100_000
 
 # Rays are traced on the CPU, and travel there and back.
-TRACING = ("kernels/arrays.py", "samplers/paths/", "geometry/intersection.py", "media/sdf_grid.py", "rays.py")
-TRACING += ("paper/compiled.py", "paper/eikonal.py")
+TRACING = ("kernels/arrays.py", "samplers/paths/compiled.py", "paper/compiled.py", "paper/eikonal.py")
+TRACING += ("samplers/paths/snell.py", "samplers/paths/polylines.py", "samplers/paths/wavefront.py")
+TRACING += ("geometry/intersection.py", "media/sdf_grid.py")
 
 ADAPTIVE = ["sampler.path.integrator=adaptive", "sampler.path.max_steps=60", "sampler.points.draw=arc_length"]
 
 # A constant is copied to the device once. Fields are asked for samples in the object alone, whose number must be known.
 ONCE = "kernels/constants.py: constant (tensor)"
+# Triangles are met on the CPU in a replay as well. Some rays are traced again with more vertices.
+TO_CPU = {"rays.py: <genexpr> (to)", "samplers/paths/replay.py: <genexpr> (to)"}
+AGAIN = "rays.py: <genexpr> (__getitem__)"
 SELECTED = "fields/selection.py: evaluate_selected (nonzero)"
 
 
@@ -35,12 +39,12 @@ SELECTED = "fields/selection.py: evaluate_selected (nonzero)"
     ("experiment", "waits"),
     [
         (["refractive"], {ONCE, SELECTED}),
-        (["refractive", "sampler.path.interface=mesh"], {ONCE, SELECTED}),
+        (["refractive", "sampler.path.interface=mesh"], {ONCE, SELECTED, *TO_CPU}),
         (["refractive_room"], {ONCE}),
         (["straight"], {ONCE}),
         (["mipnerf"], set()),
         (["paper_refractive"], set()),
-        (["paper_refractive", *ADAPTIVE], {ONCE}),
+        (["paper_refractive", *ADAPTIVE], {ONCE, AGAIN}),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )

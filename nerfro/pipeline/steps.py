@@ -47,10 +47,11 @@ def calibrate(config: DictConfig, data: list[str], out: Path) -> list[str]:
             "the photographs have no masks; add mask='view=true' to draw the outline of the object in two to five "
             f"images in the browser, outlines={{{linked[0].stem}:[[COLUMN,ROW],...],...}}, or masks=FOLDER"
         )
-    report = out / "calibration.json"
+    written = plugin_module("camera_calibration.calibrated_data")
+    report, plot = out / written.REPORT, out / written.PLOT
     options = [*as_overrides({"images": out / "images", "out": out}), "target=colmap", "overwrite=true"]
     options += [text.removeprefix("data.") for text in data if text.startswith("data.mask_labels=")]
-    Stage("calibrate", [*options, *shlex.split(config.calibrate)], report, out / "cameras.png").run()
+    Stage("calibrate", [*options, *shlex.split(config.calibrate)], report, plot).run()
     content = read_json(report, "delete the file to repeat the stage")
     bounds = content.get("options", []) if isinstance(content, dict) else []  # bounds of the rays in earlier releases
     return [*as_overrides({"data.root": out}), *bounds, *data]
