@@ -120,7 +120,18 @@ def test_experiments_stack() -> None:
         ("paper_refractive", "paper_ablation_noBD", {"loss.boundary.weight"}),
         ("glass", "glass_noReflection", {"sampler.path.branches"}),
         ("glass", "glass_noTint", {"medium.learn_absorption"}),
-        ("mipnerf", "mipnerf_sky", {"boundary", "sampler.points", "model.colour", "loss.total_variation.weight"}),
+        (
+            "mipnerf",
+            "mipnerf_sky",
+            {
+                "field.box_min",
+                "field.box_max",
+                "boundary",
+                "sampler.points",
+                "model.colour",
+                "loss.total_variation.weight",
+            },
+        ),
     ],
 )
 def test_an_ablation_changes_its_part_alone(experiment: str, ablation: str, changed: set[str]) -> None:

@@ -6,29 +6,33 @@ frustums, and of `model=mip_nerf`.
 
 from __future__ import annotations
 
+from math import inf
 from typing import Literal
 
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerfro.allowed import Depth, Width
+from nerfro.allowed import AnyNumber, Depth, Width
 from nerfro.draws import Draws
-from nerfro.fields.base import Field
+from nerfro.fields.selection import inside_box
 from nerfro.registry import register
 from nerfro.rendering import Components, Renderer, composite
 from nerfro.types import Path, Radiance, Rendering, Samples
 
 from .encoding import DIRECTION_DEGREE, integrated_positional_encoding, positional_encoding
 from .mlp import RadianceMLP, in_blocks
+from .nerf import FieldInBox
 
 
 @register("field", "mip_nerf")
-class MipNerfField(Field):
+class MipNerfField(FieldInBox):
     """8x256 MLP on the expected encoding of each sample's frustum (mip-NeRF, section 3); needs `cast=cones`.
 
     Args:
         width, depth, skip, view_width: shape of the MLP, see `RadianceMLP`.
         position_degree: number of octaves of the integrated encoding, which damps octaves finer than the frustum.
+        box_min, box_max: opposite corners of the bounds of the scene, world units. The field is empty outside. With
+            infinite corners, it covers all of space.
     """
 
     def __init__(
@@ -38,14 +42,19 @@ class MipNerfField(Field):
         skip: int = 5,
         view_width: Width = 128,
         position_degree: Depth = 16,
+        box_min: list[AnyNumber] = (-inf, -inf, -inf),  # type: ignore[assignment]
+        box_max: list[AnyNumber] = (inf, inf, inf),  # type: ignore[assignment]
     ) -> None:
-        super().__init__()
+        super().__init__(box_min, box_max)
         self.position_degree = position_degree
         num_position, num_direction = 6 * position_degree, 3 * (1 + 2 * DIRECTION_DEGREE)
         self.mlp = RadianceMLP(num_position, num_direction, width, depth, skip, view_width)
 
     def forward(self, samples: Samples) -> Radiance:
-        return Radiance(*in_blocks(self._decode_block, *frustum_gaussians(samples), samples.directions))
+        density, rgb = in_blocks(self._decode_block, *frustum_gaussians(samples), samples.directions)
+        if not self.everywhere:
+            density = density * inside_box(samples.positions, *self.box)
+        return Radiance(density, rgb)
 
     def _decode_block(
         self, mean: Float[Tensor, "P 3"], variance: Float[Tensor, "P 3"], directions: Float[Tensor, "P 3"]

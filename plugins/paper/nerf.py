@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import inf
 from typing import Annotated
 
@@ -19,8 +20,28 @@ from .encoding import DIRECTION_DEGREE, positional_encoding
 from .mlp import RadianceMLP, in_blocks
 
 
+class FieldInBox(Field):
+    """A field that is empty outside of a box.
+
+    Args:
+        box_min, box_max: opposite corners, world units; with infinite corners, the field covers all of space.
+    """
+
+    box: Float[Tensor, "2 3"]
+
+    def __init__(self, box_min: Sequence[float], box_max: Sequence[float]) -> None:
+        super().__init__()
+        box = corners_of_box(box_min, box_max, bounded=False)
+        self.register_buffer("box", torch.from_numpy(box).float(), persistent=False)
+        self.everywhere = not self.box.isfinite().any()
+
+    @property
+    def bounds(self) -> Float[Tensor, "2 3"] | None:
+        return None if self.everywhere else self.box
+
+
 @register("field", "nerf")
-class NerfField(Field):
+class NerfField(FieldInBox):
     """8x256 MLP on positional encodings of position and local direction (paper, section 2; NeRF, section 5).
 
     Args:
@@ -29,8 +50,6 @@ class NerfField(Field):
         box_min, box_max: opposite corners of the bounds of the scene, world units. The field is empty outside, and
             samples there are not evaluated. With infinite corners, all samples are evaluated, as in the authors' code.
     """
-
-    box: Float[Tensor, "2 3"]
 
     def __init__(
         self,
@@ -42,17 +61,10 @@ class NerfField(Field):
         box_min: list[AnyNumber] = (-inf, -inf, -inf),  # type: ignore[assignment]
         box_max: list[AnyNumber] = (inf, inf, inf),  # type: ignore[assignment]
     ) -> None:
-        super().__init__()
-        box = corners_of_box(box_min, box_max, bounded=False)
-        self.register_buffer("box", torch.from_numpy(box).float(), persistent=False)
-        self.everywhere = not self.box.isfinite().any()
+        super().__init__(box_min, box_max)
         self.position_degree = position_degree
         num_position, num_direction = 3 * (1 + 2 * position_degree), 3 * (1 + 2 * DIRECTION_DEGREE)
         self.mlp = RadianceMLP(num_position, num_direction, width, depth, skip, view_width)
-
-    @property
-    def bounds(self) -> Float[Tensor, "2 3"] | None:
-        return None if self.everywhere else self.box
 
     def forward(self, samples: Samples) -> Radiance:
         if self.everywhere:

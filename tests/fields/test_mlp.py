@@ -82,16 +82,18 @@ def test_points_evaluated_in_blocks_equal_points_evaluated_together_with_their_g
     require_equal_gradients(whole[1], rgb, [*field.mlp.trunk.parameters()], atol=1e-5)
 
 
-def test_nerf_field_with_a_box_equals_one_without_inside_and_is_empty_outside() -> None:
-    everywhere = NerfField(width=16, depth=2, skip=1, view_width=8)
-    inside = NerfField(width=16, depth=2, skip=1, view_width=8, box_min=[-0.4, -0.5, -0.6], box_max=[0.6, 0.5, 0.4])
+@pytest.mark.parametrize("make", [NerfField, MipNerfField])
+def test_field_with_a_box_equals_one_without_inside_and_is_empty_outside(make: type[NerfField | MipNerfField]) -> None:
+    everywhere = make(width=16, depth=2, skip=1, view_width=8)
+    inside = make(width=16, depth=2, skip=1, view_width=8, box_min=[-0.4, -0.5, -0.6], box_max=[0.6, 0.5, 0.4])
     inside.load_state_dict(everywhere.state_dict())
-    samples = Stratified(32)(example_path(8), None)
+    samples = Stratified(32, cast="cones")(example_path(8), None)
     kept = ((samples.positions > inside.box[0]) & (samples.positions < inside.box[1])).all(-1)
     assert 0 < kept.sum() < kept.numel()
     expected, radiance = everywhere(samples), inside(samples)
     torch.testing.assert_close(radiance.density, expected.density * kept)
-    torch.testing.assert_close(radiance.rgb, expected.rgb * kept[..., None])
+    torch.testing.assert_close(radiance.rgb * kept[..., None], expected.rgb * kept[..., None])
+    assert (everywhere.bounds is None, inside.bounds is inside.box) == (True, True)
 
 
 @pytest.mark.usefixtures("unchecked")  # the compiler cannot trace the checks
