@@ -40,7 +40,7 @@ METHODS = {
     "ablation_noBD": "refractive w/o BD",
     "refractive": "refractive",
 }
-SHOWN = ("mipnerf", "refractive", "ablation_noH", "ablation_noBD")
+SHOWN = ("mipnerf_sky", "refractive", "ablation_noH", "ablation_noBD")
 VIEWS = (1, 3)
 SQUARE = 32  # side of the enlarged square in pixels
 ROOT = Path(__file__).resolve().parent.parent

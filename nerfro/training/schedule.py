@@ -18,7 +18,8 @@ from nerfro.training.phases.base import Phase, Run
 class Schedule(Callback):
     """Take the steps of all phases, before the first training step and between training steps.
 
-    Steps before the training can be interrupted, and a resumed run takes the remaining ones.
+    Steps before the training can be interrupted, and a resumed run takes the remaining ones. No step between training
+    steps begins after the limit of time.
 
     Args:
         phases: phases by name, in the order in which they begin.
@@ -52,6 +53,8 @@ class Schedule(Callback):
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: object, batch_idx: int) -> None:
         for name in self._begun:
             for _ in self._due(name, trainer.global_step):
+                if training_progress(trainer) >= 1:
+                    return
                 self._step(name, trainer)
 
     def _due(self, name: str, training_step: int) -> Iterator[int]:

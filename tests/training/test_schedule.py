@@ -1,12 +1,14 @@
 """Phases take their steps before and between training steps, and continue after an interruption."""
 
 import copy
+from collections.abc import Sequence
 from typing import Any
 from unittest.mock import Mock
 
 import pytest
 import torch
-from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.callbacks import Timer
 from torch import nn
 from torch.optim import Adam
 
@@ -38,12 +40,12 @@ class Counted(Phase):
         return number < self.end
 
 
-def steps(schedule: Schedule, first: int, last: int) -> dict[str, Any]:
+def steps(schedule: Schedule, first: int, last: int, callbacks: Sequence[Callback] = ()) -> dict[str, Any]:
     """Take some training steps without a model; returns the state of the schedule."""
     module = Mock(spec=LightningModule, renderer=Mock(spec=Renderer))
     data = Mock(batches=Mock(spec=RayBatches))
-    trainer = Mock(spec=Trainer, callbacks=[], datamodule=data, lightning_module=module, optimizers=[Mock(spec=Adam)])
-    trainer.configure_mock(global_step=first, max_steps=100)
+    trainer = Mock(spec=Trainer, datamodule=data, lightning_module=module, optimizers=[Mock(spec=Adam)])
+    trainer.configure_mock(global_step=first, max_steps=100, callbacks=list(callbacks))
     schedule.on_train_start(trainer, module)
     for trainer.global_step in range(first, last):
         schedule.on_train_batch_start(trainer, module, None, 0)
@@ -78,6 +80,18 @@ def test_steps_of_phases_are_those_of_an_undisturbed_run(stop: int) -> None:
     resumed.load_state_dict(steps(schedule(parted), 0, stop))
     assert steps(resumed, stop, 7) == state
     assert parted == whole
+
+
+def test_no_step_between_training_steps_begins_after_the_limit_of_time() -> None:
+    record: list[tuple[str, int, int]] = []
+    schedule = Schedule({"a": Counted(record, "a", 9)}, Mock(spec=Views))
+    left = iter([2.0, 1.0, 0.0])
+    timer = Mock(spec=Timer, time_elapsed=lambda: 10.0, time_remaining=lambda: next(left, 0.0))
+    steps(schedule, 0, 0)
+    state = steps(schedule, 9, 10, [timer])  # four steps are due
+    assert [number for _, number, _ in record] == [-1, 0, 1, 2, 3]
+    assert steps(schedule, 9, 10) != state
+    assert [number for _, number, _ in record] == [-1, 0, 1, 2, 3, 4, 5, 6]
 
 
 def test_a_step_of_a_phase_moves_only_its_parameters() -> None:
