@@ -53,7 +53,8 @@ class MipNerfField(FieldInBox):
     def forward(self, samples: Samples) -> Radiance:
         density, rgb = in_blocks(self._decode_block, *frustum_gaussians(samples), samples.directions)
         if not self.everywhere:
-            density = density * inside_box(samples.positions, *self.box)
+            inside = inside_box(samples.positions, *self.box)
+            density, rgb = density * inside, rgb * inside[..., None]
         return Radiance(density, rgb)
 
     def _decode_block(
