@@ -31,10 +31,12 @@ def browser(page: str, tmp_path: Path) -> Iterator[Browser]:
         yield browser
 
 
+PLACE = "(({ x, y, width, height }) => ({ x, y, width, height }))($('canvas').getBoundingClientRect())"
+
+
 def middle(browser: Browser) -> tuple[float, float]:
-    box = browser.evaluate("(({ x, y, width, height }) => [x + width / 2, y + height / 2])"
-                           "($('canvas').getBoundingClientRect())")  # fmt: skip
-    return box[0], box[1]
+    place = browser.evaluate(PLACE)
+    return place["x"] + place["width"] / 2, place["y"] + place["height"] / 2
 
 
 def test_pointer_turns_moves_and_zooms(browser: Browser) -> None:
@@ -102,6 +104,17 @@ def test_a_test_camera_is_chosen_with_the_keyboard_and_left_by_dragging(browser:
     browser.drag((x, y), (x + 20, y))
     assert browser.evaluate("page.camera") is None
     assert browser.evaluate("$('photograph').hidden")
+
+
+def test_a_chosen_camera_has_its_place_before_the_next_frame(browser: Browser) -> None:
+    browser.wait_for("page.rays > 0")
+    at_once = browser.evaluate(f"(page.show(1), {PLACE})")
+    browser.wait_for("page.rays > 0")
+    assert browser.evaluate(PLACE) == at_once
+    back_at_once = browser.evaluate(f"(page.show(null), {PLACE})")
+    browser.wait_for("page.rays > 0")
+    assert browser.evaluate(PLACE) == back_at_once
+    assert back_at_once["width"] > at_once["width"]
 
 
 @pytest.mark.parametrize("suffix", [".png", ".hdr"])

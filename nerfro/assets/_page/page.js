@@ -76,9 +76,8 @@ class Page {
     this.wake();
   }
 
-  // Give the canvas as many pixels as it is shown with; a camera's picture keeps its form.
-  fit() {
-    const { canvas } = this.tracer;
+  // Give the canvas, and the photograph beside it, their place; a camera's picture keeps its form.
+  layOut() {
     const stage = $("stage").getBoundingClientRect();
     let [width, height] = [stage.width, stage.height];
     if (this.camera !== null) {
@@ -87,12 +86,18 @@ class Page {
       const scale = Math.min(width / (stage.width > stage.height ? beside * w : w), height / (stage.width > stage.height ? h : beside * h));
       [width, height] = [w * scale, h * scale];
     }
-    for (const part of [canvas, $("photograph")]) {
+    for (const part of [this.tracer.canvas, $("photograph")]) {
       part.style.width = `${width}px`;
       part.style.height = `${height}px`;
     }
+    return [width, height];
+  }
+
+  // Give the canvas as many pixels as it is shown with. This clears it, so a frame is drawn next.
+  fit() {
+    const { canvas } = this.tracer;
     const ratio = Math.min(window.devicePixelRatio || 1, 2);
-    const size = [width, height].map((side) => Math.max(1, Math.round(side * ratio)));
+    const size = this.layOut().map((side) => Math.max(1, Math.round(side * ratio)));
     if (canvas.width !== size[0] || canvas.height !== size[1]) {
       [canvas.width, canvas.height] = size;
       this.rays = 0;
@@ -116,6 +121,7 @@ class Page {
     for (const button of document.querySelectorAll("#cameras button")) {
       button.setAttribute("aria-pressed", button.value === String(camera ?? ""));
     }
+    this.layOut(); // now, so that a pointer finds the canvas before the next frame is drawn
     this.changed();
   }
 }
