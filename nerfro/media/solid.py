@@ -72,6 +72,11 @@ class Solid(Medium):
     def _set_materials(self, materials: Sequence[Material], names: Sequence[str] = ()) -> None:
         if len(materials) > _MAX_BODIES:
             raise NerfroError(f"the medium has {len(materials)} bodies; at most {_MAX_BODIES} are allowed")
+        if materials and "ior" in materials[0].learned() and materials[0].ior.item() == 1:
+            raise NerfroError(
+                "the refractive index of the first body is learned from 1, the index of air, where its surface bends "
+                "no ray and the index has no gradient; start from another value, such as 1.3"
+            )
         self.materials = nn.ModuleList(materials)  # type: ignore[assignment]
         self.names = list(names) or body_names(len(materials))
 

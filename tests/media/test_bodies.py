@@ -159,6 +159,7 @@ def test_the_index_of_one_body_and_the_absorption_of_the_other_are_learned_toget
         ({"ior": 1.5, "absorption": [0.1, 0.2]}, "give red, green and blue, or one"),
         ({"ior": 1.5, "absorption": [-0.1]}, r"bodies\.glass\.absorption=.* is not allowed"),
         ({"ior": 1.5, "learn": ["colour"]}, "choose ior and absorption"),
+        ({"ior": 1, "learn": ["ior"]}, "has no gradient; start from another value"),
         ({"ior": 1.5, "mesh": None}, r"bodies\.glass needs a mesh"),
         ({"ior": 1.5, "mesh": "missing.ply"}, "missing.ply"),
         (1.5, r"bodies\.glass=1.5 is not a set of settings"),
