@@ -56,7 +56,7 @@ def bake_parts(
     """Convert everything that training may change: sky, volume and, if `surface` is set, the bodies."""
     renderer = scene.renderer
     parts = {"surface": bake_surface(renderer)} if surface else {}
-    volume = sample_field(scene, resolution, content_box(scene, cameras), progress, contraction_radius(scene))
+    volume = sample_field(scene, resolution, volume_bounds(scene, cameras), progress, contraction_radius(scene))
     return {
         **parts,
         "volume": bake_volume(volume, renderer.scene.colour_space),
@@ -80,7 +80,7 @@ def static_parts(scene: TrainedScene, views: Views, split: str) -> dict[str, Any
     renderer, cameras, contraction = scene.renderer, views.cameras, contraction_radius(scene)
     box = renderer.scene.medium.content_box.float().cpu()
     if not (box[1] > box[0]).all():
-        box = content_box(scene, cameras)
+        box = volume_bounds(scene, cameras)
         if contraction is not None:  # the undistorted region is half as wide as contracted space
             box = box.mean(0) + 0.5 * (box - box.mean(0))
     # Arc length at which the integration along a ray begins.
@@ -120,10 +120,11 @@ def _thumbnail(rgb: Float[Tensor, "H W 3"]) -> str:
     return data_uri(np.asarray(image), "JPEG", quality=90)
 
 
-def content_box(scene: TrainedScene, cameras: Cameras) -> Float[Tensor, "2 3"]:
-    """Return the bounds of the content: the box of the point sampler, or the box of the dense cells among the cameras.
+def volume_bounds(scene: TrainedScene, cameras: Cameras) -> Float[Tensor, "2 3"]:
+    """Return the bounds of the volume on the page.
 
-    If space is contracted, the box is the cube around contracted space.
+    They are the box of the point sampler or, without one, the box of the dense cells among the cameras. If space
+    is contracted, they are the cube around contracted space.
 
     Raises:
         NerfroError: the point sampler has no box, and all cameras are at one position.
