@@ -1,9 +1,9 @@
-"""Where the squared error of a trained run lies: which pixels hold it, and what the picture would gain without them.
+"""Assign the squared error of a trained run to classes of pixels, and print the PSNR without the error of each class.
 
     python benchmarks/error_budget.py RUN [--views 5] [--divergence 0]
 
-RUN is a run folder. Its first test views are rendered again, as they were evaluated or with other numbers of rays, and
-every pixel is put into the first class that it fits.
+RUN is a run folder. Its first test views are rendered again, as in its evaluation or with other numbers of rays, and
+every pixel is assigned to the first class that it fits.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from nerfro.evaluation.render_view import render_view
 from nerfro.rendering import Renderer
 from nerfro.subdivision import divergence, neighbour_rays, pixel_rays
 
-CLASSES = ("past the glass", "things inside", "edges", "sky through the glass")
+CLASSES = ("background beside the glass", "objects inside", "edges", "background through the glass")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
     parser.add_argument("run", type=Path)
-    parser.add_argument("--views", type=int, help="test views that are looked at; all by default")
+    parser.add_argument("--views", type=int, help="number of test views; all by default")
     for option, kind in (("side", int), ("divergence", float), ("contrast", float)):
         parser.add_argument(f"--{option}", type=kind, help=f"evaluation.subdivision.{option}; as trained by default")
-    parser.add_argument("--edge", type=float, default=8.0, help="pixel angles from which neighbours part")
+    parser.add_argument("--edge", type=float, default=8.0, help="divergence of an edge, in pixel angles")
     arguments = parser.parse_args()
     scene = nerfro.load(arguments.run, device="cpu")
     model, views = scene.renderer, scene.views().checked()

@@ -2,19 +2,24 @@
 
     python benchmarks/processor_time.py +experiment=straight data.root=DIR trainer.max_time=00:00:05:00
 
-The arguments are those of `python -m nerfro.train`. Processor time is that of all threads of the process. With one
-thread on an idle core, both limits are the same.
+The arguments are those of `python -m nerfro.train`. PyTorch and Numba use one thread, unless `OMP_NUM_THREADS` and
+`NUMBA_NUM_THREADS` say otherwise. Processor time is that of all threads of the process.
 """
 
 from __future__ import annotations
 
+import os
 import time
 from types import SimpleNamespace
 
-from lightning.pytorch.callbacks import timer
-
-from nerfro.train import main
-
 if __name__ == "__main__":
+    for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
+        os.environ.setdefault(variable, "1")
+
+    # Torch and Numba read the variables when they are imported.
+    from lightning.pytorch.callbacks import timer
+
+    from nerfro.train import main
+
     timer.time = SimpleNamespace(monotonic=time.process_time)
     main()

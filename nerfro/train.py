@@ -86,18 +86,19 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetr
         sys.exit(EXIT_INTERRUPTED)
 
     write_cameras(folder / "cameras.json", renderer.to(device).scene.camera, training, source.origin)
-    spent = trainer.global_step, throughput.seconds, throughput.rays_per_second
+    num_steps, seconds, rays_per_second = trainer.global_step, throughput.seconds, throughput.rays_per_second
     for callback in trainer.early_stopping_callbacks:
         if trainer.should_stop and callback.stopping_reason_message:
-            print(f"stopped by early stopping at step {spent[0]}: {callback.stopping_reason_message}")
-    print(f"{spent[0]} steps in {spent[1]:.0f} s, {spent[2] or 0:,.0f} rays/s")
+            print(f"stopped by early stopping at step {num_steps}: {callback.stopping_reason_message}")
+    print(f"{num_steps} steps in {seconds:.0f} s, {rays_per_second or 0:,.0f} rays/s")
     scored, scores = None, {}
     try:
         if split is not None:
             result, treated = score_split(renderer, test, metrics, folder, subdivision, split)
             scores = {f"{split}/{name}": mean for name, mean in result.means().items()}
             states = {each.state_key: each.state_dict() for each in trainer.callbacks}  # type: ignore[attr-defined]
-            scored = RunMetrics(result, *spent, treated, steps_by_phase(states, spent[0]))
+            phases = steps_by_phase(states, num_steps)
+            scored = RunMetrics(result, num_steps, seconds, rays_per_second, treated, phases)
     finally:
         finish_logs(trainer, scores)
     if scored is not None:

@@ -26,6 +26,11 @@ class Boundary(nn.Module, ABC):
             Linear radiance of each exit, not negative and without upper bound.
         """
 
+    @property
+    def face_resolution(self) -> int:
+        """Number of samples along 90 degrees with which exports represent the background."""
+        return 256
+
 
 def background_radiance(
     boundary: Boundary, exits: Exits, teaches: Bool[Tensor, "P"] | None = None

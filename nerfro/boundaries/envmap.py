@@ -113,6 +113,10 @@ class EnvironmentMap(Boundary):
         face, coordinates = cube_map.project(exits.directions.float().reshape(-1, 3))
         return _radiance(self._raw_at(face, coordinates)).view(exits.directions.shape)
 
+    @property
+    def face_resolution(self) -> int:
+        return self.levels.resolutions[-1]
+
     def _raw_at(self, face: Int[Tensor, "P"], coordinates: Float[Tensor, "P 2"]) -> Float[Tensor, "P 3"]:
         raw = torch.zeros_like(coordinates[:, :1])
         padded = self.padded.split([sum(levels.padded_sizes) for levels in self._groups])

@@ -37,13 +37,13 @@ class ValidationPixels:
         cameras: cameras of the validation views.
         index: numbers of the pixels, view * H * W + row * W + column.
         rgb: colours in the photographs, sRGB in [0, 1].
-        contrast: contrast to the neighbouring pixels, see `subdivision.contrast`.
+        contrasts: contrast to the neighbouring pixels, see `subdivision.contrast`.
     """
 
     cameras: Cameras
     index: Int[Tensor, "R"]
     rgb: Float[Tensor, "R 3"]
-    contrast: Float[Tensor, "R"]
+    contrasts: Float[Tensor, "R"]
 
     @classmethod
     def of(cls, views: Views, seed: int = 0) -> ValidationPixels:
@@ -65,14 +65,14 @@ class ValidationPixels:
 
     def rays(self, renderer: Renderer, subdivision: Subdivision) -> PixelRays:
         """Return rays through the pixels, subdivided as in training."""
-        contrast = self.contrast.to(renderer.scene.device)
+        contrasts = self.contrasts.to(renderer.scene.device)
         return subdivide(
             self.cameras.to(renderer.scene.device),
             self.index.to(renderer.scene.device),
             subdivision,
             lambda rays, view: renderer.path_sampler(rays, renderer.scene.medium),
             lambda rays, view: renderer.exit_directions(rays),
-            lambda rows: contrast[rows],
+            lambda rows: contrasts[rows],
         )
 
     def psnr(self, renderer: Renderer, subdivision: Subdivision) -> Float[Tensor, ""]:

@@ -14,7 +14,6 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from nerfro.boundaries.base import Boundary
-from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.errors import NerfroError
 from nerfro.light import to_srgb
 from nerfro.media.analytic import Vacuum
@@ -33,7 +32,6 @@ from nerfro.viewing.volume import MIN_OPTICAL_DEPTH, Volume
 # Distances are stored up to this many cells from the surface, where the B-spline of the surface reads them. Farther
 # away, rays advance by the clearance of the blocks.
 _BAND = 3.5
-_SKY_SIZE = 256  # texels per side of the cube map, unless the background is a texture
 _MAX_OPTICAL_DEPTH = 30.0  # of one cell
 _BRICK = 8  # voxels per side of the bricks that are skipped if they are empty
 _CHUNK = 2**16  # texels that are evaluated at once
@@ -117,7 +115,7 @@ def _on_same_grid(medium: Solid) -> SdfGrid:
 @torch.inference_mode()
 def bake_sky(boundary: Boundary, device: torch.device) -> Baked:
     """Evaluate the background radiance at the texels of a cube map, seen from the centre of the scene."""
-    size = boundary.levels.resolutions[-1] if isinstance(boundary, EnvironmentMap) else _SKY_SIZE
+    size = boundary.face_resolution
     directions = cube_directions(size).to(device)
     radiance = torch.cat([boundary(Exits(chunk)).float().cpu() for chunk in directions.split(_CHUNK)])
     upper, rest = packing.shared_exponent(radiance.view(6, size, size, 3).double().numpy())

@@ -28,7 +28,8 @@ class ExportConfig:
     checkpoint: str = MISSING  # run folder, or a checkpoint in it
     what: ExportName = MISSING  # content and kind of the file
     out: str = MISSING  # output file; its ending selects the format
-    # Grid vertices along the longest side of the volume (default 128), or rows of the sky (default 512).
+    # Grid vertices along the longest side of the volume (default 128), or rows of the sky (by default as
+    # many as the background has, at least 512).
     resolution: Optional[Count] = None
     # Length, world units, within which dense content absorbs half the light; the surface is extracted at this density.
     # By default a hundredth of the object's longest side.

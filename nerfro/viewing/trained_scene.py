@@ -29,11 +29,11 @@ from nerfro.variants import variant
 from nerfro.viewing.changes import with_absorption, with_indices, with_sky, without_glass, without_inside
 from nerfro.viewing.surface import surface_of
 
-SKY_HEIGHT = 512  # rows of `TrainedScene.sky`: the finest level of the default environment map
+_MIN_SKY_HEIGHT = 512
 
 
 class RenderedViews(NamedTuple):
-    """Images of V cameras, on the CPU, in the order `rgb, depth, opacity, normals, exits, radiance`.
+    """Images of V cameras, on the CPU.
 
     Attributes:
         rgb: sRGB in [0, 1].
@@ -123,9 +123,14 @@ class TrainedScene:
         return tuple(value.float().cpu().view(cameras.height, cameras.width, *value.shape[1:]) for value in values)
 
     @property
-    def sky(self) -> Float[Tensor, "512 1024 3"]:
-        """Background as a lat-long image of linear radiance, z up (see `files.lat_long`)."""
-        return self.sky_of_height(SKY_HEIGHT)
+    def sky(self) -> Float[Tensor, "H 2*H 3"]:
+        """Background as a lat-long image of linear radiance, z up (see `files.lat_long`), with `sky_height` rows."""
+        return self.sky_of_height(self.sky_height)
+
+    @property
+    def sky_height(self) -> int:
+        """Number of rows of a lat-long image as fine as the background, at least 512."""
+        return max(_MIN_SKY_HEIGHT, 2 * self.renderer.scene.boundary.face_resolution)
 
     def sky_of_height(self, height: int) -> Float[Tensor, "H 2*H 3"]:
         """Evaluate the background as a lat-long image with a given number of rows."""

@@ -24,12 +24,13 @@ from nerfro.media.solid import Solid
 from nerfro.viewing.changes import absorption_of
 from nerfro.viewing.exports import Export
 from nerfro.viewing.page import page_split
-from nerfro.viewing.trained_scene import SKY_HEIGHT, TrainedScene
+from nerfro.viewing.trained_scene import TrainedScene
 
 from .meshes import glass_meshes, inside_mesh
 
 MITSUBA_FILES = ("_glass.ply", "_inside.ply", "_sky.hdr")  # endings of the files beside the .xml
 _MAX_DEPTH, _SAMPLES = 64, 64
+_MIN_SKY_HEIGHT = 1024
 # The y axis is up in an environment map of Mitsuba, and the z axis in nerfro.
 _Y_UP_TO_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 _ELEMENTS = {
@@ -104,7 +105,7 @@ def _write_sky(file: Path, scene: TrainedScene) -> None:
         flat = torch.from_numpy(directions.reshape(-1, 3)).float()
         return scene.background(flat).numpy().reshape(directions.shape)
 
-    write_radiance(file, envmap_texture(sky, 2 * SKY_HEIGHT, _Y_UP_TO_Z_UP[:3, :3]))
+    write_radiance(file, envmap_texture(sky, max(_MIN_SKY_HEIGHT, scene.sky_height), _Y_UP_TO_Z_UP[:3, :3]))
 
 
 def _write_shape(file: Path, mesh: trimesh.Trimesh) -> dict[str, Any]:

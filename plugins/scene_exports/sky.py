@@ -8,12 +8,12 @@ from omegaconf import DictConfig
 
 from nerfro.files.lat_long import save_lat_long
 from nerfro.viewing.exports import Export
-from nerfro.viewing.trained_scene import SKY_HEIGHT, TrainedScene
+from nerfro.viewing.trained_scene import TrainedScene
 
 
 def write_sky(scene: TrainedScene, out: Path, config: DictConfig) -> str:
     """Write the background radiance; `config` is an `ExportConfig`, whose resolution is the number of rows."""
-    sky = scene.sky_of_height(config.resolution or SKY_HEIGHT)
+    sky = scene.sky_of_height(config.resolution or scene.sky_height)
     save_lat_long(out, sky)
     return f"the sky: {sky.shape[1]}x{sky.shape[0]} pixels, lat-long, z up"
 

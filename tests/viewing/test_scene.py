@@ -75,6 +75,14 @@ def test_a_changed_scene_leaves_the_first_as_it_was(scene: TrainedScene) -> None
     assert changed.renderer.scene.fields is scene.renderer.scene.fields, "what is not changed is shared"
 
 
+def test_the_sky_has_the_detail_of_the_background(scene: TrainedScene) -> None:
+    stripes = torch.full((1200, 2400, 3), 0.2)
+    stripes[:, ::2] = 0.6
+    sky = scene.with_(sky=stripes).sky
+    assert sky.shape == stripes.shape
+    torch.testing.assert_close(sky[590:610, 80:520], stripes[590:610, 80:520], atol=0.02, rtol=0)
+
+
 def test_the_sky_is_read_and_replaced_as_linear_radiance(scene: TrainedScene, tmp_path) -> None:
     torch.testing.assert_close(scene.sky, sky_of(lat_long.directions(512)), atol=5e-3, rtol=0)
     # A lamp that no picture of eight bits could hold.

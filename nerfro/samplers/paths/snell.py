@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Annotated, Any, Literal
 
 import torch
@@ -119,7 +120,7 @@ class Snell(PathSampler):
         if not isinstance(medium, Solid):
             raise NerfroError("sampler/path=snell needs a medium with a surface; take medium=sdf_grid, or path=eikonal")
         if medium.disperses:
-            return _traced_in_bands(rays, self._at_wavelengths(medium), self._trace)
+            return _traced_in_bands(rays, self._at_wavelengths(medium), partial(self._trace, branching=branching))
         return self._trace(rays, medium, branching)
 
     def _trace(self, rays: Rays, medium: Solid, branching: Branching | None = None) -> SnellTrace:

@@ -265,10 +265,11 @@ def _random_quantiles(u, num_intervals, index, key):
 
 @compiled
 def _bin_weights(weights, settings):
-    """Convert the optical depths of the bins to the share of the samples that each bin receives."""
+    """Convert optical depths of the bins, in place, to the share of the samples that each bin receives."""
     total, transmittance = 0.0, 1.0
     for index in range(len(weights)):
-        alpha = min(_stopped(weights[index]), settings.max_bin_alpha)
+        optical_depth = weights[index]
+        alpha = min(_stopped(optical_depth), settings.max_bin_alpha)
         weights[index] = transmittance * alpha
         transmittance *= 1.0 - alpha
         total += weights[index]

@@ -102,5 +102,5 @@ class Phase(ABC):
             state: result of `begin`.
 
         Returns:
-            True if a step was taken, False to end the phase.
+            True to continue with the next step later, False to end the phase.
         """
