@@ -21,6 +21,7 @@ from nerfro.paths import user_path
 from nerfro.registry import build
 from nerfro.rendering.scene_file import with_scene
 from nerfro.samplers.paths.snell import Snell
+from nerfro.samplers.paths.thin_walls import warn_of_thin_walls
 from nerfro.samplers.paths.traced_file import TraceConfig, leave_box, make_rays, read_rays
 
 _PLOTTED_RAYS = 24
@@ -36,6 +37,7 @@ def main(config: DictConfig) -> None:
     origins, directions = read_rays(user_path(config.rays))
     sampler = build(config.sampler.path)
     medium = build(config.medium)
+    warn_of_thin_walls(sampler, medium)
     rays = make_rays(origins, directions, medium, config.near, config.far)
     if isinstance(sampler, Snell):
         trace = sampler.trace(rays, medium)

@@ -21,6 +21,7 @@ from nerfro.paths import CONF_DIR
 from nerfro.registry import discover
 from nerfro.rendering import Renderer
 from nerfro.rendering.scene_file import with_scene
+from nerfro.samplers.paths.thin_walls import warn_of_thin_walls
 from nerfro.training.config import TrainConfig, build_data, build_each, build_model, check_run, settle_trainer
 from nerfro.training.data_module import RayDataModule, traced
 from nerfro.training.memory import require_memory
@@ -94,7 +95,7 @@ def build_training(config: DictConfig, source: DataSource, training: Views) -> t
 
 
 def check_first_batch(renderer: Renderer, batches: RayBatches, device: torch.device) -> str:
-    """Refuse a run whose rays miss the field, or that needs more memory than is free.
+    """Refuse a run whose rays miss the field, or that needs more memory than is free; warn of thin walls.
 
     Args:
         renderer: the model.
@@ -107,4 +108,5 @@ def check_first_batch(renderer: Renderer, batches: RayBatches, device: torch.dev
     few = batches.smaller(4096)
     first = few.batch(0)
     require_reach(renderer, first)
+    warn_of_thin_walls(renderer.path_sampler, renderer.scene.medium)
     return require_memory(renderer, first.rays, device, few.batch_size / batches.batch_size, batches.pixel_bytes)

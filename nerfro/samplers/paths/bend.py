@@ -20,6 +20,7 @@ from nerfro.media.solid import Solid
 from nerfro.paths import resolve_path
 from nerfro.registry import discover, find
 from nerfro.samplers.paths.snell import Snell
+from nerfro.samplers.paths.thin_walls import warn_of_thin_walls
 from nerfro.samplers.paths.traced_file import leave_box, make_rays
 
 # Margin of air around the body in voxels; the grid needs at least two.
@@ -73,7 +74,9 @@ def bend(
     margin = (high - low).max() * _MARGIN / (resolution - 1 - 2 * _MARGIN)
     low, high = (low - margin).tolist(), (high + margin).tolist()
     medium = SdfGrid(str(mesh), ior, resolution=resolution, box_min=low, box_max=high)
-    path = Snell(interface)(make_rays(starts, towards, medium, 0.0, None), medium)
+    sampler = Snell(interface)
+    warn_of_thin_walls(sampler, medium)
+    path = sampler(make_rays(starts, towards, medium, 0.0, None), medium)
     positions, path_lengths = leave_box(path, medium)
     positions = (positions + torch.from_numpy(medium.origin)).to(starts)
     return Bent(positions, path.exit_directions, path_lengths, path.refracted)

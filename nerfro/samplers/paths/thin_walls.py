@@ -1,0 +1,63 @@
+"""Warning of walls that are too thin for a grid of signed distances."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from nerfro.errors import warn
+from nerfro.geometry.intersection import MeshIntersector, Triangles
+from nerfro.geometry.mesh import TriangleMesh
+from nerfro.media.base import Medium
+from nerfro.media.sdf_grid import SdfGrid
+from nerfro.samplers.base import PathSampler
+from nerfro.samplers.paths.snell import Snell
+
+# Thickness, in voxels, below which the spline of one side of a wall contains the fold of the distances in its middle.
+# Median error of exit directions behind a hollow ball of index 1.5: 0.01 degrees at 4.8 voxels, 0.6 at 3, and 2 at 1.8.
+_LEAST_VOXELS = 5.0
+# Share of the surface that may belong to thinner parts, such as the surroundings of a sharp edge.
+_FEW = 0.2
+_NUM_POINTS = 4096
+_MOST_VERTICES = 512  # largest resolution that the warning recommends
+
+
+def warn_of_thin_walls(sampler: PathSampler, medium: Medium) -> None:
+    """Print a warning for each body with walls that are too thin for its grid, unless the sampler traces triangles."""
+    traces_triangles = isinstance(sampler, Snell) and sampler.interface == "mesh"
+    if traces_triangles or not sampler.needs_medium or not isinstance(medium, SdfGrid):
+        return
+    for name, mesh, grid in zip(medium.names, medium.meshes, medium.grids, strict=False):
+        if not mesh.is_closed:
+            continue
+        voxels = thickness(mesh) / float(grid.spacing.max())
+        thin = voxels < _LEAST_VOXELS
+        if thin.mean() <= _FEW:
+            continue
+        typical = float(np.median(voxels[thin]))
+        resolution = math.ceil((len(grid.distances) - 1) * _LEAST_VOXELS / typical) + 1
+        finer = f"set medium.resolution={resolution}, or " if resolution <= _MOST_VERTICES else "set "
+        warn(
+            f"{thin.mean():.0%} of the surface of {name} bounds walls of about {typical:.1f} voxels, which bend rays in "
+            f"wrong directions below {_LEAST_VOXELS:.0f} voxels; {finer}sampler.path.interface=mesh, or describe a "
+            "cavity as a body of index 1 (medium.inner_meshes and medium.inner_iors)"
+        )
+
+
+def thickness(mesh: TriangleMesh) -> Float[np.ndarray, "P"]:
+    """Return the distance to the opposite side at random points of a closed surface, world units."""
+    triangles = Triangles.of([mesh])
+    areas = triangles.areas(torch.arange(len(mesh.faces)))
+    size = areas.norm(dim=-1)
+    generator = np.random.default_rng(0)
+    face = torch.from_numpy(generator.choice(len(size), _NUM_POINTS, p=(size / size.sum()).numpy()))
+    weights = torch.from_numpy(generator.dirichlet(np.ones(3), _NUM_POINTS))
+    inwards = -areas[face] / size[face, None]
+    points = (weights[..., None] * triangles.corners[face]).sum(1)
+    start = points + 1e-5 * float(np.ptp(mesh.bounds, 0).max()) * inwards
+    hit = MeshIntersector(triangles.corners).first_hits(start, inwards)
+    met = hit >= 0
+    return triangles.distance(start[met], inwards[met], hit[met]).numpy()

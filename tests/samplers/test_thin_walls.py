@@ -1,0 +1,51 @@
+"""A warning names walls that are too thin for the grid, and the resolution that it recommends is sufficient."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+import nerfro
+from tests.conftest import Runner
+
+
+def _hollow_ball(path: Path, wall: float) -> Path:
+    outer, inner = (trimesh.creation.icosphere(4, radius) for radius in (1.0, 1.0 - wall))
+    inner.invert()
+    trimesh.util.concatenate([outer, inner]).export(path)
+    return path
+
+
+def _exits(mesh: Path, interface: str, resolution: int = 64) -> torch.Tensor:
+    x = np.linspace(0.05, 0.7, 8)
+    origins = np.stack([x, 0 * x, 0 * x - 3], -1)
+    return nerfro.bend(mesh, 1.5, origins, [[0.0, 0.0, 1.0]] * 8, interface, resolution).directions  # type: ignore[arg-type]
+
+
+def test_the_recommended_resolution_traces_a_thin_wall(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    mesh = _hollow_ball(tmp_path / "hollow.ply", 0.1)
+    expected = _exits(mesh, "mesh")
+    assert "warning" not in capsys.readouterr().out
+    wrong = _exits(mesh, "sdf", 64)
+    found = re.search(
+        r"the surface of object bounds walls .* set medium\.resolution=(\d+), or", capsys.readouterr().out
+    )
+    assert found is not None
+    right = _exits(mesh, "sdf", int(found[1]))
+    assert "warning" not in capsys.readouterr().out
+    assert torch.dist(right, expected) < 0.1 * torch.dist(wrong, expected)
+
+
+def test_a_solid_with_sharp_edges_has_no_thin_walls(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    trimesh.creation.cylinder(1.0, 1.5, sections=3).export(tmp_path / "prism.ply")
+    _exits(tmp_path / "prism.ply", "sdf")
+    assert "warning" not in capsys.readouterr().out
+
+
+def test_a_training_warns_of_thin_walls(tmp_path: Path, tiny_default_run: list[str], run_here: Runner) -> None:
+    mesh = _hollow_ball(tmp_path / "hollow.ply", 0.05)
+    done = run_here("train", *tiny_default_run, f"medium.mesh={mesh}", "trainer.max_steps=1")
+    assert "bounds walls of about" in done.out
