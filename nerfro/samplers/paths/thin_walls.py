@@ -41,8 +41,8 @@ def warn_of_thin_walls(sampler: PathSampler, medium: Medium) -> None:
         resolution = math.ceil((len(grid.distances) - 1) * _LEAST_VOXELS / typical) + 1
         finer = f"set medium.resolution={resolution}, or " if resolution <= _MOST_VERTICES else "set "
         warn(
-            f"{thin.mean():.0%} of the surface of {name} bounds walls of about {typical:.1f} voxels, which bend rays in "
-            f"wrong directions below {_LEAST_VOXELS:.0f} voxels; {finer}sampler.path.interface=mesh, or describe a "
+            f"{thin.mean():.0%} of the surface of {name} bounds walls of about {typical:.1f} voxels, which bend rays "
+            f"in wrong directions below {_LEAST_VOXELS:.0f} voxels; {finer}sampler.path.interface=mesh, or describe a "
             "cavity as a body of index 1 (medium.inner_meshes and medium.inner_iors)"
         )
 
