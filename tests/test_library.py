@@ -88,6 +88,16 @@ def test_bending_at_a_ball_is_as_in_closed_form(interface: str, tmp_path: Path, 
     assert (bent.lengths > 4 - 0.8).all()
 
 
+def test_rays_that_begin_on_a_face_of_a_slab_do_not_cross_the_face(tmp_path: Path) -> None:
+    trimesh.creation.box((2, 2, 1)).export(tmp_path / "slab.ply")
+    direction = np.array([0.5, 0, math.sqrt(0.75)])
+    bent = nerfro.bend(tmp_path / "slab.ply", 1.5, [[0.1, 0.2, 0.5], [0.1, 0.2, -0.5]], [direction, direction])
+    leaves_glass = torch.tensor([0.75, 0.0, math.sqrt(1 - 0.75**2)], dtype=torch.float64)
+    assert bent.hit.tolist() == [False, True]
+    torch.testing.assert_close(bent.directions[0].double(), torch.from_numpy(direction))
+    torch.testing.assert_close(bent.directions[1].double(), leaves_glass, atol=1e-6, rtol=0)
+
+
 @pytest.mark.parametrize(
     ("rays", "message"),
     [

@@ -181,7 +181,8 @@ def _trace_triangles(rays: Rays, medium: SdfGrid, max_events: int, branching: Br
     """Trace rays from triangle to triangle of meshes, on the CPU and in double precision.
 
     The number of crossings of its surface determines whether a ray is inside a body; the orientation of triangles does
-    not matter. Signed distances determine which rays begin inside.
+    not matter. Signed distances determine which rays begin inside, half-way to their first triangle, because they are
+    inaccurate at surfaces.
     """
     triangles, scene = medium.triangles, medium.intersector
     box = medium.box.double().cpu()
@@ -189,7 +190,13 @@ def _trace_triangles(rays: Rays, medium: SdfGrid, max_events: int, branching: Br
     front = Wavefront(rays.to("cpu").to(torch.float64), medium, box, max_events, branching, offset, scene.num_layers)
     within = (front.moving & (front.enter < 0)).nonzero()[:, 0]
     if len(within):
-        front.inside[within] = (medium.signed_distances(front.x[within].to(medium.box))[0] < 0).cpu()
+        x, d = front.x[within], front.d[within]
+        front.start[within] = offset  # a ray that begins on a surface does not cross it
+        faces = scene.first_hits(x + offset * d, d)
+        lengths = torch.where(faces >= 0, triangles.distance(x[:, None], d[:, None], faces), torch.inf).amin(1)
+        half_way = x + 0.5 * torch.where(lengths < torch.inf, lengths, 0.0)[:, None] * d
+        inside = (medium.signed_distances(half_way.to(medium.box))[0] < 0).cpu()
+        front.inside[within] = inside & (lengths < torch.inf)[:, None]
     front.add_vertices(front.ray)
     while len(rows := front.moving.nonzero()[:, 0]):
         faces = scene.first_hits(front.x[rows] + front.start[rows, None] * front.d[rows], front.d[rows])
