@@ -58,7 +58,8 @@ def read_cameras(file: Path, geometry: CaptureGeometry, origin: Float[np.ndarray
         )
     if not entries:
         raise NerfroError(f"{file} has no cameras; give one or more")
-    width, height = (_pixels(document, key, default, file) for key, default in
+    sizes = {**document, **entries[0]} if isinstance(entries[0], dict) else document
+    width, height = (_pixels(sizes, key, default, file) for key, default in
                      zip(size, (geometry.camera.width, geometry.camera.height), strict=True))  # fmt: skip
     poses, lenses = [], []
     for number, entry in enumerate(entries):

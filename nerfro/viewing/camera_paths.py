@@ -12,6 +12,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from nerfro.cameras import Cameras, up_direction
+from nerfro.errors import NerfroError
+
+# Sine of the angle to the vertical below which a camera counts as directly above or below its target.
+_ABOVE = 1e-4
 
 
 @dataclass(frozen=True)
@@ -51,23 +55,42 @@ class CaptureGeometry:
             replace(cameras.select([0]), distortion=None),
         )
 
-    def position_at(self, position: OrbitPosition) -> Float[Tensor, "3"]:
-        """Convert angles and a distance to a point; azimuth 0 is along the x axis of the world, or y if x is up."""
+    def pose_at(self, position: OrbitPosition) -> Float[Tensor, "3 4"]:
+        """Return the pose of an upright camera that looks at the centre, also from above and below.
+
+        Azimuth 0 is along the x axis of the world, or y if x is up.
+        """
         x = torch.eye(3)[int(self.up[0].abs() > 0.9)]
         x = functional.normalize(x - (x @ self.up) * self.up, dim=0)
         y = torch.linalg.cross(self.up, x)
         azimuth, elevation = math.radians(position.azimuth), math.radians(position.elevation)
-        horizontal = math.cos(azimuth) * x + math.sin(azimuth) * y
-        return self.centre + position.distance * (math.cos(elevation) * horizontal + math.sin(elevation) * self.up)
+        right = math.cos(azimuth) * y - math.sin(azimuth) * x
+        back = math.cos(elevation) * torch.linalg.cross(right, self.up) + math.sin(elevation) * self.up
+        eye = self.centre + position.distance * back
+        return torch.stack([right, torch.linalg.cross(back, right), back, eye], -1)
 
     def look_at(self, positions: Float[Tensor, "V 3"], target: Float[Tensor, "3"]) -> Cameras:
-        """Make upright cameras at positions that look at a target, with the lens of the photographs."""
+        """Make upright cameras at positions that look at a target, with the lens of the photographs.
+
+        Raises:
+            NerfroError: a position is the target, or is not finite.
+        """
+        distance = torch.linalg.vector_norm(positions - target, dim=-1)
+        if not ((distance > 0) & torch.isfinite(distance)).all():
+            raise NerfroError(
+                f"a camera at {positions.tolist()[0]} cannot look at {target.tolist()}; give another position or target"
+            )
         back = functional.normalize(positions - target, dim=-1)
+        right = torch.linalg.cross(self.up.expand_as(back), back)
         # A camera directly above has no upright orientation; any horizontal axis is as good as another.
-        up = torch.where((back @ self.up).abs()[:, None] > 0.9999, self.up.roll(1), self.up)
-        right = functional.normalize(torch.linalg.cross(up, back), dim=-1)
-        pose = torch.stack([right, torch.linalg.cross(back, right), back, positions], -1)
-        return self.with_ray_bounds(replace(self.camera.select([0] * len(positions)), camera_to_world=pose))
+        horizontal = torch.linalg.cross(self.up, torch.eye(3)[self.up.abs().argmin()])
+        above = torch.linalg.vector_norm(right, dim=-1, keepdim=True) < _ABOVE
+        right = functional.normalize(torch.where(above, horizontal, right), dim=-1)
+        return self.cameras_at(torch.stack([right, torch.linalg.cross(back, right), back, positions], -1))
+
+    def cameras_at(self, poses: Float[Tensor, "V 3 4"]) -> Cameras:
+        """Make cameras with given poses and the lens of the photographs."""
+        return self.with_ray_bounds(replace(self.camera.select([0] * len(poses)), camera_to_world=poses))
 
     def with_ray_bounds(self, cameras: Cameras) -> Cameras:
         """Set near and far so that rays enclose the object by the same margins as the rays of the photographs."""
@@ -109,5 +132,5 @@ def path_cameras(geometry: CaptureGeometry, name: str, start: OrbitPosition, num
     """Make the cameras of a path in `PATHS`, which look at the centre of the object."""
     path, closed = PATHS[name]
     last = num_frames if closed else max(num_frames - 1, 1)
-    positions = [geometry.position_at(path(start, frame / last)) for frame in range(num_frames)]
-    return geometry.look_at(torch.stack(positions), geometry.centre)
+    poses = [geometry.pose_at(path(start, frame / last)) for frame in range(num_frames)]
+    return geometry.cameras_at(torch.stack(poses))

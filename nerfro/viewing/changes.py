@@ -34,6 +34,9 @@ def with_sky(renderer: Renderer, radiance: Float[Tensor, "H 2*H 3"]) -> Renderer
     """Replace the background by a lat-long image of linear radiance, z up."""
     if radiance.ndim != 3 or radiance.shape[1:] != (2 * len(radiance), 3):
         raise NerfroError(f"a sky of shape {list(radiance.shape)} is no lat-long image; give one of [H, 2 H, 3]")
+    radiance = radiance.float()
+    if not torch.isfinite(radiance).all() or (radiance < 0).any():
+        raise NerfroError("the radiance of a sky must be finite and not negative; correct its values")
     # A face of the cube spans a quarter of the width of the image.
     sky, scene = EnvironmentMap([max(1, radiance.shape[1] // 4)]), renderer.scene
     sky.set_lat_long(to_srgb(radiance) if scene.colour_space is ColourSpace.SRGB else radiance)
@@ -82,6 +85,7 @@ def _of_bodies(given: Tensor, known: Tensor, name: str) -> Tensor:
         raise NerfroError(f"{name} cannot be set: the model has no bodies on which rays bend; leave {name} out")
     if given.shape == known.shape[1:]:
         given = torch.cat([given[None], known[1:]])
-    if given.shape != known.shape or not torch.isfinite(given).all() or (given < 0).any():
-        raise NerfroError(f"{name}={given.tolist()} is not allowed; give {list(known.shape)} positive numbers")
+    allowed, kind = (given > 0, "positive numbers") if name == "ior" else (given >= 0, "numbers that are not negative")
+    if given.shape != known.shape or not (torch.isfinite(given) & allowed).all():
+        raise NerfroError(f"{name}={given.tolist()} is not allowed; give {list(known.shape)} {kind}")
     return given

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -55,6 +56,26 @@ def test_a_dolly_comes_nearer_and_a_spiral_rises(around: CaptureGeometry) -> Non
     torch.testing.assert_close(heights[0], -heights[-1])
 
 
+@pytest.mark.parametrize("elevation", [90, -90])
+def test_an_orbit_above_or_below_turns_the_image(elevation: float, around: CaptureGeometry) -> None:
+    poses, nearly = (
+        path_cameras(around, "orbit", OrbitPosition(10, share * elevation, 5.0), 8).camera_to_world
+        for share in (1.0, 0.9999)
+    )
+    torch.testing.assert_close(poses, nearly, atol=2e-3, rtol=0)
+    turns = torch.linalg.cross(poses[:, :, 0], poses.roll(-1, 0)[:, :, 0])[:, 2]
+    torch.testing.assert_close(turns, torch.full((8,), math.sin(math.radians(45))))
+
+
+@pytest.mark.parametrize("up", [[0.0, 0.0, 1.0], [1.0, 1.0, 1.0]])
+def test_a_camera_above_its_target_looks_down(up: list[float], around: CaptureGeometry) -> None:
+    vertical = torch.nn.functional.normalize(torch.tensor(up), dim=0)
+    cameras = replace(around, up=vertical).look_at((CENTRE + 4 * vertical)[None], CENTRE)
+    rotation = cameras.camera_to_world[0, :, :3]
+    torch.testing.assert_close(rotation.T @ rotation, torch.eye(3), atol=1e-5, rtol=0)
+    torch.testing.assert_close(rotation[:, 2], vertical, atol=1e-5, rtol=0)
+
+
 def test_up_is_what_is_up_in_the_photographs(scene: TrainedScene) -> None:
     cameras = scene.cameras("train")
     turn = torch.tensor([[1.0, 0, 0], [0, 0.0, 1], [0, -1, 0]])  # z to y
@@ -82,12 +103,13 @@ def test_transforms_are_read_without_their_pictures(around: CaptureGeometry, tmp
     pose = torch.eye(4)
     pose[2, 3] = 3.0
     frames = [{"file_path": "gone.png", "transform_matrix": pose.tolist()}]
-    document = {"fl_x": 80.0, "fl_y": 82.0, "cx": 31.0, "cy": 17.0, "w": 64, "h": 36, "frames": frames}
-    (tmp_path / "transforms.json").write_text(json.dumps(document))
-    cameras = read_cameras(tmp_path / "transforms.json", around)
-    found = [float(value) for value in (cameras.fx, cameras.fy, cameras.cx, cameras.cy)]
-    assert (found, cameras.width, cameras.height) == ([80, 82, 31, 17], 64, 36)
-    torch.testing.assert_close(cameras.camera_to_world[0], pose[:3])
+    lens = {"fl_x": 80.0, "fl_y": 82.0, "cx": 31.0, "cy": 17.0, "w": 64, "h": 36}
+    for document in ({**lens, "frames": frames}, {"frames": [{**lens, **frames[0]}]}):
+        (tmp_path / "transforms.json").write_text(json.dumps(document))
+        cameras = read_cameras(tmp_path / "transforms.json", around)
+        found = [float(value) for value in (cameras.fx, cameras.fy, cameras.cx, cameras.cy)]
+        assert (found, cameras.width, cameras.height) == ([80, 82, 31, 17], 64, 36)
+        torch.testing.assert_close(cameras.camera_to_world[0], pose[:3])
 
 
 @pytest.mark.parametrize(

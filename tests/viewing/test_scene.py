@@ -78,7 +78,7 @@ def test_a_changed_scene_leaves_the_first_as_it_was(scene: TrainedScene) -> None
 def test_the_sky_has_the_detail_of_the_background(scene: TrainedScene) -> None:
     stripes = torch.full((1200, 2400, 3), 0.2)
     stripes[:, ::2] = 0.6
-    sky = scene.with_(sky=stripes).sky
+    sky = scene.with_(sky=stripes.double()).sky
     assert sky.shape == stripes.shape
     torch.testing.assert_close(sky[590:610, 80:520], stripes[590:610, 80:520], atol=0.02, rtol=0)
 
@@ -136,6 +136,9 @@ def test_images_of_no_camera_are_refused(scene: TrainedScene) -> None:
         ({"sky": "/nowhere.hdr"}, "does not exist"),
         ({"ior": [1.2, 1.3]}, "ior=.* is not allowed"),
         ({"ior": float("nan")}, "ior=.* is not allowed"),
+        ({"ior": 0.0}, "ior=.* is not allowed"),
+        ({"sky": torch.full((4, 8, 3), -1.0)}, "must be finite and not negative"),
+        ({"sky": torch.full((4, 8, 3), float("nan"))}, "must be finite and not negative"),
     ],
 )
 @pytest.mark.usefixtures("unchecked")
