@@ -17,7 +17,7 @@ from omegaconf import DictConfig
 from trimesh.exchange.ply import export_ply
 
 from nerfro.cameras import Cameras
-from nerfro.errors import NerfroError
+from nerfro.errors import NerfroError, warn
 from nerfro.files.atomic import refuse_existing, write_atomically
 from nerfro.files.deep_images import write_radiance
 from nerfro.media.solid import Solid
@@ -31,6 +31,7 @@ from .meshes import glass_meshes, inside_mesh
 MITSUBA_FILES = ("_glass.ply", "_inside.ply", "_sky.hdr")  # endings of the files beside the .xml
 _MAX_DEPTH, _SAMPLES = 64, 64
 _MIN_SKY_HEIGHT = 1024
+_SQUARE = 1e-3  # relative difference of the focal lengths up to which pixels count as square
 # The y axis is up in an environment map of Mitsuba, and the z axis in nerfro.
 _Y_UP_TO_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 _ELEMENTS = {
@@ -77,6 +78,7 @@ def write_mitsuba(scene: TrainedScene, out: Path, config: DictConfig) -> str:
         black = {"type": "conductor", "material": "none", "specular_reflectance": (0.0, 0.0, 0.0)}
         light = {"type": "area", "radiance": {"type": "mesh_attribute", "name": "vertex_color"}}
         objects["inside"] = {**_write_shape(inside_file, inside), "bsdf": black, "emitter": light}
+    _warn_of_lenses(cameras)
     objects |= {f"{split}_{view:03d}": _sensor(cameras, view) for view in range(len(cameras))}
     root = ElementTree.Element("scene", version="3.0.0")
     ElementTree.SubElement(root, "default", name="glass", value="dielectric")
@@ -111,6 +113,16 @@ def _write_sky(file: Path, scene: TrainedScene) -> None:
 def _write_shape(file: Path, mesh: trimesh.Trimesh) -> dict[str, Any]:
     write_atomically(file, export_ply(mesh, vertex_normal=True))
     return {"type": "ply", "filename": file.name}
+
+
+def _warn_of_lenses(cameras: Cameras) -> None:
+    """Print a warning if the sensors cannot represent the lenses of the cameras."""
+    distorted = cameras.distortion is not None and bool(cameras.distortion.any())
+    if distorted or not torch.allclose(cameras.fx, cameras.fy, rtol=_SQUARE):
+        warn(
+            "the sensors for Mitsuba have no lens distortion and square pixels, unlike the cameras; undistort the "
+            "photographs before the training for equal images"
+        )
 
 
 def _sensor(cameras: Cameras, view: int) -> dict[str, Any]:

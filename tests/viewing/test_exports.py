@@ -107,6 +107,17 @@ def test_mitsuba_scenes_hold_bodies_that_are_apart(two_bodies: TrainedScene, tmp
         write(two_bodies, "mitsuba", tmp_path / "overlapping.xml")
 
 
+def test_mitsuba_sensors_that_differ_from_the_cameras_are_named(
+    scene: TrainedScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write(scene, "mitsuba", tmp_path / "same.xml")
+    assert "warning" not in capsys.readouterr().out
+    cameras = scene.cameras("test")
+    monkeypatch.setattr(TrainedScene, "cameras", lambda self, split: replace(cameras, fy=1.5 * cameras.fy))
+    write(scene, "mitsuba", tmp_path / "tall.xml")
+    assert "have no lens distortion and square pixels, unlike the cameras" in capsys.readouterr().out
+
+
 VALIDATE = """const bytes = new Uint8Array(require("fs").readFileSync(process.argv[1]));
 require("gltf-validator").validateBytes(bytes).then((report) => console.log(JSON.stringify(report)));"""
 
