@@ -152,7 +152,7 @@ def find_masks(
         return None
     if not unmasked:
         return _of_files(images, masks, lambda mask: read_mask(mask, labels), downscale, size)
-    return LazyImages.of(images, _read_alpha, downscale) if _is_transparent(images[0]) else None
+    return LazyImages.of(images, _read_alpha, downscale) if _any_is_transparent(images) else None
 
 
 def masked_views(views: Views) -> Views:
@@ -241,13 +241,15 @@ def _read_usable(mask: Path) -> Levels:
     return np.where(levels > most // 2, most, 0).astype(levels.dtype)
 
 
-def _is_transparent(image: Path) -> bool:
-    """Return whether an image has pixels that are not opaque."""
-    with open_image(image, whole=False) as (opened, _):
-        if not opened.has_transparency_data:  # known without decoding
-            return False
-    levels = _read_alpha(image)
-    return bool((levels < np.iinfo(levels.dtype).max).any())
+def _any_is_transparent(images: Sequence[Path]) -> bool:
+    """Return whether any image has pixels that are not opaque; only files that may have such pixels are decoded."""
+    files = []
+    for path in images:
+        with open_image(path, whole=False) as (image, _):
+            if image.has_transparency_data:
+                files.append(path)
+    alphas = LazyImages.of(files, _read_alpha).all_levels() if files else ()
+    return any(bool((levels < np.iinfo(levels.dtype).max).any()) for levels in alphas)
 
 
 def _read_alpha(image: Path) -> Levels:

@@ -61,6 +61,23 @@ def test_transparency_is_a_silhouette_where_there_are_no_files(tmp_path: Path) -
     torch.testing.assert_close(torch.stack(list(share)), torch.tensor([[[0.5, 0.8]], [[1.0, 1.0]]]))
 
 
+@pytest.mark.parametrize("mode", ["RGB", "RGBA"])
+def test_transparency_of_a_later_image_is_a_silhouette(tmp_path: Path, mode: str) -> None:
+    paths = [tmp_path / f"{i}.png" for i in range(3)]
+    for path in paths:
+        Image.new(mode, (4, 2)).convert("RGB").convert(mode).save(path)
+    Image.new("RGBA", (4, 2), (9, 9, 9, 51)).save(paths[2])
+    masks = find_masks(paths, [None] * 3, 1, (4, 2))
+    assert masks is not None
+    assert [mask.unique().tolist() for mask in masks] == [[1.0], [1.0], [pytest.approx(0.2)]]
+
+
+def test_images_without_alpha_are_not_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    Image.new("RGB", (4, 2)).save(tmp_path / "a.jpg")
+    monkeypatch.setattr("nerfro.data.masks.read_levels", lambda path: pytest.fail("decoded"))
+    assert find_masks([tmp_path / "a.jpg"] * 2, [None] * 2, 1, (4, 2)) is None
+
+
 def test_masks_of_some_images_only_are_told_and_left(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     image = _touch(tmp_path / "a.png")
     assert find_masks([image, image], [None, image], 1, (4, 2)) is None
