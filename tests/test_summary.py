@@ -184,6 +184,13 @@ def test_places_are_folders_and_globs_and_runs_without_scores_are_named(tmp_path
     refused("nowhere does not exist", find_runs, [str(tmp_path / "nowhere")])
 
 
+def test_existing_folders_with_wildcards_in_their_names_are_not_patterns(tmp_path: Path) -> None:
+    for name in ("a [12]", "a 1", "b*", "b1"):
+        write_run(tmp_path / name, "a", 20.0)
+    for name in ("a [12]", "b*"):
+        assert [run.folder.name for run in find_runs([str(tmp_path / name)])[0]] == [name]
+
+
 def test_run_without_scores_has_those_of_its_later_evaluation(tmp_path: Path) -> None:
     run = write_run(tmp_path / "a", "a", 20.0)
     for name in ("metrics.json", "images"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import os
 import re
 import shlex
 from collections.abc import Mapping, Sequence
@@ -135,8 +136,10 @@ def find_runs(places: Sequence[str]) -> tuple[list[Run], list[str]]:
     """
     folders: set[Path] = set()
     for place in places:
-        refuse_root(user_path(place), "runs")
-        matches = [Path(match) for match in glob.glob(str(user_path(place)), recursive=True)]
+        path = user_path(place)
+        refuse_root(path, "runs")
+        exists = os.path.exists(path)  # its name may contain wildcards
+        matches = [path] if exists else [Path(match) for match in glob.glob(str(path), recursive=True)]
         if not matches:
             raise NerfroError(
                 f"runs: {place} does not exist; give run folders, folders that contain these, or glob patterns"
