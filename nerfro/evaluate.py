@@ -7,12 +7,14 @@ Examples:
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 
 from omegaconf import DictConfig
 
 import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
 from nerfro.cli import entry_point
+from nerfro.errors import NerfroError
 from nerfro.evaluation.error_sheets import write_error_sheet
 from nerfro.evaluation.folders import match_folders
 from nerfro.evaluation.metrics import prepared_metrics
@@ -69,7 +71,11 @@ def _evaluate_checkpoint(config: DictConfig) -> None:
 def _evaluate_folder(config: DictConfig) -> None:
     predictions, references = user_path(config.predictions), user_path(config.references)
     masks = None if config.masks is None else user_path(config.masks)
-    pairs = match_folders(predictions, references, masks, config.mask_labels, _names_in_run(predictions))
+    run_config = predictions.parent / CONFIG_FILE
+    if config.root is not None and not run_config.is_file():
+        raise NerfroError(f"root={config.root} has no effect, because {run_config} does not exist; remove it")
+    read_names = functools.partial(_names_in_run, run_config, config.root)
+    pairs = match_folders(predictions, references, masks, config.mask_labels, read_names)
     for pair in pairs:  # damaged or mismatched images are reported before the scoring starts
         pair.load(config.alpha)
     device = find_device(config.device)
@@ -81,12 +87,13 @@ def _evaluate_folder(config: DictConfig) -> None:
     print(f"images and tables: {folder}")
 
 
-def _names_in_run(predictions: Path) -> dict[str, str]:
+def _names_in_run(file: Path, root: str | None) -> dict[str, str]:
     """Return the names of the images of a run by their names in the data set; empty for images of other programs."""
-    file = predictions.parent / CONFIG_FILE
     if not file.is_file():
         return {}
     config = check_trained(read_foreign_config(file), file)
+    if root is not None:
+        config.data.root = root
     split = config.evaluation.split
     names = build_data(config).load(split).names
     return {Path(name).stem: f"{split}_{number:03d}" for number, name in enumerate(names)}

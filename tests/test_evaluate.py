@@ -1,10 +1,12 @@
 """`python -m nerfro.evaluate predictions=... references=...`; scoring a checkpoint is tested in test_train.py."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+from omegaconf import OmegaConf
 from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio
 
@@ -85,7 +87,7 @@ def test_damaged_picture_is_told_before_anything_is_scored(
         (["predictions=b"], "predictions=b need references; give references=DIR"),
         (["checkpoint=a", "references=b"], "references=b has no effect with checkpoint=...; remove it"),
         (["checkpoint=a", "alpha=white"], "alpha=white has no effect with checkpoint=...; remove it"),
-        (["predictions=a", "references=b", "root=c"], "root=c has no effect with predictions=...; remove it"),
+        (["predictions=a", "references=b", "root=c"], "root=c has no effect, because config.yaml does not exist"),
         (["predictions=a", "references=b", "split=val"], "split=val has no effect with predictions=...; remove it"),
         (["predictions=a", "references=b", "alpha=red"], "alpha='red' is not allowed; choose 'drop', 'white', 'black'"),
     ],
@@ -101,3 +103,18 @@ def test_pictures_of_a_run_match_the_photographs_of_its_data(
     evaluate_here(*folders, f"out={tmp_path}")
     run, again = (json.loads((folder / "metrics.json").read_text())["views"] for folder in (trained_run, tmp_path))
     assert [(view["name"], view["psnr"]) for view in again] == [(f["name"], pytest.approx(f["psnr"])) for f in run]
+
+
+def test_pictures_of_a_run_whose_data_set_has_moved(
+    trained_run: Path, tiny_scene: Path, tmp_path: Path, evaluate_here: Runner
+) -> None:
+    run, config = tmp_path / "run", OmegaConf.load(trained_run / "config.yaml")
+    config.data.root = str(tmp_path / "old")
+    shutil.copytree(trained_run / "images", run / "images")
+    OmegaConf.save(config, run / "config.yaml")
+    folders = [f"predictions={run / 'images'}", f"references={tiny_scene / 'test'}", f"out={tmp_path / 'out'}"]
+    error = evaluate_here(*folders, code=1).error
+    assert f"have different names, and the data set that relates them cannot be loaded (data.root={tmp_path}" in error
+    evaluate_here(*folders, f"root={tiny_scene}")
+    shutil.copytree(run / "images", tmp_path / "same_names")
+    evaluate_here(folders[0], f"references={tmp_path / 'same_names'}")

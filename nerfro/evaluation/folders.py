@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -63,7 +63,7 @@ def match_folders(
     references: Path,
     masks: Path | None,
     labels: Sequence[int] | None = None,
-    renamed: Mapping[str, str] | None = None,
+    read_names: Callable[[], Mapping[str, str]] = dict,
 ) -> list[ImagePair]:
     """Match the images of two folders by name without extension.
 
@@ -72,7 +72,8 @@ def match_folders(
         references: folder of reference images. Files `mask_<name>.png` are masks.
         masks: folder of masks. By default, `find_mask` searches the folder of references.
         labels: labels of the object in the masks, see `nerfro.data.image_files.read_mask`.
-        renamed: names of predictions by the names of their references and masks, where these differ.
+        read_names: returns the names of predictions by the names of their references and masks, where these differ.
+            It may raise an error if all references have the names of the predictions.
 
     Returns:
         The pairs, sorted by name.
@@ -82,7 +83,15 @@ def match_folders(
     """
     predicted, truth = _list_images(predictions, "predictions"), _list_images(references, "references")
     truth = {name: path for name, path in truth.items() if not name.startswith("mask_") or name[5:] not in truth}
-    renamed = renamed or {}
+    try:
+        renamed = read_names()
+    except NerfroError as error:
+        if predicted.keys() != truth.keys():
+            raise NerfroError(
+                f"the images in predictions={predictions} and references={references} have different names, and the "
+                f"data set that relates them cannot be loaded ({error}); if it has moved, give its folder as root=DIR"
+            ) from error
+        renamed = {}
     truth = {renamed.get(name, name): path for name, path in truth.items()}
     _require(predicted, truth, f"reference in references={references}")
     _require(truth, predicted, f"prediction in predictions={predictions}")

@@ -55,7 +55,7 @@ def require_one_task(config: DictConfig) -> None:
         raise NerfroError(f"predictions={config.predictions} need references; give references=DIR")
     others: tuple[str, ...]
     if config.checkpoint is None:
-        task, others = "predictions", ("split", "root", "chunk_size", "subdivision")
+        task, others = "predictions", ("split", "chunk_size", "subdivision")
     else:
         task, others = "checkpoint", ("references", "masks", "mask_labels", "alpha")
     default = OmegaConf.structured(EvaluateConfig)
