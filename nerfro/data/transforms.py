@@ -29,11 +29,13 @@ class Manifest:
         path: the file.
         document: content of the file.
         frames: checked frames, at least one.
+        skipped: names of the frames whose image does not exist.
     """
 
     path: Path
     document: Mapping[str, object]
     frames: list[Frame]
+    skipped: Sequence[str] = ()
 
     def number(self, key: str, default: float) -> float:
         """Return a number of the file, which may lack the key."""
@@ -98,15 +100,16 @@ def parse_manifest(path: Path, mask_key: str = "mask_path", skip_missing: bool =
     if repeated:
         raise NerfroError(f"{path}: {first_of(list(repeated))} occurs in several frames; keep one frame per image")
     kept = list(range(len(frames)))
-    missing = [names[i] for i in kept if images[i] is None]
+    missing, skipped = [names[i] for i in kept if images[i] is None], []
     if skip_missing and 0 < len(missing) < len(frames):
         warn(f"{path}: {len(missing)} of {len(frames)} frames have no image and are skipped: {first_of(missing)}")
+        skipped = missing
         kept = [i for i in kept if images[i] is not None]
     read = [
         _read_frame(f"{path}: frame {i} ('{names[i]}')", frames[i], names[i], images[i], path.parent, mask_key)
         for i in kept
     ]
-    return Manifest(path, document | {"frames": [frames[i] for i in kept]}, read)
+    return Manifest(path, document | {"frames": [frames[i] for i in kept]}, read, skipped)
 
 
 def _frame_name(where: str, entry: object) -> str:

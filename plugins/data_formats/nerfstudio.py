@@ -100,7 +100,10 @@ class NerfstudioData(PosedImages):
             )
         known = {manifest.frames[i].name: i for i in by_name}
         names = [PurePosixPath(name.replace("\\", "/")).as_posix() for name in names]
-        unknown = [name for name in names if name not in known]
+        unknown = [name for name in names if name not in known and name not in manifest.skipped]
         if unknown:
             raise NerfroError(f"{manifest.path}: {split}_filenames lists '{unknown[0]}', but no frame has this name")
-        return [known[name] for name in names]
+        chosen = [known[name] for name in names if name in known]
+        if not chosen:
+            raise NerfroError(f"{manifest.path}: no image of {split}_filenames exists; restore {names[0]}")
+        return chosen

@@ -279,6 +279,17 @@ def test_frames_without_an_image_are_skipped_in_one_line_or_refused(
     refused(r"f_4\.png does not exist", load, root)
 
 
+def test_listed_frames_without_an_image_are_skipped(tmp_path: Path) -> None:
+    files = [f"images/f_{i}.png" for i in range(4)]
+    lists = {"train_filenames": files[:2], "val_filenames": files[2:3], "test_filenames": files[3:]}
+    root = write_nerfstudio(tmp_path, seeds=range(4), top=SHARED | lists)
+    for name in files[1:3]:
+        (root / name).unlink()
+    source = NerfstudioData(str(root), near=0.5, far=9.0)
+    assert [source.load(split).names for split in ("train", "test")] == [files[:1], files[3:]]
+    refused("no image of val_filenames exists; restore images/f_2.png", source.load, "val")
+
+
 def test_bounds_are_estimated_from_the_cameras(tmp_path: Path) -> None:
     # The cameras look at about the origin from a distance of 3.
     root = str(write_nerfstudio(tmp_path, seeds=range(12)))
