@@ -46,7 +46,7 @@ def _decode(path: Path, image: Image.Image, bits: int) -> Levels:
 
 def read_size(path: Path) -> tuple[int, int, int]:
     """Read width, height and bits per channel from the header of an image file."""
-    with open_image(path, whole=False) as (image, bits):
+    with open_image(path) as (image, bits):
         return *image.size, bits
 
 

@@ -47,7 +47,7 @@ def checksum(image: Image.Image) -> int:
 
 def method_of(mask: Path) -> str | None:
     """Return how nerfro derived a mask from others; None for all other masks, and for masks edited since."""
-    with open_image(mask, whole=False) as (image, _):
+    with open_image(mask) as (image, _):
         method, _, expected = str(image.info.get(METHOD, "")).partition(":")
         return method if expected and expected == str(checksum(image)) else None
 
@@ -245,7 +245,7 @@ def _any_is_transparent(images: Sequence[Path]) -> bool:
     """Return whether any image has pixels that are not opaque; only files that may have such pixels are decoded."""
     files = []
     for path in images:
-        with open_image(path, whole=False) as (image, _):
+        with open_image(path) as (image, _):
             if image.has_transparency_data:
                 files.append(path)
     alphas = LazyImages.of(files, _read_alpha).all_levels() if files else ()

@@ -63,12 +63,11 @@ def reading(
 
 
 @contextlib.contextmanager
-def open_image(path: Path, whole: bool = True, upright: bool = True) -> Iterator[tuple[Image.Image, int]]:
+def open_image(path: Path, upright: bool = True) -> Iterator[tuple[Image.Image, int]]:
     """Open an image file, and yield it with the bits per channel of the file, of which Pillow silently keeps 8.
 
     Args:
         path: the file.
-        whole: whether the end of a PNG file must be there; Pillow decodes the file without it.
         upright: whether to refuse an EXIF orientation.
 
     Raises:
@@ -87,10 +86,10 @@ def open_image(path: Path, whole: bool = True, upright: bool = True) -> Iterator
         if too_large:
             raise NerfroError(f"image {path} has more than {MAX_PIXELS / 1e6:.0f} million pixels; downscale the image")
         with image:
+            if image.format == "PNG" and _metadata_follow_pixels(file):
+                image.load()  # reads them
             if upright:
                 _require_upright(image, path)
-            if image.format == "PNG" and whole:
-                _require_end(file)
             yield image, _bits(image, file)
 
 
@@ -106,26 +105,35 @@ def _bits(image: Image.Image, file: BinaryIO) -> int:
     return 8
 
 
-def _require_end(file: BinaryIO) -> None:
-    """Require all chunks of a PNG file, including the last one, IEND."""
-    place, kind = file.tell(), b""
+def _metadata_follow_pixels(file: BinaryIO) -> bool:
+    """Require all chunks of a PNG file, and return whether EXIF or XMP data follow the pixels.
+
+    Pillow decodes a file without its end, and reads what follows the pixels only after decoding.
+    """
+    place, kind, after_pixels, found = file.tell(), b"", False, False
     file.seek(8)
     while kind != b"IEND":
         head = file.read(8)
         if len(head) < 8:
             raise OSError("the file is truncated")
         length, kind = struct.unpack(">I4s", head)
+        if kind == b"IDAT":
+            after_pixels = True
+        elif after_pixels:
+            start = file.read(min(length, 17))
+            length -= len(start)
+            found |= kind == b"eXIf" or start in (b"Raw profile type ", b"XML:com.adobe.xmp")
         file.seek(length, 1)
         if len(file.read(4)) < 4:  # checksum
             raise OSError("the file is truncated")
     file.seek(place)
+    return found
 
 
 def orientation_of(image: Image.Image) -> int:
-    """Return the EXIF orientation of an image; 1 is upright."""
-    tags = image.tag_v2 if isinstance(image, TiffImagePlugin.TiffImageFile) else {}
-    tags = image.getexif() if "exif" in image.info else tags
-    return tags.get(ExifTags.Base.Orientation, 1)
+    """Return the EXIF orientation of an image, which may be in XMP data; 1 is upright."""
+    # The method of PNG files would decode the pixels.
+    return Image.Image.getexif(image).get(ExifTags.Base.Orientation, 1)
 
 
 def _require_upright(image: Image.Image, path: Path) -> None:

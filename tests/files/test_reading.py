@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageFile
 
 from nerfro.data.image_files import read_levels, read_rgb, read_size
 from nerfro.errors import NerfroError
@@ -113,3 +113,51 @@ def test_one_transparent_colour_is_composited(tmp_path: Path, bits: int) -> None
     read = {alpha: read_rgb(tmp_path / "image.png", alpha)[0].tolist() for alpha in ("white", "black")}
     assert read == {"white": [[65535] * 3, [65535, 0, 0]], "black": [[0] * 3, [65535, 0, 0]]}
     refused("convert it, with transparency composited first", load_png, tmp_path / "image.png")
+
+
+def exif_chunks(orientation: int) -> dict[str, bytes]:
+    """Chunks of a PNG file with an orientation, in all forms that Pillow reads."""
+    exif = Image.Exif()
+    exif[274] = orientation
+    content = b"Exif\0\0" + exif.tobytes().removeprefix(b"Exif\0\0")
+    text = b"\nexif\n%8d\n" % len(content) + content.hex().encode() + b"\n"
+    return {
+        "eXIf": chunk(b"eXIf", content[6:]),
+        "profile": chunk(b"zTXt", b"Raw profile type exif\0\0" + zlib.compress(text)),
+        "XMP": chunk(b"iTXt", b"XML:com.adobe.xmp\0\0\0\0\0" + xmp(orientation)),
+    }
+
+
+def xmp(orientation: int) -> bytes:
+    return b'<rdf:Description tiff:Orientation="%d"/>' % orientation
+
+
+@pytest.mark.parametrize("form", ["eXIf", "profile", "XMP"])
+@pytest.mark.parametrize("after", ["IHDR", "IDAT"])
+def test_orientation_is_found_anywhere_in_a_png_file(tmp_path: Path, form: str, after: str) -> None:
+    path, content = tmp_path / "a.png", png(1, 1, 8, 0, b"\0\0")
+    place = content.index(b"IDAT" if after == "IHDR" else b"IEND") - 4
+    for orientation in (1, 6):
+        path.write_bytes(content[:place] + exif_chunks(orientation)[form] + content[place:])
+        if orientation == 1:
+            assert read_size(path) == (1, 1, 8)
+            assert read_levels(path).tolist() == [[[0]]]
+        else:
+            for read in (read_size, read_levels):
+                refused("EXIF orientation 6; rotate its pixels", read, path)
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".webp"])
+def test_orientation_is_found_in_xmp(tmp_path: Path, suffix: str) -> None:
+    for orientation in (1, 6):
+        Image.new("L", (2, 1)).save(tmp_path / f"{orientation}{suffix}", xmp=xmp(orientation))
+    assert read_size(tmp_path / f"1{suffix}") == (2, 1, 8)
+    refused("EXIF orientation 6; rotate its pixels", read_size, tmp_path / f"6{suffix}")
+
+
+def test_pixels_are_decoded_only_if_metadata_follow_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, content = tmp_path / "a.png", png(1, 1, 8, 0, b"\0\0", exif_chunks(1)["eXIf"])
+    place = content.index(b"IEND") - 4
+    path.write_bytes(content[:place] + chunk(b"tEXt", b"date:create\0today") + content[place:])
+    monkeypatch.setattr(ImageFile.ImageFile, "load", lambda image: pytest.fail("decoded"))
+    assert read_size(path) == (1, 1, 8)
