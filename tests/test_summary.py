@@ -191,6 +191,17 @@ def test_existing_folders_with_wildcards_in_their_names_are_not_patterns(tmp_pat
         assert [run.folder.name for run in find_runs([str(tmp_path / name)])[0]] == [name]
 
 
+def test_run_without_its_first_image_is_omitted(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        write_run(tmp_path / name, name, 20.0)
+    image = tmp_path / "b" / "images" / "test_000.png"
+    image.unlink()
+    runs, unfinished = find_runs([str(tmp_path)])
+    assert [run.name for run in runs] == ["a"]
+    assert unfinished == [f"{tmp_path / 'b'} is omitted: its image {image} does not exist; restore it"]
+    refused(r"b is omitted: its image .*test_000\.png does not exist", find_runs, [str(tmp_path / "b")])
+
+
 def test_run_without_scores_has_those_of_its_later_evaluation(tmp_path: Path) -> None:
     run = write_run(tmp_path / "a", "a", 20.0)
     for name in ("metrics.json", "images"):

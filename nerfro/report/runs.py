@@ -93,6 +93,10 @@ class EvaluationSet:
         return scene_name(self.root)
 
 
+class IncompleteRunError(NerfroError):
+    """A run that is omitted; the message is the reason."""
+
+
 @dataclass(frozen=True)
 class Run:
     """An evaluated run.
@@ -149,13 +153,13 @@ def find_runs(places: Sequence[str]) -> tuple[list[Run], list[str]]:
         folders |= {file.parent.resolve() for file in found}
     runs, unfinished = [], []
     for folder in sorted(folders):
-        if _scores_folder(folder) is not None:
+        try:
             runs.append(read_run(folder))
-        else:
-            unfinished.append(f"{shown(folder)} is omitted: {_why_unfinished(folder)}")
+        except IncompleteRunError as error:
+            unfinished.append(f"{shown(folder)} is omitted: {error}")
     if not runs:
-        reason = f"; {unfinished[0]}" if unfinished else "; nerfro.train writes this file into every run folder"
-        raise NerfroError(f"runs: no metrics.json beside a run.json below {', '.join(places)}{reason}")
+        reason = unfinished[0] if unfinished else "nerfro.train writes metrics.json beside run.json into a run folder"
+        raise NerfroError(f"runs: no evaluated run below {', '.join(places)}; {reason}")
     return runs, unfinished
 
 
@@ -178,8 +182,15 @@ def _why_unfinished(folder: Path) -> str:
 
 
 def read_run(folder: Path) -> Run:
-    """Read an evaluated run folder."""
-    scores = _scores_folder(folder) or folder
+    """Read an evaluated run folder.
+
+    Raises:
+        IncompleteRunError: the run has no scores, or the first image is missing.
+        NerfroError: a file is damaged.
+    """
+    scores = _scores_folder(folder)
+    if scores is None:
+        raise IncompleteRunError(_why_unfinished(folder))
     metrics = read_metrics_json(scores / "metrics.json")
     try:
         path = folder / "config.yaml"
@@ -191,7 +202,10 @@ def read_run(folder: Path) -> Run:
         check(f"{folder / 'run.json'}: ", {"threads": Count}, {"threads": facts["threads"]})
         data, trainer, root = config["data"], config["trainer"], str(config["data"]["root"])
         view = metrics.result.views[0].name
-        with open_image(scores / "images" / f"{view}.png") as (image, _):
+        file = scores / "images" / f"{view}.png"
+        if not file.is_file():
+            raise IncompleteRunError(f"its image {shown(file)} does not exist; restore it")
+        with open_image(file) as (image, _):
             width, height = image.size
         options = sorted((key, str(value)) for key, value in data.items() if key not in ("root", "near", "far"))
         return Run(
