@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path as FilePath
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -138,6 +139,14 @@ def test_a_png_sky_is_decoded_and_encoded_again(tmp_path: FilePath) -> None:
     levels = torch.linspace(0, 1, 64).expand(32, 64)[..., None].expand(-1, -1, 3)
     lat_long.save_lat_long(tmp_path / "sky.png", to_linear(levels))
     torch.testing.assert_close(to_srgb(lat_long.load_lat_long(tmp_path / "sky.png")), levels, rtol=0, atol=1 / 400)
+
+
+@pytest.mark.parametrize("num_channels", [1, 3])
+def test_a_sky_of_16_bits_keeps_its_levels(tmp_path: FilePath, num_channels: int) -> None:
+    levels = np.random.default_rng(0).integers(0, 65536, (4, 8, num_channels), dtype=np.uint16)
+    cv2.imwrite(str(tmp_path / "sky.png"), levels[..., ::-1])
+    expected = to_linear(torch.from_numpy(levels / 65535).float()).expand(-1, -1, 3)
+    torch.testing.assert_close(lat_long.load_lat_long(tmp_path / "sky.png"), expected)
 
 
 # --- what learns ---

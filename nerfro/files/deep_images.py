@@ -82,4 +82,6 @@ def _read(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
     image.close()
     if pixels is None:
         raise OSError(error.partition("\n")[0])
+    if pixels.dtype == np.uint16 and image.spec().get_int_attribute("tiff:PhotometricInterpretation", 1) == 0:
+        pixels[..., 0] = 65535 - pixels[..., 0]  # white is zero, which OpenImageIO only converts for 8 bits
     return pixels, tuple(image.spec().channelnames)

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.errors import NerfroError
-from nerfro.files.deep_images import read_radiance, write_radiance
+from nerfro.files.deep_images import read_16bit, read_radiance, write_radiance
 from nerfro.files.images import save_png
 from nerfro.files.reading import open_image, reading
 from nerfro.light import to_linear, to_srgb
@@ -58,8 +58,9 @@ def load_lat_long(path: Path | str) -> Float[Tensor, "H 2*H 3"]:
         if suffix in (".hdr", ".exr"):
             rgb = read_radiance(path)
         else:
-            with open_image(path) as (image, _):
-                rgb = to_linear(np.array(image.convert("RGB")) / 255)
+            with open_image(path) as (image, bits):
+                levels = read_16bit(path) / 65535 if bits > 8 else np.array(image.convert("RGB")) / 255
+            rgb = to_linear(levels[..., :3] if levels.shape[-1] > 2 else levels[..., :1].repeat(3, -1))
     height, width = rgb.shape[:2]
     if width != 2 * height:
         raise NerfroError(f"the sky {path} has {width}x{height} pixels; give an image that is twice as wide as high")

@@ -29,6 +29,10 @@ from nerfro.errors import NerfroError
 MAX_PIXELS, MAX_JSON_BYTES, MAX_ARRAY_BYTES = 2**27, 2**27, 2**31
 
 _AGAIN = "copy or export it again"
+# Headers of 16-bit grey TIFF files with alpha, which Pillow does not know. OpenImageIO decodes their pixels.
+TiffImagePlugin.OPEN_INFO.update(
+    {(order, grey, (1,), 1, (16, 16), (2,)): ("LA", "LA;16B") for order in (b"II", b"MM") for grey in (0, 1)}
+)
 # Python's warning filters belong to all threads.
 _filters = threading.Lock()
 

@@ -52,6 +52,19 @@ def test_16bit_levels_keep_all_their_bits(num_channels: int, suffix: str, tmp_pa
     np.testing.assert_array_equal(image_files.read_levels(tmp_path / f"image{suffix}"), picture)
 
 
+@pytest.mark.parametrize("photometric", ["minisblack", "miniswhite"])
+@pytest.mark.parametrize("num_channels", [1, 2])
+def test_16bit_grey_tiff_files_may_have_alpha_or_zero_for_white(num_channels: int, photometric: str, tmp_path: Path):
+    picture = np.random.default_rng(0).integers(0, 65536, (9, 7, num_channels), dtype=np.uint16)
+    stored = picture.copy()
+    if photometric == "miniswhite":
+        stored[..., 0] = 65535 - picture[..., 0]
+    extra = ["unassalpha"] if num_channels > 1 else None
+    tifffile.imwrite(tmp_path / "a.tif", stored.squeeze(), photometric=photometric, extrasamples=extra)
+    assert image_files.read_size(tmp_path / "a.tif") == (7, 9, 16)
+    np.testing.assert_array_equal(image_files.read_levels(tmp_path / "a.tif"), picture)
+
+
 @pytest.mark.parametrize("mode", ["L", "P", "1"])
 def test_grey_palette_and_bilevel_images_become_rgb(save, mode):
     grey = np.where(levels(5, 4) > 127, 255, 0).astype(np.uint8)
