@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerfro.allowed import Range, check
 from nerfro.geometry.contraction import contraction_scale, expand
 from nerfro.progress import track
 from nerfro.viewing.trained_scene import TrainedScene
@@ -50,7 +52,11 @@ def sample_field(
         box: corners, world units; by default the bounds of the content.
         progress: whether to show a progress bar.
         radius: radius around the centre of the box beyond which space is contracted (`geometry.contraction`).
+
+    Raises:
+        NerfroError: the resolution is below 2.
     """
+    check("", {"resolution": Annotated[int, Range(at_least=2)]}, {"resolution": resolution})
     if box is None:
         box = scene.bounds if scene.content is None else scene.content
     field, device = scene.field, scene.renderer.scene.device

@@ -25,6 +25,7 @@ from nerfro.subdivision import Subdivision
 from nerfro.viewing.changes import with_changed_scene
 from nerfro.viewing.exports import ExportConfig, find_export
 from nerfro.viewing.trained_scene import TrainedScene
+from tests.conftest import refused
 from tests.viewing.conftest import INSIDE_CENTRE, INSIDE_RADIUS, IOR, RADIUS, colour, sky_of
 
 CELL = 2.12 * RADIUS / 47  # of the box with its margin of air
@@ -168,6 +169,19 @@ def test_the_volume_is_the_field_at_the_vertices_of_a_grid(scene: TrainedScene, 
     inside = np.linalg.norm(places - INSIDE_CENTRE, axis=-1) < INSIDE_RADIUS
     np.testing.assert_array_equal(density, 500.0 * inside)
     np.testing.assert_allclose(rgb[inside], colour(torch.from_numpy(places[inside])), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("what", "suffix"), [("page", ".html"), ("volume", ".npz"), ("mesh", ".glb"), ("mitsuba", ".xml")]
+)
+def test_a_volume_has_at_least_two_vertices_along_each_side(
+    scene: TrainedScene, what: str, suffix: str, tmp_path: Path
+) -> None:
+    out = tmp_path / f"out{suffix}"
+    refused("^resolution=1 is not allowed; take at least 2$", write, scene, what, out, resolution=1)
+    assert not out.exists()
+    write(scene, what, out, resolution=2)
+    assert out.exists()
 
 
 @pytest.mark.slow
