@@ -287,6 +287,8 @@ def _check_samples(samples: Samples, path: Path) -> None:
     _require(samples.edges.shape == (NUM_RAYS, num_samples + 1), "a sampler returns one edge more than samples")
     _require(bool((samples.s.diff(dim=1) >= 0).all()), "samples are sorted by arc length")
     _require(bool((samples.deltas >= 0).all()), "edges do not decrease")
+    between = (samples.s >= samples.edges[:, :-1] - 1e-4) & (samples.s <= samples.edges[:, 1:] + 1e-4)
+    _require(bool(between.all()), "samples lie between their edges")
     inside = (samples.s >= path.near[:, None] - 1e-4) & (samples.s <= path.far[:, None] + 1e-4)
     _require(bool(inside.all()), "samples lie between near and far")
     expected, _ = path.at(samples.s)
@@ -451,7 +453,9 @@ def _unit(directions: torch.Tensor) -> bool:
 
 def _require_gradients(module: torch.nn.Module) -> None:
     for name, parameter in module.named_parameters():
-        _require(parameter.grad is not None and bool(parameter.grad.isfinite().all()), f"{name} gets a finite gradient")
+        if parameter.requires_grad:
+            finite = parameter.grad is not None and bool(parameter.grad.isfinite().all())
+            _require(finite, f"{name} gets a finite gradient")
 
 
 def _require_type(result: object, expected: type) -> None:

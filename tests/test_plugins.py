@@ -17,6 +17,7 @@ from omegaconf import DictConfig
 from PIL import Image
 from torch import nn
 
+from nerfro import types
 from nerfro.data.base import DataSource, Views
 from nerfro.data.blender import BlenderData
 from nerfro.losses.base import Loss
@@ -24,7 +25,7 @@ from nerfro.media.base import Medium
 from nerfro.media.surface import Surface
 from nerfro.paths import PLUGINS_DIR
 from nerfro.registry import KINDS, discover, find, plugins, register
-from nerfro.samplers.base import PathSampler
+from nerfro.samplers.base import PathSampler, PointSampler
 from nerfro.testing import ContractError, check, check_export
 from nerfro.training.phases.base import Phase, Run
 from nerfro.viewing import PLUGIN_EXPORTS
@@ -130,6 +131,12 @@ def ball(change: Callable[[np.ndarray], np.ndarray], bounds: np.ndarray = CUBE) 
     return {"bounds": bounds, "distances": lambda _, grid: change(np.linalg.norm(grid.points, axis=-1) - 1)}
 
 
+def outside_of_edges(sampler: PointSampler, path: types.Path, previous: object, draws: object = None) -> types.Samples:
+    near, length = path.near[:, None], (path.far - path.near)[:, None]
+    s, edges = near + length * torch.linspace(0.4, 0.6, 4), near + length * torch.linspace(0.0, 0.2, 5)
+    return types.Samples.along(path, s, edges)
+
+
 def loss(forward: Callable[..., object]) -> dict[str, object]:
     return {"forward": lambda _, renderings, batch, scene: forward(renderings[-1], batch)}
 
@@ -191,6 +198,7 @@ def overflow(parameter: nn.Parameter) -> bool:
             {"steps_before": lambda _, step: step % 5, "step": None},
             "steps_before is cumulative: it returned 4 before step 4 and 0 before step 5",
         ),
+        ("sampler/points", PointSampler, {"forward": outside_of_edges, "num_levels": 1}, "samples lie between their edges"),
         ("data", DataSource, {"load": None, "splits": ["train"]}, "has the attribute `root`"),
     ],
 )

@@ -26,11 +26,11 @@ from tests.viewing.browser import Browser, needs_chromium
 PSNR = find_metrics(["psnr"])
 
 
-def write_scored_run(folder: Path, name: str, scene: Path, noise: float) -> None:
+def write_scored_run(folder: Path, name: str, scene: Path, noise: float, num_views: int = 2) -> None:
     """A run folder whose pictures are the references of a scene with noise, scored."""
     write_run(folder, name, psnr=20.0, root=str(scene), max_time="00:00:00:20")
     metrics, scores = ImageMetrics(), []
-    for view in range(2):
+    for view in range(num_views):
         reference = load_png(scene / "test" / f"r_{view}.png")
         prediction = (reference + noise * (1 + view) * torch.randn_like(reference)).clamp(0, 1)
         save_png(folder / "images" / f"test_{view:03d}.png", prediction)
@@ -112,6 +112,15 @@ def test_pictures_of_another_data_set_are_refused(runs: Path, tmp_path: Path, ti
     for run in comparison.runs:
         run.config["data"]["root"] = str(changed)  # type: ignore[index]
     refused("has changed since these views", scene_images, comparison, scored, Selection())
+
+
+def test_runs_that_score_only_the_first_views_show_these(runs: Path, tmp_path: Path) -> None:
+    scene = Path(find_runs([str(runs)])[0][0].config["data"]["root"])
+    write_scored_run(tmp_path / "few", "few", scene, 0.1, num_views=1)
+    (comparison,) = compare(find_runs([str(tmp_path)])[0], {}, {})
+    comparison.runs[0].config["trainer"]["limit_test_batches"] = 1  # type: ignore[index]
+    (scored,) = comparison.scenes
+    assert len(scene_images(comparison, scored, Selection()).views) == 1
 
 
 def test_each_budget_has_a_table_that_tells_medals_without_colours(tmp_path: Path) -> None:

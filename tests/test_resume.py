@@ -119,6 +119,16 @@ def test_resuming_a_finished_run_with_more_steps_trains_the_rest(
     assert checkpoint["callbacks"]["Throughput"]["num_rays"] >= 5 * 32
 
 
+def test_resuming_with_fewer_steps_than_the_checkpoint_has_is_refused(
+    train: Runner, trained_run: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(trained_run, tmp_path / "run")
+    before = (tmp_path / "run" / "config.yaml").read_text()
+    refused = train("evaluation.every=0", "trainer.max_steps=1", "ckpt_path=last", code=1)
+    assert "steps, and trainer.max_steps=1; give at least" in refused.error
+    assert (tmp_path / "run" / "config.yaml").read_text() == before
+
+
 def test_last_finds_the_newest_run_beside_a_new_folder(tmp_path: Path) -> None:
     for name in ("older", "newer"):
         (tmp_path / name / LAST_CHECKPOINT).parent.mkdir(parents=True)

@@ -30,6 +30,9 @@ from nerfro.training.ray_batches import RayBatches
 from nerfro.training.reach import require_reach
 from nerfro.training.schedule import Schedule
 
+# Steps whose rays are checked: a small batch, or one photograph, may miss the object by chance.
+_CHECKED_STEPS = 16
+
 
 def build(experiment: str | None = None, overrides: Sequence[str] = ()) -> tuple[TrainingModule, RayDataModule]:
     """Build an experiment for any Trainer of Lightning.
@@ -107,6 +110,12 @@ def check_first_batch(renderer: Renderer, batches: RayBatches, device: torch.dev
     """
     few = batches.smaller(4096)
     first = few.batch(0)
-    require_reach(renderer, first)
+    for step in range(_CHECKED_STEPS):
+        try:
+            require_reach(renderer, few.batch(step))
+            break
+        except NerfroError:
+            if step == _CHECKED_STEPS - 1:
+                raise
     warn_of_thin_walls(renderer.path_sampler, renderer.scene.medium)
     return require_memory(renderer, first.rays, device, few.batch_size / batches.batch_size, batches.pixel_bytes)

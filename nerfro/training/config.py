@@ -40,7 +40,7 @@ from nerfro.subdivision import Subdivision
 from nerfro.synthetic import SCENES
 from nerfro.training.angular_resolution import settle_angular_resolution
 from nerfro.training.backdrop import settle_backdrop
-from nerfro.training.content import ContentConfig, settle_content
+from nerfro.training.content import ContentConfig, require_contraction, settle_content
 from nerfro.training.optimizer import OptimizerConfig
 
 Score = Annotated[str, Names(lambda: [plugin.name for plugin in plugins("metric")])]  # of a region: mask.NAME
@@ -355,6 +355,7 @@ def build_model(config: DictConfig, training: Views | None = None) -> Renderer:
     settle_content(config, medium, None if training is None else training.cameras)
     camera = build(config.camera)
     if training is not None:
+        require_contraction(config)
         settle_backdrop(config, training.images)
         settle_angular_resolution(config, training.cameras)
         camera.begin(training.cameras)

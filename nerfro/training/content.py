@@ -78,6 +78,20 @@ def settle_content(config: DictConfig, medium: Medium, cameras: Cameras | None =
         _settle_ball(content, build(config.data).load("train").cameras if cameras is None else cameras)
 
 
+def require_contraction(config: DictConfig) -> None:
+    """Refuse `content.space=all` without a component that covers all of space.
+
+    Raises:
+        NerfroError: neither the field nor the point sampler has a radius.
+    """
+    nodes = (OmegaConf.to_container(node, resolve=False) for node in (config.field, config.sampler.points))
+    if config.content.space == "all" and not any(isinstance(node, dict) and node.get("radius") for node in nodes):
+        raise NerfroError(
+            "content.space=all needs a field and samples in all of space; add field=volume sampler/points=volume, or "
+            "take +experiment=refractive_room"
+        )
+
+
 def describe(content: DictConfig) -> str:
     """Describe the space of a run in one line; the result is empty if the space is a box."""
     if content.space == "box":

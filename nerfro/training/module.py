@@ -111,6 +111,11 @@ class TrainingModule(LightningModule):
                     raise NerfroError(f"loss={name} returned shape {list(value.shape)}; a loss is a scalar")
                 self.log(f"loss/{name}", value)
                 total = total + weight * value
+        if not total.requires_grad:
+            raise NerfroError(
+                f"no loss has a positive weight in step {self.global_step}, so there is nothing to learn; raise a "
+                "weight (loss.photometric.weight=1), or start a loss earlier"
+            )
         if self._trainer is not None and self.trainer.world_size > 1:
             # Processes wait for each other's gradients of all parameters, also of those that a batch does not use.
             learned = [parameter.sum().to(total) for parameter in self.parameters() if parameter.requires_grad]

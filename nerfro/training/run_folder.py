@@ -235,6 +235,9 @@ def require_same_run(
         content, trained = load_checkpoint(checkpoint)
         require_same_configuration(checkpoint, trained, config)
         require_optimizer_fits(content, groups, checkpoint)
+        done, most = content["global_step"], config.trainer.max_steps
+        if 0 <= most < done:
+            raise NerfroError(f"{checkpoint} has {done} steps, and trainer.max_steps={most}; give at least {done}")
     elif config.ckpt_path is not None:
         require_same_configuration(begun, read_foreign_config(begun), config)
 

@@ -27,6 +27,7 @@ _NAMED = {
     "trainer.max_steps": Role.BUDGET,
     "trainer.max_time": Role.BUDGET,
     "evaluation": Role.SCORING,
+    "trainer.limit_test_batches": Role.SCORING,
     "evaluation.chunk_size": Role.MACHINE,
     "medium.cache": Role.MACHINE,
     "compile": Role.MACHINE,
@@ -44,7 +45,10 @@ _NAMED = {
     "viewer": Role.WATCHING,
     "viewer_port": Role.WATCHING,
     "trainer.log_every_n_steps": Role.WATCHING,
+    "trainer.enable_checkpointing": Role.WATCHING,
     "trainer.enable_model_summary": Role.WATCHING,
+    "trainer.enable_progress_bar": Role.WATCHING,
+    "trainer.profiler": Role.WATCHING,
 }
 
 # Settings with these roles must be equal to resume a checkpoint; budget, machine and scoring may differ.

@@ -65,6 +65,7 @@ def make_trainer(config: DictConfig, folder: Path, throughput: Throughput, extra
         "plugins": [CheckpointFiles()],
         "logger": [build(node, save_dir=str(folder)) for node in (config.logger or {}).values()],
         "max_epochs": -1,
+        "min_epochs": 0,  # with `min_steps`, Lightning would wait for the end of an epoch, which no training has
         "val_check_interval": validation_interval(every) or None,
         "check_val_every_n_epoch": None,
         "limit_val_batches": 1 if every > 0 else 0,

@@ -19,7 +19,7 @@ def test_every_setting_that_is_named_exists() -> None:
 
 def test_settings_are_flat_and_their_first_difference_is_named() -> None:
     flat = {"seed": 1, "field.width": 64, "field.levels": [1, 2], "checkpoints": "no group of watching"}
-    watching = ("logger.csv.name=x", "checkpoint.every_steps=3", "evaluation.every=9")
+    watching = ("logger.csv.name=x", "checkpoint.every_steps=3", "evaluation.every=9", "trainer.profiler=simple")
     config = OmegaConf.from_dotlist([*(f"{name}={value}" for name, value in flat.items()), *watching])
     assert settings(config, RESUMING) == flat
     assert first_difference(flat, dict(flat)) is None

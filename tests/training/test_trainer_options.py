@@ -21,6 +21,7 @@ from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.testing import check
 from nerfro.training.config import TrainConfig, TrainerConfig, clock_time, settle_trainer
 from nerfro.training.ray_batches import RayBatches
+from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
 from nerfro.training.trainer import _OWN
 from tests.conftest import Runner, refused
 
@@ -146,6 +147,31 @@ def test_training_without_evaluation_ends_after_its_time(train: Runner, tmp_path
     assert "max_time: 00:00:00:01\n" in (tmp_path / "run" / "config.yaml").read_text()
     assert not list(tmp_path.rglob("*.png"))
     assert not (tmp_path / "run" / "metrics.json").exists()
+
+
+def test_least_number_of_steps_ends_after_the_time(train: Runner, tmp_path: Path) -> None:
+    train("trainer.max_time=1s", "trainer.min_steps=3", "trainer.max_steps=3000", "evaluation=none")
+    checkpoint, _ = load_checkpoint(tmp_path / "run" / LAST_CHECKPOINT)
+    assert 3 <= checkpoint["global_step"] < 3000
+
+
+@pytest.mark.parametrize("options", [["trainer.precision=64-true"], ["batches.size=1"]])
+def test_unusual_precision_and_size_train(options: list[str], train: Runner) -> None:
+    train(*options, "trainer.max_steps=4", "evaluation=none")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["content.space=all"], "add field=volume sampler/points=volume"),
+        (
+            [f"loss.{name}.weight=0" for name in ("photometric", "boundary", "smoothness", "total_variation")],
+            "no loss has a positive weight in step 0",
+        ),
+    ],
+)
+def test_settings_without_an_effect_are_refused(options: list[str], message: str, train: Runner) -> None:
+    assert message in train(*options, "trainer.max_steps=4", code=1).error
 
 
 def test_training_ends_with_the_table_of_means_and_the_files(train: Runner, tmp_path: Path) -> None:

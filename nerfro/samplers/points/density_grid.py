@@ -281,7 +281,7 @@ class DensityGridSampler(PointSampler):
         flat = self.density.view(-1)
         # A cell that is drawn twice must not depend on the order of writing, because runs must be repeatable.
         flat[cells] = flat[cells] * self.decay
-        flat.scatter_reduce_(0, cells, density, "amax")
+        flat.scatter_reduce_(0, cells, density.to(flat), "amax")
 
     def _query(self, field: Field, contracted: Float[Tensor, "M 3"]) -> Float[Tensor, "M"]:
         """Density of a field at positions in the space of the grid."""
