@@ -198,7 +198,7 @@ def overflow(parameter: nn.Parameter) -> bool:
             {"steps_before": lambda _, step: step % 5, "step": None},
             "steps_before is cumulative: it returned 4 before step 4 and 0 before step 5",
         ),
-        ("sampler/points", PointSampler, {"forward": outside_of_edges, "num_levels": 1}, "samples lie between their edges"),
+        ("sampler/points", PointSampler, {"forward": outside_of_edges, "num_levels": 1}, "lie between their edges"),
         ("data", DataSource, {"load": None, "splits": ["train"]}, "has the attribute `root`"),
     ],
 )
