@@ -73,7 +73,7 @@ def match_folders(
         masks: folder of masks. By default, `find_mask` searches the folder of references.
         labels: labels of the object in the masks, see `nerfro.data.image_files.read_mask`.
         read_names: returns the names of predictions by the names of their references and masks, where these differ.
-            It may raise an error if all references have the names of the predictions.
+            It may raise an error if references have the names of the predictions.
 
     Returns:
         The pairs, sorted by name.
@@ -86,7 +86,7 @@ def match_folders(
     try:
         renamed = read_names()
     except NerfroError as error:
-        if predicted.keys() != truth.keys():
+        if not predicted.keys() & truth.keys():
             raise NerfroError(
                 f"the images in predictions={predictions} and references={references} have different names, and the "
                 f"data set that relates them cannot be loaded ({error}); if it has moved, give its folder as root=DIR"

@@ -99,7 +99,7 @@ def scene_images(comparison: Comparison, test_set: EvaluationSet, selection: Sel
     first = next(iter(runs.values()))
     references: Views = build_data(OmegaConf.create(dict(first.config))).load(test_set.split)
     if test_set.num_views == first.config["trainer"].get("limit_test_batches"):
-        references = references.select(range(test_set.num_views))
+        references = references.select(range(min(len(references), test_set.num_views)))
     cameras = references.cameras
     if (len(references), cameras.height, cameras.width) != (test_set.num_views, test_set.height, test_set.width):
         raise NerfroError(f"{test_set.root} has changed since these views were scored; restore the data set")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -27,11 +28,11 @@ from nerfro.training.data_module import RayDataModule, traced
 from nerfro.training.memory import require_memory
 from nerfro.training.module import TrainingModule
 from nerfro.training.ray_batches import RayBatches
-from nerfro.training.reach import require_reach
+from nerfro.training.reach import MissedError, require_reach
 from nerfro.training.schedule import Schedule
 
-# Steps whose rays are checked: a small batch, or one photograph, may miss the object by chance.
-_CHECKED_STEPS = 16
+# Number of rays that are checked before training, and bounds of the number of their steps.
+_CHECKED_RAYS, _FEWEST_CHECKED, _MOST_CHECKED = 4096, 16, 1024
 
 
 def build(experiment: str | None = None, overrides: Sequence[str] = ()) -> tuple[TrainingModule, RayDataModule]:
@@ -108,14 +109,16 @@ def check_first_batch(renderer: Renderer, batches: RayBatches, device: torch.dev
     Returns:
         The estimated memory in one line.
     """
-    few = batches.smaller(4096)
+    few = batches.smaller(_CHECKED_RAYS)
     first = few.batch(0)
-    for step in range(_CHECKED_STEPS):
+    # A small batch, or one photograph, may miss the object by chance.
+    num_steps = min(max(_FEWEST_CHECKED, math.ceil(_CHECKED_RAYS / few.batch_size)), _MOST_CHECKED)
+    for step in range(num_steps):
         try:
             require_reach(renderer, few.batch(step))
             break
-        except NerfroError:
-            if step == _CHECKED_STEPS - 1:
+        except MissedError:
+            if step == num_steps - 1:
                 raise
     warn_of_thin_walls(renderer.path_sampler, renderer.scene.medium)
     return require_memory(renderer, first.rays, device, few.batch_size / batches.batch_size, batches.pixel_bytes)

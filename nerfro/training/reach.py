@@ -16,12 +16,17 @@ from nerfro.types import Batch
 _FEW = 0.1
 
 
+class MissedError(NerfroError):
+    """No ray meets the field."""
+
+
 @torch.no_grad()
 def require_reach(renderer: Renderer, batch: Batch) -> None:
     """Refuse a field that no ray meets; warn if many rays miss the field and see a constant background.
 
     Raises:
-        NerfroError: every ray of the batch misses the box of the field, ends before the object or begins behind it.
+        MissedError: every ray of the batch misses the box of the field.
+        NerfroError: every ray of the batch ends before the object, or begins behind it.
     """
     _require_object(renderer, batch.rays)
     field = renderer.scene.fields[0]
@@ -34,7 +39,7 @@ def require_reach(renderer: Renderer, batch: Batch) -> None:
     box = f"the field's box from {_rounded(bounds[0])} to {_rounded(bounds[1])}"
     advice = "set content.box_min and content.box_max (or those of field) around what the cameras see"
     if missed == 1:
-        raise NerfroError(
+        raise MissedError(
             f"no ray of the training views meets {box}, and nothing is outside of it; check that unit, axes and place "
             f"of the object are those of the cameras, or {advice}"
         )

@@ -58,7 +58,7 @@ def read_cameras(file: Path, geometry: CaptureGeometry, origin: Float[np.ndarray
         )
     if not entries:
         raise NerfroError(f"{file} has no cameras; give one or more")
-    sizes = {**document, **entries[0]} if isinstance(entries[0], dict) else document
+    sizes = {**entries[0], **document} if isinstance(entries[0], dict) else document
     width, height = (_pixels(sizes, key, default, file) for key, default in
                      zip(size, (geometry.camera.width, geometry.camera.height), strict=True))  # fmt: skip
     poses, lenses = [], []

@@ -77,9 +77,7 @@ class CaptureGeometry:
         """
         distance = torch.linalg.vector_norm(positions - target, dim=-1)
         if not ((distance > 0) & torch.isfinite(distance)).all():
-            raise NerfroError(
-                f"a camera at {positions.tolist()[0]} cannot look at {target.tolist()}; give another position or target"
-            )
+            raise NerfroError("a camera lies at its target, or infinitely far away; give another position or target")
         back = functional.normalize(positions - target, dim=-1)
         right = torch.linalg.cross(self.up.expand_as(back), back)
         # A camera directly above has no upright orientation; any horizontal axis is as good as another.

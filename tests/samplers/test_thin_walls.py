@@ -1,6 +1,7 @@
 """A warning names walls that are too thin for the grid, and the resolution that it recommends is sufficient."""
 
 import re
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +13,9 @@ import nerfro
 from tests.conftest import Runner
 
 
-def _hollow_ball(path: Path, wall: float) -> Path:
+def _hollow_ball(path: Path, wall: float, shift: float = 0.0) -> Path:
     outer, inner = (trimesh.creation.icosphere(4, radius) for radius in (1.0, 1.0 - wall))
+    inner.apply_translation([0, 0, shift])
     inner.invert()
     trimesh.util.concatenate([outer, inner]).export(path)
     return path
@@ -25,18 +27,29 @@ def _exits(mesh: Path, interface: str, resolution: int = 64) -> torch.Tensor:
     return nerfro.bend(mesh, 1.5, origins, [[0.0, 0.0, 1.0]] * 8, interface, resolution).directions  # type: ignore[arg-type]
 
 
+def _recommended(capsys: pytest.CaptureFixture[str]) -> int:
+    found = re.search(r"of object bounds walls .* resolution of the grid to (\d+), trace", capsys.readouterr().out)
+    assert found is not None
+    return int(found[1])
+
+
 def test_the_recommended_resolution_traces_a_thin_wall(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     mesh = _hollow_ball(tmp_path / "hollow.ply", 0.1)
     expected = _exits(mesh, "mesh")
     assert "warning" not in capsys.readouterr().out
     wrong = _exits(mesh, "sdf", 64)
-    found = re.search(
-        r"the surface of object bounds walls .* set medium\.resolution=(\d+), or", capsys.readouterr().out
-    )
-    assert found is not None
-    right = _exits(mesh, "sdf", int(found[1]))
+    right = _exits(mesh, "sdf", _recommended(capsys))
     assert "warning" not in capsys.readouterr().out
     assert torch.dist(right, expected) < 0.1 * torch.dist(wrong, expected)
+
+
+def test_the_recommended_resolution_holds_for_walls_of_varying_thickness(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mesh = _hollow_ball(tmp_path / "hollow.ply", 0.15, 0.1)
+    _exits(mesh, "sdf", 64)
+    _exits(mesh, "sdf", _recommended(capsys))
+    assert "warning" not in capsys.readouterr().out
 
 
 def test_a_solid_with_sharp_edges_has_no_thin_walls(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -49,3 +62,12 @@ def test_a_training_warns_of_thin_walls(tmp_path: Path, tiny_default_run: list[s
     mesh = _hollow_ball(tmp_path / "hollow.ply", 0.05)
     done = run_here("train", *tiny_default_run, f"medium.mesh={mesh}", "trainer.max_steps=1")
     assert "bounds walls of about" in done.out
+
+
+def test_without_embree_nothing_is_warned_of(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trimesh.creation.icosphere(2).export(tmp_path / "ball.ply")
+    monkeypatch.setitem(sys.modules, "embreex.mesh_construction", None)
+    _exits(tmp_path / "ball.ply", "sdf", 32)
+    assert "warning" not in capsys.readouterr().out

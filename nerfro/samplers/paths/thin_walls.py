@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from nerfro.errors import warn
+from nerfro.errors import NerfroError, warn
 from nerfro.geometry.intersection import MeshIntersector, Triangles
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.media.base import Medium
@@ -33,17 +33,20 @@ def warn_of_thin_walls(sampler: PathSampler, medium: Medium) -> None:
     for name, mesh, grid in zip(medium.names, medium.meshes, medium.grids, strict=False):
         if not mesh.is_closed:
             continue
-        voxels = thickness(mesh) / float(grid.spacing.max())
+        try:
+            voxels = thickness(mesh) / float(grid.spacing.max())
+        except NerfroError:  # without Embree
+            return
         thin = voxels < _LEAST_VOXELS
         if thin.mean() <= _FEW:
             continue
-        typical = float(np.median(voxels[thin]))
-        resolution = math.ceil((len(grid.distances) - 1) * _LEAST_VOXELS / typical) + 1
-        finer = f"set medium.resolution={resolution}, or " if resolution <= _MOST_VERTICES else "set "
+        factor = _LEAST_VOXELS / float(np.quantile(voxels, _FEW))
+        resolution = math.ceil((len(grid.distances) - 1) * factor) + 1
+        finer = f"raise the resolution of the grid to {resolution}, " if resolution <= _MOST_VERTICES else ""
         warn(
-            f"{thin.mean():.0%} of the surface of {name} bounds walls of about {typical:.1f} voxels, which bend rays "
-            f"in wrong directions below {_LEAST_VOXELS:.0f} voxels; {finer}sampler.path.interface=mesh, or describe a "
-            "cavity as a body of index 1 (medium.inner_meshes and medium.inner_iors)"
+            f"{thin.mean():.0%} of the surface of {name} bounds walls of about {np.median(voxels[thin]):.1f} voxels, "
+            f"which bend rays in wrong directions below {_LEAST_VOXELS:.0f} voxels; {finer}trace triangles "
+            "(sampler/path=snell with interface=mesh), or describe a cavity as a body of index 1"
         )
 
 
