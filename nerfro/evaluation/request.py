@@ -30,7 +30,7 @@ class EvaluateConfig:
 
     checkpoint: Optional[str] = None  # run folder or checkpoint of nerfro.train to render and score
     split: str = "test"  # split to render
-    root: Optional[str] = None  # folder of the data set, if it has moved since training
+    root: Optional[str] = None  # folder of the data set of the run, if it has moved since training
     chunk_size: Optional[NumRays] = None  # rays rendered at once, which limits memory; by default as in training
     # Which pixels get several rays (see docs/concepts/background.md); by default as in training.
     subdivision: SubdivisionChanges = dataclasses.field(default_factory=SubdivisionChanges)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import torch
@@ -28,11 +27,8 @@ from nerfro.training.data_module import RayDataModule, traced
 from nerfro.training.memory import require_memory
 from nerfro.training.module import TrainingModule
 from nerfro.training.ray_batches import RayBatches
-from nerfro.training.reach import MissedError, require_reach
+from nerfro.training.reach import CHECKED_RAYS, require_reach
 from nerfro.training.schedule import Schedule
-
-# Number of rays that are checked before training, and bounds of the number of their steps.
-_CHECKED_RAYS, _FEWEST_CHECKED, _MOST_CHECKED = 4096, 16, 1024
 
 
 def build(experiment: str | None = None, overrides: Sequence[str] = ()) -> tuple[TrainingModule, RayDataModule]:
@@ -109,16 +105,8 @@ def check_first_batch(renderer: Renderer, batches: RayBatches, device: torch.dev
     Returns:
         The estimated memory in one line.
     """
-    few = batches.smaller(_CHECKED_RAYS)
+    few = batches.smaller(CHECKED_RAYS)
     first = few.batch(0)
-    # A small batch, or one photograph, may miss the object by chance.
-    num_steps = min(max(_FEWEST_CHECKED, math.ceil(_CHECKED_RAYS / few.batch_size)), _MOST_CHECKED)
-    for step in range(num_steps):
-        try:
-            require_reach(renderer, few.batch(step))
-            break
-        except MissedError:
-            if step == num_steps - 1:
-                raise
+    require_reach(renderer, few, first)
     warn_of_thin_walls(renderer.path_sampler, renderer.scene.medium)
     return require_memory(renderer, first.rays, device, few.batch_size / batches.batch_size, batches.pixel_bytes)

@@ -254,6 +254,7 @@ def check_run(config: DictConfig) -> None:
         check_node(node)
     if check_node(config.sampler.path).needs_medium:  # type: ignore[attr-defined]
         check_node(config.medium)
+    require_contraction(config)
     if limit is None and config.trainer.max_steps < 0 and not (config.debug or config.trainer.fast_dev_run):
         raise NerfroError("the run would never end; set trainer.max_time, such as 5m, trainer.max_steps, or both")
 
@@ -355,7 +356,6 @@ def build_model(config: DictConfig, training: Views | None = None) -> Renderer:
     settle_content(config, medium, None if training is None else training.cameras)
     camera = build(config.camera)
     if training is not None:
-        require_contraction(config)
         settle_backdrop(config, training.images)
         settle_angular_resolution(config, training.cameras)
         camera.begin(training.cameras)

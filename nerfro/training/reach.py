@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 
 from nerfro.boundaries.constant import ConstantBoundary
@@ -10,36 +12,51 @@ from nerfro.fields.base import Field
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.rays import Rays
 from nerfro.rendering import Renderer
+from nerfro.training.ray_batches import RayBatches
 from nerfro.types import Batch
 
 # Fraction of rays that may miss the field without a warning if the background does not learn.
 _FEW = 0.1
 
 
-class MissedError(NerfroError):
-    """No ray meets the field."""
+# Number of rays that are checked, and bounds of the number of their steps.
+CHECKED_RAYS = 4096
+_FEWEST_STEPS, _MOST_STEPS = 16, 1024
 
 
 @torch.no_grad()
-def require_reach(renderer: Renderer, batch: Batch) -> None:
+def require_reach(renderer: Renderer, batches: RayBatches, first: Batch) -> None:
     """Refuse a field that no ray meets; warn if many rays miss the field and see a constant background.
 
+    A small batch, or one photograph, may miss the field by chance, so batches are checked until a ray meets the field.
+
+    Args:
+        renderer: the model.
+        batches: batches of the training.
+        first: batch of step 0.
+
     Raises:
-        MissedError: every ray of the batch misses the box of the field.
-        NerfroError: every ray of the batch ends before the object, or begins behind it.
+        NerfroError: every ray misses the box of the field, ends before the object or begins behind it.
     """
-    _require_object(renderer, batch.rays)
     field = renderer.scene.fields[0]
     assert isinstance(field, Field)
     if (bounds := field.bounds) is None:
+        _require_object(renderer, first.rays)
         return
-    path = renderer.trace(batch.rays, batch.path)
-    enters, leaves = path.span(bounds.to(path.s))
-    missed = float((enters >= leaves).double().mean())
+    missed = 1.0
+    num_steps = min(max(_FEWEST_STEPS, math.ceil(CHECKED_RAYS / batches.batch_size)), _MOST_STEPS)
+    for step in range(num_steps):
+        batch = first if step == 0 else batches.batch(step)
+        _require_object(renderer, batch.rays)
+        path = renderer.trace(batch.rays, batch.path)
+        enters, leaves = path.span(bounds.to(path.s))
+        missed = float((enters >= leaves).double().mean())
+        if missed < 1:
+            break
     box = f"the field's box from {_rounded(bounds[0])} to {_rounded(bounds[1])}"
     advice = "set content.box_min and content.box_max (or those of field) around what the cameras see"
     if missed == 1:
-        raise MissedError(
+        raise NerfroError(
             f"no ray of the training views meets {box}, and nothing is outside of it; check that unit, axes and place "
             f"of the object are those of the cameras, or {advice}"
         )

@@ -9,8 +9,9 @@ import torch
 from jaxtyping import Float
 
 from nerfro.errors import NerfroError, warn
-from nerfro.geometry.intersection import MeshIntersector, Triangles
+from nerfro.geometry.intersection import MeshIntersector
 from nerfro.geometry.mesh import TriangleMesh
+from nerfro.geometry.orientation import area_vectors
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.samplers.base import PathSampler
@@ -52,15 +53,14 @@ def warn_of_thin_walls(sampler: PathSampler, medium: Medium) -> None:
 
 def thickness(mesh: TriangleMesh) -> Float[np.ndarray, "P"]:
     """Return the distance to the opposite side at random points of a closed surface, world units."""
-    triangles = Triangles.of([mesh])
-    areas = triangles.areas(torch.arange(len(mesh.faces)))
-    size = areas.norm(dim=-1)
+    triangles, normals = mesh.triangles, area_vectors(mesh.triangles)
+    size = np.linalg.norm(normals, axis=1)
     generator = np.random.default_rng(0)
-    face = torch.from_numpy(generator.choice(len(size), _NUM_POINTS, p=(size / size.sum()).numpy()))
-    weights = torch.from_numpy(generator.dirichlet(np.ones(3), _NUM_POINTS))
-    inwards = -areas[face] / size[face, None]
-    points = (weights[..., None] * triangles.corners[face]).sum(1)
-    start = points + 1e-5 * float(np.ptp(mesh.bounds, 0).max()) * inwards
-    hit = MeshIntersector(triangles.corners).first_hits(start, inwards)
-    met = hit >= 0
-    return triangles.distance(start[met], inwards[met], hit[met]).numpy()
+    face = generator.choice(len(size), _NUM_POINTS, p=size / size.sum())
+    weights = generator.dirichlet(np.ones(3), _NUM_POINTS)
+    inwards = -normals[face] / size[face, None]
+    start = (weights[..., None] * triangles[face]).sum(1) + 1e-5 * np.ptp(mesh.bounds, 0).max() * inwards
+    hit = MeshIntersector(triangles).first_hits(torch.from_numpy(start), torch.from_numpy(inwards)).numpy()
+    start, inwards, hit = start[hit >= 0], inwards[hit >= 0], hit[hit >= 0]
+    opposite = normals[hit]
+    return ((triangles[hit, 0] - start) * opposite).sum(1) / (inwards * opposite).sum(1)
