@@ -213,6 +213,23 @@ def _check_medium(medium: Medium) -> None:
     _require(bool((ior > 0).all()) and bool(gradient.isfinite().all()), "n is positive and grad n finite")
     ior, gradient = medium(high + (high - low) * (1 + torch.rand(50, 3)))
     _require(bool((ior == 1).all()) and bool((gradient == 0).all()), "outside the box n = 1 and grad n = 0")
+    _check_gradient_of_index(medium)
+
+
+@torch.no_grad()
+def _check_gradient_of_index(medium: Medium) -> None:
+    """Compare grad n with central differences at random points; the tolerance admits steps of n at surfaces."""
+    low, high = medium.box
+    points = low + torch.rand(5000, 3, generator=torch.Generator().manual_seed(0)).to(low) * (high - low)
+    gradient = medium(points)[1]
+    shift = 1e-3 * (high - low).norm()
+    shifts = shift * torch.eye(3).to(low)
+    differences = torch.stack([medium(points + each)[0] - medium(points - each)[0] for each in shifts], -1) / (
+        2 * shift
+    )
+    steepness = gradient.square().sum()
+    ratio = (gradient * differences).sum() / steepness
+    _require(bool(steepness == 0) or 0.5 < float(ratio) < 1.5, "forward returns grad n per world unit")
 
 
 def _check_surface(surface: Surface) -> None:

@@ -160,11 +160,28 @@ def overflow(parameter: nn.Parameter) -> bool:
     return True
 
 
+def lens(factor: float) -> dict[str, object]:
+    """Members of a medium with n = 2 - |x|^2 in the unit ball, and grad n = `factor` x, which -2 makes correct."""
+
+    def forward(medium: Medium, positions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        squared = positions.square().sum(-1)
+        return (2 - squared).clamp(min=1), torch.where(squared[..., None] < 1, factor * positions, 0.0)
+
+    return {"forward": forward, "box": torch.tensor(CUBE, dtype=torch.float32)}
+
+
+def test_a_medium_of_varying_index_keeps_its_contract() -> None:
+    register("medium", "broken")(type("Lens", (Medium,), {"__doc__": "Lens.", "__module__": __name__, **lens(-2.0)}))
+    check(find("medium", "broken"))
+
+
 @pytest.mark.parametrize(
     ("kind", "base", "members", "contract"),
     [
         ("medium", Medium, {"forward": ones}, r"a medium has a buffer `box` \[2, 3\]"),
         ("medium", Medium, {}, "Broken lacks forward"),
+        ("medium", Medium, lens(1.0), "forward returns grad n per world unit"),
+        ("medium", Medium, lens(-4.0), "forward returns grad n per world unit"),
         ("surface", Surface, {"distances": None}, "a surface has `bounds`"),
         ("surface", Surface, {"distances": None, "bounds": CUBE[0]}, r"a surface has `bounds` \[2, 3\]"),
         ("surface", Surface, ball(lambda d: d, CUBE[::-1]), "the lower corner of `bounds` is first"),
