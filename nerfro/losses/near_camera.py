@@ -43,6 +43,7 @@ class NearCamera(Loss):
     def forward(self, renderings: list[Rendering], batch: Batch, scene: Scene) -> Float[Tensor, ""]:
         rendering = renderings[-1]
         path = rendering.path
-        distance = (path.positions[:, 0].detach() - self.middle).norm(dim=-1).clamp(min=1e-6)
-        counts = (1 - rendering.samples.s / distance[:, None]).clamp(min=0)
-        return batch.per_pixel(path.per_ray((rendering.weights * counts).sum(-1))).mean()
+        cameras = (path.positions[:, 0] - path.near[:, None] * path.directions[:, 0]).detach()
+        distance = (cameras - self.middle).norm(dim=-1).clamp(min=1e-6)
+        closeness = (1 - rendering.samples.s / distance[:, None]).clamp(min=0)
+        return batch.per_pixel(path.per_ray((rendering.weights * closeness).sum(-1))).mean()

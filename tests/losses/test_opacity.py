@@ -10,9 +10,11 @@ from nerfro.losses.backdrop import Backdrop
 from nerfro.losses.base import Loss
 from nerfro.losses.near_camera import NearCamera
 from nerfro.losses.opaque import Opaque
+from nerfro.media.shapes import Ball
 from nerfro.rendering import Scene, composite
+from nerfro.samplers.paths.straight import Straight
 from nerfro.testing import example_batch, example_path
-from nerfro.types import Path, Radiance, Rendering, Samples
+from nerfro.types import Path, Radiance, Rays, Rendering, Samples
 
 SCENE = Mock(spec=Scene)
 
@@ -67,24 +69,23 @@ def white_fog(path: Path, density: torch.Tensor) -> Rendering:
     return composite(samples, Radiance(density.expand(8, 8), torch.ones(8, 8, 3)), torch.ones(8, 3), path)
 
 
-def loss_around(path: Path) -> NearCamera:
-    """Of content 4 units before the first camera; all paths are taken to begin there."""
-    middle = path.positions[0, 0] + 4 * path.directions[0, 0]
-    return NearCamera((middle - 1).tolist(), (middle + 1).tolist())
+CONTENT = NearCamera((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
 
 
-def first_camera(path: Path) -> Path:
-    positions = path.positions - path.positions[:, :1] + path.positions[:1, :1]
-    return replace(path, positions=positions)
+def straight_paths(near: float = 0.0) -> Path:
+    """Return eight straight paths of a camera 4 units before the content, which begin at arc length `near`."""
+    eight = torch.ones(8)
+    origins, directions = torch.tensor([0.0, 0.0, 4.0]).expand(8, 3), torch.tensor([0.0, 0.0, -1.0]).expand(8, 3)
+    return Straight()(Rays(origins, directions, 1e-3 * eight, near * eight, 8 * eight), Ball())
 
 
 def test_white_fog_before_white_clears_where_it_is_near_alone() -> None:
-    path = first_camera(example_path(8))
+    path = straight_paths()
     raw = torch.full((8,), -1.0, requires_grad=True)
-    optimizer, near_camera = torch.optim.Adam([raw], lr=0.1), loss_around(path)
+    optimizer = torch.optim.Adam([raw], lr=0.1)
     for _ in range(200):
         rendering = white_fog(path, raw.exp())
-        loss = (1 - rendering.rgb).square().mean() + 0.1 * near_camera([rendering], BATCH, SCENE)
+        loss = (1 - rendering.rgb).square().mean() + 0.1 * CONTENT([rendering], BATCH, SCENE)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -92,10 +93,11 @@ def test_white_fog_before_white_clears_where_it_is_near_alone() -> None:
     assert (raw[4:].detach().exp() > 0.3).all()
 
 
-@pytest.mark.parametrize(("interval", "counts"), [(0, 1 - 0.5 / 4), (2, 1 - 2.5 / 4), (4, 0.0), (7, 0.0)])
-def test_a_wall_counts_by_how_near_it_is(interval: int, counts: float) -> None:
-    path = first_camera(example_path(8))
+@pytest.mark.parametrize(("interval", "closeness"), [(0, 1 - 0.5 / 4), (2, 1 - 2.5 / 4), (4, 0.0), (7, 0.0)])
+@pytest.mark.parametrize("near", [0.0, 1.5])
+def test_a_wall_counts_by_its_distance_from_the_camera(interval: int, closeness: float, near: float) -> None:
+    path = straight_paths(near)
     density = torch.zeros(8)
     density[interval] = 100.0
-    found = loss_around(path)([white_fog(path, density)], BATCH, SCENE)
-    assert float(found) == pytest.approx(counts, abs=1e-5)
+    found = CONTENT([white_fog(path, density)], BATCH, SCENE)
+    assert float(found) == pytest.approx(closeness, abs=1e-5)
