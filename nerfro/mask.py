@@ -59,7 +59,7 @@ def main(config: DictConfig) -> None:
     plugin_module("object_masks.command").run(config)
     given = of_groups(("data",), HydraConfig.get().overrides.task)
     given = given if is_given("data", given) else ["data=opencv", *given]
-    print_next("next", "preprocess", [*given, "medium.ior=1.33"])
+    print_next("next", "preprocess", given)
 
 
 if __name__ == "__main__":

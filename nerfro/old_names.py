@@ -9,7 +9,51 @@ from typing import cast
 from omegaconf import DictConfig, OmegaConf
 
 from nerfro.errors import NerfroError, warn
-from nerfro.registry import MOVED_CLASSES
+
+_PLUGINS = "nerfro_plugins"
+# Former and present places of classes; configurations of earlier releases name the former ones.
+MOVED_CLASSES = (
+    {
+        f"nerfro.data.{module}.{name}": f"{_PLUGINS}.data_formats.{module}.{name}"
+        for module, name in (
+            ("idr", "IdrData"),
+            ("llff", "LlffData"),
+            ("nerfstudio", "NerfstudioData"),
+            ("colmap", "ColmapData"),
+            ("refref", "RefRefData"),
+        )
+    }
+    | {
+        f"nerfro.samplers.{module}.{name}": f"nerfro.samplers.{group}.{module}.{name}"
+        for group, module, name in (
+            ("paths", "snell", "Snell"),
+            ("paths", "straight", "Straight"),
+            ("points", "density_grid", "DensityGridSampler"),
+            ("points", "stratified", "Stratified"),
+        )
+    }
+    | {
+        f"{package}.{module}.{name}": f"{_PLUGINS}.paper.{module}.{name}"
+        for module, name, packages in (
+            ("eikonal", "Eikonal", ("nerfro.samplers", "nerfro.samplers.paths")),
+            ("hierarchical", "Hierarchical", ("nerfro.samplers", "nerfro.samplers.points")),
+            ("mip_nerf", "MipNerfField", ("nerfro.fields", _PLUGINS)),
+            ("mip_nerf", "MipNerfModel", ("nerfro.models", _PLUGINS)),
+            ("nerf", "NerfField", ("nerfro.fields",)),
+            ("skybox", "Skybox", ("nerfro.boundaries",)),
+            ("voxel_grid", "VoxelGrid", ("nerfro.media",)),
+        )
+        for package in packages
+    }
+    | {
+        "nerfro.camera.refined.RefinedCamera": f"{_PLUGINS}.refined_cameras.refined.RefinedCamera",
+        "nerfro.training.phases.cameras.CameraSteps": f"{_PLUGINS}.refined_cameras.phase.CameraSteps",
+        "nerfro.data.opencv.OpenCVData": "nerfro.data.blender.OpenCVData",
+        "nerfro.losses.distortion.Distortion": f"{_PLUGINS}.distortion.Distortion",
+        "nerfro.media.vessel.SdfVessel": f"{_PLUGINS}.vessels.vessel.SdfVessel",
+        "nerfro.losses.smoothness.Smoothness": f"{_PLUGINS}.paper.smoothness.Smoothness",
+    }
+)
 
 # Old spellings of configuration keys and of options, which work for one release with a warning. Add one line for each
 # name that you change; command lines, YAML files of users, run folders and checkpoints then follow. Three forms:

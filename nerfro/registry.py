@@ -29,6 +29,7 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from nerfro.allowed import Names, Range, check, checked
 from nerfro.errors import NerfroError
+from nerfro.old_names import MOVED_CLASSES
 from nerfro.paths import PLUGINS_DIR
 
 KINDS = (
@@ -45,49 +46,6 @@ _BUILT_IN = (
     "training.phases",
 )  # fmt: skip
 _LOCAL_PACKAGE = "nerfro_plugins"
-# Former and present places of classes; configurations of earlier releases name the former ones.
-MOVED_CLASSES = (
-    {
-        f"nerfro.data.{module}.{name}": f"{_LOCAL_PACKAGE}.data_formats.{module}.{name}"
-        for module, name in (
-            ("idr", "IdrData"),
-            ("llff", "LlffData"),
-            ("nerfstudio", "NerfstudioData"),
-            ("colmap", "ColmapData"),
-            ("refref", "RefRefData"),
-        )
-    }
-    | {
-        f"nerfro.samplers.{module}.{name}": f"nerfro.samplers.{group}.{module}.{name}"
-        for group, module, name in (
-            ("paths", "snell", "Snell"),
-            ("paths", "straight", "Straight"),
-            ("points", "density_grid", "DensityGridSampler"),
-            ("points", "stratified", "Stratified"),
-        )
-    }
-    | {
-        f"{package}.{module}.{name}": f"{_LOCAL_PACKAGE}.paper.{module}.{name}"
-        for module, name, packages in (
-            ("eikonal", "Eikonal", ("nerfro.samplers", "nerfro.samplers.paths")),
-            ("hierarchical", "Hierarchical", ("nerfro.samplers", "nerfro.samplers.points")),
-            ("mip_nerf", "MipNerfField", ("nerfro.fields", _LOCAL_PACKAGE)),
-            ("mip_nerf", "MipNerfModel", ("nerfro.models", _LOCAL_PACKAGE)),
-            ("nerf", "NerfField", ("nerfro.fields",)),
-            ("skybox", "Skybox", ("nerfro.boundaries",)),
-            ("voxel_grid", "VoxelGrid", ("nerfro.media",)),
-        )
-        for package in packages
-    }
-    | {
-        "nerfro.camera.refined.RefinedCamera": f"{_LOCAL_PACKAGE}.refined_cameras.refined.RefinedCamera",
-        "nerfro.training.phases.cameras.CameraSteps": f"{_LOCAL_PACKAGE}.refined_cameras.phase.CameraSteps",
-        "nerfro.data.opencv.OpenCVData": "nerfro.data.blender.OpenCVData",
-        "nerfro.losses.distortion.Distortion": f"{_LOCAL_PACKAGE}.distortion.Distortion",
-        "nerfro.media.vessel.SdfVessel": f"{_LOCAL_PACKAGE}.vessels.vessel.SdfVessel",
-        "nerfro.losses.smoothness.Smoothness": f"{_LOCAL_PACKAGE}.paper.smoothness.Smoothness",
-    }
-)
 ENTRY_POINTS = "nerfro.plugins"
 
 # Objects of Lightning that a configuration may name as Hydra's `_target_`, beside registered classes.

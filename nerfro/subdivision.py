@@ -69,14 +69,15 @@ class PixelRays:
     Attributes:
         rays: R rays.
         path: path of each ray; None without tracing.
-        pixel: row of the pixel of each ray.
+        ray_pixel: pixel of each ray, as an index of the given pixels.
         part: number of the ray within the pixel.
-        diverges: pixels whose neighbouring rays diverge by at least `DIVERGENT` pixel angles.
+        diverges: pixels whose neighbouring rays diverge by at least `DIVERGENT` pixel angles; none if no pixel may be
+            divided.
     """
 
     rays: Rays
     path: Path | None
-    pixel: Int[Tensor, "R"]
+    ray_pixel: Int[Tensor, "R"]
     part: Int[Tensor, "R"]
     diverges: Bool[Tensor, "Q"]
 
@@ -118,7 +119,7 @@ def subdivide(
     return PixelRays(
         rays=Rays.joined([rays[whole], parts]),
         path=Path.joined([path.of_rays(whole), trace(parts, view[pixel])]),
-        pixel=torch.cat([whole, pixel]),
+        ray_pixel=torch.cat([whole, pixel]),
         part=torch.cat([torch.zeros_like(whole), part]),
         diverges=angle >= DIVERGENT,
     )

@@ -24,7 +24,7 @@ from omegaconf import OmegaConf
 from nerfro.boundaries.base import Boundary
 from nerfro.boundaries.constant import ConstantBoundary
 from nerfro.boundaries.envmap import EnvironmentMap
-from nerfro.camera.base import Camera
+from nerfro.camera.base import CameraModel
 from nerfro.cameras import Cameras
 from nerfro.data.base import DataSource, Views
 from nerfro.draws import Draws
@@ -139,8 +139,8 @@ def example_batch(num_rays: int = NUM_RAYS, rays_per_pixel: int = 1) -> Batch:
     every = pixel.unique()
     return Batch(
         rays=example_rays(num_rays),
-        pixel=pixel,
-        index=every,
+        ray_pixel=pixel,
+        pixel_number=every,
         view=every % 2,
         rgb=torch.full((len(every), 3), 0.5),
         teaches_background=torch.ones(len(every), dtype=torch.bool),
@@ -251,7 +251,7 @@ def _check_surface(surface: Surface) -> None:
     _require(not near.any() or bool(np.median(slope) > 0.9), "distances are exact within `grid.band` voxels")
 
 
-def _check_camera(camera: Camera) -> None:
+def _check_camera(camera: CameraModel) -> None:
     camera.begin(example_batch().cameras)
     rays = camera(example_rays(), torch.arange(NUM_RAYS) % 2)
     _require(rays.origins.shape == (NUM_RAYS, 3) and _unit(rays.directions), "forward returns unit rays")
@@ -435,7 +435,7 @@ def _check_callback(callback: Any) -> None:
 
 
 _CONTRACTS: dict[str, tuple[type, Callable[[Any], None]]] = {
-    "camera": (Camera, _check_camera),
+    "camera": (CameraModel, _check_camera),
     "medium": (Medium, _check_medium),
     "surface": (Surface, _check_surface),
     "sampler/path": (PathSampler, _check_path_sampler),

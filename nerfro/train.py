@@ -25,11 +25,11 @@ from nerfro.fields.networks import compile_networks
 from nerfro.overrides import prints_hints
 from nerfro.rendering.scene_file import with_scene
 from nerfro.subdivision import Subdivision
-from nerfro.training.build import build_training, check_first_batch
+from nerfro.training.build import build_training, check_before_training
 from nerfro.training.callbacks import StopOnSignal, Throughput, steps_by_phase
-from nerfro.training.config import TrainConfig, build_data, check_run, settle_trainer
+from nerfro.training.config import TrainConfig, build_data, check_run, resolve_trainer_options
 from nerfro.training.mesh_match import require_match
-from nerfro.training.run_folder import LAST_CHECKPOINT, begin, next_steps, own, require_same_run, resume_advice
+from nerfro.training.run_folder import LAST_CHECKPOINT, begin, lock_run, next_steps, require_same_run, resume_advice
 from nerfro.training.sweeps import run_cell
 from nerfro.training.trainer import finish_logs, fit, make_trainer, prepare_process, print_profile
 from nerfro.training.viewer import Viewer
@@ -42,7 +42,7 @@ def main(config: DictConfig) -> float | None:
     folder = Path(HydraConfig.get().runtime.output_dir)
 
     def train() -> RunMetrics | None:
-        with own(folder, config) as checkpoint:
+        with lock_run(folder, config) as checkpoint:
             return _train(config, folder, checkpoint)
 
     metrics = run_cell(config, folder, train)
@@ -52,7 +52,7 @@ def main(config: DictConfig) -> float | None:
 def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetrics | None:
     """Train and evaluate; everything that can be refused is refused before training starts."""
     prepare_process(config.seed)
-    settle_trainer(config)
+    resolve_trainer_options(config)
     source = build_data(config)
     training, split = source.load("train"), config.evaluation.split
     test = training if split is None else source.load(split).checked()
@@ -66,8 +66,8 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetr
     trainer = make_trainer(config, folder, throughput, [interruption, Viewer(config, source, test)])
     device = trainer.strategy.root_device
     require_match(renderer.scene.medium, training)
-    # The share is not kept, because the data module moves the pixels to the training device.
-    memory = check_first_batch(renderer, datamodule.batches.share(trainer.global_rank, trainer.world_size), device)
+    # These batches are not kept, because the data module moves the pixels to the training device.
+    memory = check_before_training(renderer, datamodule.batches_of(trainer), device)
     if trainer.is_global_zero:
         begin(folder, config, renderer)
         print(memory, flush=True)

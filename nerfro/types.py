@@ -45,8 +45,8 @@ class Path:
         splits: whether rays may have several polylines. If not, `ray` counts from 0 and `throughput` is 1 everywhere.
         ray: ray of each polyline, non-decreasing; every ray has at least one polyline.
         throughput: linear factor of the light of the polyline; the factors of a ray sum to at most 1.
-        body: innermost body of the segment after each vertex, numbered from 1; 0 in air, or if the index varies
-            continuously.
+        body: body of the segment after each vertex (`Solid.deciding_body`), numbered from 1; 0 in air, or if the index
+            varies continuously.
         surface: body on whose surface each vertex lies, numbered from 0; -1 for vertices on no sharp surface, such as
             both ends.
         across: body on the other side of the surface, numbered as `body`. Transmitted light enters the body, reflected
@@ -180,6 +180,7 @@ class Path:
 
     @property
     def exit_positions(self) -> Float[Tensor, "P 3"]:
+        """End of each polyline, behind the last event."""
         return self.positions[:, -1]
 
     @property
@@ -249,7 +250,8 @@ class Exits:
 
     Attributes:
         directions: unit directions away from the volume.
-        positions: starts of the segments: the last event of the path, or the camera. None for the centre of the scene.
+        positions: starts of the segments: the last event of the path, or the point at near. None for the centre of the
+            scene.
         radii: radius of the pixel cone at unit distance along the segment; 0 if unknown.
     """
 
@@ -317,7 +319,7 @@ class Rendering:
 
     Attributes:
         rgb: radiance of each ray in the colour space of the scene, including the background; the sum over all
-            polylines of the ray. Linear radiance is unbounded above.
+            polylines of the ray.
         weights: contribution of each sample to its polyline.
         transmittance: transmittance at the end of each polyline, T_{N+1}.
         boundary_rgb: background radiance in the exit direction, C'(d_N), after absorption by the medium.
@@ -352,7 +354,10 @@ class Rendering:
 
     @property
     def depth(self) -> Float[Tensor, "R"]:
-        """Expected arc length of the samples; the end of the main polyline if the opacity is zero."""
+        """Expected arc length: intervals count at their centres, in contracted space at their samples.
+
+        The end of the main polyline if the opacity is zero.
+        """
         weight = self.opacity
         edges = self.samples.edges
         centres = self.samples.s if self.samples.lengths is not None else 0.5 * (edges[:, 1:] + edges[:, :-1])
@@ -374,19 +379,20 @@ class Batch:
 
     Attributes:
         rays: rays of the cameras of the data set.
-        pixel: row of the pixel of each ray, from 0 to Q - 1.
-        index: number of each pixel in the data set, view * H * W + row * W + column.
+        ray_pixel: pixel of each ray, as an index from 0 to Q - 1.
+        pixel_number: number of each pixel in the data set, view * H * W + row * W + column.
         view: number of the training view of each pixel.
         rgb: colour of each pixel in its photograph, sRGB in [0, 1].
         teaches_background: pixels from which the background learns; diverging rays of other pixels would cause noise.
-        cameras: all training cameras, for losses that need further directions.
+        cameras: all training cameras, cropped to the window of the first steps (`batches.precrop_steps`); for losses
+            that need further directions.
         draws: random numbers of the step, with an index for each ray.
         path: paths of the rays without gradients; None before tracing.
     """
 
     rays: Rays
-    pixel: Int[Tensor, "R"]
-    index: Int[Tensor, "Q"]
+    ray_pixel: Int[Tensor, "R"]
+    pixel_number: Int[Tensor, "Q"]
     view: Int[Tensor, "Q"]
     rgb: Float[Tensor, "Q 3"]
     teaches_background: Bool[Tensor, "Q"]
@@ -397,23 +403,25 @@ class Batch:
     @property
     def ray_view(self) -> Int[Tensor, "R"]:
         """Number of the training view of each ray."""
-        return self.view[self.pixel]
+        return self.view[self.ray_pixel]
 
     def per_pixel(self, values: Float[Tensor, "R *C"]) -> Float[Tensor, "Q *C"]:
         """Average the values of each pixel's rays."""
-        return mean_per_pixel(values, self.pixel, len(self.rgb))
+        return mean_per_pixel(values, self.ray_pixel, len(self.rgb))
 
 
-def mean_per_pixel(values: Float[Tensor, "R *C"], pixel: Int[Tensor, "R"], num_pixels: int) -> Float[Tensor, "Q *C"]:
+def mean_per_pixel(
+    values: Float[Tensor, "R *C"], ray_pixel: Int[Tensor, "R"], num_pixels: int
+) -> Float[Tensor, "Q *C"]:
     """Average the values of the rays of each pixel.
 
     Args:
         values: values of the rays.
-        pixel: row of the pixel of each ray; each pixel has a ray, and single rays are in the order of the pixels.
+        ray_pixel: index of the pixel of each ray; each pixel has a ray, and single rays are in the order of the pixels.
         num_pixels: number of pixels.
     """
-    if len(pixel) == num_pixels:  # one ray through each pixel, in their order
+    if len(ray_pixel) == num_pixels:  # one ray through each pixel, in their order
         return values
-    total = values.new_zeros(num_pixels, *values.shape[1:]).index_add(0, pixel, values)
-    num_rays = values.new_zeros(num_pixels).index_add(0, pixel, torch.ones_like(pixel, dtype=values.dtype))
+    total = values.new_zeros(num_pixels, *values.shape[1:]).index_add(0, ray_pixel, values)
+    num_rays = values.new_zeros(num_pixels).index_add(0, ray_pixel, torch.ones_like(ray_pixel, dtype=values.dtype))
     return total / num_rays.view(-1, *[1] * (values.ndim - 1))

@@ -8,14 +8,14 @@ import torch
 from jaxtyping import Int
 from torch import Tensor, nn
 
-from nerfro.camera.base import Camera
+from nerfro.camera.base import CameraModel
 from nerfro.cameras import Cameras
 from nerfro.rays import Rays
 from nerfro.registry import register
 
 
 @register("camera", "shifted")
-class Shifted(Camera):
+class Shifted(CameraModel):
     """Estimate one translation of all training cameras.
 
     Args:

@@ -31,7 +31,7 @@ class ExtraSteps(Phase):
     def step(self, run: Run, number: int, state: dict[str, Any]) -> bool:
         renderer = run.renderer
         with torch.no_grad():
-            batch = run.batches.share(0, 1).batch(_OTHER_PIXELS + number)  # the same pixels in all processes
+            batch = run.batches.for_rank(0, 1).batch(_OTHER_PIXELS + number)  # the same pixels in all processes
         path = renderer.trace(renderer.scene.camera(batch.rays, batch.ray_view), batch.path)
         radiance = batch.per_pixel(renderer.render_path(path, batch.draws)[-1].rgb)
         error = renderer.scene.colour_space.to_srgb(radiance) - batch.rgb

@@ -68,7 +68,7 @@ def test_training_and_rendering_stay_on_the_gpu(
         batch = batches.batch(STEP)
         loss = module.training_step(batch, 0)["loss"]
         loss.backward()
-        renderer.point_sampler.after_step(list(renderer.scene.fields), batch.draws)
+        renderer.point_sampler.update(list(renderer.scene.fields), batch.draws)
         assert {wait for wait in gpu.waits if not wait.startswith(TRACING)} == waits
         rendered = render_view(renderer, cameras, 0, Subdivision())
         if isinstance(renderer.scene.medium, SdfGrid):

@@ -5,6 +5,7 @@ import re
 import sys
 from collections.abc import Iterator
 from graphlib import TopologicalSorter
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -60,6 +61,27 @@ def room(module: str) -> str:
 def test_imports_point_down(module: str) -> None:
     below = ORDER[ORDER.index(room(module)) :]
     assert {other for other in IMPORTS[module] if room(other) not in below} == set()
+
+
+def reachable(arrows: set[tuple[str, str]], start: str) -> set[str]:
+    found, new = set(), {start}
+    while new:
+        new = {below for above, below in arrows if above in new} - found
+        found |= new
+    return found
+
+
+def test_the_graph_of_the_documentation_shows_the_imports() -> None:
+    page = PACKAGE_DIR.parent / "docs" / "reference" / "architecture.md"
+    if not page.is_file():
+        pytest.skip("there is no checkout with the documentation")
+    graph = re.search(r"```mermaid\n(.*?)```", page.read_text(encoding="utf-8"), re.S)[1]
+    shown = {pair for line in graph.splitlines()[1:] for pair in pairwise(line.split(" --> "))}
+    shown = {(above.strip(), below.strip()) for above, below in shown}
+    imports = {(room(module), room(other)) for module, others in IMPORTS.items() for other in others}
+    imports = {(above, below) for above, below in imports if above != below}
+    assert shown <= imports
+    assert {each: reachable(shown, each) for each in ORDER} == {each: reachable(imports, each) for each in ORDER}
 
 
 def test_no_modules_import_each_other_in_a_circle() -> None:

@@ -105,21 +105,21 @@ def batches_of(views: Views, subdivision: Subdivision, size: int = 64) -> RayBat
 
 def of_pixels(batch: Batch, divided: bool) -> torch.Tensor:
     """Rows of a batch's pixels that have several rays, or one."""
-    return ((torch.bincount(batch.pixel) > 1) == divided).nonzero()[:, 0]
+    return ((torch.bincount(batch.ray_pixel) > 1) == divided).nonzero()[:, 0]
 
 
 def test_pixels_whose_rays_diverge_have_a_ray_through_each_part(views: Views) -> None:
     batch = batches_of(views, Subdivision(2, 8.0)).batch(7)
     divided, whole = of_pixels(batch, True), of_pixels(batch, False)
     assert 0 < len(divided) < 64
-    assert torch.equal(divided, (diverging(views.cameras, Snell(), CUBE)[batch.index] >= 8.0).nonzero()[:, 0])
-    assert torch.equal(batch.teaches_background, (batch.pixel.bincount() == 1))
-    assert torch.equal(batch.rgb, views.images.view(-1, 3)[batch.index])
-    expected = part_rays(views.cameras, batch.index[divided], 2).directions.view(-1, 4, 3)
+    assert torch.equal(divided, (diverging(views.cameras, Snell(), CUBE)[batch.pixel_number] >= 8.0).nonzero()[:, 0])
+    assert torch.equal(batch.teaches_background, (batch.ray_pixel.bincount() == 1))
+    assert torch.equal(batch.rgb, views.images.view(-1, 3)[batch.pixel_number])
+    expected = part_rays(views.cameras, batch.pixel_number[divided], 2).directions.view(-1, 4, 3)
     for parts, pixel in zip(expected, divided, strict=True):
-        torch.testing.assert_close(batch.rays.directions[batch.pixel == pixel], parts)
-    of_whole = torch.isin(batch.pixel, whole)
-    directions = pixel_rays(views.cameras, batch.index[batch.pixel[of_whole]]).directions
+        torch.testing.assert_close(batch.rays.directions[batch.ray_pixel == pixel], parts)
+    of_whole = torch.isin(batch.ray_pixel, whole)
+    directions = pixel_rays(views.cameras, batch.pixel_number[batch.ray_pixel[of_whole]]).directions
     torch.testing.assert_close(batch.rays.directions[of_whole], directions)
 
 
@@ -128,9 +128,9 @@ def test_pixels_of_the_object_are_divided_for_their_contrast(views: Views) -> No
     images[:, :, 20:] = 0.5  # an edge down the photograph, beside the cube and through it
     fine = replace(views, images=images)
     batch = batches_of(fine, Subdivision(2, 8.0, 0.1, contrast_start=1), 1000).batch(1)
-    angles = diverging(views.cameras, Snell(), CUBE)[batch.index]
-    refracted = Snell()(pixel_rays(views.cameras, batch.index), CUBE).refracted
-    edge = torch.isin(batch.index % SIDE, torch.tensor([19, 20]))
+    angles = diverging(views.cameras, Snell(), CUBE)[batch.pixel_number]
+    refracted = Snell()(pixel_rays(views.cameras, batch.pixel_number), CUBE).refracted
+    edge = torch.isin(batch.pixel_number % SIDE, torch.tensor([19, 20]))
     assert (edge & refracted & (angles < 8)).sum() > 5
     assert (edge & ~refracted).any(), "the sky beside the object is not divided"
     expected = (angles >= 8) | (edge & refracted)
@@ -143,7 +143,7 @@ def test_pixels_of_the_object_are_divided_for_their_contrast(views: Views) -> No
 def test_all_pixels_are_divided_and_steady_ones_teach_the_background(views: Views) -> None:
     batch = batches_of(views, Subdivision(2, 0.0), 1000).batch(1)
     assert len(of_pixels(batch, False)) == 0
-    angles = diverging(views.cameras, Snell(), CUBE)[batch.index]
+    angles = diverging(views.cameras, Snell(), CUBE)[batch.pixel_number]
     assert (angles >= 8).any()
     assert torch.equal(batch.teaches_background, angles < 8)
 
@@ -170,11 +170,11 @@ def test_batches_and_renderings_do_not_depend_on_the_process_or_the_chunk(views:
     sampled = model.render_path(whole.path, whole.draws)[-1].samples.s
     assert len(whole.draws.ray.unique()) == len(whole.rays) > 60
     for rank in range(3):
-        share, own = batches.share(rank, 3).batch(4), torch.arange(20 * rank, 20 * (rank + 1))
+        share, own = batches.for_rank(rank, 3).batch(4), torch.arange(20 * rank, 20 * (rank + 1))
         for name in ("index", "rgb", "view", "teaches_background"):
             assert torch.equal(getattr(share, name), getattr(whole, name)[own])
-        rows = torch.isin(whole.pixel, own).nonzero()[:, 0]
-        assert torch.equal(share.pixel + 20 * rank, whole.pixel[rows])
+        rows = torch.isin(whole.ray_pixel, own).nonzero()[:, 0]
+        assert torch.equal(share.ray_pixel + 20 * rank, whole.ray_pixel[rows])
         assert torch.equal(share.draws.ray, whole.draws.ray[rows])
         assert torch.equal(share.rays.directions, whole.rays.directions[rows])
         assert torch.equal(share.path.exit_directions, whole.path.exit_directions[rows])

@@ -199,7 +199,7 @@ class EnvironmentMap(Boundary):
 
 
 def _radiance(raw: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
-    """Map raw values to linear radiance, by the square of a softplus that is 0.5 at 0; see `HashGridField`."""
+    """Map raw values to linear radiance, by the square of a softplus that is 0.5 at 0 (see `networks.radiance`)."""
     return (F.softplus(raw.float()) * _GREY).square()
 
 

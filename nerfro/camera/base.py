@@ -12,10 +12,10 @@ from nerfro.cameras import Cameras
 from nerfro.rays import Rays
 
 
-class Camera(nn.Module, ABC):
+class CameraModel(nn.Module, ABC):
     """Estimated poses, lens and exposures of the training views. Derive from this class to add a camera model.
 
-    The parameters of a camera model are trained with the scene.
+    Gradient descent learns the exposures; poses and lens are moved by the phase `cameras`.
 
     Args:
         exposure: whether to estimate a gain for each training view.

@@ -5,13 +5,13 @@ from __future__ import annotations
 from jaxtyping import Int
 from torch import Tensor
 
-from nerfro.camera.base import Camera
+from nerfro.camera.base import CameraModel
 from nerfro.rays import Rays
 from nerfro.registry import register
 
 
 @register("camera", "given")
-class GivenCamera(Camera):
+class GivenCamera(CameraModel):
     """Keep the cameras of the data set.
 
     Args:

@@ -1,1 +1,1 @@
-"""Reconstruction of lens, poses, masks, surface and refractive index from photographs."""
+"""Optics of a photographed object: surroundings, refractive index, and refinement of the surface."""

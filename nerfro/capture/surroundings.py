@@ -301,7 +301,7 @@ def _learn(boundary: Boundary, pixels: Pixels, steps: int, batch: int, progress:
             functional.mse_loss(seen, drawn.radiance).backward()
             optimizer.step()
             if isinstance(boundary, Room):
-                boundary.sampler.after_step([boundary.field], Draws(0, step + 1, torch.arange(batch)))
+                boundary.sampler.update([boundary.field], Draws(0, step + 1, torch.arange(batch)))
             progress((step + 1) / steps)
     boundary.eval().requires_grad_(False)
 

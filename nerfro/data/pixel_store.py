@@ -40,7 +40,7 @@ class PixelStore:
         """Size of all colours in memory."""
         return self._levels.nbytes
 
-    def forget(self) -> None:
+    def release_memory(self) -> None:
         """Release the memory of a memory-mapped store. The pages are read again on the next access."""
         if isinstance(self._array, np.memmap) and hasattr(mmap, "MADV_DONTNEED"):
             self._array._mmap.madvise(mmap.MADV_DONTNEED)  # type: ignore[attr-defined]

@@ -11,7 +11,7 @@ from nerfro.registry import register
 from nerfro.rendering import Scene
 from nerfro.types import Batch, Rendering
 
-# Rays count if their final transmittance is above this value, as in the paper.
+# Pixels count if their final transmittance is above this value, as in the paper.
 _MIN_TRANSMITTANCE = 0.5
 
 
@@ -21,7 +21,7 @@ class BoundaryRegulariser(Loss):
 
     The background should explain such pixels without the field, so the loss removes fog in front of the surface. Only
     the density of the finest level learns, because the colour of the background is detached. Channels are summed, and
-    the sum over rays is divided by the number of rays plus one, as in the authors' code.
+    the sum over pixels is divided by the number of counted pixels plus one, as in the authors' code.
 
     Args:
         refracted_only: whether to count only rays that meet the medium.
@@ -36,11 +36,11 @@ class BoundaryRegulariser(Loss):
     def forward(self, renderings: list[Rendering], batch: Batch, scene: Scene) -> Float[Tensor, ""]:
         fine = renderings[-1]
         path = fine.path
-        counts = batch.per_pixel(path.per_ray(fine.transmittance.detach())) > _MIN_TRANSMITTANCE
+        counted = batch.per_pixel(path.per_ray(fine.transmittance.detach())) > _MIN_TRANSMITTANCE
         if self.refracted_only:
-            counts = counts & (batch.per_pixel(path.first_of_ray(path.refracted).to(fine.rgb)) > 0.5)
+            counted = counted & (batch.per_pixel(path.first_of_ray(path.refracted).to(fine.rgb)) > 0.5)
         background = path.per_ray(fine.transmittance[:, None] * fine.boundary_rgb.detach())
         shown = scene.colour_space.to_srgb(batch.per_pixel(background))
         error = (shown - batch.rgb).abs().sum(-1)
         # Gradients are averaged over processes, so each process multiplies its sum by the number of processes.
-        return (error * counts).sum() * rank_and_size()[1] / (sum_over_processes(counts.sum()) + 1)
+        return (error * counted).sum() * rank_and_size()[1] / (sum_over_processes(counted.sum()) + 1)

@@ -30,7 +30,7 @@ class TotalVariation(Loss):
 
     Args:
         angle: angle between the two directions in degrees. None derives it from the photographs: two texels of the
-            finest level of the background.
+            finest level of the background that gradient descent learns.
     """
 
     weight = 1e-3

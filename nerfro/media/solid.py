@@ -167,8 +167,12 @@ class Solid(Medium):
         phi, body = phi.cummax(-1)
         return phi, gradients.gather(-2, body[..., None].expand_as(gradients))
 
-    def innermost(self, inside: Bool[Tensor, "*batch K"]) -> Int[Tensor, "*batch"]:
-        """Return the number of the body that contains a point, given which surfaces enclose it; 0 for none."""
+    def deciding_body(self, inside: Bool[Tensor, "*batch K"]) -> Int[Tensor, "*batch"]:
+        """Return the number of the body that decides the index and absorption at a point, from 1; 0 in air.
+
+        Args:
+            inside: whether the surface of each body encloses the point.
+        """
         numbers = torch.arange(inside.shape[-1] + 1, device=inside.device)
         if self.nested:
             # Air in a vessel is the air outside: a ray passes between them without an event.

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from nerfro.allowed import checked
 from nerfro.boundaries.base import Boundary, background_radiance
-from nerfro.camera.base import Camera
+from nerfro.camera.base import CameraModel
 from nerfro.camera.given import GivenCamera
 from nerfro.draws import Draws
 from nerfro.fields.base import Field
@@ -47,7 +47,7 @@ class Components:
     point_sampler: PointSampler
     make_field: Callable[[], Field]
     boundary: Boundary
-    camera: Camera = dataclasses.field(default_factory=GivenCamera)
+    camera: CameraModel = dataclasses.field(default_factory=GivenCamera)
     chunk_size: int = 8192
 
 
@@ -154,10 +154,11 @@ class Renderer(nn.Module, ABC):
         return background_radiance(self.scene.boundary, path.exits(directions), teaches)
 
     def trace(self, rays: Rays, path: Path | None = None) -> Path:
-        """Trace rays, or complete traced paths by their gradients and the absorption of the medium."""
+        """Trace rays, or add gradients and absorption to paths that were traced before."""
         medium = self.scene.medium
         path = self.path_sampler(rays, medium) if path is None else path
-        return medium.with_absorption(self._refined(path, rays) if self.paths_learn else path)
+        learns = self.paths_learn and torch.is_grad_enabled()
+        return medium.with_absorption(self._refined(path, rays) if learns else path)
 
     def exit_directions(self, rays: Rays) -> Float[Tensor, "R 3"]:
         """Return the unit exit direction of the main polyline of each ray; other branches are not traced."""
@@ -165,9 +166,9 @@ class Renderer(nn.Module, ABC):
 
     @property
     def paths_learn(self) -> bool:
-        """Whether paths depend on learned parameters, and must be traced in the training step."""
+        """Whether paths depend on parameters that gradient descent learns."""
         parameters = [*self.scene.path_parameters(), *self.path_sampler.parameters()]
-        return torch.is_grad_enabled() and any(parameter.requires_grad for parameter in parameters)
+        return any(parameter.requires_grad for parameter in parameters)
 
     @torch.inference_mode()
     def render(self, rays: Rays) -> RenderedRays:

@@ -8,7 +8,7 @@ import torch
 from torch import nn
 
 from nerfro.boundaries.base import Boundary
-from nerfro.camera.base import Camera
+from nerfro.camera.base import CameraModel
 from nerfro.camera.given import GivenCamera
 from nerfro.errors import NerfroError
 from nerfro.fields.base import Field
@@ -35,7 +35,7 @@ class Scene(nn.Module):
         medium: Medium,
         fields: Sequence[Field],
         boundary: Boundary,
-        camera: Camera | None = None,
+        camera: CameraModel | None = None,
         colour_space: ColourSpace = ColourSpace.LINEAR,
     ) -> None:
         super().__init__()

@@ -87,12 +87,12 @@ class PointSampler(nn.Module, ABC):
         """Return a traced path with the samples of its first level, or the path itself to sample it in the step.
 
         A thread may choose the samples of the next step during a step, so they may depend on the state that
-        `after_step` updates, but on no learned parameter.
+        `update` updates, but on no learned parameter.
         """
         return path
 
-    def after_step(self, fields: Sequence[Field], draws: Draws) -> None:
-        """Update the state of the sampler after a training step.
+    def update(self, fields: Sequence[Field], draws: Draws) -> None:
+        """Update the state of the sampler before a training step, except the first.
 
         Args:
             fields: radiance field of each sampling level after `draws.step` training steps.

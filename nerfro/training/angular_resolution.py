@@ -18,7 +18,7 @@ _MOST_BESIDE_FITS, _MOST_ALONE = 256, 512
 _COMPARED_TEXELS = 2
 
 
-def settle_angular_resolution(config: DictConfig, cameras: Cameras) -> None:
+def derive_angular_resolution(config: DictConfig, cameras: Cameras) -> None:
     """Set the missing resolutions of `boundary=envmap`, and the missing angle of `loss=total_variation`.
 
     A texel of the finest level is about as wide as a pixel. If a volume covers all of space, the background shows only

@@ -19,7 +19,7 @@ _NUM_IMAGES = 8
 _OF_BORDER, _OF_IMAGES, _OF_PIXELS = 0.9, 0.8, 0.3
 
 
-def settle_backdrop(config: DictConfig, images: LazyImages | Float[Tensor, "V H W 3"]) -> None:
+def derive_backdrop(config: DictConfig, images: LazyImages | Float[Tensor, "V H W 3"]) -> None:
     """Set the colour of `loss=backdrop` and of the background if the photographs have a plain backdrop.
 
     Args:

@@ -22,7 +22,7 @@ from nerfro.registry import discover
 from nerfro.rendering import Renderer
 from nerfro.rendering.scene_file import with_scene
 from nerfro.samplers.paths.thin_walls import warn_of_thin_walls
-from nerfro.training.config import TrainConfig, build_data, build_each, build_model, check_run, settle_trainer
+from nerfro.training.config import TrainConfig, build_data, build_each, build_model, check_run, resolve_trainer_options
 from nerfro.training.data_module import RayDataModule, traced
 from nerfro.training.memory import require_memory
 from nerfro.training.module import TrainingModule
@@ -60,7 +60,7 @@ def build(experiment: str | None = None, overrides: Sequence[str] = ()) -> tuple
         raise NerfroError(in_one_line(error)) from error
     check_configuration(config, TrainConfig, CONF_DIR)
     check_run(config)
-    settle_trainer(config)
+    resolve_trainer_options(config)
     if config.callbacks:
         warn("nerfro.build ignores callbacks; give them to your own Trainer: lightning.Trainer(callbacks=[...])")
     seed_everything(config.seed, verbose=False)
@@ -94,7 +94,7 @@ def build_training(config: DictConfig, source: DataSource, training: Views) -> t
     return TrainingModule.of(renderer, config, [Schedule(build_each("phase", config.phase), training)]), data
 
 
-def check_first_batch(renderer: Renderer, batches: RayBatches, device: torch.device) -> str:
+def check_before_training(renderer: Renderer, batches: RayBatches, device: torch.device) -> str:
     """Refuse a run whose rays miss the field, or that needs more memory than is free; warn of thin walls.
 
     Args:

@@ -38,9 +38,9 @@ from nerfro.registry import build, check_node, configure, create, find, plugins,
 from nerfro.rendering import Components, Renderer
 from nerfro.subdivision import Subdivision
 from nerfro.synthetic import SCENES
-from nerfro.training.angular_resolution import settle_angular_resolution
-from nerfro.training.backdrop import settle_backdrop
-from nerfro.training.content import ContentConfig, require_contraction, settle_content
+from nerfro.training.angular_resolution import derive_angular_resolution
+from nerfro.training.backdrop import derive_backdrop
+from nerfro.training.content import ContentConfig, derive_content, require_contraction
 from nerfro.training.optimizer import OptimizerConfig
 
 Score = Annotated[str, Names(lambda: [plugin.name for plugin in plugins("metric")])]  # of a region: mask.NAME
@@ -56,7 +56,7 @@ class SamplerConfig:
 
 @dataclass
 class BatchesConfig:
-    """Selection of the training pixels."""
+    """Selection of the training pixels; defaults as in the paper, which conf/train.yaml changes."""
 
     size: NumRays = 1024  # number of pixels in a step
     # Whether the pixels of a step come from one image or from all images.
@@ -97,10 +97,10 @@ _EPOCHS = "a run has no epochs; set trainer.max_steps, trainer.max_time or evalu
 
 @dataclass
 class TrainerConfig:
-    """The arguments of Lightning's Trainer; None selects the default of Lightning."""
+    """Arguments of Lightning's Trainer; those that nerfro sets itself are refused. None is Lightning's default."""
 
     _target_: str = "lightning.pytorch.Trainer"
-    accelerator: str = "auto"
+    accelerator: str = "auto"  # the CPU; gpu or cuda selects a GPU
     devices: Any = 1
     num_nodes: Optional[Count] = None  # noqa: UP045
     strategy: Any = "auto"
@@ -277,7 +277,7 @@ def clock_time(duration: object) -> object:
     return f"{seconds // 86400:02d}:{seconds // 3600 % 24:02d}:{seconds // 60 % 60:02d}:{seconds % 60:02d}"
 
 
-def settle_trainer(config: DictConfig) -> None:
+def resolve_trainer_options(config: DictConfig) -> None:
     """Convert `max_time`, and shorten the run to a few steps and one scored view for `debug` or `fast_dev_run`."""
     config.trainer.max_time = clock_time(config.trainer.max_time)
     fast = config.trainer.fast_dev_run
@@ -353,11 +353,13 @@ def build_model(config: DictConfig, training: Views | None = None) -> Renderer:
     """
     path_sampler = build(config.sampler.path)
     medium = build(config.medium) if path_sampler.needs_medium else Vacuum()
-    settle_content(config, medium, None if training is None else training.cameras)
+    # The order matters: the field is built for the derived space, and a plain backdrop replaces the background whose
+    # resolution would be derived.
+    derive_content(config, medium, None if training is None else training.cameras)
     camera = build(config.camera)
     if training is not None:
-        settle_backdrop(config, training.images)
-        settle_angular_resolution(config, training.cameras)
+        derive_backdrop(config, training.images)
+        derive_angular_resolution(config, training.cameras)
         camera.begin(training.cameras)
     components = Components(
         medium=medium,

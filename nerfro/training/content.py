@@ -52,7 +52,7 @@ class ContentConfig:
     cells: Optional[Count] = None  # noqa: UP045
 
 
-def settle_content(config: DictConfig, medium: Medium, cameras: Cameras | None = None) -> None:
+def derive_content(config: DictConfig, medium: Medium, cameras: Cameras | None = None) -> None:
     """Derive the missing settings of `config.content`.
 
     Args:
@@ -75,7 +75,7 @@ def settle_content(config: DictConfig, medium: Medium, cameras: Cameras | None =
         elif content.space == "box":
             _require_no_box(config)
     if content.space == "all" and None in (content.box_min, content.radius, content.near, content.cells):
-        _settle_ball(content, build(config.data).load("train").cameras if cameras is None else cameras)
+        _derive_ball(content, build(config.data).load("train").cameras if cameras is None else cameras)
 
 
 def require_contraction(config: DictConfig) -> None:
@@ -103,7 +103,7 @@ def describe(content: DictConfig) -> str:
     )
 
 
-def _settle_ball(content: DictConfig, cameras: Cameras) -> None:
+def _derive_ball(content: DictConfig, cameras: Cameras) -> None:
     """Derive the ball between the cameras, and the resolution of the cameras in the ball."""
     poses = cameras.camera_to_world.double().cpu().numpy()
     centres, forward = poses[:, :, 3], -poses[:, :, 2]

@@ -11,7 +11,7 @@ from typing import Generic, TypeVar, cast
 
 import torch
 from jaxtyping import Float
-from lightning.pytorch import LightningDataModule
+from lightning.pytorch import LightningDataModule, Trainer
 from omegaconf import DictConfig
 from torch import Tensor, nn
 
@@ -44,7 +44,8 @@ class RayDataModule(LightningDataModule):
     Each validation (`validation_interval`) evaluates the validation pixels, and every fifth one also renders a view.
 
     Lightning fetches data one step early. Therefore the loader yields the numbers of steps, and the batch is made when
-    its step begins, so that paths depend on the current medium.
+    its step begins, or one step ahead if no learned parameter bends paths. Phases that precede the step come after the
+    batch: directly after a step of `phase=cameras`, paths of one batch belong to the previous cameras.
     """
 
     def __init__(
@@ -59,13 +60,16 @@ class RayDataModule(LightningDataModule):
     def train_dataloader(self) -> Iterator[int]:
         assert self.trainer is not None  # attached by Lightning
         device, module = self.trainer.strategy.root_device, cast(TrainingModule, self.trainer.lightning_module)
-        shared = self.batches.share(self.trainer.global_rank, self.trainer.world_size)
-        self.batches = shared.to(device, cast(torch.dtype, module.dtype))
+        self.batches = self.batches_of(self.trainer).to(device, cast(torch.dtype, module.dtype))
         self.end_thread()
         if can_prefetch(module.renderer):
             self._ahead = Prefetcher(self._batch, spare_core=not multiplies_large_matrices(module.renderer))
         # Lightning calls this method after restoring a checkpoint, so a resumed run continues with the next batch.
         return itertools.count(self.trainer.global_step)
+
+    def batches_of(self, trainer: Trainer) -> RayBatches:
+        """Return the part of the batches that belongs to the process of a Trainer."""
+        return self.batches.for_rank(trainer.global_rank, trainer.world_size)
 
     def val_dataloader(self) -> RotatingView | list[int]:
         return [] if self.validation is None else RotatingView(self)
@@ -96,13 +100,13 @@ class RayDataModule(LightningDataModule):
 
     def teardown(self, stage: str) -> None:
         self.end_thread()
-        self.batches.forget()
+        self.batches.release_memory()
 
     def on_exception(self, exception: BaseException) -> None:
         self.end_thread()
 
     def prefetch(self) -> None:
-        """Begin to make the batch of the next step, once everything on which it depends is up to date."""
+        """Begin to make the batch of the next step; the density grid is up to date."""
         if self._ahead is not None:
             self._ahead.begin_next()
 
@@ -171,8 +175,7 @@ def multiplies_large_matrices(renderer: Renderer) -> bool:
 def can_prefetch(renderer: Renderer) -> bool:
     """Return whether a thread can trace the rays of the next step: no parameter changes paths, and a core is free."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    with torch.enable_grad():
-        return cores > 1 and not renderer.paths_learn and renderer.path_sampler.releases_gil(renderer.scene.medium)
+    return cores > 1 and not renderer.paths_learn and renderer.path_sampler.releases_gil(renderer.scene.medium)
 
 
 def traced(batches: RayBatches, renderer: Renderer, config: DictConfig) -> RayBatches:

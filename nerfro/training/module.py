@@ -52,7 +52,7 @@ class TrainingModule(LightningModule):
 
     @classmethod
     def of(cls, renderer: Renderer, config: DictConfig, callbacks: Sequence[Callback] = ()) -> TrainingModule:
-        """Train a model with the losses and the optimizer of a run's configuration."""
+        """Create the module from a configuration."""
         configuration = OmegaConf.to_yaml(config, resolve=True)
         optimizer = cast(OptimizerConfig, OmegaConf.to_object(config.optimizer))
         return cls(renderer, build_each("loss", config.loss), optimizer, callbacks, configuration)
@@ -98,7 +98,7 @@ class TrainingModule(LightningModule):
         with self._full_precision():
             rays = camera(batch.rays, batch.ray_view)
         path = self.renderer.trace(rays, batch.path)
-        renderings = self.renderer.render_path(path, batch.draws, batch.teaches_background[batch.pixel])
+        renderings = self.renderer.render_path(path, batch.draws, batch.teaches_background[batch.ray_pixel])
         if (gains := camera.gains(batch.ray_view)) is not None:
             renderings = [rendering.exposed(gains) for rendering in renderings]
         total = torch.zeros((), device=self.device)
@@ -148,7 +148,7 @@ class TrainingModule(LightningModule):
         # At the end of the previous step, the update would follow the checkpoint, and a resumed run would miss it.
         if self.global_step > 0:
             draws = replace(batch.draws, step=self.global_step)  # a repeated batch repeats its number
-            self.renderer.point_sampler.after_step(list(self.scene.fields), draws)  # type: ignore[arg-type]
+            self.renderer.point_sampler.update(list(self.scene.fields), draws)  # type: ignore[arg-type]
         self.trainer.datamodule.prefetch()  # type: ignore[attr-defined]
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:

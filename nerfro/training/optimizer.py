@@ -34,7 +34,10 @@ class GroupConfig:
 @checked("optimizer")
 @dataclass
 class OptimizerConfig:
-    """Adam with a log-linear learning rate and a sine warm-up (authors' code; mip-NeRF, section 4)."""
+    """Adam with a log-linear learning rate and a sine warm-up (authors' code; mip-NeRF, section 4).
+
+    The defaults are those of the paper; conf/train.yaml changes them.
+    """
 
     learning_rate: Positive = 5e-4  # initial learning rate
     final_learning_rate: Positive = 5e-6  # learning rate at the end of the run

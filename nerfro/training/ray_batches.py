@@ -107,12 +107,12 @@ class RayBatches:
         traced.subdivision = subdivision or Subdivision()
         return traced
 
-    def forget(self) -> None:
+    def release_memory(self) -> None:
         """Release the memory of mapped pixels, which are read again on demand."""
-        self._pixels.forget()
+        self._pixels.release_memory()
 
-    def share(self, rank: int, size: int) -> RayBatches:
-        """Return the sequence of process `rank` of `size`, which has an equal part of every batch."""
+    def for_rank(self, rank: int, size: int) -> RayBatches:
+        """Return the batches of process `rank` of `size` processes, each with an equal part of the pixels."""
         if self.batch_size % size:
             raise NerfroError(
                 f"batches.size={self.batch_size} cannot be shared evenly by {size} processes; take a multiple of {size}"
@@ -144,13 +144,13 @@ class RayBatches:
         found = self._rays(pixels, step)
         return Batch(
             rays=found.rays,
-            pixel=found.pixel,
-            index=pixels,
+            ray_pixel=found.ray_pixel,
+            pixel_number=pixels,
             view=cameras.view_of(pixels),
             rgb=self._pixels[pixels],
             teaches_background=~found.diverges,
             cameras=cameras.crop(window),
-            draws=replace(draws, ray=slot[found.pixel] * self.subdivision.side**2 + found.part),
+            draws=replace(draws, ray=slot[found.ray_pixel] * self.subdivision.side**2 + found.part),
             path=found.path,
         )
 

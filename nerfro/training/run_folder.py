@@ -47,7 +47,7 @@ _SPARE_BYTES = 64 * 2**20  # images and logs, in addition to checkpoints
 
 
 @contextmanager
-def own(folder: Path, config: DictConfig) -> Iterator[Path | None]:
+def lock_run(folder: Path, config: DictConfig) -> Iterator[Path | None]:
     """Lock the folder of a run, and yield the checkpoint from which the run resumes, or None.
 
     Raises:

@@ -83,7 +83,7 @@ class ValidationPixels:
             subdivision: which pixels get several rays.
         """
         found, rgb = self.rays(renderer, subdivision), self.rgb.to(renderer.scene.device)
-        radiance = mean_per_pixel(renderer.radiance(found.rays), found.pixel, len(rgb))
+        radiance = mean_per_pixel(renderer.radiance(found.rays), found.ray_pixel, len(rgb))
         if renderer.scene.camera.exposure is None:
             return _psnr(renderer.scene.colour_space.to_display(radiance), rgb)
         views = self.cameras.view_of(self.index.to(renderer.scene.device))

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from nerfro.camera.base import Camera
+from nerfro.camera.base import CameraModel
 from nerfro.camera.similarity import motion_between
 from nerfro.cameras import Cameras
 from nerfro.data.base import Views
@@ -82,7 +82,7 @@ def read_cameras(file: Path, geometry: CaptureGeometry, origin: Float[np.ndarray
     )
 
 
-def write_cameras(file: Path, camera: Camera, views: Views, origin: Float[np.ndarray, "3"] = WORLD_ORIGIN) -> None:
+def write_cameras(file: Path, camera: CameraModel, views: Views, origin: Float[np.ndarray, "3"] = WORLD_ORIGIN) -> None:
     """Write the estimated training cameras as a `transforms.json` for `data=nerfstudio`, if cameras are optimized.
 
     Positions of `views` are relative to `origin`. Each frame also has the motion of its camera (`turned_degrees`, and

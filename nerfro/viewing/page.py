@@ -90,7 +90,7 @@ def static_parts(scene: TrainedScene, views: Views, split: str) -> dict[str, Any
         with_photograph = {i * len(views) // _MAX_PHOTOGRAPHS for i in range(_MAX_PHOTOGRAPHS)}
     return {
         "linear": renderer.scene.colour_space is ColourSpace.LINEAR,
-        "reflection": renderer.path_sampler.branching.num_events > 0,
+        "reflection": renderer.path_sampler.branching.max_split_events > 0,
         "orbit": {
             "target": box.mean(0).tolist(),
             "radius": float((box[1] - box[0]).norm() / 2),

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from nerfro.camera.base import Camera
+from nerfro.camera.base import CameraModel
 from nerfro.camera.exposure import PerView
 from nerfro.camera.similarity import similarity
 from nerfro.cameras import Cameras
@@ -88,10 +88,10 @@ class _Motions(PerView):
 
 
 @register("camera", "refined")
-class RefinedCamera(Camera):
+class RefinedCamera(CameraModel):
     """Refine the pose of each training camera, and optionally the common lens, during training.
 
-    The phase `cameras` of the training moves them (`phase`). The motion that a similarity
+    The phase `cameras` moves the cameras. The motion that a similarity
     transformation of the world would cause is removed to first order, so that the world and the surface keep their
     place.
 

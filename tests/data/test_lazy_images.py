@@ -105,7 +105,7 @@ def test_mapped_pixels_are_made_once_for_a_content(bits: int, tmp_path: Path, mo
         assert torch.equal(PixelStore(LazyImages.of(paths, reader))[EVERY], resident)
     assert len(reader.decoded) == NUM_VIEWS
     mapped = PixelStore(LazyImages.of(paths, reader))
-    mapped.forget()
+    mapped.release_memory()
     assert torch.equal(mapped[EVERY], resident)
     half = PixelStore(LazyImages.of(paths, reader, recipe="other"))
     assert len(reader.decoded) == 2 * NUM_VIEWS  # another recipe may make other colours of the same files

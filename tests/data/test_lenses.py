@@ -9,7 +9,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from nerfro.camera.base import Camera
+from nerfro.camera.base import CameraModel
 from nerfro.data.blender import BlenderData
 from nerfro.data.lenses import Lens, check_lenses, read_lens
 from nerfro.lens import coefficients, opencv_coefficients
@@ -163,7 +163,7 @@ def test_lenses_beyond_reason_are_refused_in_every_format(tmp_path: Path, form: 
 @pytest.mark.parametrize("dist", [[0.1, -0.02, 0.001, 0.002, 0.003], [0.4, 0.05, 0.001, -0.002, 0.002, 0.6, 0.1, 0.01]])
 def test_written_cameras_keep_their_distortion(tmp_path: Path, dist: list[float]) -> None:
     views = FORMATS["opencv"].load(write_opencv(tmp_path, dist=dist))
-    camera: Any = Mock(spec=Camera, moves=True, exposure=None, estimated=lambda cameras: cameras)
+    camera: Any = Mock(spec=CameraModel, moves=True, exposure=None, estimated=lambda cameras: cameras)
     write_cameras(tmp_path / "transforms.json", camera, views)
     read = NerfstudioData(str(tmp_path), near=0.5, far=9.0, test_every=2).load("train").cameras.distortion
     np.testing.assert_allclose(read, views.cameras.distortion[1::2], rtol=1e-5)

@@ -85,6 +85,19 @@ def test_light_passes_from_one_touching_body_to_the_other(gap: float, upper_firs
         assert angle(path.directions[0, 2], expected) < 0.01
 
 
+def test_a_gap_is_air_from_both_sides_if_the_smaller_body_resolves_it(tmp_path: Path) -> None:
+    """Light can be followed backwards, although the searches for the two surfaces have steps of different lengths."""
+    gap = 4e-4  # between the steps, 2e-4 and 1e-3
+    for name, side, z in (("small", 0.5, 0.25 + gap), ("large", 4.0, -2.0)):
+        shape = trimesh.creation.box([side] * 3, trimesh.transformations.translation_matrix([0, 0, z]))
+        shape.export(tmp_path / f"{name}.ply")
+    medium = _medium(**{name: {"mesh": str(tmp_path / f"{name}.ply"), "ior": 1.5} for name in ("small", "large")})
+    directions = torch.tensor([[0.1, 0.0, -0.99499], [-0.1, 0.0, 0.99499]])
+    origins = torch.tensor([[-0.1, 0.0, 1.0], [0.5, 0.0, -5.0]])
+    path = Snell()(make_rays(origins, directions, 0.0, 9.0), medium)
+    assert path.body[:, :6].tolist() == [[0, 1, 0, 2, 0, 0], [0, 2, 0, 1, 0, 0]]
+
+
 @pytest.mark.parametrize(
     ("order", "priorities", "owner"),
     [("ab", (0, 0), "b"), ("ba", (0, 0), "a"), ("ab", (1, 0), "a"), ("ba", (0, 1), "b"), ("ba", (-1, 0), "b")],

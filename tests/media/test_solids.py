@@ -76,7 +76,7 @@ def test_a_nested_body_is_only_within_those_before_it() -> None:
     n, gradient = medium(places)
     torch.testing.assert_close(n, torch.tensor([1.33, 1.0, 1.5, 1.5, 1.0]), atol=2e-3, rtol=0)
     assert (gradient == 0).all()
-    assert medium.innermost(medium.signed_distances(places)[0] < 0).tolist() == [3, 0, 1, 1, 0]
+    assert medium.deciding_body(medium.signed_distances(places)[0] < 0).tolist() == [3, 0, 1, 1, 0]
 
 
 @pytest.mark.parametrize("make", [_nested_balls, _half_full_ball])

@@ -73,7 +73,7 @@ def scores(space: dict, boundary: Boundary, num_steps: int = 150) -> list[float]
     optimizer = torch.optim.Adam(parameters, eps=1e-15)
     for step in range(num_steps):
         draws = Draws(0, step, torch.arange(512))
-        sampler.after_step([field], draws)
+        sampler.update([field], draws)
         optimizer.param_groups[0]["lr"] = 4e-2 * 0.1 ** (step / num_steps)
         chosen = torch.randint(len(target), (512,))
         loss = (rendered(path[chosen], sampler, field, boundary, draws) - target[chosen]).square().mean()

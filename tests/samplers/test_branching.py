@@ -102,8 +102,8 @@ def test_compiled_branches_are_those_of_torch(iors: list[float], monkeypatch: py
     fast = sampler.trace(rays, medium)
     # The same with too little room for polylines and vertices at first.
     assert torch.bincount(fast.path.ray).max() > 4
-    monkeypatch.setattr(compiled, "_ROOM", 2)
-    monkeypatch.setattr(compiled, "_CAPACITY", 5)
+    monkeypatch.setattr(compiled, "_MAX_POLYLINES", 2)
+    monkeypatch.setattr(compiled, "_MAX_VERTICES", 5)
     again = sampler.trace(rays, medium)
     for name in ("ray", "positions", "directions", "s", "body", "throughput", "radii"):
         assert torch.equal(getattr(again.path, name), getattr(fast.path, name))

@@ -28,7 +28,7 @@ ALL_OF_SPACE = {"radius": 0.7, "near": 0.3, "max_bin_alpha": 0.4}
 def trained_sampler(**space: float) -> DensityGridSampler:
     sampler = DensityGridSampler(num_samples=16, num_bins=64, resolution=32, update_every=1, **space)
     for step in range(200):
-        sampler.after_step([DenseBall()], example_draws(step=step))
+        sampler.update([DenseBall()], example_draws(step=step))
     return sampler
 
 
@@ -120,7 +120,7 @@ class Fog(Field):
 def test_small_updates_reach_all_cells(resolution: int, fraction: float) -> None:
     sampler = DensityGridSampler(resolution=resolution, update_fraction=fraction, update_every=1)
     for step in range(12 * resolution**3):
-        sampler.after_step([Fog()], example_draws(step=step))
+        sampler.update([Fog()], example_draws(step=step))
     assert (sampler.density > 0).all()
 
 

@@ -8,9 +8,9 @@ from omegaconf import DictConfig, OmegaConf
 from nerfro.cameras import Cameras
 from nerfro.media.analytic import Vacuum
 from nerfro.registry import discover, find
-from nerfro.training.angular_resolution import settle_angular_resolution
+from nerfro.training.angular_resolution import derive_angular_resolution
 from nerfro.training.config import TrainConfig
-from nerfro.training.content import common_target, describe, settle_content
+from nerfro.training.content import common_target, derive_content, describe
 from tests.exact_silhouettes import cameras_around
 
 MIDDLE = np.array([0.4, -2.0, 1.0])
@@ -28,7 +28,7 @@ def of_all_space(**content: object) -> DictConfig:
     config.medium = {}
     config.content.space = "all"
     config.content.update(content)
-    settle_content(config, Vacuum(), around(7))
+    derive_content(config, Vacuum(), around(7))
     return config.content
 
 
@@ -59,7 +59,7 @@ def test_axes_that_are_parallel_are_followed_to_a_usual_depth() -> None:
 def test_a_box_covers_nothing_else_and_needs_no_cameras() -> None:
     config = OmegaConf.structured(TrainConfig)
     config.content.box_min, config.content.box_max = [0.0] * 3, [1.0] * 3
-    settle_content(config, Vacuum())
+    derive_content(config, Vacuum())
     assert config.content.radius is None
     assert describe(config.content) == ""
 
@@ -88,7 +88,7 @@ def test_finest_texel_follows_the_pixel(
         "loss": {"total_variation": {"weight": 1.0, "angle": None}},
         "phase": {"background": {"steps": 10 if fits else 0}},
     })  # fmt: skip
-    settle_angular_resolution(config, cameras)
+    derive_angular_resolution(config, cameras)
     assert max(config.boundary.resolutions) == descent
     assert max([*config.boundary.resolutions, *(config.boundary.fitted_resolutions or ())]) == finest
     if given is None and side < 4000 and fits:

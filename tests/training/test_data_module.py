@@ -127,13 +127,13 @@ def test_weights_depend_neither_on_the_thread_nor_on_an_interruption(
     def weights(name: str, cores: set[int], *overrides: str) -> dict[str, torch.Tensor]:
         monkeypatch.setattr("os.sched_getaffinity", lambda pid: cores, raising=False)
         # A batch that is begun before the update is finished before the update.
-        monkeypatch.setattr(DensityGridSampler, "after_step", lambda *given: time.sleep(0.05) or update(*given))
+        monkeypatch.setattr(DensityGridSampler, "update", lambda *given: time.sleep(0.05) or update(*given))
         even = ["optimizer.learning_rate=1e-2", "optimizer.final_learning_rate=1e-2"]
         options = [*even, "evaluation=none", "trainer.max_steps=7", "sampler.points.update_every=2", *overrides]
         train(*options, f"hydra.run.dir={tmp_path / name}")
         return weights_of(tmp_path / name)
 
-    update = DensityGridSampler.after_step
+    update = DensityGridSampler.update
     expected = weights("one core", {0})
     weights("resumed", {0, 1}, "trainer.max_steps=4")
     for found in (weights("two cores", {0, 1}), weights("resumed", {0, 1}, "ckpt_path=last")):
@@ -152,7 +152,7 @@ def test_a_batch_is_made_when_its_step_begins_if_paths_learn(
     batches: Any = Mock(spec=RayBatches, batch=lambda step: made.append(step) or batch)
     batches.share = lambda rank, size: batches
     batches.to = lambda device, dtype: batches
-    batches.forget = lambda: None
+    batches.release_memory = lambda: None
     data = RayDataModule(batches, None, 0)
     scene = Mock(spec=Scene, medium=ball)
     renderer = Mock(spec=Renderer, path_sampler=Snell(), scene=scene, paths_learn=learns, modules=list)

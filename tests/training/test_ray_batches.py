@@ -44,7 +44,7 @@ def place(index: torch.Tensor) -> torch.Tensor:
 @pytest.mark.parametrize("batching", ["single_image", "all_images"])
 def test_rays_and_colours_belong_to_the_index(views, batching):
     batch = RayBatches(views, 50, batching, seed=3).batch(7)
-    view, row, column = place(batch.index).unbind(-1)
+    view, row, column = place(batch.pixel_number).unbind(-1)
     assert torch.equal(batch.rgb, torch.stack([view, row, column], -1).float() / 16)
     assert torch.equal(batch.rays.directions, views.cameras.rays(view, row, column).directions)
     assert torch.equal(batch.rays.origins, views.cameras.camera_to_world[view, :, 3])
@@ -56,11 +56,11 @@ def test_batch_depends_on_seed_and_step_alone(views, batching):
     in_order = [batches.batch(step) for step in range(6)]
     again = RayBatches(views, 30, batching, seed=3)
     for step in (5, 0, 3):
-        assert torch.equal(again.batch(step).index, in_order[step].index)
+        assert torch.equal(again.batch(step).pixel_number, in_order[step].pixel_number)
         assert torch.equal(again.batch(step).rays.directions, in_order[step].rays.directions)
     other = RayBatches(views, 30, batching, seed=4)
-    assert not torch.equal(other.batch(0).index, in_order[0].index)
-    assert not torch.equal(in_order[0].index, in_order[1].index)
+    assert not torch.equal(other.batch(0).pixel_number, in_order[0].pixel_number)
+    assert not torch.equal(in_order[0].pixel_number, in_order[1].pixel_number)
 
 
 @pytest.mark.parametrize(
@@ -71,7 +71,7 @@ def test_masked_pixels_are_never_drawn_and_all_others_equally_often(given, batch
     batches = RayBatches(given, 96, batching, seed=0)
     counts = torch.zeros(NUM_VIEWS * HEIGHT * WIDTH)
     for step in range(800):
-        counts += torch.bincount(batches.batch(step).index, minlength=len(counts))
+        counts += torch.bincount(batches.batch(step).pixel_number, minlength=len(counts))
     usable = torch.ones(len(counts), dtype=torch.bool) if given.usable is None else given.usable.flatten()
     mean = 800 * 96 / int(usable.sum())
     assert counts[~usable].sum() == 0
@@ -93,7 +93,7 @@ def test_rows_share_all_usable_pixels(kind, request):
 def test_masked_batch_of_one_image_is_different_usable_pixels_of_it(masked):
     seen = set()
     for step in range(200):
-        index = RayBatches(masked, 1, seed=0).batch(step).index
+        index = RayBatches(masked, 1, seed=0).batch(step).pixel_number
         assert masked.usable.flatten()[index].all()
         seen.add(int(index) // (HEIGHT * WIDTH))
     assert seen == set(range(NUM_VIEWS))  # views are drawn alike, whatever their masks leave
@@ -102,9 +102,9 @@ def test_masked_batch_of_one_image_is_different_usable_pixels_of_it(masked):
     smallest = int(two.usable.sum((1, 2)).min())
     for step in range(20):
         batch = RayBatches(two, smallest, seed=0).batch(step)
-        assert two.usable.flatten()[batch.index].all()
-        assert len(batch.index.unique()) == smallest
-        assert len((batch.index // (HEIGHT * WIDTH)).unique()) == 1
+        assert two.usable.flatten()[batch.pixel_number].all()
+        assert len(batch.pixel_number.unique()) == smallest
+        assert len((batch.pixel_number // (HEIGHT * WIDTH)).unique()) == 1
 
 
 def test_a_share_of_the_pixels_is_of_the_object(views, masked):
@@ -118,20 +118,20 @@ def test_a_share_of_the_pixels_is_of_the_object(views, masked):
         wanted = of_object if given.usable is None else of_object & given.usable.flatten()
         counts = torch.zeros(len(wanted))
         for step in range(300):
-            counts += torch.bincount(batches.batch(step).index, minlength=len(counts))
+            counts += torch.bincount(batches.batch(step).pixel_number, minlength=len(counts))
         usable = torch.ones_like(wanted) if given.usable is None else given.usable.flatten()
         others, own = 300 * 48 / int(usable.sum()), 300 * 16 / int(wanted.sum())
         expected = torch.where(usable, others, 0.0) + torch.where(wanted, own, 0.0)
         assert ((counts - expected).abs() <= 6 * expected.sqrt()).all()
-        processes = [batches.share(rank, 2).batch(3).index for rank in range(2)]
-        assert torch.equal(torch.cat(processes), batches.batch(3).index)
+        processes = [batches.for_rank(rank, 2).batch(3).pixel_number for rank in range(2)]
+        assert torch.equal(torch.cat(processes), batches.batch(3).pixel_number)
         assert min(int(wanted[index].sum()) for index in processes) >= 8
 
 
 def test_without_masks_there_are_no_pixels_of_the_object(views, capsys):
     batches = RayBatches(views, 64, "all_images", seed=3, object_fraction=0.25)
     assert "not every training photograph has a mask" in capsys.readouterr().out
-    assert torch.equal(batches.batch(5).index, RayBatches(views, 64, "all_images", seed=3).batch(5).index)
+    assert torch.equal(batches.batch(5).pixel_number, RayBatches(views, 64, "all_images", seed=3).batch(5).pixel_number)
 
 
 def test_pixels_of_an_object_need_all_images_and_an_object(views):
@@ -163,13 +163,13 @@ def test_masks_hold_while_precropped_and_in_every_share(masked, batching, size):
     whole = RayBatches(masked, size, batching, seed=3, precrop_steps=20)
     for step in (*range(5), *range(20, 25)):
         batch = whole.batch(step)
-        shares = [whole.share(rank, size).batch(step) for rank in range(size)]
-        assert torch.equal(torch.cat([share.index for share in shares]), batch.index)
+        shares = [whole.for_rank(rank, size).batch(step) for rank in range(size)]
+        assert torch.equal(torch.cat([share.pixel_number for share in shares]), batch.pixel_number)
         for name in ("origins", "directions"):
             parts = [getattr(share.rays, name) for share in shares]
             assert torch.equal(torch.cat(parts), getattr(batch.rays, name))
-        assert masked.usable.flatten()[batch.index].all()
-        _, row, column = place(batch.index).unbind(-1)
+        assert masked.usable.flatten()[batch.pixel_number].all()
+        _, row, column = place(batch.pixel_number).unbind(-1)
         inside = (row >= 3) & (row < 9) & (column >= 4) & (column < 12)
         assert bool(inside.all()) or step >= 20
 
@@ -187,10 +187,10 @@ def test_masks_that_leave_too_few_pixels_are_refused(masked):
 @pytest.mark.parametrize("batching", ["single_image", "all_images"])
 def test_precrop_draws_from_the_middle_and_ends_on_time(views, batching):
     batches = RayBatches(views, 40, batching, seed=0, precrop_steps=30, precrop_fraction=0.5)
-    cropped = torch.cat([place(batches.batch(step).index) for step in range(30)])
+    cropped = torch.cat([place(batches.batch(step).pixel_number) for step in range(30)])
     assert cropped[:, 1].unique().tolist() == list(range(3, 9))
     assert cropped[:, 2].unique().tolist() == list(range(4, 12))
-    whole = torch.cat([place(batches.batch(step).index) for step in range(30, 60)])
+    whole = torch.cat([place(batches.batch(step).pixel_number) for step in range(30, 60)])
     assert whole[:, 1].unique().tolist() == list(range(HEIGHT))
     assert whole[:, 2].unique().tolist() == list(range(WIDTH))
 

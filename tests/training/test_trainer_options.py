@@ -19,7 +19,7 @@ from nerfro.allowed import Refused, check_settings
 from nerfro.registry import build, find, register
 from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.testing import check
-from nerfro.training.config import TrainConfig, TrainerConfig, clock_time, settle_trainer
+from nerfro.training.config import TrainConfig, TrainerConfig, clock_time, resolve_trainer_options
 from nerfro.training.ray_batches import RayBatches
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
 from nerfro.training.trainer import _OWN
@@ -123,7 +123,7 @@ def test_short_runs_score_one_view(train: Runner, tmp_path: Path) -> None:
 def test_switches_shorten_runs(option: str, steps: int) -> None:
     config = OmegaConf.structured(TrainConfig)
     OmegaConf.update(config, option, True)
-    settle_trainer(config)
+    resolve_trainer_options(config)
     assert config.trainer.max_steps == config.evaluation.every == steps
 
 
@@ -195,7 +195,7 @@ def test_overfitting_repeats_batches(train: Runner, monkeypatch: pytest.MonkeyPa
         return batch(self, step)
 
     monkeypatch.setattr(RayBatches, "batch", recorded)
-    monkeypatch.setattr(DensityGridSampler, "after_step", lambda self, fields, draws: updated.append(draws.step))
+    monkeypatch.setattr(DensityGridSampler, "update", lambda self, fields, draws: updated.append(draws.step))
     finished = train("trainer.max_steps=6", "trainer.overfit_batches=2", "evaluation.every=0")
     assert set(drawn) <= {0, 1, 2}  # the thread that traces ahead draws one more
     assert updated == [1, 2, 3, 4, 5], "each update of the density grid draws other cells"

@@ -128,8 +128,8 @@ def test_watched_pixels_have_the_rays_that_training_gives_them(contrast: float |
     batch = batches.traced(trace, subdivision=Subdivision(2, 8.0, contrast)).batch(0)
     watched = ValidationPixels.of(views)
     found = watched.rays(model, Subdivision(2, 8.0, contrast))
-    trained = rays_of_pixels(batch.rays, batch.index[batch.pixel])
-    shown = rays_of_pixels(found.rays, watched.index[found.pixel])
+    trained = rays_of_pixels(batch.rays, batch.pixel_number[batch.ray_pixel])
+    shown = rays_of_pixels(found.rays, watched.index[found.ray_pixel])
     assert all(torch.equal(trained[pixel], shown[pixel]) for pixel in trained)
     assert sum(len(directions) == 4 for directions in trained.values()) > (8 if contrast is None else 16)
     assert sum(len(directions) == 1 for directions in trained.values()) > 100
@@ -148,7 +148,7 @@ def test_where_exposures_learn_each_watched_view_has_the_gain_that_suits_it(
     model.radiance = lambda rays: 0.3 + 0.2 * rays.directions
     model.scene.camera = GivenCamera(exposure=learns)
     rays = watched.rays(model, Subdivision(side, 8.0))
-    shown = mean_per_pixel(model.radiance(rays.rays), rays.pixel, len(watched.index))
+    shown = mean_per_pixel(model.radiance(rays.rays), rays.ray_pixel, len(watched.index))
     gains = torch.tensor([[0.7, 0.8, 0.9], [1.4, 1.2, 1.1]])[watched.index // 256]
     watched = replace(watched, rgb=to_srgb(gains * shown))
     found = float(watched.psnr(model, Subdivision(side, 8.0)))

@@ -146,7 +146,7 @@ def test_contracted_surroundings_are_shown(scene: TrainedScene, tmp_path: Path) 
     )
     field = Surroundings()
     for step in range(3):
-        sampler.after_step([field], example_draws(step=step * sampler.update_every))
+        sampler.update([field], example_draws(step=step * sampler.update_every))
     renderer = with_changed_scene(scene.renderer, fields=torch.nn.ModuleList([field]))
     everywhere = replace(scene, renderer=variant(renderer, point_sampler=sampler))
     found = ask(

@@ -13,16 +13,17 @@ from torch import Tensor
 class Branching:
     """Rule for splitting: light splits if both parts have enough weight; otherwise, the heavier part takes all weight.
 
-    Therefore the weights of the polylines of a ray sum to 1, and a ray has at most 1 / least_weight polylines.
+    Therefore the weights of all polylines of a ray sum to 1 (with `main_only`, one of them is followed), and a ray has
+    at most 1 / least_weight polylines.
 
     Attributes:
-        num_events: number of first events of a ray at which light may split; at later events, all light is transmitted
-            unless it is totally reflected.
+        max_split_events: number of first events of a polyline at which light may split; at later events, all light is
+            transmitted unless it is totally reflected.
         least_weight: share of the light of a ray below which a part is not followed.
         main_only: whether only the first polyline of each ray is followed.
     """
 
-    num_events: int = 0
+    max_split_events: int = 0
     least_weight: float = 1.0
     main_only: bool = False
 
@@ -36,7 +37,7 @@ class Branching:
             reflectance: Fresnel reflectance, 1 for total reflection.
             num_events: number of earlier events of each polyline.
         """
-        may = (num_events < self.num_events) & (reflectance < 1)
+        may = (num_events < self.max_split_events) & (reflectance < 1)
         splits = may & (weight * torch.minimum(reflectance, 1 - reflectance) >= self.least_weight)
         return splits, may & ~splits & (reflectance > 0.5)
 

@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from nerfro.media.sdf_grid import SdfGrid
     from nerfro.samplers.paths.snell_cpu import TracedRows
 
-# Capacity of the first attempt, in vertices of a polyline and polylines of a ray. Rays that need more are traced again;
+# Capacity of the first attempt: vertices of a polyline, and polylines of a ray. Rays that need more are traced again;
 # these have many reflections and are slow, so the capacity covers the usual numbers.
-_CAPACITY, _ROOM = 18, 8
+_MAX_VERTICES, _MAX_POLYLINES = 18, 8
 
 
 def snell_on_grid(rays: Rays, medium: SdfGrid, max_events: int, branching: Branching) -> SnellTrace:
@@ -31,10 +31,10 @@ def snell_on_grid(rays: Rays, medium: SdfGrid, max_events: int, branching: Branc
     from nerfro.samplers.paths.snell_cpu import Settings, trace_snell
 
     solids = medium.packed()
-    settings = Settings(max_events, branching.num_events, branching.least_weight, branching.main_only)
-    room = _ROOM if branching.num_events and not branching.main_only else 1
-    rows, counts = trace_snell(*ray_arrays(rays), solids, settings, _CAPACITY, room)
-    kept, needed = (counts <= (room, _CAPACITY)).all(1), counts.max(0, initial=1)
+    settings = Settings(max_events, branching.max_split_events, branching.least_weight, branching.main_only)
+    max_polylines = _MAX_POLYLINES if branching.max_split_events and not branching.main_only else 1
+    rows, counts = trace_snell(*ray_arrays(rays), solids, settings, _MAX_VERTICES, max_polylines)
+    kept, needed = (counts <= (max_polylines, _MAX_VERTICES)).all(1), counts.max(0, initial=1)
     width = max(int(needed[1]), 2)
     parts = [_polylines(rows, np.where(kept, counts[:, 0], 0), width)]
     if not kept.all():
@@ -46,10 +46,10 @@ def snell_on_grid(rays: Rays, medium: SdfGrid, max_events: int, branching: Branc
         parts = [tuple(np.concatenate(column)[order] for column in zip(*parts, strict=True))]
     owner, *columns = (torch.from_numpy(column).to(rays.radii.device) for column in parts[0])
     positions, directions, s, body, surface, across, weight, num_vertices, num_events, exceeded = columns
-    radii = rays.radii[owner] if branching.num_events else rays.radii
+    radii = rays.radii[owner] if branching.max_split_events else rays.radii
     path = Path.unbranched(positions, directions, s, num_vertices > 2, radii)
     path = replace(path, body=body, surface=surface, across=across)
-    if branching.num_events:
+    if branching.max_split_events:
         path = replace(path, splits=True, ray=owner, throughput=weight[:, None].expand(-1, 3))
     return SnellTrace(path, num_events, exceeded)
 

@@ -30,7 +30,7 @@ _MIN_COSINE = 1e-6
 
 # Intersects rays with the recorded surfaces. Arguments: rows and column of the vertices, positions and directions of
 # the previous vertices, and traced distances. Results, with gradients: distances and unit normals.
-Meet = Callable[[Tensor, int, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
+Intersect = Callable[[Tensor, int, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 # Rows and columns of vertices; their positions, directions and arc lengths.
 Vertices = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 
@@ -78,7 +78,7 @@ def start_of(path: Path, rays: Rays) -> tuple[Float[Tensor, "P 3"], Float[Tensor
     return origins + s[:, None] * d, d, s
 
 
-def replay(path: Path, rays: Rays, medium: Medium, meet: Meet, branching: Branching = ONE_PATH) -> Path:
+def replay(path: Path, rays: Rays, medium: Medium, intersect: Intersect, branching: Branching = ONE_PATH) -> Path:
     """Replay paths of refractions and reflections, with gradients with respect to rays, indices and surfaces.
 
     Each event is an intersection with the recorded surface, and refraction or reflection as in the trace. Derivatives
@@ -99,20 +99,20 @@ def replay(path: Path, rays: Rays, medium: Medium, meet: Meet, branching: Branch
         before, after, across = (numbers[rows].long() for numbers in (
             path.body[:, i - 1], path.body[:, i], path.across[:, i]))  # fmt: skip
         reflected = after != across
-        length, normal = meet(rows, i, old_x, old_d, path.s[rows, i] - path.s[rows, i - 1])
-        turned, _ = refract(old_d, normal, indices[before], indices[across], reflected)
-        if (num_events[rows] < branching.num_events).any():
+        length, normal = intersect(rows, i, old_x, old_d, path.s[rows, i] - path.s[rows, i - 1])
+        outgoing, _ = refract(old_d, normal, indices[before], indices[across], reflected)
+        if (num_events[rows] < branching.max_split_events).any():
             visible = indices[before] != indices[across]
             share = torch.where(visible, reflectance(old_d, normal, indices[before], indices[across]), 0.0)
             splits, _ = branching.decide(weight[rows].detach(), share.detach(), num_events[rows])
             num_events[rows] += visible
             factor = torch.where(splits, torch.where(reflected, share, 1 - share), 1.0)
             weight = weight.index_copy(0, rows, weight[rows] * factor)
-        vertex = old_x + length[:, None] * old_d, turned, old_s + length
+        vertex = old_x + length[:, None] * old_d, outgoing, old_s + length
         vertices.append((rows, torch.full_like(rows, i), *vertex))
         x, d, s = (old.index_copy(0, rows, new) for old, new in zip((x, d, s), vertex, strict=True))
     replayed = assembled(path, rays, medium, vertices, (x, d, s))
-    if not branching.num_events:
+    if not branching.max_split_events:
         return replayed
     relative = (weight / weight.detach())[:, None]
     return replace(replayed, throughput=with_gradient(path.throughput, path.throughput * relative))
@@ -150,7 +150,7 @@ def is_interior(path: Path) -> Bool[Tensor, "P S"]:
     return (path.s < path.s[:, -1:]) & (torch.arange(path.s.shape[1], device=path.s.device) > 0)
 
 
-def meet_solid(medium: Solid, surface: Int[Tensor, "P S"]) -> Meet:
+def intersect_solid(medium: Solid, surface: Int[Tensor, "P S"]) -> Intersect:
     """Intersect rays with zero levels of signed distances: t <- t - phi(x + t d) / (grad phi . d), divisor detached.
 
     Args:
@@ -158,7 +158,7 @@ def meet_solid(medium: Solid, surface: Int[Tensor, "P S"]) -> Meet:
         surface: recorded surface of each vertex.
     """
 
-    def meet(rows: Tensor, column: int, x: Tensor, d: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
+    def intersect(rows: Tensor, column: int, x: Tensor, d: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
         body = surface[rows, column].long()
         phi, gradients = medium.signed_distances(x + length[:, None] * d)
         slope = (_of_body(gradients, body) * d).sum(-1).detach()
@@ -167,14 +167,14 @@ def meet_solid(medium: Solid, surface: Int[Tensor, "P S"]) -> Meet:
         _, gradients = medium.signed_distances(x + length[:, None] * d)
         return length, functional.normalize(_of_body(gradients, body), dim=-1)
 
-    return meet
+    return intersect
 
 
 def _of_body(gradients: Float[Tensor, "R K 3"], body: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
     return gradients.gather(1, body[:, None, None].expand(-1, 1, 3))[:, 0]
 
 
-def meet_triangles(triangles: Triangles, triangle: Int[Tensor, "P S"]) -> Meet:
+def intersect_triangles(triangles: Triangles, triangle: Int[Tensor, "P S"]) -> Intersect:
     """Intersect rays with triangles of meshes, on the CPU and in double precision.
 
     Args:
@@ -182,10 +182,10 @@ def meet_triangles(triangles: Triangles, triangle: Int[Tensor, "P S"]) -> Meet:
         triangle: recorded triangle of each vertex.
     """
 
-    def meet(rows: Tensor, column: int, x: Tensor, d: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
+    def intersect(rows: Tensor, column: int, x: Tensor, d: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
         like, face = length, triangle[rows, column].long().cpu()
         x, d = x.cpu().double(), d.cpu().double()
         length = triangles.distance(x, d, face)
         return length.to(like), triangles.normal(x + length[:, None] * d, face).to(like)
 
-    return meet
+    return intersect

@@ -25,7 +25,7 @@ from nerfro.samplers.base import PathSampler
 from nerfro.samplers.paths.branching import ONE_PATH, Branching
 from nerfro.samplers.paths.compiled import snell_on_grid
 from nerfro.samplers.paths.polylines import SnellTrace
-from nerfro.samplers.paths.replay import meet_solid, meet_triangles, replay, smallest_cosine
+from nerfro.samplers.paths.replay import intersect_solid, intersect_triangles, replay, smallest_cosine
 from nerfro.samplers.paths.straight import refined_straight, straight_path
 from nerfro.samplers.paths.wavefront import Wavefront
 from nerfro.types import Path, Rays
@@ -47,7 +47,7 @@ class Snell(PathSampler):
             `mesh` is the triangles, with sharp edges, and vertex normals where the mesh is smooth.
         max_events: largest number of refractions and reflections of a ray.
         branches: `none` transmits all light that is not totally reflected, as the paper does; `first` adds the
-            reflection at the first surface of a ray; `all` adds every reflection.
+            reflection at the first surface of a ray; `all` adds all reflections.
         least_weight: share of the light of a ray below which a branch is not followed; the other part takes its weight.
         wavelengths: wavelengths in nm at which rays are traced if the medium disperses: equally many for red, green and
             blue, in this order.
@@ -92,12 +92,12 @@ class Snell(PathSampler):
 
     def _refine(self, path: Path, rays: Rays, medium: Medium) -> Path:
         if self.interface == "mesh" and isinstance(medium, SdfGrid):
-            meet = meet_triangles(medium.triangles, path.triangle)
+            intersect = intersect_triangles(medium.triangles, path.triangle)
         elif isinstance(medium, Solid):
-            meet = meet_solid(medium, path.surface)
+            intersect = intersect_solid(medium, path.surface)
         else:
             return refined_straight(path, rays)
-        return replay(path, rays, medium, meet, self.branching)
+        return replay(path, rays, medium, intersect, self.branching)
 
     def _at_wavelengths(self, medium: Solid) -> list[Solid]:
         """Return the medium at each wavelength."""
@@ -118,7 +118,9 @@ class Snell(PathSampler):
             none = torch.zeros(len(rays), dtype=torch.long, device=rays.near.device)
             return SnellTrace(straight_path(rays), none, none.bool())
         if not isinstance(medium, Solid):
-            raise NerfroError("sampler/path=snell needs a medium with a surface; take medium=sdf_grid, or path=eikonal")
+            raise NerfroError(
+                "sampler/path=snell needs a medium with a surface; take medium=sdf_grid, or sampler/path=eikonal"
+            )
         if medium.disperses:
             return _traced_in_bands(rays, self._at_wavelengths(medium), partial(self._trace, branching=branching))
         return self._trace(rays, medium, branching)
@@ -214,7 +216,7 @@ def _trace_triangles(rays: Rays, medium: SdfGrid, max_events: int, branching: Br
         faces = torch.where(lengths <= length[:, None] + offset, faces, -1)
         body = torch.where(faces >= 0, triangles.body[faces], -1)
         normal = triangles.normal(front.x[rows] + length[:, None] * front.d[rows], faces[:, 0])
-        front.meet(rows, length, length, body, normal, faces)
+        front.apply_interface(rows, length, length, body, normal, faces)
     return front.finish(rays)
 
 
@@ -238,7 +240,7 @@ def trace_interfaces(rays: Rays, medium: Solid, max_events: int, branching: Bran
         _, normals = medium.signed_distances(x + after[:, None] * d)
         normal = normals.gather(1, body[:, None, None].expand(-1, 1, 3))[:, 0]
         normal = normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
-        front.meet(rows, before, after, bodies, normal)
+        front.apply_interface(rows, before, after, bodies, normal)
     return front.finish(rays)
 
 
@@ -286,7 +288,7 @@ def _closed_gaps(
     if inside.shape[1] == 1:
         return after, body[:, None]
     flipped = inside ^ one_hot(body, inside.shape[1]).bool()
-    leaves = (medium.innermost(inside) > 0) & (medium.innermost(flipped) == 0)
+    leaves = (medium.deciding_body(inside) > 0) & (medium.deciding_body(flipped) == 0)
     phi, _ = medium.signed_distances(x + (after + min_step)[:, None] * d)
     behind = leaves[:, None] & ((phi < 0) != flipped)
     others = torch.where(behind, torch.arange(inside.shape[1], device=x.device), -1)

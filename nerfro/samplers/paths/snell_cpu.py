@@ -26,7 +26,7 @@ class Settings(NamedTuple):
     """Settings of the trace, see `samplers.paths.snell.Snell` and `samplers.paths.branching.Branching`."""
 
     max_events: int
-    num_splits: int  # first events of a polyline at which light may split
+    max_split_events: int  # first events of a polyline at which light may split
     least_weight: float
     main_only: bool
 
@@ -87,8 +87,8 @@ class Scratch(NamedTuple):
 
 
 @compiled
-def _innermost(inside, solids):
-    """Return the number of the innermost body around a point, from 1; 0 in air (see `media.solid`)."""
+def _deciding_body(inside, solids):
+    """Return the number of the body that decides at a point, from 1; 0 in air (`media.solid.Solid.deciding_body`)."""
     number = 0
     for body in range(len(inside)):
         if inside[body]:
@@ -144,24 +144,25 @@ def _reflected(line, nx, ny, nz, ratio):
 
 
 @compiled
-def _event(solids, hit, near, far, ratio, settings, branch):
+def _event(solids, hit, line_before, line_behind, ratio, settings, branch):
     """Decide whether light is refracted, reflected or split at a surface.
 
     Args:
         solids: bodies.
         hit: body whose surface is met.
-        near, far: arriving line, with its start just before and just behind the surface.
+        line_before, line_behind: arriving line, with its start just before and just behind the surface.
         ratio: ratio of the index before the surface to the index behind the surface.
         settings: settings of the trace.
         branch: arriving branch.
     """
-    _, nx, ny, nz = spline_value_gradient(solids.coefficients, grid_of(solids, hit), far.x, far.y, far.z)
+    x, y, z = line_behind.x, line_behind.y, line_behind.z
+    _, nx, ny, nz = spline_value_gradient(solids.coefficients, grid_of(solids, hit), x, y, z)
     norm = math.sqrt(nx * nx + ny * ny + nz * nz)
     nx, ny, nz = nx / norm, ny / norm, nz / norm
-    transmitted, total = _transmitted(far, nx, ny, nz, ratio)
-    if not total and branch.num_events >= settings.num_splits:
+    transmitted, total = _transmitted(line_behind, nx, ny, nz, ratio)
+    if not total and branch.num_events >= settings.max_split_events:
         return Event(transmitted, False, transmitted, 0.0)
-    mirrored, share = _reflected(near, nx, ny, nz, ratio)
+    mirrored, share = _reflected(line_before, nx, ny, nz, ratio)
     if total:
         return Event(mirrored, True, mirrored, 0.0)
     if branch.weight * min(share, 1.0 - share) >= settings.least_weight:
@@ -173,7 +174,7 @@ def _event(solids, hit, near, far, ratio, settings, branch):
 
 @compiled
 def _put_vertex(rows, row, branch, body, surface, across):
-    """Append the vertex of a branch to a row; beyond the capacity, vertices are only counted."""
+    """Append the vertex of a branch to a row; beyond the capacity of the row, vertices are only counted."""
     i, line = branch.num_vertices, branch.line
     if i < rows.s.shape[1]:
         position, direction = rows.positions[row, i], rows.directions[row, i]
@@ -234,15 +235,15 @@ def _resume(solids, scratch, top, rows, former, row):
         rows.surface[row, i], rows.across[row, i] = rows.surface[former, i], rows.across[former, i]
     x, y, z, dx, dy, dz = pending.line[top]
     branch = Branch(Line(x, y, z, dx, dy, dz), pending.s[top], pending.weight[top], count, pending.num_events[top])
-    return _put_vertex(rows, row, branch, _innermost(inside, solids), pending.surface[top], pending.across[top])
+    return _put_vertex(rows, row, branch, _deciding_body(inside, solids), pending.surface[top], pending.across[top])
 
 
 @compiled
 def _cross(solids, scratch, body, hit, after):
     """Move a ray to the other side of a surface; returns the body there, and the arc length behind the surface.
 
-    A gap of air between two bodies that is thinner than the shortest step of the search counts as closed, so touching
-    bodies need not fit exactly.
+    A gap of air between two bodies that is thinner than the shortest step of the search for their surfaces counts as
+    closed, so touching bodies need not fit exactly.
 
     Args:
         solids: bodies.
@@ -254,15 +255,15 @@ def _cross(solids, scratch, body, hit, after):
     """
     inside, crossings = scratch.inside, scratch.crossings
     inside[hit] = not inside[hit]
-    across, behind = _innermost(inside, solids), after
+    across, behind = _deciding_body(inside, solids), after
     crossings[hit] = -1.0
     if across == 0 and body > 0:
         for other in range(len(inside)):
-            if 0.0 <= crossings[other] <= after + solids.min_step[other]:
+            if 0.0 <= crossings[other] <= after + min(solids.min_step[hit], solids.min_step[other]):
                 inside[other] = not inside[other]
                 behind = max(behind, crossings[other])
                 crossings[other] = -1.0
-        across = _innermost(inside, solids)
+        across = _deciding_body(inside, solids)
     return across, behind
 
 
@@ -287,7 +288,7 @@ def _follow(solids, settings, scratch, rows, row, branch, num_pending):
         hit, before, after = first_surface(solids, inside, scratch.crossings, here)
         if hit < 0:
             return branch, False, num_pending
-        body = _innermost(inside, solids)
+        body = _deciding_body(inside, solids)
         across, behind = _cross(solids, scratch, body, hit, after)
         n_before, n_across = _index(body, solids), _index(across, solids)
         far = advance(here, behind)
@@ -329,7 +330,7 @@ def _trace_ray(solids, line, near, far, settings, scratch, rows):
     entry = advance(branch.line, max(enter, 0.0))
     for body in range(len(inside)):
         inside[body] = not misses and body_distance(solids, body, entry.x, entry.y, entry.z) < 0.0
-    branch = _put_vertex(rows, 0, branch, _innermost(inside, solids), -1, 0)
+    branch = _put_vertex(rows, 0, branch, _deciding_body(inside, solids), -1, 0)
     if misses:
         return 1, _put_end(solids, rows, 0, branch, far, False)
     branch = Branch(entry, near + max(enter, 0.0), 1.0, branch.num_vertices, 0)
@@ -346,35 +347,36 @@ def _trace_ray(solids, line, near, far, settings, scratch, rows):
 
 
 @compiled_parallel
-def trace_snell(origins, directions, near, far, solids, settings, capacity, room):
+def trace_snell(origins, directions, near, far, solids, settings, max_vertices, max_polylines):
     """Trace the polylines of all rays, which may split at their first events (`samplers.paths.branching`).
 
     Args:
         origins, directions, near, far: rays [R, ...].
         solids: bodies, a `kernels.lookup.Solids`.
         settings: settings of the trace.
-        capacity: largest number of vertices of a polyline, V.
-        room: largest number of polylines of a ray, B.
+        max_vertices: largest number of vertices of a polyline, V.
+        max_polylines: largest number of polylines of a ray, B.
 
     Returns:
         rows: `TracedRows` of all rays, with a leading axis R, in the precision of the rays. Entries after the last
             vertex of a polyline are undefined.
         counts [R, 2]: number of polylines of each ray, and largest number of vertices, which may exceed B and V.
     """
-    num_rays, num_bodies, num_splits = origins.shape[0], len(solids.iors), settings.num_splits
+    num_rays, dtype = origins.shape[0], origins.dtype
+    num_bodies, num_pending = len(solids.iors), settings.max_split_events
+    polylines, vertices = (num_rays, max_polylines), (num_rays, max_polylines, max_vertices)
     rows = TracedRows(
-        np.empty((num_rays, room, capacity, 3), origins.dtype), np.empty((num_rays, room, capacity, 3), origins.dtype),
-        np.empty((num_rays, room, capacity), origins.dtype), np.empty((num_rays, room, capacity), np.int8),
-        np.empty((num_rays, room, capacity), np.int8), np.empty((num_rays, room, capacity), np.int8),
-        np.empty((num_rays, room), origins.dtype), np.empty((num_rays, room), np.int64),
-        np.empty((num_rays, room), np.int64), np.empty((num_rays, room), np.bool_),
+        np.empty((*vertices, 3), dtype), np.empty((*vertices, 3), dtype), np.empty(vertices, dtype),
+        np.empty(vertices, np.int8), np.empty(vertices, np.int8), np.empty(vertices, np.int8),
+        np.empty(polylines, dtype), np.empty(polylines, np.int64),
+        np.empty(polylines, np.int64), np.empty(polylines, np.bool_),
     )  # fmt: skip
     counts = np.empty((num_rays, 2), np.int64)
     for block in prange((num_rays + _BLOCK - 1) // _BLOCK):
         pending = Pending(
-            np.empty((num_splits, 6)), np.empty(num_splits), np.empty(num_splits), np.empty(num_splits, np.int64),
-            np.empty(num_splits, np.int64), np.empty(num_splits, np.int64), np.empty(num_splits, np.int64),
-            np.empty((num_splits, num_bodies), np.bool_),
+            np.empty((num_pending, 6)), np.empty(num_pending), np.empty(num_pending), np.empty(num_pending, np.int64),
+            np.empty(num_pending, np.int64), np.empty(num_pending, np.int64), np.empty(num_pending, np.int64),
+            np.empty((num_pending, num_bodies), np.bool_),
         )  # fmt: skip
         scratch = Scratch(np.empty(num_bodies, np.bool_), np.empty(num_bodies), pending)
         for ray in range(block * _BLOCK, min((block + 1) * _BLOCK, num_rays)):
@@ -404,7 +406,7 @@ def polylines_of_width(rows, ray, place, width):
     Returns:
         positions, directions, s, body, surface and across.
     """
-    number, capacity, dtype = len(ray), rows.s.shape[2], rows.s.dtype
+    number, max_vertices, dtype = len(ray), rows.s.shape[2], rows.s.dtype
     positions, directions = np.empty((number, width, 3), dtype), np.empty((number, width, 3), dtype)
     s = np.empty((number, width), dtype)
     body, surface, across = (
@@ -412,7 +414,7 @@ def polylines_of_width(rows, ray, place, width):
     )  # fmt: skip
     for p in prange(number):
         r, b = ray[p], place[p]
-        last = min(rows.num_vertices[r, b], capacity, width) - 1
+        last = min(rows.num_vertices[r, b], max_vertices, width) - 1
         for i in range(width):
             j = min(i, last)
             for axis in range(3):

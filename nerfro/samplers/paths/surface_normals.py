@@ -26,7 +26,7 @@ def first_normals(path: Path, medium: Medium) -> Float[Tensor, "R 3"]:
 
 
 def _bent_normals(path: Path, medium: Medium) -> Float[Tensor, "P 3"]:
-    """Compute the normals of polylines that meet the medium."""
+    """Compute the normals of polylines that intersect the medium."""
     rows = torch.arange(len(path.s), device=path.s.device)
     before, after = path.directions[:, :-1], path.directions[:, 1:]
     n = indices_of(medium, path.s).detach()[path.body.long()]

@@ -23,7 +23,7 @@ _COLUMNS = ("x", "d", "s", "inside", "triangles", "start", "moving", "ray", "wei
 
 
 class _Crossing(NamedTuple):
-    """Crossings of A rows: arguments of `Wavefront.meet`, and the media on both sides."""
+    """Crossings of A rows: arguments of `Wavefront.apply_interface`, and the media on both sides."""
 
     before: Float[Tensor, "A"]
     after: Float[Tensor, "A"]
@@ -62,7 +62,7 @@ class Wavefront:
         inside: whether each row is inside the surface of each body [P, K]; the tracers set the first values.
         triangles: triangles that each row lies on [P, L]; -1 for none.
         start: distance from `x` at which the search for the next surface begins.
-        moving: whether each row may meet another surface.
+        moving: whether each row may intersect another surface.
         ray, weight: ray of each row, and its share of the light of this ray.
         num_events, exceeded: events of each row, and whether it met the limit.
         enter: arc length from near at which each ray enters the box.
@@ -94,7 +94,7 @@ class Wavefront:
         self.lines = PolylineBuilder(len(rays), self.x)
 
     def begin(self, inside: Callable[[Tensor], Bool[Tensor, "P K"]]) -> None:
-        """Record the first vertices, and move the rows that meet the box to the box.
+        """Record the first vertices, and move the rows that intersect the box to the box.
 
         Args:
             inside: function that returns which bodies contain each point.
@@ -115,10 +115,10 @@ class Wavefront:
         triangle: Int[Tensor, "A"] | int = -1,
     ) -> None:
         """Record the present positions of rows as vertices; see `Path` for the numbers."""
-        body = self.medium.innermost(self.inside[rows])
+        body = self.medium.deciding_body(self.inside[rows])
         self.lines.append(rows, self.x[rows], self.d[rows], self.s[rows], Crossed(body, surface, across, triangle))
 
-    def meet(
+    def apply_interface(
         self,
         rows: Int[Tensor, "A"],
         before: Float[Tensor, "A"],
@@ -130,7 +130,7 @@ class Wavefront:
         """Refract and reflect rows at the next surface.
 
         Args:
-            rows: rows that meet a surface.
+            rows: rows that intersect a surface.
             before, after: distances to points just before and just behind the surface, from which reflected and
                 transmitted light continues.
             body: bodies whose surfaces are met at this distance, from 0; -1 for none. The first is recorded.
@@ -143,7 +143,7 @@ class Wavefront:
         num_crossed = rows.new_zeros(len(rows), inside.shape[1] + 1)
         num_crossed.scatter_add_(1, body + 1, torch.ones_like(body))
         flipped = inside ^ (num_crossed[:, 1:] % 2 == 1)
-        number, across = self.medium.innermost(inside), self.medium.innermost(flipped)
+        number, across = self.medium.deciding_body(inside), self.medium.deciding_body(flipped)
         n_before, n_after = self.indices[number], self.indices[across]
         visible = n_before != n_after
         recorded = visible | (number != across) & (self.absorbs[number] | self.absorbs[across])
@@ -151,18 +151,18 @@ class Wavefront:
         self.exceeded[rows], self.moving[rows] = exceeds, ~exceeds
         met = _Crossing(before, after, body, normal, triangles, flipped, across, n_before, n_after, visible, recorded)
         rows, met = rows[~exceeds], met.select(~exceeds)
-        turned, reflected = refract(self.d[rows], met.normal, met.n_before, met.n_after)
+        outgoing, reflected = refract(self.d[rows], met.normal, met.n_before, met.n_after)
         reflected &= met.visible
-        if self.branching.num_events:
+        if self.branching.max_split_events:
             share = reflectance(self.d[rows], met.normal, met.n_before, met.n_after)
             rows, place, reflected = self._split(rows, torch.where(met.visible, share, 0.0), reflected)
             met = met.select(place)
-            turned, _ = refract(self.d[rows], met.normal, met.n_before, met.n_after, reflected)
+            outgoing, _ = refract(self.d[rows], met.normal, met.n_before, met.n_after, reflected)
         length = torch.where(reflected, met.before, met.after)
         self.inside[rows] = torch.where(reflected[:, None], self.inside[rows], met.flipped)
         self.x[rows] += length[:, None] * self.d[rows]
         self.s[rows] += length
-        self.d[rows] = torch.where(met.visible[:, None], turned, self.d[rows])
+        self.d[rows] = torch.where(met.visible[:, None], outgoing, self.d[rows])
         self.triangles[rows], self.start[rows] = met.triangles, self.offset
         self.num_events[rows] += met.visible
         vertex = met.select(met.recorded)
@@ -174,7 +174,7 @@ class Wavefront:
         """Duplicate rows whose light splits; the reflected part becomes the next row.
 
         Args:
-            rows: rows that meet a surface.
+            rows: rows that intersect a surface.
             share: reflectance, 0 where there is nothing to see.
             reflected: whether each row is totally reflected.
 
@@ -201,6 +201,6 @@ class Wavefront:
         """Append the last vertices, and return the trace in the precision and on the device of the rays."""
         refracted, device = self.lines.counts > 1, rays.origins.device
         self.lines.append_ends(self.far[self.ray], self.box, refracted, self.x, self.d, self.s)
-        split = (self.ray, self.weight) if self.branching.num_events else (None, None)
+        split = (self.ray, self.weight) if self.branching.max_split_events else (None, None)
         path = self.lines.path(rays, refracted, *split)
         return SnellTrace(path, self.num_events.to(device), self.exceeded.to(device))

@@ -264,7 +264,7 @@ class DensityGridSampler(PointSampler):
         return self.density.view(-1)[(x * self.resolution + y) * self.resolution + z]
 
     @torch.no_grad()
-    def after_step(self, fields: Sequence[Field], draws: Draws) -> None:
+    def update(self, fields: Sequence[Field], draws: Draws) -> None:
         """Update some of the cells from the finest field, each at a random position in it."""
         if draws.step % self.update_every:
             return
