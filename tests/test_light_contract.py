@@ -113,7 +113,7 @@ def test_exits_begin_where_the_last_straight_run_does() -> None:
 def test_a_pixel_is_the_encoded_mean_of_radiance_not_the_mean_of_its_code() -> None:
     one = torch.zeros(1, dtype=torch.long)
     batch = replace(
-        example_batch(), pixel=one.expand(NUM_RAYS), index=one, view=one, rgb=torch.zeros(1, 3),
+        example_batch(), ray_pixel=one.expand(NUM_RAYS), pixel_number=one, view=one, rgb=torch.zeros(1, 3),
         teaches_background=torch.ones(1, dtype=torch.bool),
     )  # fmt: skip
     radiance = torch.zeros(NUM_RAYS, 3)

@@ -171,7 +171,7 @@ def test_batches_and_renderings_do_not_depend_on_the_process_or_the_chunk(views:
     assert len(whole.draws.ray.unique()) == len(whole.rays) > 60
     for rank in range(3):
         share, own = batches.for_rank(rank, 3).batch(4), torch.arange(20 * rank, 20 * (rank + 1))
-        for name in ("index", "rgb", "view", "teaches_background"):
+        for name in ("pixel_number", "rgb", "view", "teaches_background"):
             assert torch.equal(getattr(share, name), getattr(whole, name)[own])
         rows = torch.isin(whole.ray_pixel, own).nonzero()[:, 0]
         assert torch.equal(share.ray_pixel + 20 * rank, whole.ray_pixel[rows])

@@ -156,7 +156,12 @@ def batch() -> Batch:
     """Three pixels of any colour."""
     rows = torch.arange(3)
     return replace(
-        example_batch(8), pixel=PIXEL, index=rows, view=0 * rows, rgb=torch.rand(3, 3), teaches_background=rows >= 0
+        example_batch(8),
+        ray_pixel=PIXEL,
+        pixel_number=rows,
+        view=0 * rows,
+        rgb=torch.rand(3, 3),
+        teaches_background=rows >= 0,
     )
 
 

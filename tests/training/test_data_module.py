@@ -150,7 +150,7 @@ def test_a_batch_is_made_when_its_step_begins_if_paths_learn(
     made: list[int] = []
     batch = Mock(spec=Batch, path=None)
     batches: Any = Mock(spec=RayBatches, batch=lambda step: made.append(step) or batch)
-    batches.share = lambda rank, size: batches
+    batches.for_rank = lambda rank, size: batches
     batches.to = lambda device, dtype: batches
     batches.release_memory = lambda: None
     data = RayDataModule(batches, None, 0)
