@@ -39,9 +39,9 @@ _CHUNK = 2**16  # texels that are evaluated at once
 
 @dataclass(frozen=True)
 class Baked:
-    """Arrays of a page as images by name, and the numbers that describe them."""
+    """Arrays of a page by name, and the metadata with which the page reads them."""
 
-    facts: dict[str, Any]
+    metadata: dict[str, Any]
     voxels: dict[str, UInt8[np.ndarray, "Z Y X C"]] = field(default_factory=dict)
 
     def packed(self, compression: int = 9) -> dict[str, str]:
@@ -57,45 +57,50 @@ def bake_surface(renderer: Renderer) -> Baked:
     """
     medium: Medium = renderer.scene.medium
     if isinstance(medium, Vacuum):
-        return Baked({"iors": [], "dispersion": [], "nested": False, "absorption": [], "vertices": [2, 2, 2],
-                      "low": [[0, 0, 0]], "high": [[1, 1, 1]], "steps": [1.0], "clearances": [1.0], "block": BLOCK,
-                      "shortest": 1.0, "events": 0})  # fmt: skip
+        return Baked({"iors": [], "dispersion": [], "nested": False, "absorption": [], "numVertices": [2, 2, 2],
+                      "low": [[0, 0, 0]], "high": [[1, 1, 1]], "distanceUnits": [1.0], "clearanceUnits": [1.0],
+                      "blockCells": BLOCK, "minStep": 1.0, "maxEvents": 0})  # fmt: skip
     if not isinstance(medium, Solid):
         raise NerfroError(
             f"an interactive page shows bodies with a surface, and the index of {type(medium).__name__} varies "
             "in space; render a film of this run, or train with medium=sdf_grid"
         )
-    # The page traces as `Snell` does, after a training with another sampler with the default settings.
+    # The page traces paths as `Snell` does, with the default settings if the model has another path sampler, but:
+    # - Light splits only at the first event, also with `branches: all`. Both parts are followed, whatever their weight.
+    # - Surfaces are always the zero levels of signed distances, also with `interface: mesh`.
+    # - Each colour channel is traced at one wavelength.
     snell = renderer.path_sampler if isinstance(renderer.path_sampler, Snell) else Snell()
     wavelengths = np.reshape(snell.wavelengths, (3, -1))
     colours = wavelengths[:, wavelengths.shape[1] // 2].tolist()  # the middle band of each channel
     on_grid = _on_same_grid(medium)
     solids, bodies = on_grid.packed(), range(len(on_grid.grids))
     spacing = 1 / solids.inverse_spacing
-    steps = _BAND * spacing.max(1) / 32767
+    distance_units = _BAND * spacing.max(1) / 32767
     clearance = np.stack([grid.coarse_clearance().double().numpy() for grid in on_grid.grids])
-    units = clearance.max((1, 2, 3)).clip(min=1e-9) / 255
+    clearance_units = clearance.max((1, 2, 3)).clip(min=1e-9) / 255
     coefficients = solids.coefficients.reshape(len(bodies), *solids.shape[0]).astype(np.float64)
     # The grids of all bodies follow each other along z.
-    slices = np.concatenate([np.round(coefficients[body] / steps[body]).transpose(2, 1, 0) for body in bodies])
+    slices = np.concatenate([np.round(coefficients[body] / distance_units[body]).transpose(2, 1, 0) for body in bodies])
     slices = slices.clip(-32767, 32767).astype(np.int64)
-    blocks = np.concatenate([np.floor(clearance[body] / units[body] + 1e-9).transpose(2, 1, 0) for body in bodies])
+    blocks = np.concatenate(
+        [np.floor(clearance[body] / clearance_units[body] + 1e-9).transpose(2, 1, 0) for body in bodies]
+    )
     return Baked(
         {
             "iors": [float(ior) for ior in medium.indices],
             "dispersion": [[body.dispersion_at(colour) for colour in colours] for body in medium.materials],
             "nested": medium.nested,
             "absorption": absorption_of(renderer.scene).tolist(),
-            "vertices": solids.shape[0].tolist(),
-            "size": list(slices.shape[::-1]),
-            "blocks": list(blocks.shape[::-1]),
+            "numVertices": solids.shape[0].tolist(),
+            "gridSize": list(slices.shape[::-1]),
+            "clearanceSize": list(blocks.shape[::-1]),
             "low": solids.low.tolist(),
             "high": solids.high.tolist(),
-            "steps": steps.tolist(),
-            "clearances": units.tolist(),
-            "block": BLOCK,
-            "shortest": float(solids.min_step.min()),
-            "events": snell.max_events,
+            "distanceUnits": distance_units.tolist(),
+            "clearanceUnits": clearance_units.tolist(),
+            "blockCells": BLOCK,
+            "minStep": float(solids.min_step.min()),
+            "maxEvents": snell.max_events,
         },
         {"distances": packing.two_bytes(slices), "clearance": blocks[..., None].astype(np.uint8)},
     )
@@ -144,11 +149,11 @@ def bake_volume(volume: Volume, colour_space: ColourSpace) -> Baked:
     """
     sides = volume.box[1] - volume.box[0]
     cell = float((sides / (torch.tensor(volume.density.shape) - 1)).min())
-    thinnest, span = MIN_OPTICAL_DEPTH / cell, math.log(_MAX_OPTICAL_DEPTH / MIN_OPTICAL_DEPTH)
-    levels = (volume.density.clamp(min=thinnest) / thinnest).log().div(span).clamp(max=1)
+    min_density, span = MIN_OPTICAL_DEPTH / cell, math.log(_MAX_OPTICAL_DEPTH / MIN_OPTICAL_DEPTH)
+    levels = (volume.density.clamp(min=min_density) / min_density).log().div(span).clamp(max=1)
     rgb = (to_srgb(volume.rgb) if colour_space is ColourSpace.SRGB else volume.rgb).clamp(min=0)
-    brightest = max(float(rgb.max()), 1e-6)
-    content = torch.cat([(rgb / brightest).sqrt(), levels[..., None]], -1).mul(255).round().byte()
+    max_radiance = max(float(rgb.max()), 1e-6)
+    content = torch.cat([(rgb / max_radiance).sqrt(), levels[..., None]], -1).mul(255).round().byte()
     slices = content.permute(2, 1, 0, 3).numpy()
     occupied = _occupied_bricks(slices[..., 3])
     return Baked(
@@ -156,11 +161,11 @@ def bake_volume(volume: Volume, colour_space: ColourSpace) -> Baked:
             "low": volume.box[0].tolist(),
             "high": volume.box[1].tolist(),
             "size": list(volume.density.shape),
-            "bricks": list(occupied.shape[::-1]),
-            "density": [math.log(thinnest), span],
-            "brightest": brightest,
-            "step": 0.7 * cell,
-            "radius": volume.radius or 0.0,
+            "occupiedSize": list(occupied.shape[::-1]),
+            "logDensity": [math.log(min_density), span],
+            "maxRadiance": max_radiance,
+            "marchStep": 0.7 * cell,
+            "contractionRadius": volume.radius or 0.0,
         },
         {"colour": slices[..., :3], "density": slices[..., 3:], "occupied": occupied[..., None]},
     )

@@ -55,7 +55,7 @@ class LivePage:
         surface_changes = any(parameter.requires_grad for parameter in medium.parameters())
         parts = self._bake(surface=surface_changes)
         arrays = {name: uri for part in parts.values() for name, uri in part.packed(_COMPRESSION).items()}
-        self._server.publish({name: part.facts for name, part in parts.items()}, arrays)
+        self._server.publish({name: part.metadata for name, part in parts.items()}, arrays)
 
     def _bake(self, surface: bool) -> dict[str, Baked]:
         renderer = self._scene.renderer

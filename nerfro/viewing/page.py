@@ -66,7 +66,7 @@ def bake_parts(
 
 def assemble_page(title: str, static: dict[str, Any], parts: dict[str, Baked], live: bool = False) -> str:
     """Fill the template with `static_parts` and `bake_parts`; a live page asks its server for updates."""
-    scene = {**static, **{name: part.facts for name, part in parts.items()}, "live": live}
+    scene = {**static, **{name: part.metadata for name, part in parts.items()}, "live": live}
     arrays = {name: uri for part in parts.values() for name, uri in part.packed().items()}
 
     def asset(name: str) -> Markup:

@@ -106,7 +106,7 @@ class PageServer:
             # Counted from the end, because the page states the last loss.
             losses = json.dumps(self._losses[::-every][::-1]).encode()
             update = self._update if self._version > after else b"null"
-        return b'{"losses": ' + losses + b', "news": ' + update + b"}"
+        return b'{"losses": ' + losses + b', "update": ' + update + b"}"
 
     def answer(self, request: bytes) -> tuple[HTTPStatus, bytes]:
         """Answer a request of the page; requests are answered one after the other."""

@@ -50,7 +50,7 @@ def test_sky_is_the_boundary() -> None:
 
 
 def unpacked(uri: str, shape: tuple[int, int, int]) -> np.ndarray:
-    """The slices of a picture, one by one, as the page's `voxelsOf` finds them."""
+    """The slices of a picture, one by one, as the page's `unpackVoxels` finds them."""
     depth, height, width = shape
     columns = math.ceil(math.sqrt(depth))
     mosaic = np.array(Image.open(io.BytesIO(base64.b64decode(uri.partition(",")[2]))))

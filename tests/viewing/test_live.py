@@ -33,8 +33,8 @@ def test_bakes_take_their_share_of_the_time(scene: TrainedScene, server: PageSer
     page = LivePage(server, scene, scene.views(), "test", resolution=24)
 
     def version() -> int:
-        news = json.loads(server.state(0))["news"]
-        return news["scene"]["version"] if news else 0
+        update = json.loads(server.state(0))["update"]
+        return update["scene"]["version"] if update else 0
 
     page.update()
     assert version() == 0, "nobody looks"
@@ -55,11 +55,11 @@ def test_training_mode_and_weights_stay(scene: TrainedScene, server: PageServer)
     page = LivePage(server, scene, scene.views(), "test", resolution=8)
     page.show()
     assert scene.renderer.training
-    assert set(json.loads(server.state(0))["news"]["scene"]) == {"volume", "sky", "version"}, "the surface stays"
+    assert set(json.loads(server.state(0))["update"]["scene"]) == {"volume", "sky", "version"}, "the surface stays"
 
 
 @needs_chromium
-def test_browser_shows_news_and_losses(scene: TrainedScene, server: PageServer, tmp_path: Path) -> None:
+def test_browser_shows_updates_and_losses(scene: TrainedScene, server: PageServer, tmp_path: Path) -> None:
     page = LivePage(server, scene, scene.views(), "test", resolution=8)
     server.add_loss(3, 0.5)
     server.add_loss(7, 0.25)

@@ -20,19 +20,19 @@ def get(server: PageServer, path: str, **headers: str) -> tuple[int, str]:
     return answer.status, answer.read().decode()
 
 
-def test_page_and_its_news(server: PageServer) -> None:
+def test_page_and_its_updates(server: PageServer) -> None:
     assert "being made" in get(server, "/")[1]
     server.open("<p>page")
     assert get(server, "/") == (200, "<p>page")
     assert not server.watched
-    assert json.loads(get(server, "/state?after=0")[1]) == {"losses": [], "news": None}
+    assert json.loads(get(server, "/state?after=0")[1]) == {"losses": [], "update": None}
     assert server.watched
     server.add_loss(3, 0.5)
     server.publish({"volume": {"step": 1}}, {"sky": "data:,"})
     state = json.loads(get(server, "/state?after=0")[1])
     assert state["losses"] == [[3, 0.5]]
-    assert state["news"] == {"scene": {"volume": {"step": 1}, "version": 1}, "arrays": {"sky": "data:,"}}
-    assert json.loads(get(server, "/state?after=1")[1])["news"] is None
+    assert state["update"] == {"scene": {"volume": {"step": 1}, "version": 1}, "arrays": {"sky": "data:,"}}
+    assert json.loads(get(server, "/state?after=1")[1])["update"] is None
 
 
 @pytest.mark.parametrize("path", ["/../pyproject.toml", "/etc/passwd", "/%2e%2e/pyproject.toml", "/index.html"])

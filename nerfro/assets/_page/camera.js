@@ -1,25 +1,26 @@
-// Views: where the eye is (world units), its axes right, up and back (nine numbers), and the pinhole in pixels.
+// Views are pinhole cameras: position of the eye (world units), axes right, up and back (nine numbers), focal lengths,
+// principal point and image size (pixels), and the arc length at which rays begin (near).
 
 const cross = ([a, b, c], [x, y, z]) => [b * z - c * y, c * x - a * z, a * y - b * x];
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-const along = (a, s, b) => a.map((x, i) => x + s * b[i]);
+const addScaled = (a, s, b) => a.map((x, i) => x + s * b[i]);
 const unit = (a) => a.map((x) => x / Math.hypot(...a));
 const clamp = (x, low, high) => Math.min(Math.max(x, low), high);
 
-// A camera of the data as a view.
+// Return the view of a camera of the data set.
 const viewOf = (camera) => ({
   eye: camera.eye, axes: camera.axes, focal: camera.focal, principal: camera.principal, size: camera.size, near: camera.near,
 });
 
-// An eye on a sphere around a target: turned by angles, moved by its radius.
+// A camera on a sphere around a target, which it looks at. Its state is target, radius, azimuth and elevation.
 class Orbit {
   constructor({ up, target, radius, near }) {
     this.up = up;
     this.home = { target, radius, near };
     const sideways = Math.abs(up[0]) < 0.9 ? [1, 0, 0] : [0, 1, 0];
-    this.first = unit(along(sideways, -dot(sideways, up), up));
+    this.first = unit(addScaled(sideways, -dot(sideways, up), up));
     this.second = cross(up, this.first);
-    this.fieldOfView = 0.7; // radians, of the picture's shorter side
+    this.fieldOfView = 0.7; // radians, along the shorter side of the image
     this.reset();
   }
 
@@ -30,10 +31,10 @@ class Orbit {
     this.elevation = 0.35;
   }
 
-  // Go on from where another view's eye is, looking at the target.
+  // Move to the eye of another view, and look at the initial target.
   follow(view) {
     this.target = this.home.target;
-    const offset = along(view.eye, -1, this.target);
+    const offset = addScaled(view.eye, -1, this.target);
     this.radius = Math.hypot(...offset);
     this.azimuth = Math.atan2(dot(offset, this.second), dot(offset, this.first));
     this.elevation = Math.asin(clamp(dot(offset, this.up) / this.radius, -1, 1));
@@ -50,22 +51,22 @@ class Orbit {
     this.radius = clamp(this.radius * factor, 0.05 * this.home.radius, 20 * this.home.radius);
   }
 
-  // Move the target in the picture's plane, by shares of the radius.
+  // Move the target parallel to the image plane, by fractions of the radius.
   pan(right, up) {
     const { axes } = this.view([1, 1]);
-    this.target = along(this.target, -right * this.radius, axes.slice(0, 3));
-    this.target = along(this.target, -up * this.radius, axes.slice(3, 6));
+    this.target = addScaled(this.target, -right * this.radius, axes.slice(0, 3));
+    this.target = addScaled(this.target, -up * this.radius, axes.slice(3, 6));
   }
 
   view([width, height]) {
-    const flat = Math.cos(this.elevation);
+    const horizontal = Math.cos(this.elevation);
     let back = this.up.map((x) => x * Math.sin(this.elevation));
-    back = along(back, flat * Math.cos(this.azimuth), this.first);
-    back = along(back, flat * Math.sin(this.azimuth), this.second);
+    back = addScaled(back, horizontal * Math.cos(this.azimuth), this.first);
+    back = addScaled(back, horizontal * Math.sin(this.azimuth), this.second);
     const right = unit(cross(this.up, back));
     const focal = (0.5 * Math.min(width, height)) / Math.tan(0.5 * this.fieldOfView);
     return {
-      eye: along(this.target, this.radius, back), axes: [...right, ...cross(back, right), ...back],
+      eye: addScaled(this.target, this.radius, back), axes: [...right, ...cross(back, right), ...back],
       focal: [focal, focal], principal: [width / 2, height / 2], size: [width, height],
       near: Math.min(this.home.near, 0.5 * this.radius),
     };

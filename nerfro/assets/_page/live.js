@@ -1,45 +1,45 @@
-// The page that is served: filled again whenever a training has something new.
+// Live page of a training: asks the server for updates of the model and for the training curve.
 
-const LOOK_AGAIN = 2000; // milliseconds
+const POLL_INTERVAL = 2000; // milliseconds
 
-async function watch(page) {
+async function pollUpdates(page) {
   for (;;) {
-    // While nobody looks, the training need not show anything.
-    if (!document.hidden) await askForNews(page);
-    await new Promise((done) => setTimeout(done, LOOK_AGAIN));
+    // A hidden page sends no requests, so that the training spends no time on updates.
+    if (!document.hidden) await fetchUpdate(page);
+    await new Promise((done) => setTimeout(done, POLL_INTERVAL));
   }
 }
 
-async function askForNews(page) {
+async function fetchUpdate(page) {
   try {
     const answer = await fetch(`state?after=${page.scene.version}`, { cache: "no-store" });
     if (!answer.ok) throw new Error(`${answer.status} ${answer.statusText}`);
-    const { losses, news } = await answer.json();
+    const { losses, update } = await answer.json();
     showLosses(losses);
-    if (news) await refill(page, news);
+    if (update) await applyUpdate(page, update);
     $("message").textContent = "";
   } catch (error) {
     $("message").textContent = `nerfro does not answer (${error.message}); it may have ended.`;
   }
 }
 
-async function refill(page, { scene, arrays }) {
+async function applyUpdate(page, { scene, arrays }) {
   const images = { ...page.images };
   for (const [name, uri] of Object.entries(arrays)) {
     images[name] = new Image();
     images[name].src = uri;
     await images[name].decode();
   }
-  followIndices(page.scene.surface.iors, scene.surface?.iors ?? []);
+  updateIndices(page.scene.surface.iors, scene.surface?.iors ?? []);
   page.images = images;
   page.scene = { ...page.scene, ...scene };
   page.tracer.load(page.scene, images);
   page.changed();
 }
 
-// Sliders that nobody has moved follow indices that are learned.
-function followIndices(before, now) {
-  now.forEach((ior, body) => {
+// Set the sliders to the learned refractive indices, except sliders that the user has moved.
+function updateIndices(before, after) {
+  after.forEach((ior, body) => {
     const slider = $(`ior${body}`);
     if (Number(slider.value) !== before[body]) return;
     slider.value = ior;

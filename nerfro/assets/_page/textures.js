@@ -1,8 +1,8 @@
-// Arrays travel as pictures, so that the browser's own decoder unpacks them: the slices of an array along its last axis
-// lie side by side, see nerfro/viewing/packing.py.
+// Arrays are stored as PNG images, which the browser decodes. The tiles of an image are the slices of an array along its
+// last axis; see nerfro/viewing/packing.py.
 
-// Red, green and blue of every voxel, x fastest; the fourth byte is 255.
-function voxelsOf(image, [width, height, depth]) {
+// Return red, green, blue and alpha (255) of every voxel, x fastest.
+function unpackVoxels(image, [width, height, depth]) {
   const columns = Math.ceil(Math.sqrt(depth));
   const canvas = document.createElement("canvas");
   canvas.width = image.naturalWidth;
@@ -20,17 +20,19 @@ function voxelsOf(image, [width, height, depth]) {
   return new Uint8Array(voxels.buffer);
 }
 
-const distanceBytes = (voxels) =>
+// Decode `two_bytes` of packing.py.
+const signedIntegers = (voxels) =>
   Int16Array.from({ length: voxels.length / 4 }, (_, i) => voxels[4 * i] * 256 + voxels[4 * i + 1] - 32768);
 
-const firstBytes = (voxels) => Uint8Array.from({ length: voxels.length / 4 }, (_, i) => voxels[4 * i]);
+const redChannel = (voxels) => Uint8Array.from({ length: voxels.length / 4 }, (_, i) => voxels[4 * i]);
 
 function withAlpha(colours, alphas) {
   for (let i = 0; i < colours.length; i += 4) colours[i + 3] = alphas[i];
   return colours;
 }
 
-// Radiance with a common exponent (RGB9_E5) of the upper eight bits of its mantissas, and of all that is left.
+// Combine the two arrays of `shared_exponent` in packing.py to the format RGB9_E5: `upper` has the upper eight bits of the
+// mantissas, `rest` has the exponent and the lowest bits.
 function sharedExponent(upper, rest) {
   return Uint32Array.from({ length: upper.length / 4 }, (_, i) => {
     const low = rest[4 * i];
@@ -39,19 +41,20 @@ function sharedExponent(upper, rest) {
   });
 }
 
-// A picture of Radiance's .hdr format: width, height and linear radiance, four numbers a pixel; see files/deep_images.py.
+// Decode an image in Radiance's .hdr format to width, height and linear radiance, four numbers per pixel; see
+// files/deep_images.py.
 function decodeHdr(bytes) {
   let at = 0;
   const line = () => {
     const end = bytes.indexOf(10, at);
-    if (end < 0) throw new Error("the picture is cut short");
+    if (end < 0) throw new Error("the file is truncated");
     const text = String.fromCharCode(...bytes.subarray(at, end));
     at = end + 1;
     return text;
   };
   while (line() !== "");
   const size = /^-Y (\d+) \+X (\d+)$/.exec(line());
-  if (!size) throw new Error("only .hdr pictures of the usual orientation (-Y +X) are read");
+  if (!size) throw new Error("only .hdr images with the orientation -Y +X are supported");
   const [height, width] = [Number(size[1]), Number(size[2])];
   const pixels = new Float32Array(4 * width * height);
   const row = new Uint8Array(4 * width);
@@ -60,7 +63,7 @@ function decodeHdr(bytes) {
       at += 4;
       for (let i = 0; i < 4 * width; ) {
         const count = bytes[at++];
-        if (!count) throw new Error("the picture is damaged");
+        if (!count) throw new Error("the file is damaged");
         const repeated = count > 128;
         for (let k = repeated ? count - 128 : count; k > 0; --k, ++i) {
           row[(i % width) * 4 + Math.floor(i / width)] = repeated ? bytes[at] : bytes[at++];

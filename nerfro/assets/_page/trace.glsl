@@ -1,6 +1,7 @@
 #version 300 es
-// The radiance of one ray through each pixel: nerfro's paths (samplers/snell_cpu.py), and light along all their runs.
-// Positions and lengths are in world units, directions have unit length.
+// Traces one ray through each pixel and integrates radiance along its path. The terms are those of
+// samplers/paths/snell_cpu.py: a segment is the straight part of a path between two events, which are refractions or
+// reflections at the surface of a body. Positions and lengths are in world units; directions are unit vectors.
 precision highp float;
 precision highp int;
 precision highp sampler2D;
@@ -9,50 +10,54 @@ precision highp samplerCube;
 precision highp isampler3D;
 precision highp usampler3D;
 
-// The camera: pixels are counted from the picture's upper left corner, axes are right, up and back (OpenGL).
+// Camera. Pixels are counted from the upper left corner of the image; the axes are right, up and back (OpenGL).
 uniform vec2 focal, principal, jitter;
 uniform float height;
 uniform mat3 axes;
 uniform vec3 eye;
 uniform float near;
 
-// Bodies: the quadratic B-splines of their signed distances, one grid after another along z, each in its own box.
+// Bodies. Their signed distances are quadratic B-splines on grids that follow each other along z in one texture.
 uniform isampler3D coefficients;
-uniform ivec3 vertices;  // of one body's grid
-uniform vec3 gridLow[MAX_BODIES], gridHigh[MAX_BODIES];
-uniform vec3 allLow, allHigh;  // corners of the box of all bodies
-uniform float distanceStep[MAX_BODIES];  // distance of one step of the coefficients
-uniform usampler3D clearance;  // how far blocks of cells are from the body's surface, at least
-uniform float clearanceStep[MAX_BODIES], blockCells;
-uniform float shortestStep;
-uniform int bodies, maxEvents;
-uniform bool nested;  // whether a body is only where all before it are too; a clear one of index 1 is air then
-uniform int startInside;  // bodies that the eye is in, a bit for each
-uniform float index[MAX_BODIES + 1];  // of air and of each body
-uniform vec3 absorption[MAX_BODIES + 1];  // for each world unit
-uniform bool reflection;  // whether the first surface splits light (Fresnel), or the one transmitted path has it all
+uniform ivec3 numVertices;  // of each body's grid
+uniform vec3 gridLow[MAX_BODIES], gridHigh[MAX_BODIES];  // corners of each body's grid
+uniform vec3 boxLow, boxHigh;  // corners of the box of all bodies
+uniform float distanceUnit[MAX_BODIES];  // distance that one unit of the coefficients stands for
+uniform usampler3D clearance;  // lower bound of the distance from each block of cells to the surface of the body
+uniform float clearanceUnit[MAX_BODIES];  // distance that one unit of the clearance stands for
+uniform float blockCells;  // cells per side of a block
+uniform float minStep;  // shortest step of the search for a surface
+uniform int numBodies, maxEvents;
+uniform bool nested;  // whether a body exists only inside all previous bodies; a clear body of index 1 is then air
+uniform int insideAtEye;  // bodies that contain the eye, one bit each
+uniform float index[MAX_BODIES + 1];  // refractive index of air and of each body
+uniform vec3 absorption[MAX_BODIES + 1];  // absorption coefficients of air and of each body, per world unit
+uniform bool reflection;  // whether light splits at the first event (Fresnel); otherwise it is transmitted completely
 
-// What is in the volume: sqrt of colour, and the logarithm of density from 1 / 255 on.
+// Radiance field: square root of the colour; in alpha, a linear function of the logarithm of the density, or 0 if empty.
 uniform sampler3D volume;
-uniform usampler3D occupied;  // whether a brick of the volume holds anything
+uniform usampler3D occupied;  // whether each brick of the volume contains anything
 uniform vec3 volumeLow, volumeHigh;
-uniform vec2 logDensity;  // lowest, and range
-uniform float brightest, marchStep;
-uniform float ball;  // radius around the volume's middle beyond which space is contracted in it; 0 for none
+uniform vec2 logDensity;  // minimum and range
+uniform float maxRadiance;  // radiance that the largest stored colour stands for
+uniform float marchStep;  // length of a step through the volume
+uniform float contractionRadius;  // radius around the centre of the volume beyond which space is contracted; 0 for none
 
-uniform samplerCube sky;  // equal angles, see boundaries/cube_map.py
+// Background radiance: the cube map of the model, or a picture that the user has chosen.
+uniform samplerCube sky;  // texels of equal angles, see boundaries/cube_map.py
 uniform sampler2D picture;  // lat-long, z up, +x in the middle
 uniform bool skyIsPicture;
 
 out vec4 colour;
 
-const int MAX_SEARCH = 512;
-const int MAX_RUNS = 64;
+const int MAX_SEARCH_STEPS = 512;
+const int MAX_SEGMENTS = 64;
 const float FAR = 1e30;
-// Beyond an event, a ray begins so far from the surface on its side, in cells: single precision knows the side there.
-const float ON_ITS_SIDE = 2e-4;
+// Distance between a surface and the start of the next segment, in cells. Closer to the surface, single precision may give
+// the wrong side.
+const float SURFACE_OFFSET = 2e-4;
 
-// Distances at which a line enters and leaves a box.
+// Returns the distances at which a line enters and leaves a box.
 vec2 boxSpan(vec3 low, vec3 high, vec3 x, vec3 d) {
   vec3 inverse = 1.0 / mix(d, vec3(1e-20), equal(d, vec3(0.0)));
   vec3 toLow = (low - x) * inverse, toHigh = (high - x) * inverse;
@@ -61,19 +66,20 @@ vec2 boxSpan(vec3 low, vec3 high, vec3 x, vec3 d) {
 }
 
 vec3 cellsPerUnit(int body) {
-  return vec3(vertices - 1) / (gridHigh[body] - gridLow[body]);
+  return vec3(numVertices - 1) / (gridHigh[body] - gridLow[body]);
 }
 
-// Gradient and value of one body's signed distance; outside of its box a lower bound (media/distance_grid.py).
+// Returns the gradient and value of the signed distance to a body; outside of its box a lower bound
+// (media/distance_grid.py).
 vec4 signedDistance(int body, vec3 x) {
   vec3 scale = cellsPerUnit(body);
   vec3 nearest = clamp(x, gridLow[body], gridHigh[body]);
-  vec3 place = (nearest - gridLow[body]) * scale;
-  ivec3 centre = clamp(ivec3(floor(place + 0.5)), ivec3(1), vertices - 2);
-  vec3 t = clamp(place - vec3(centre), -1.5, 1.5);
+  vec3 gridPosition = (nearest - gridLow[body]) * scale;
+  ivec3 centre = clamp(ivec3(floor(gridPosition + 0.5)), ivec3(1), numVertices - 2);
+  vec3 t = clamp(gridPosition - vec3(centre), -1.5, 1.5);
   vec3 weight[3] = vec3[3](0.5 * (0.5 - t) * (0.5 - t), 0.75 - t * t, 0.5 * (0.5 + t) * (0.5 + t));
   vec3 slope[3] = vec3[3](t - 0.5, -2.0 * t, t + 0.5);
-  ivec3 corner = centre - 1 + ivec3(0, 0, body * vertices.z);
+  ivec3 corner = centre - 1 + ivec3(0, 0, body * numVertices.z);
   vec4 sum = vec4(0.0);
   for (int k = 0; k < 3; ++k) {
     for (int j = 0; j < 3; ++j) {
@@ -86,27 +92,29 @@ vec4 signedDistance(int body, vec3 x) {
       sum += vec4(line.x * wy * wz, line.y * slope[j].y * wz, line.y * wy * slope[k].z, line.y * wy * wz);
     }
   }
-  vec4 phi = distanceStep[body] * sum * vec4(scale, 1.0);
-  float beyond = distance(x, nearest);
-  return beyond > 0.0 && phi.w > 0.0 ? vec4(normalize(x - nearest), length(vec2(beyond, phi.w))) : phi;
+  vec4 phi = distanceUnit[body] * sum * vec4(scale, 1.0);
+  float outside = distance(x, nearest);
+  return outside > 0.0 && phi.w > 0.0 ? vec4(normalize(x - nearest), length(vec2(outside, phi.w))) : phi;
 }
 
-float freeAround(vec3 x) {
+// Returns a lower bound of the distance to the surfaces of all bodies.
+float clearanceAt(vec3 x) {
   ivec3 blocks = textureSize(clearance, 0);
-  blocks.z /= bodies;
+  blocks.z /= numBodies;
   float free = FAR;
-  for (int body = 0; body < bodies; ++body) {
+  for (int body = 0; body < numBodies; ++body) {
     vec3 nearest = clamp(x, gridLow[body], gridHigh[body]);
     ivec3 block = min(ivec3((nearest - gridLow[body]) * cellsPerUnit(body) / blockCells), blocks - 1);
-    float known = float(texelFetch(clearance, block + ivec3(0, 0, body * blocks.z), 0).r);
-    free = min(free, length(vec2(distance(x, nearest), clearanceStep[body] * known)));
+    float units = float(texelFetch(clearance, block + ivec3(0, 0, body * blocks.z), 0).r);
+    free = min(free, length(vec2(distance(x, nearest), clearanceUnit[body] * units)));
   }
   return free;
 }
 
+// Returns the number of the innermost body, from 1; 0 in air (media/solid.py).
 int innermost(int inside) {
   int number = 0;
-  for (int body = 0; body < bodies; ++body) {
+  for (int body = 0; body < numBodies; ++body) {
     if ((inside >> body & 1) == 1) number = body + 1;
     else if (nested) break;
   }
@@ -114,24 +122,25 @@ int innermost(int inside) {
 }
 
 struct Hit {
-  int body;  // -1 where no surface lies ahead
-  float before, after;  // lengths on both sides of the surface
+  int body;  // body whose surface is hit; -1 for none
+  float before, after;  // lengths just before and just behind the surface
   vec3 normal;
 };
 
-// The first surface on a line. Sphere tracing ends in a change of sign; then the root is bracketed (Illinois method).
-Hit surfaceAhead(vec3 x, vec3 d, int inside) {
+// Finds the first surface on a line. Sphere tracing advances to a change of sign; the Illinois method then shrinks the
+// bracket around the root.
+Hit firstSurface(vec3 x, vec3 d, int inside) {
   Hit hit = Hit(-1, 0.0, 0.0, vec3(0.0));
-  vec2 span = boxSpan(allLow, allHigh, x, d);
+  vec2 span = boxSpan(boxLow, boxHigh, x, d);
   float t = max(span.x, 0.0), leave = span.y;
-  if (bodies == 0 || t >= leave) return hit;
+  if (numBodies == 0 || t >= leave) return hit;
   float before = t, after = FAR, ownSide = 1.0, otherSide = 0.0;
   float tolerance = 1e-7 * (leave - t) + 2e-7 * t;
-  for (int search = 0; search < MAX_SEARCH; ++search) {
+  for (int search = 0; search < MAX_SEARCH_STEPS; ++search) {
     vec3 p = x + t * d;
     if (hit.body < 0) {
-      float free = freeAround(p);
-      if (free > 2.0 * shortestStep) {
+      float free = clearanceAt(p);
+      if (free > 2.0 * minStep) {
         before = t;
         ownSide = free;
         t += free;
@@ -139,10 +148,10 @@ Hit surfaceAhead(vec3 x, vec3 d, int inside) {
         continue;
       }
     }
-    // The smallest distance to a surface, each body's positive on the ray's side of it.
+    // Signed distance to the nearest surface, positive on the side of the surface where the line begins.
     vec4 nearest = vec4(FAR);
     int body = 0;
-    for (int b = 0; b < bodies; ++b) {
+    for (int b = 0; b < numBodies; ++b) {
       vec4 phi = signedDistance(b, p) * ((inside >> b & 1) == 1 ? -1.0 : 1.0);
       if (phi.w < nearest.w) {
         nearest = phi;
@@ -161,7 +170,7 @@ Hit surfaceAhead(vec3 x, vec3 d, int inside) {
       otherSide *= 0.5;
     }
     if (hit.body < 0) {
-      t = min(t + max(nearest.w, shortestStep), leave);
+      t = min(t + max(nearest.w, minStep), leave);
       continue;
     }
     if (after - before <= tolerance) break;
@@ -175,68 +184,73 @@ Hit surfaceAhead(vec3 x, vec3 d, int inside) {
   return hit;
 }
 
-// Share of unpolarised light that a surface reflects, for cosines on both sides and n = n_after / n_before.
-float fresnel(float cosine, float cosineAfter, float n) {
+// Returns the Fresnel reflectance for unpolarised light, given the cosines on both sides and n = n_after / n_before.
+float fresnelReflectance(float cosine, float cosineAfter, float n) {
   float s = (cosine - n * cosineAfter) / (cosine + n * cosineAfter);
   float p = (n * cosine - cosineAfter) / (n * cosine + cosineAfter);
   return 0.5 * (s * s + p * p);
 }
 
-// Share of a length that is left of it in the volume, and the place there (geometry/contraction.py).
-float shrinkage(vec3 x) {
+// Returns the scale of lengths under contraction (geometry/contraction.py).
+float contractionScale(vec3 x) {
   vec3 offset = x - 0.5 * (volumeLow + volumeHigh);
-  return ball > 0.0 ? min(ball * ball / dot(offset, offset), 1.0) : 1.0;
+  return contractionRadius > 0.0 ? min(contractionRadius * contractionRadius / dot(offset, offset), 1.0) : 1.0;
 }
 
-vec3 inVolume(vec3 x) {
+// Maps a position to contracted space.
+vec3 contract(vec3 x) {
   vec3 middle = 0.5 * (volumeLow + volumeHigh);
-  float share = sqrt(shrinkage(x));
+  float share = sqrt(contractionScale(x));
   return middle + (2.0 - share) * share * (x - middle);
 }
 
-// Steps of `delta` to the wall of an empty brick, at least one; none is skipped where lines are bent in the volume.
-float stepsToWall(vec3 place, vec3 brick, vec3 bricks, vec3 x, vec3 d, float delta) {
+// Returns the number of steps of length `delta` to the end of an empty brick, at least 1. In contracted space, lines are
+// curved, so the result is 1 there.
+float stepsToBrickEnd(vec3 position, vec3 brick, vec3 bricks, vec3 x, vec3 d, float delta) {
   vec3 size = volumeHigh - volumeLow;
-  vec3 walls = ((brick + vec3(greaterThan(d, vec3(0.0)))) / bricks - place) * size;
+  vec3 walls = ((brick + vec3(greaterThan(d, vec3(0.0)))) / bricks - position) * size;
   vec3 ahead = mix(walls / d, vec3(FAR), lessThan(abs(d), vec3(1e-9)));
-  float straight = ball > 0.0 ? ball - distance(x, 0.5 * (volumeLow + volumeHigh)) : FAR;
+  float straight = contractionRadius > 0.0 ? contractionRadius - distance(x, 0.5 * (volumeLow + volumeHigh)) : FAR;
   return max(ceil(min(straight, min(ahead.x, min(ahead.y, ahead.z))) / delta), 1.0);
 }
 
-// Light of the volume on a straight run, and what the run leaves of the light behind it.
-void march(vec3 x, vec3 d, float start, float end, vec3 absorbed, inout vec3 left, inout vec3 radiance) {
+// Marches along a segment: adds the radiance of the volume, and multiplies the throughput by the transmittance of the
+// volume and of the absorbing body.
+void march(vec3 x, vec3 d, float start, float end, vec3 bodyAbsorption, inout vec3 throughput, inout vec3 radiance) {
   vec3 size = volumeHigh - volumeLow;
-  vec2 span = ball > 0.0 ? vec2(start, min(end, 1e4 * ball)) : boxSpan(volumeLow, volumeHigh, x, d);
+  vec2 span = boxSpan(volumeLow, volumeHigh, x, d);
+  if (contractionRadius > 0.0) span = vec2(start, min(end, 1e4 * contractionRadius));
   float first = max(span.x, start), last = min(span.y, end);
   vec3 bricks = vec3(textureSize(occupied, 0)), texels = vec3(textureSize(volume, 0));
   float transmittance = 1.0;
   if (first < last) {
-    // Where a run only just enters the volume a step must still be one in single precision, or the loop never ends.
+    // A segment may touch only a corner of the volume. The lower bound keeps t + delta > t in single precision.
     float delta = max((last - first) / ceil((last - first) / marchStep), 1e-6 * last);
-    // Steps are even in the volume, and wider in the world where it contracts space.
-    for (float t = first + 0.5 * delta / shrinkage(x + first * d); t < last && transmittance > 1e-3;) {
+    // Steps have equal lengths in contracted space.
+    for (float t = first + 0.5 * delta / contractionScale(x + first * d); t < last && transmittance > 1e-3;) {
       vec3 here = x + t * d;
-      float smaller = shrinkage(here);
-      vec3 place = clamp((inVolume(here) - volumeLow) / size, 0.0, 0.999999);
-      vec3 brick = floor(place * bricks);
+      float scale = contractionScale(here);
+      vec3 position = clamp((contract(here) - volumeLow) / size, 0.0, 0.999999);
+      vec3 brick = floor(position * bricks);
       if (texelFetch(occupied, ivec3(brick), 0).r == 0u) {
-        t += delta / smaller * stepsToWall(place, brick, bricks, here, d, delta);
+        t += delta / scale * stepsToBrickEnd(position, brick, bricks, here, d, delta);
         continue;
       }
-      vec4 stored = textureLod(volume, (place * (texels - 1.0) + 0.5) / texels, 0.0);
+      vec4 stored = textureLod(volume, (position * (texels - 1.0) + 0.5) / texels, 0.0);
       if (stored.a > 0.5 / 255.0) {
-        float passes = exp(-delta * exp(logDensity.x + logDensity.y * stored.a));
-        vec3 light = brightest * stored.rgb * stored.rgb;
-        radiance += left * exp(-absorbed * (t - start)) * transmittance * (1.0 - passes) * light;
-        transmittance *= passes;
+        float stepTransmittance = exp(-delta * exp(logDensity.x + logDensity.y * stored.a));
+        vec3 light = maxRadiance * stored.rgb * stored.rgb;
+        radiance += throughput * exp(-bodyAbsorption * (t - start)) * transmittance * (1.0 - stepTransmittance) * light;
+        transmittance *= stepTransmittance;
       }
-      t += delta / smaller;
+      t += delta / scale;
     }
   }
-  left *= transmittance * exp(-absorbed * (min(end, FAR) - start));
+  throughput *= transmittance * exp(-bodyAbsorption * (min(end, FAR) - start));
 }
 
-vec3 fromSky(vec3 d) {
+// Returns the background radiance from a direction.
+vec3 backgroundRadiance(vec3 d) {
   const float PI = 3.14159265358979;
   if (skyIsPicture) {
     return textureLod(picture, vec2(0.5 - atan(d.y, d.x) / (2.0 * PI), acos(clamp(d.z, -1.0, 1.0)) / PI), 0.0).rgb;
@@ -245,75 +259,76 @@ vec3 fromSky(vec3 d) {
   return textureLod(sky, atan(d / max(a.x, max(a.y, a.z))) * (4.0 / PI), 0.0).rgb;
 }
 
-// All light on a path, and on the one that the first surface splits from it.
-vec3 radianceFrom(vec3 x, vec3 d) {
-  vec3 radiance = vec3(0.0), left = vec3(1.0);
-  vec3 splitFrom = vec3(0.0), splitTowards = vec3(0.0), splitLeft = vec3(0.0);
-  int inside = startInside, splitInside = 0;
+// Integrates radiance along the main path, then along the pending branch that is reflected at the first event, if any.
+vec3 pathRadiance(vec3 x, vec3 d) {
+  vec3 radiance = vec3(0.0), throughput = vec3(1.0);
+  vec3 pendingPosition = vec3(0.0), pendingDirection = vec3(0.0), pendingThroughput = vec3(0.0);
+  int inside = insideAtEye, pendingInside = 0;
   float start = near;
-  int events = 0;
+  int numEvents = 0;
   for (int branch = 0; branch < 2; ++branch) {
-    for (int run = 0; run < MAX_RUNS; ++run) {
-      Hit hit = surfaceAhead(x, d, inside);
-      int flipped = inside, bodyBefore = innermost(inside), bodyAfter = bodyBefore;
+    for (int segment = 0; segment < MAX_SEGMENTS; ++segment) {
+      Hit hit = firstSurface(x, d, inside);
+      int insideAfter = inside, bodyBefore = innermost(inside), bodyAfter = bodyBefore;
       if (hit.body >= 0) {
-        flipped = inside ^ (1 << hit.body);
-        bodyAfter = innermost(flipped);
-        if (bodyAfter == 0 && bodyBefore > 0) {  // a thin gap of air between bodies counts as closed
-          vec3 behind = x + (hit.after + shortestStep) * d;
-          int met = 0;
-          for (int b = 0; b < bodies; ++b) {
-            if (b != hit.body && (signedDistance(b, behind).w < 0.0) != ((flipped >> b & 1) == 1)) met |= 1 << b;
+        insideAfter = inside ^ (1 << hit.body);
+        bodyAfter = innermost(insideAfter);
+        if (bodyAfter == 0 && bodyBefore > 0) {  // a gap of air thinner than the shortest step counts as closed
+          vec3 behind = x + (hit.after + minStep) * d;
+          int crossed = 0;
+          for (int b = 0; b < numBodies; ++b) {
+            bool isInside = (insideAfter >> b & 1) == 1;
+            if (b != hit.body && (signedDistance(b, behind).w < 0.0) != isInside) crossed |= 1 << b;
           }
-          if (met != 0) hit.after += shortestStep;
-          flipped ^= met;
-          bodyAfter = innermost(flipped);
+          if (crossed != 0) hit.after += minStep;
+          insideAfter ^= crossed;
+          bodyAfter = innermost(insideAfter);
         }
       }
       float n = index[bodyAfter] / index[bodyBefore];
-      bool bends = hit.body >= 0 && n != 1.0;
-      bool ends = hit.body < 0 || bends && events >= maxEvents;
-      march(x, d, start, ends ? FAR : hit.after, ends ? vec3(0.0) : absorption[bodyBefore], left, radiance);
-      if (ends) {
-        radiance += left * fromSky(d);
+      bool isEvent = hit.body >= 0 && n != 1.0;
+      bool isLast = hit.body < 0 || isEvent && numEvents >= maxEvents;
+      march(x, d, start, isLast ? FAR : hit.after, isLast ? vec3(0.0) : absorption[bodyBefore], throughput, radiance);
+      if (isLast) {
+        radiance += throughput * backgroundRadiance(d);
         break;
       }
       vec3 normal = dot(hit.normal, d) > 0.0 ? -hit.normal : hit.normal;
       vec3 cells = cellsPerUnit(hit.body);
-      vec3 apart = normal * ON_ITS_SIDE / min(cells.x, min(cells.y, cells.z));
+      vec3 offset = normal * SURFACE_OFFSET / min(cells.x, min(cells.y, cells.z));
       start = 0.0;
-      if (!bends) {
-        x += hit.after * d - apart;
-        inside = flipped;
+      if (!isEvent) {
+        x += hit.after * d - offset;
+        inside = insideAfter;
         continue;
       }
-      ++events;
+      ++numEvents;
       float cosine = -dot(normal, d);
       float squared = 1.0 - (1.0 - cosine * cosine) / (n * n);
-      vec3 mirrored = normalize(d + 2.0 * cosine * normal);
+      vec3 reflected = normalize(d + 2.0 * cosine * normal);
       if (squared <= 0.0) {
-        x += hit.before * d + apart;
-        d = mirrored;
+        x += hit.before * d + offset;
+        d = reflected;
         continue;
       }
-      if (reflection && branch == 0 && events == 1) {
-        float share = fresnel(cosine, sqrt(squared), n);
-        splitFrom = x + hit.before * d + apart;
-        splitTowards = mirrored;
-        splitInside = inside;
-        splitLeft = share * left;
-        left *= 1.0 - share;
+      if (reflection && branch == 0 && numEvents == 1) {
+        float reflectance = fresnelReflectance(cosine, sqrt(squared), n);
+        pendingPosition = x + hit.before * d + offset;
+        pendingDirection = reflected;
+        pendingInside = inside;
+        pendingThroughput = reflectance * throughput;
+        throughput *= 1.0 - reflectance;
       }
-      x += hit.after * d - apart;
+      x += hit.after * d - offset;
       d = normalize(d / n + (cosine / n - sqrt(squared)) * normal);
-      inside = flipped;
+      inside = insideAfter;
     }
-    if (splitLeft == vec3(0.0)) break;
-    x = splitFrom;
-    d = splitTowards;
-    left = splitLeft;
-    inside = splitInside;
-    events = 1;
+    if (pendingThroughput == vec3(0.0)) break;
+    x = pendingPosition;
+    d = pendingDirection;
+    throughput = pendingThroughput;
+    inside = pendingInside;
+    numEvents = 1;
     start = 0.0;
   }
   return radiance;
@@ -322,6 +337,6 @@ vec3 radianceFrom(vec3 x, vec3 d) {
 void main() {
   vec2 pixel = vec2(gl_FragCoord.x, height - gl_FragCoord.y) + jitter;
   vec3 direction = vec3((pixel.x - principal.x) / focal.x, (principal.y - pixel.y) / focal.y, -1.0);
-  // Half floats end at 65504.
-  colour = vec4(min(radianceFrom(eye, normalize(axes * direction)), 6e4), 1.0);
+  // The largest half-precision number is 65504.
+  colour = vec4(min(pathRadiance(eye, normalize(axes * direction)), 6e4), 1.0);
 }

@@ -1,6 +1,6 @@
-// WebGL2: the textures of a scene, and the two programs that trace and show it.
+// WebGL2: the textures of a scene, the program that traces it, and the program that shows the result.
 
-// Textures of the tracing program, in the order of their units.
+// Textures of the tracing program, in the order of their texture units.
 const UNITS = ["coefficients", "clearance", "volume", "occupied", "sky", "picture"];
 
 class Tracer {
@@ -19,7 +19,7 @@ class Tracer {
     gl.bindVertexArray(gl.createVertexArray());
   }
 
-  // Fill the textures with a scene's arrays; `images` are decoded pictures by name.
+  // Upload the arrays of a scene to textures; `images` are the arrays as decoded images, by name.
   load(scene, images) {
     const gl = this.gl;
     const { surface, volume, sky } = scene;
@@ -32,21 +32,21 @@ class Tracer {
     }
     this.scene = scene;
     if (surface.iors.length) {
-      const distances = distanceBytes(voxelsOf(images.distances, surface.size));
-      this.texture3D("coefficients", gl.R16I, gl.RED_INTEGER, gl.SHORT, surface.size, distances);
-      const blocks = firstBytes(voxelsOf(images.clearance, surface.blocks));
-      this.texture3D("clearance", gl.R8UI, gl.RED_INTEGER, gl.UNSIGNED_BYTE, surface.blocks, blocks);
-      this.signs = distances;
+      const distances = signedIntegers(unpackVoxels(images.distances, surface.gridSize));
+      this.texture3D("coefficients", gl.R16I, gl.RED_INTEGER, gl.SHORT, surface.gridSize, distances);
+      const clearance = redChannel(unpackVoxels(images.clearance, surface.clearanceSize));
+      this.texture3D("clearance", gl.R8UI, gl.RED_INTEGER, gl.UNSIGNED_BYTE, surface.clearanceSize, clearance);
+      this.distances = distances;
     } else {
       this.texture3D("coefficients", gl.R16I, gl.RED_INTEGER, gl.SHORT, [1, 1, 1], new Int16Array(1));
       this.texture3D("clearance", gl.R8UI, gl.RED_INTEGER, gl.UNSIGNED_BYTE, [1, 1, 1], new Uint8Array(1));
     }
-    const content = withAlpha(voxelsOf(images.colour, volume.size), voxelsOf(images.density, volume.size));
+    const content = withAlpha(unpackVoxels(images.colour, volume.size), unpackVoxels(images.density, volume.size));
     this.texture3D("volume", gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, volume.size, content, gl.LINEAR);
-    const occupied = firstBytes(voxelsOf(images.occupied, volume.bricks));
-    this.texture3D("occupied", gl.R8UI, gl.RED_INTEGER, gl.UNSIGNED_BYTE, volume.bricks, occupied);
+    const occupied = redChannel(unpackVoxels(images.occupied, volume.occupiedSize));
+    this.texture3D("occupied", gl.R8UI, gl.RED_INTEGER, gl.UNSIGNED_BYTE, volume.occupiedSize, occupied);
     const faces = sharedExponent(
-      voxelsOf(images.sky, [sky.size, sky.size, 6]), voxelsOf(images.sky_exponent, [sky.size, sky.size, 6]));
+      unpackVoxels(images.sky, [sky.size, sky.size, 6]), unpackVoxels(images.sky_exponent, [sky.size, sky.size, 6]));
     this.bind("sky", gl.TEXTURE_CUBE_MAP, gl.LINEAR);
     for (let face = 0; face < 6; ++face) {
       gl.texImage2D(
@@ -56,7 +56,7 @@ class Tracer {
     if (!this.textures.picture) this.setPicture(null);
   }
 
-  // Another sky: a lat-long picture (an image, or decoded radiance); null for the scene's own.
+  // Replace the sky by a lat-long picture (an image, or radiance from `decodeHdr`); null restores the sky of the scene.
   setPicture(picture) {
     const gl = this.gl;
     this.skyIsPicture = picture !== null;
@@ -68,13 +68,13 @@ class Tracer {
       const { width, height, pixels } = picture;
       gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA16F, width, height, 0, gl.RGBA, gl.FLOAT, pixels);
     } else {
-      const format = this.scene.linear ? gl.SRGB8_ALPHA8 : gl.RGBA8; // the sampler undoes sRGB
+      const format = this.scene.linear ? gl.SRGB8_ALPHA8 : gl.RGBA8; // SRGB8_ALPHA8 textures are decoded to linear values
       gl.texImage2D(gl.TEXTURE_2D, 0, format, gl.RGBA, gl.UNSIGNED_BYTE, picture);
     }
   }
 
-  // Trace one ray through each pixel, `jitter` from its centre, and mix it with those before: its share is `weight`.
-  // A view has: eye, axes (right, up, back), focal, principal and size in pixels of its own picture, near.
+  // Trace one ray through each pixel, at the offset `jitter` from its centre, and blend the result with the previous rays
+  // by `weight`. See camera.js for views; the resolution of the traced image may differ from `view.size`.
   trace(view, settings, [width, height], jitter = [0, 0], weight = 1) {
     const gl = this.gl;
     this.resize(width, height);
@@ -87,36 +87,37 @@ class Tracer {
     });
     const scale = [width / view.size[0], height / view.size[1]];
     const { surface, volume } = this.scene;
-    const shown = settings.glass ? surface.iors.length : 0;
-    this.set("trace", {
+    const numBodies = settings.glass ? surface.iors.length : 0;
+    this.setUniforms("trace", {
       focal: [view.focal[0] * scale[0], view.focal[1] * scale[1]],
       principal: [view.principal[0] * scale[0], view.principal[1] * scale[1]],
       jitter, height, axes: view.axes, eye: view.eye, near: view.near,
-      vertices: surface.vertices, gridLow: surface.low.flat(), gridHigh: surface.high.flat(),
-      allLow: extremes(surface.low, Math.min), allHigh: extremes(surface.high, Math.max), distanceStep: surface.steps,
-      clearanceStep: surface.clearances, blockCells: surface.block, shortestStep: surface.shortest,
-      bodies: shown, nested: surface.nested, maxEvents: surface.events, startInside: shown ? this.bodiesAt(view.eye) : 0,
+      numVertices: surface.numVertices, gridLow: surface.low.flat(), gridHigh: surface.high.flat(),
+      boxLow: alongAxes(Math.min, surface.low), boxHigh: alongAxes(Math.max, surface.high),
+      distanceUnit: surface.distanceUnits, clearanceUnit: surface.clearanceUnits, blockCells: surface.blockCells,
+      minStep: surface.minStep, numBodies, nested: surface.nested, maxEvents: surface.maxEvents,
+      insideAtEye: numBodies ? this.bodiesAt(view.eye) : 0,
       absorption: [0, 0, 0, ...settings.absorption.flat()],
       reflection: settings.reflection,
-      volumeLow: volume.low, volumeHigh: volume.high, logDensity: volume.density, brightest: volume.brightest,
-      marchStep: volume.step, ball: volume.radius, skyIsPicture: this.skyIsPicture,
+      volumeLow: volume.low, volumeHigh: volume.high, logDensity: volume.logDensity, maxRadiance: volume.maxRadiance,
+      marchStep: volume.marchStep, contractionRadius: volume.contractionRadius, skyIsPicture: this.skyIsPicture,
     });
     gl.enable(gl.BLEND);
     gl.blendColor(0, 0, 0, weight);
     gl.blendFunc(gl.CONSTANT_ALPHA, gl.ONE_MINUS_CONSTANT_ALPHA);
-    // Bodies whose index depends on the wavelength take one pass for each colour.
-    const colours = surface.dispersion.flat().some((change) => change !== 0) ? [0, 1, 2] : [-1];
-    for (const colour of colours) {
-      const indexOf = (ior, body) => ior + (colour < 0 ? 0 : (ior - 1) * surface.dispersion[body][colour]);
-      this.set("trace", { index: [1, ...settings.iors.map(indexOf)] });
-      if (colour >= 0) gl.colorMask(colour === 0, colour === 1, colour === 2, colour === 2);
+    // If a body disperses, each colour channel is traced with its own indices; otherwise (-1) all channels at once.
+    const channels = surface.dispersion.flat().some((change) => change !== 0) ? [0, 1, 2] : [-1];
+    for (const channel of channels) {
+      const indexOf = (ior, body) => ior + (channel < 0 ? 0 : (ior - 1) * surface.dispersion[body][channel]);
+      this.setUniforms("trace", { index: [1, ...settings.iors.map(indexOf)] });
+      if (channel >= 0) gl.colorMask(channel === 0, channel === 1, channel === 2, channel === 2);
       gl.drawArrays(gl.TRIANGLES, 0, 3);
     }
     gl.colorMask(true, true, true, true);
     gl.disable(gl.BLEND);
   }
 
-  // Show what is traced on the whole canvas.
+  // Scale the traced image to the canvas.
   show() {
     const gl = this.gl;
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
@@ -124,18 +125,19 @@ class Tracer {
     gl.useProgram(this.programs.show.program);
     gl.activeTexture(gl.TEXTURE0);
     gl.bindTexture(gl.TEXTURE_2D, this.target);
-    this.set("show", { size: [this.canvas.width, this.canvas.height], linear: this.scene.linear });
+    this.setUniforms("show", { size: [this.canvas.width, this.canvas.height], linear: this.scene.linear });
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  // A bit for each body that a place is in, by the vertex next to it.
-  bodiesAt(place) {
-    const { vertices, low, high, iors } = this.scene.surface;
-    const [nx, ny, nz] = vertices;
+  // Return the bodies that contain a position, one bit each, from the signed distances at the nearest grid vertex.
+  bodiesAt(position) {
+    const { numVertices, low, high, iors } = this.scene.surface;
+    const [nx, ny, nz] = numVertices;
     return iors.reduce((bits, _, b) => {
-      const at = place.map((x, i) => Math.round(((x - low[b][i]) / (high[b][i] - low[b][i])) * (vertices[i] - 1)));
-      if (at.some((i, axis) => i < 0 || i >= vertices[axis])) return bits;
-      return bits | ((this.signs[((b * nz + at[2]) * ny + at[1]) * nx + at[0]] < 0) << b);
+      const vertex = position.map((x, axis) =>
+        Math.round(((x - low[b][axis]) / (high[b][axis] - low[b][axis])) * (numVertices[axis] - 1)));
+      if (vertex.some((i, axis) => i < 0 || i >= numVertices[axis])) return bits;
+      return bits | ((this.distances[((b * nz + vertex[2]) * ny + vertex[1]) * nx + vertex[0]] < 0) << b);
     }, 0);
   }
 
@@ -178,11 +180,11 @@ class Tracer {
   program(fragment) {
     const gl = this.gl;
     const program = gl.createProgram();
-    // One triangle over the whole picture.
+    // One triangle that covers the whole image.
     const vertex = `#version 300 es
       void main() { gl_Position = vec4(4 * (gl_VertexID & 1) - 1, 2 * (gl_VertexID & 2) - 1, 0, 1); }`;
-    for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
-      const shader = gl.createShader(kind);
+    for (const [type, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
+      const shader = gl.createShader(type);
       gl.shaderSource(shader, text);
       gl.compileShader(shader);
       gl.attachShader(program, shader);
@@ -196,13 +198,13 @@ class Tracer {
     const uniforms = {};
     for (let i = gl.getProgramParameter(program, gl.ACTIVE_UNIFORMS) - 1; i >= 0; --i) {
       const { name, type } = gl.getActiveUniform(program, i);
-      uniforms[name.replace("[0]", "")] = { type, place: gl.getUniformLocation(program, name) };
+      uniforms[name.replace("[0]", "")] = { type, location: gl.getUniformLocation(program, name) };
     }
-    UNITS.forEach((name, unit) => uniforms[name] && gl.uniform1i(uniforms[name].place, unit));
+    UNITS.forEach((name, unit) => uniforms[name] && gl.uniform1i(uniforms[name].location, unit));
     return { program, uniforms };
   }
 
-  set(program, values) {
+  setUniforms(program, values) {
     const gl = this.gl;
     const setters = {
       [gl.FLOAT]: "uniform1fv", [gl.FLOAT_VEC2]: "uniform2fv", [gl.FLOAT_VEC3]: "uniform3fv",
@@ -210,13 +212,13 @@ class Tracer {
     };
     for (const [name, value] of Object.entries(values)) {
       const uniform = this.programs[program].uniforms[name];
-      if (!uniform) continue; // the compiler found that it changes nothing
-      if (uniform.type === gl.FLOAT_MAT3) gl.uniformMatrix3fv(uniform.place, false, value);
-      else gl[setters[uniform.type]](uniform.place, [value].flat());
+      if (!uniform) continue; // the compiler has removed an unused uniform
+      if (uniform.type === gl.FLOAT_MAT3) gl.uniformMatrix3fv(uniform.location, false, value);
+      else gl[setters[uniform.type]](uniform.location, [value].flat());
     }
   }
 }
 
-// The least or largest coordinate of several corners along each axis.
-const extremes = (corners, choose) => [0, 1, 2].map((axis) => choose(...corners.map((corner) => corner[axis])));
+// Apply a function to the coordinates of all corners along each axis.
+const alongAxes = (reduce, corners) => [0, 1, 2].map((axis) => reduce(...corners.map((corner) => corner[axis])));
 const source = (name) => document.getElementById(`${name}.glsl`).textContent.trim();
