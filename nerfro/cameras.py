@@ -180,7 +180,9 @@ class Cameras:
             far=torch.full_like(x, self.far),
         )
 
-    def project(self, points: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "V P 2"], Float[Tensor, "V P"]]:
+    def project(
+        self, points: Float[Tensor, "points 3"]
+    ) -> tuple[Float[Tensor, "V points 2"], Float[Tensor, "V points"]]:
         """Project points of the world into the images.
 
         Returns:

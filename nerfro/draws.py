@@ -40,7 +40,7 @@ class Draws:
         """
         return self.uniform(self.ray[ray], num, stream)
 
-    def uniform(self, index: Int[Tensor, "N"], num: int, stream: str) -> Float[Tensor, "N num"]:
+    def uniform(self, index: Int[Tensor, " rows"], num: int, stream: str) -> Float[Tensor, "rows num"]:
         """Draw uniform multiples of 2^-24 in [0, 1), in single precision.
 
         Args:
@@ -50,7 +50,7 @@ class Draws:
         """
         return (self.words(index, num, stream) >> 8).float() * 2.0**-24
 
-    def words(self, index: Int[Tensor, "N"], num: int, stream: str) -> Int[Tensor, "N num"]:
+    def words(self, index: Int[Tensor, " rows"], num: int, stream: str) -> Int[Tensor, "rows num"]:
         """Draw uniform integers from 0 to 2^32 - 1; the arguments are those of `uniform`."""
         block = torch.arange(-(-num // 4), device=index.device)
         index = index[:, None].expand(-1, len(block))

@@ -88,7 +88,7 @@ def subdivide(
     subdivision: Subdivision,
     trace: Trace | None,
     trace_exits: TraceExits | None,
-    contrasts: Callable[[Int[Tensor, "N"]], Float[Tensor, "N"]] | None,
+    contrasts: Callable[[Int[Tensor, " subset"]], Float[Tensor, " subset"]] | None,
 ) -> PixelRays:
     """Trace rays through pixels, several for pixels that one ray does not represent.
 

@@ -1,7 +1,20 @@
 """Values that pass between components. Lengths are in world units, and shapes use the following axis letters.
 
-R rays, P polylines, S path vertices, N samples, V views, H and W pixels, L sampling levels. If no ray splits, the
-number of polylines equals the number of rays, P = R.
+| Letter | Axis |
+|---|---|
+| R | rays |
+| P | polylines; P = R if no ray splits |
+| S | vertices of a polyline |
+| N | samples of a polyline |
+| E | boundaries of the intervals of samples, E = N + 1 |
+| Q | pixels |
+| V | views |
+| H, W | rows and columns of an image |
+| K | bodies |
+| C | channels |
+
+All modules and plugins use these letters for these axes only. Other axes have names, such as `points`, or letters that
+are defined where they are used. A name on its own begins with a space, which linters require.
 """
 
 from __future__ import annotations
@@ -71,7 +84,7 @@ class Path:
     surface: Int[Tensor, "P S"]
     across: Int[Tensor, "P S"]
     triangle: Int[Tensor, "P S"]
-    absorption: Float[Tensor, "B 3"]
+    absorption: Float[Tensor, "media 3"]
     band: Int[Tensor, "P"]
     samples: Samples | None = None
 
@@ -194,7 +207,7 @@ class Path:
         rows["ray"] = torch.arange(len(rows["s"]), device=self.s.device)
         return replace(self, samples=None, **rows)
 
-    def of_rays(self, rows: Int[Tensor, "C"]) -> Path:
+    def of_rays(self, rows: Int[Tensor, " selected"]) -> Path:
         """Select rays with all their polylines."""
         if not self.splits:
             return self[rows]

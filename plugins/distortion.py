@@ -35,7 +35,7 @@ class Distortion(Loss):
         return batch.per_pixel(rendering.path.per_ray(distortion(weights, edges))).mean()
 
 
-def distortion(weights: Float[Tensor, "R N"], edges: Float[Tensor, "R N+1"]) -> Float[Tensor, "R"]:
+def distortion(weights: Float[Tensor, "P N"], edges: Float[Tensor, "P N+1"]) -> Float[Tensor, "P"]:
     """Integrate w(u) w(v) |u - v| over u and v, for weights that are constant in their intervals.
 
     The integral is sum_ij w_i w_j |m_i - m_j| + 1/3 sum_i w_i^2 (e_{i+1} - e_i), with interval midpoints m (mip-NeRF

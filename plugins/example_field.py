@@ -35,7 +35,7 @@ class Blobs(Field):
 
     def forward(self, samples: Samples) -> Radiance:
         offsets = (samples.positions[..., None, :] - self.centres) / self.log_sizes.exp()[:, None]
-        densities = torch.exp(self.log_densities - 0.5 * offsets.square().sum(-1))  # [R, N, B], per world unit
+        densities = torch.exp(self.log_densities - 0.5 * offsets.square().sum(-1))  # [P, N, blobs], per world unit
         density = densities.sum(-1)
         colour = (densities @ self.colours.sigmoid()) / density.clamp(min=1e-6)[..., None]
         inside = (samples.positions.abs() <= self.extent).all(-1)

@@ -98,7 +98,7 @@ def lookup(
     face: Int[Tensor, "P"],
     coordinates: Float[Tensor, "P 2"],
     texels: Float[Tensor, "T 3"],
-    padded: Int[Tensor, "Q"],
+    padded: Int[Tensor, " padded"],
     levels: CubeLevels,
 ) -> Float[Tensor, "P 3"]:
     """Sum the bilinear interpolations of all levels, which are continuous over the sphere.

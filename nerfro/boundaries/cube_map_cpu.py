@@ -27,7 +27,7 @@ def lookup(
     face: Int[Tensor, "P"],
     coordinates: Float[Tensor, "P 2"],
     texels: Float[Tensor, "T 3"],
-    padded: Int[Tensor, "Q"],
+    padded: Int[Tensor, " padded"],
     levels: CubeLevels,
 ) -> Float[Tensor, "P 3"]:
     """Compute `nerfro.boundaries.cube_map.lookup` on the CPU."""
@@ -41,7 +41,7 @@ class _Lookup(torch.autograd.Function):
         face: Int[Tensor, "P"],
         coordinates: Float[Tensor, "P 2"],
         texels: Float[Tensor, "T 3"],
-        padded: Int[Tensor, "Q"],
+        padded: Int[Tensor, " padded"],
         levels: CubeLevels,
     ) -> Float[Tensor, "P 3"]:
         ctx.save_for_backward(face, coordinates, texels, padded)

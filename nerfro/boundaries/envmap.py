@@ -44,13 +44,13 @@ class Observed:
         widths: angle in radians over which the radiance of each ray is a mean.
     """
 
-    directions: Float[Tensor, "P 3"]
-    radiance: Float[Tensor, "P 3"]
-    saturated: Bool[Tensor, "P 3"]
-    weights: Float[Tensor, "P"]
-    widths: Float[Tensor, "P"]
+    directions: Float[Tensor, "observations 3"]
+    radiance: Float[Tensor, "observations 3"]
+    saturated: Bool[Tensor, "observations 3"]
+    weights: Float[Tensor, " observations"]
+    widths: Float[Tensor, " observations"]
 
-    def __getitem__(self, chosen: Bool[Tensor, "P"]) -> Observed:
+    def __getitem__(self, chosen: Bool[Tensor, " observations"]) -> Observed:
         return Observed(*(value[chosen] for value in vars(self).values()))
 
     @classmethod
@@ -78,7 +78,7 @@ class EnvironmentMap(Boundary):
         fitted_texels: raw values of the levels `fitted_resolutions`.
     """
 
-    padded: Int[Tensor, "Q"]
+    padded: Int[Tensor, " padded"]
     fitted_texels: Float[Tensor, "F 3"]
 
     def __init__(
@@ -125,7 +125,7 @@ class EnvironmentMap(Boundary):
                 raw = raw + self._looked_up(face, coordinates, texels, of_group, levels)
         return raw
 
-    def texels_of_levels(self) -> list[tuple[Float[Tensor, "T 3"], Int[Tensor, "Q"]]]:
+    def texels_of_levels(self) -> list[tuple[Float[Tensor, "T 3"], Int[Tensor, " padded"]]]:
         """Return the raw values of each level, and the texels of the faces with margins (`cube_map.padded_texels`)."""
         groups = zip((self.texels, self.fitted_texels), self._groups, strict=True)
         texels = [values for group, levels in groups for values in group.split(levels.sizes)]
@@ -198,12 +198,12 @@ class EnvironmentMap(Boundary):
         self.texels_of_levels()[-1][0].copy_(_raw(radiance))
 
 
-def _radiance(raw: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
+def _radiance(raw: Float[Tensor, "rows 3"]) -> Float[Tensor, "rows 3"]:
     """Map raw values to linear radiance, by the square of a softplus that is 0.5 at 0 (see `networks.radiance`)."""
     return (F.softplus(raw.float()) * _GREY).square()
 
 
-def _raw(radiance: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
+def _raw(radiance: Float[Tensor, "rows 3"]) -> Float[Tensor, "rows 3"]:
     """Invert `_radiance`; the darkest value is slightly above black."""
     y = (radiance.sqrt() / _GREY).clamp(min=_BLACK)
     return y + torch.log(-torch.expm1(-y))

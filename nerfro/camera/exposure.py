@@ -67,7 +67,7 @@ class Exposure(PerView):
 
 
 def fit_gain(
-    encode: Callable[[Tensor], Tensor], radiance: Float[Tensor, "P 3"], target: Float[Tensor, "P 3"]
+    encode: Callable[[Tensor], Tensor], radiance: Float[Tensor, "Q 3"], target: Float[Tensor, "Q 3"]
 ) -> Float[Tensor, "3"]:
     """Fit the gain of each channel that best maps rendered radiance to a photograph (Gauss-Newton).
 

@@ -75,9 +75,9 @@ class Estimate:
     """
 
     names: list[str]
-    values: Float[np.ndarray, "K"]
-    standard_errors: Float[np.ndarray, "K"]
-    coarse: Float[np.ndarray, "C N"]
+    values: Float[np.ndarray, " indices"]
+    standard_errors: Float[np.ndarray, " indices"]
+    coarse: Float[np.ndarray, "candidates columns"]
     doubts: list[str]
 
     @property
@@ -140,39 +140,45 @@ def find_indices(
     return Estimate(names, middle, standard_errors, np.column_stack([coarse, coarse_errors.T]), doubts)
 
 
-def _grid(steps: int, num_axes: int) -> Float[np.ndarray, "C K"]:
-    """Return the points of a regular grid in [-1, 1]^K."""
+def _grid(steps: int, num_axes: int) -> Float[np.ndarray, "candidates indices"]:
+    """Return the points of a regular grid in [-1, 1]^n, with n indices."""
     return np.array(list(itertools.product(np.linspace(-1, 1, steps), repeat=num_axes)))
 
 
-def bootstrap_weights(counts: Float[np.ndarray, "V"]) -> Float[np.ndarray, "B V"]:
+def bootstrap_weights(counts: Float[np.ndarray, "V"]) -> Float[np.ndarray, "resamples V"]:
     """Return how often each view is drawn in random samples of the views with pixels."""
     num_views = int(np.count_nonzero(counts))
     drawn = np.random.default_rng(0).multinomial(num_views, (counts > 0) / max(1, num_views), _NUM_BOOTSTRAP)
     return drawn.astype(np.float64)
 
 
-def standard_error(samples: Float[np.ndarray, "B *K"], counts: Float[np.ndarray, "V"]) -> Float[np.ndarray, "*K"]:
+def standard_error(
+    samples: Float[np.ndarray, " resamples *indices"], counts: Float[np.ndarray, "V"]
+) -> Float[np.ndarray, "*indices"]:
     """Compute the standard deviation of estimates from random samples of the views; infinite for too few views."""
     return np.where(np.count_nonzero(counts) < _MIN_VIEWS, np.inf, samples.std(0))
 
 
 def mean_errors(
-    sums: Float[np.ndarray, "C V"], counts: Float[np.ndarray, "V"], weights: Num[np.ndarray, "B V"] | int = 1
-) -> Float[np.ndarray, "B C"]:
-    """Average errors that are summed by view over all pixels, optionally for B weightings of the views."""
+    sums: Float[np.ndarray, "candidates V"],
+    counts: Float[np.ndarray, "V"],
+    weights: Num[np.ndarray, "resamples V"] | int = 1,
+) -> Float[np.ndarray, "resamples candidates"]:
+    """Average errors that are summed by view over all pixels, optionally for several weightings of the views."""
     weights = np.atleast_2d(weights * np.ones_like(counts))
     return (weights @ sums.T) / (weights @ counts)[:, None].clip(1)
 
 
 def _minimum(
-    candidates: Float[np.ndarray, "C K"], errors: Float[np.ndarray, "B C"], axes: Float[np.ndarray, "K K"]
-) -> tuple[Float[np.ndarray, "B K"], Float[np.ndarray, "B K"]]:
+    candidates: Float[np.ndarray, "candidates indices"],
+    errors: Float[np.ndarray, "resamples candidates"],
+    axes: Float[np.ndarray, "indices indices"],
+) -> tuple[Float[np.ndarray, "resamples indices"], Float[np.ndarray, "resamples indices"]]:
     """Fit a quadratic function to the errors of a grid of candidates, and find its minimum.
 
     Args:
         candidates: points of the grid.
-        errors: B sets of errors.
+        errors: one set of errors for each weighting.
         axes: half axes of the grid, in columns.
 
     Returns:
@@ -239,7 +245,7 @@ class _Search:
         other = colours[torch.randint(len(colours), (len(self._pixels),), generator=torch.Generator().manual_seed(1))]
         self.unrelated = float(robust(other - self._pixels.radiance, self._half_weight).mean())
 
-    def valley(self, values: Float[np.ndarray, "K"]) -> Float[np.ndarray, "K K"]:
+    def valley(self, values: Float[np.ndarray, " indices"]) -> Float[np.ndarray, "indices indices"]:
         """Return directions across and along the valley of the error, in columns, elongated along the valley.
 
         The directions are the eigenvectors of the Gauss-Newton matrix of the robust residuals. For one index the
@@ -267,8 +273,8 @@ class _Search:
         return directions * np.sqrt(ratio).clip(max=_MAX_ELONGATION)
 
     def _residuals(
-        self, pixels: Pixels, values: Float[np.ndarray, "K"]
-    ) -> tuple[Float[torch.Tensor, "P 3"], Bool[torch.Tensor, "P"]]:
+        self, pixels: Pixels, values: Float[np.ndarray, " indices"]
+    ) -> tuple[Float[torch.Tensor, "Q 3"], Bool[torch.Tensor, "Q"]]:
         """Compute the residuals of pixels for one candidate, and whether the residuals are known."""
         medium = self._achromatic.with_indices(torch.from_numpy(values.clip(LOWEST, HIGHEST)))
         trace = self._sampler.trace(pixels.rays, medium)
@@ -276,8 +282,8 @@ class _Search:
         return radiance - pixels.radiance, known & ~trace.exceeded
 
     def errors(
-        self, candidates: Float[np.ndarray, "C K"], num_pixels: int, common: bool
-    ) -> tuple[Float[np.ndarray, "C V"], Float[np.ndarray, "V"]]:
+        self, candidates: Float[np.ndarray, "candidates indices"], num_pixels: int, common: bool
+    ) -> tuple[Float[np.ndarray, "candidates V"], Float[np.ndarray, "V"]]:
         """Sum the robust errors of candidates over the pixels of each view.
 
         Args:

@@ -381,7 +381,7 @@ class _Descent:
         return float(torch.where(known, errors, self.initial_errors).mean())
 
     @torch.no_grad()
-    def _validation_errors(self, medium: SdfGrid) -> tuple[Float[Tensor, "P"], Bool[Tensor, "P"]]:
+    def _validation_errors(self, medium: SdfGrid) -> tuple[Float[Tensor, "Q"], Bool[Tensor, "Q"]]:
         """Compute the robust errors of the validation pixels, and whether their surroundings are known."""
         trace = self.sampler.trace(self.validation.rays, medium)
         radiance, known = self.surroundings.radiance(trace.path.exits())

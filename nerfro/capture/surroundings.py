@@ -61,8 +61,8 @@ class Pixels:
     """
 
     cameras: Cameras
-    index: Int[Tensor, "P"]
-    radiance: Float[Tensor, "P 3"]
+    index: Int[Tensor, "Q"]
+    radiance: Float[Tensor, "Q 3"]
 
     def __len__(self) -> int:
         return len(self.index)
@@ -71,7 +71,7 @@ class Pixels:
         return Pixels(self.cameras, self.index[chosen], self.radiance[chosen])
 
     @property
-    def view(self) -> Int[Tensor, "P"]:
+    def view(self) -> Int[Tensor, "Q"]:
         return self.cameras.view_of(self.index)
 
     @cached_property
@@ -90,7 +90,7 @@ class Pixels:
         return self[chosen.sort().values]
 
 
-def robust(residual: Float[Tensor, "P 3"], half: float) -> Float[Tensor, "P"]:
+def robust(residual: Float[Tensor, "Q 3"], half: float) -> Float[Tensor, "Q"]:
     """Compute the Geman-McClure error r^2 / (r^2 + half^2), r^2 the mean square over channels: 0 exact, 1 outlier."""
     square = residual.square().mean(-1)
     return square / (square + half**2)
@@ -152,7 +152,7 @@ class Surroundings:
     boundary: EnvironmentMap | Room
     seen: Bool[Tensor, "6 n n"] | None
     unexplained: float
-    colours: Float[Tensor, "P 3"]
+    colours: Float[Tensor, "Q 3"]
 
     def radiance(self, exits: Exits) -> tuple[Float[Tensor, "P 3"], Bool[Tensor, "P"]]:
         """Return the radiance that a photograph records along exit rays, and whether the radiance is known."""

@@ -45,7 +45,7 @@ class PixelStore:
         if isinstance(self._array, np.memmap) and hasattr(mmap, "MADV_DONTNEED"):
             self._array._mmap.madvise(mmap.MADV_DONTNEED)  # type: ignore[attr-defined]
 
-    def __getitem__(self, pixels: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
+    def __getitem__(self, pixels: Int[Tensor, "Q"]) -> Float[Tensor, "Q 3"]:
         levels = self._levels.index_select(0, pixels)
         if levels.dtype == torch.uint8:
             return levels.float() / 255

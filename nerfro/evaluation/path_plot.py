@@ -73,7 +73,7 @@ def plot_paths(axes: Axes, path: Path, medium: Medium) -> None:
 
 
 def _plane(
-    positions: Float[Tensor, "R S 3"], centre: Float[Tensor, "3"]
+    positions: Float[Tensor, "P S 3"], centre: Float[Tensor, "3"]
 ) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
     """Return two orthogonal unit vectors: mean direction of the rays, and orthogonal direction of largest spread."""
     along = torch.nn.functional.normalize((positions[:, -1] - positions[:, 0]).mean(0), dim=0)

@@ -27,13 +27,13 @@ class Field(nn.Module, ABC):
     def begin(self, cameras: Cameras) -> None:
         """Prepare for training on photographs of these cameras."""
 
-    def density(self, positions: Float[Tensor, "P 3"]) -> Float[Tensor, "P"]:
+    def density(self, positions: Float[Tensor, "points 3"]) -> Float[Tensor, " points"]:
         """Evaluate only the density, per world unit, in single precision; density is independent of the direction."""
         return self.at_points(positions, positions.new_tensor([0.0, 0.0, -1.0]).expand_as(positions))[0]
 
     def at_points(
-        self, positions: Float[Tensor, "P 3"], directions: Float[Tensor, "P 3"]
-    ) -> tuple[Float[Tensor, "P"], Float[Tensor, "P 3"]]:
+        self, positions: Float[Tensor, "points 3"], directions: Float[Tensor, "points 3"]
+    ) -> tuple[Float[Tensor, " points"], Float[Tensor, "points 3"]]:
         """Evaluate density and colour at points, seen in unit directions, in single precision."""
         zeros = torch.zeros(len(positions), 2, device=positions.device)
         found = self(Samples(positions[:, None], directions[:, None], zeros[:, :1], zeros, zeros[:, 0]))
@@ -44,8 +44,8 @@ class Field(nn.Module, ABC):
         """Evaluate density (per world unit) and colour at samples.
 
         Args:
-            samples: R rays with N samples each.
+            samples: N samples on each of P polylines.
 
         Returns:
-            Density [R, N] and colour [R, N, 3].
+            Density [P, N] and colour [P, N, 3].
         """

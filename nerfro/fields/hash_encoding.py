@@ -58,8 +58,8 @@ def grid_levels(num_levels: int, base_resolution: int, finest_resolution: int, l
 
 
 def hash_encode(
-    positions: Float[Tensor, "P 3"], table: Float[Tensor, "T 2"], levels: GridLevels
-) -> Float[Tensor, "P F"]:
+    positions: Float[Tensor, "points 3"], table: Float[Tensor, "T 2"], levels: GridLevels
+) -> Float[Tensor, "points F"]:
     """Interpolate the features of every level trilinearly and concatenate them.
 
     Args:
@@ -74,8 +74,8 @@ def hash_encode(
 
 
 def _vertices(
-    positions: Float[Tensor, "P 3"], levels: GridLevels
-) -> tuple[Int[Tensor, "P L 8"], Float[Tensor, "P L 8"]]:
+    positions: Float[Tensor, "points 3"], levels: GridLevels
+) -> tuple[Int[Tensor, "points L 8"], Float[Tensor, "points L 8"]]:
     """Return table entries and interpolation weights of the eight vertices around each position, for every level."""
     resolution, size, offset = (
         constant(values, positions.device) for values in (levels.resolutions, levels.sizes, levels.offsets)

@@ -33,8 +33,8 @@ _UINT, _Y, _Z = np.uint32, np.uint32(HASH_Y), np.uint32(HASH_Z)
 
 
 def hash_encode(
-    positions: Float[Tensor, "P 3"], table: Float[Tensor, "T 2"], levels: GridLevels
-) -> Float[Tensor, "P F"]:
+    positions: Float[Tensor, "points 3"], table: Float[Tensor, "T 2"], levels: GridLevels
+) -> Float[Tensor, "points F"]:
     """Evaluate `nerfro.fields.hash_encoding.hash_encode` on the CPU."""
     return _HashEncode.apply(positions.float().t().contiguous(), table, levels)
 
@@ -42,8 +42,8 @@ def hash_encode(
 class _HashEncode(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, positions: Float[Tensor, "3 P"], table: Float[Tensor, "T 2"], levels: GridLevels
-    ) -> Float[Tensor, "P F"]:
+        ctx: Any, positions: Float[Tensor, "3 points"], table: Float[Tensor, "T 2"], levels: GridLevels
+    ) -> Float[Tensor, "points F"]:
         ctx.save_for_backward(positions, table)
         ctx.levels = levels
         features = positions.new_empty(positions.shape[1], NUM_FEATURES * len(levels))
@@ -58,7 +58,7 @@ class _HashEncode(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Float[Tensor, "P F"]) -> tuple[Tensor | None, Tensor | None, None]:
+    def backward(ctx: Any, gradient: Float[Tensor, "points F"]) -> tuple[Tensor | None, Tensor | None, None]:
         positions, table = ctx.saved_tensors
         places, entries, upstream = arrays(positions, table, gradient)
         layout, threads = _layout(ctx.levels), num_threads()
@@ -126,7 +126,7 @@ def _vertices(i, low_low, high_low, low_high, high_high, dense, mask):
 
 @compiled
 def _locate(positions, start, size, resolution, dense, cells, fractions, edges):
-    """Compute cells [3, B], fractions [3, B] and edges [4, B] of a block of positions [3, P]."""
+    """Compute cells [3, B], fractions [3, B] and edges [4, B] of a block of B positions [3, points]."""
     for axis in range(3):
         # One row at a time, because Numba treats a block of rows as scattered and emits no vector instructions.
         _axis_cells(positions[axis, start : start + size], resolution, cells[axis], fractions[axis])

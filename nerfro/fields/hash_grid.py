@@ -60,7 +60,7 @@ class HashGridField(Field):
 
     box_min: Float[Tensor, "3"]
     box_max: Float[Tensor, "3"]
-    observed: Bool[Tensor, "C C C"] | None
+    observed: Bool[Tensor, "cells cells cells"] | None
 
     def __init__(
         self,
@@ -107,8 +107,8 @@ class HashGridField(Field):
         return Radiance(density.view(samples.s.shape), rgb.view(samples.positions.shape))
 
     def decode(
-        self, positions: Float[Tensor, "P 3"], directions: Float[Tensor, "P 3"]
-    ) -> tuple[Float[Tensor, "P"], Float[Tensor, "P 3"]]:
+        self, positions: Float[Tensor, "points 3"], directions: Float[Tensor, "points 3"]
+    ) -> tuple[Float[Tensor, " points"], Float[Tensor, "points 3"]]:
         """Evaluate density (per unit of contracted length) and colour at contracted positions."""
         geometry = self.apply_mlp(self.density_mlp, self.encode(positions))
         raw = self.apply_mlp(self.colour_mlp, geometry, self.encode_directions(directions))
@@ -116,7 +116,7 @@ class HashGridField(Field):
             raw = raw + geometry[:, 1:4]
         return self._to_density(geometry), radiance(raw)
 
-    def density(self, positions: Float[Tensor, "P 3"]) -> Float[Tensor, "P"]:
+    def density(self, positions: Float[Tensor, "points 3"]) -> Float[Tensor, " points"]:
         if self.radius is None:
             density = self._to_density(self.apply_mlp(self.density_mlp, self.encode(positions)))
             return torch.where(inside_box(positions, self.box_min, self.box_max), density, 0.0)
@@ -129,8 +129,8 @@ class HashGridField(Field):
             self.observed = observed_cells(cameras, self.centre, self.radius)
 
     def _world_density(
-        self, density: Float[Tensor, "P"], positions: Float[Tensor, "P 3"], places: Float[Tensor, "P 3"]
-    ) -> Float[Tensor, "P"]:
+        self, density: Float[Tensor, " points"], positions: Float[Tensor, "points 3"], places: Float[Tensor, "points 3"]
+    ) -> Float[Tensor, " points"]:
         """Convert the density at contracted places to one per world unit, which is zero in cells not observed."""
         assert self.observed is not None
         assert self.radius is not None
@@ -143,10 +143,10 @@ class HashGridField(Field):
     def centre(self) -> Float[Tensor, "3"]:
         return 0.5 * (self.box_min + self.box_max)
 
-    def _to_density(self, geometry: Float[Tensor, "P G"]) -> Float[Tensor, "P"]:
+    def _to_density(self, geometry: Float[Tensor, "points G"]) -> Float[Tensor, " points"]:
         return self.initial_density * torch.exp(geometry[:, 0].float().clamp(max=_MAX_EXPONENT))
 
-    def encode(self, positions: Float[Tensor, "P 3"]) -> Float[Tensor, "P F"]:
+    def encode(self, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points F"]:
         """Encode positions in single precision, on the CPU by a compiled kernel."""
         unit = (positions - self.box_min) / self.side
         if unit.device.type == "cpu":
@@ -155,7 +155,7 @@ class HashGridField(Field):
             hash_encode = hash_encoding.hash_encode
         return hash_encode(unit, self.table, self.levels)
 
-    def encode_directions(self, directions: Float[Tensor, "P 3"]) -> Float[Tensor, "P K"]:
+    def encode_directions(self, directions: Float[Tensor, "points 3"]) -> Float[Tensor, "points bases"]:
         """Encode directions by spherical harmonics, on the CPU by a compiled kernel."""
         if directions.device.type == "cpu":
             from nerfro.fields.spherical_harmonics_cpu import spherical_harmonics
@@ -163,7 +163,7 @@ class HashGridField(Field):
             spherical_harmonics = harmonics.spherical_harmonics
         return spherical_harmonics(directions, self.direction_bands)
 
-    def apply_mlp(self, mlp: nn.Sequential, *inputs: Float[Tensor, "P _"]) -> Float[Tensor, "P O"]:
+    def apply_mlp(self, mlp: nn.Sequential, *inputs: Float[Tensor, "points _"]) -> Float[Tensor, "points O"]:
         """Apply an MLP to concatenated inputs in the precision of the field, on the CPU by `relu_mlp`."""
         device = inputs[0].device.type
         rounds = fast_bfloat16(device) if self.precision is None else self.precision == "bfloat16"

@@ -16,7 +16,7 @@ _FEWEST_CAMERAS = 3
 
 
 @torch.no_grad()
-def observed_cells(cameras: Cameras, centre: Float[Tensor, "3"], radius: float) -> Bool[Tensor, "C C C"]:
+def observed_cells(cameras: Cameras, centre: Float[Tensor, "3"], radius: float) -> Bool[Tensor, "cells cells cells"]:
     """Find the cells of contracted space that photographs can determine.
 
     A cell closer than `radius` to a camera must lie within the images of three cameras, or of all cameras if there are

@@ -22,8 +22,8 @@ _BLOCK, _STEP = 8192, 2048
 
 
 def relu_mlp(
-    inputs: Float[Tensor, "P I"] | list[Float[Tensor, "P _"]], weights: list[Tensor], dtype: torch.dtype
-) -> Float[Tensor, "P O"]:
+    inputs: Float[Tensor, "points I"] | list[Float[Tensor, "points _"]], weights: list[Tensor], dtype: torch.dtype
+) -> Float[Tensor, "points O"]:
     """Apply linear layers without biases, with ReLU between the layers.
 
     Args:
@@ -38,7 +38,7 @@ def relu_mlp(
 
 class _ReluMLP(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, dtype: torch.dtype, num_parts: int, *tensors: Tensor) -> Float[Tensor, "P O"]:
+    def forward(ctx: Any, dtype: torch.dtype, num_parts: int, *tensors: Tensor) -> Float[Tensor, "points O"]:
         parts, weights = tensors[:num_parts], tensors[num_parts:]
         layers = [weight.to(dtype) for weight in weights]
         num_points, learns = len(parts[0]), any(ctx.needs_input_grad)
@@ -74,7 +74,7 @@ class _ReluMLP(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Float[Tensor, "P O"]) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, gradient: Float[Tensor, "points O"]) -> tuple[Tensor | None, ...]:
         num_layers = len(ctx.saved_tensors) // 2
         activations, layers = ctx.saved_tensors[:num_layers], ctx.saved_tensors[num_layers:]
         num_points, wanted, num_blocks = len(gradient), ctx.needs_input_grad[2:], -(-len(activations[0]) // _BLOCK)
@@ -116,6 +116,6 @@ def _comparable(values: Tensor) -> Tensor:
     return values.view(torch.int16) if values.dtype == torch.bfloat16 else values
 
 
-def _product_of_columns(left: Float[Tensor, "Q O"], right: Float[Tensor, "Q I"]) -> Float[Tensor, "O I"]:
+def _product_of_columns(left: Float[Tensor, "rows O"], right: Float[Tensor, "rows I"]) -> Float[Tensor, "O I"]:
     """Return left^T @ right with the narrower matrix on the left, which is faster."""
     return left.t() @ right if left.shape[1] <= right.shape[1] else (right.t() @ left).t()

@@ -10,10 +10,10 @@ from torch import Tensor
 from nerfro.types import Radiance, Samples
 
 Decoder = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
-"""Maps positions and unit directions [P, 3] to density [P] and colour [P, 3]."""
+"""Maps positions and unit directions [points, 3] to density [points] and colour [points, 3]."""
 
 
-def evaluate_selected(decoder: Decoder, samples: Samples, selected: Bool[Tensor, "R N"]) -> Radiance:
+def evaluate_selected(decoder: Decoder, samples: Samples, selected: Bool[Tensor, "P N"]) -> Radiance:
     """Evaluate a decoder at selected samples that may be occupied; elsewhere, density and colour are zero.
 
     On a GPU, counting the selected samples costs one synchronization with the host.

@@ -9,7 +9,7 @@ from torch import Tensor
 MAX_BANDS = 4
 
 
-def spherical_harmonics(directions: Float[Tensor, "*batch 3"], num_bands: int) -> Float[Tensor, "*batch K"]:
+def spherical_harmonics(directions: Float[Tensor, "*batch 3"], num_bands: int) -> Float[Tensor, "*batch bases"]:
     """Evaluate the K = num_bands^2 orthonormal real harmonics of degrees l < num_bands, by degree and order."""
     x, y, z = directions.unbind(-1)
     xx, yy, zz = x * x, y * y, z * z

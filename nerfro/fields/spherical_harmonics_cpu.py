@@ -23,14 +23,16 @@ _ONE, _TWO, _THREE, _FIVE, _SIX = np.float32(1), np.float32(2), np.float32(3), n
 _TEN, _FIFTEEN = np.float32(10), np.float32(15)
 
 
-def spherical_harmonics(directions: Float[Tensor, "P 3"], num_bands: int) -> Float[Tensor, "P K"]:
+def spherical_harmonics(directions: Float[Tensor, "directions 3"], num_bands: int) -> Float[Tensor, "directions bases"]:
     """Evaluate `nerfro.fields.spherical_harmonics.spherical_harmonics` on the CPU."""
     return _Harmonics.apply(directions.float().contiguous(), num_bands)
 
 
 class _Harmonics(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, directions: Float[Tensor, "P 3"], num_bands: int) -> Float[Tensor, "P K"]:
+    def forward(
+        ctx: Any, directions: Float[Tensor, "directions 3"], num_bands: int
+    ) -> Float[Tensor, "directions bases"]:
         ctx.save_for_backward(directions)
         ctx.num_bands = num_bands
         values = torch.empty(len(directions), num_bands**2)
@@ -39,7 +41,7 @@ class _Harmonics(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Float[Tensor, "P K"]) -> tuple[Float[Tensor, "P 3"], None]:
+    def backward(ctx: Any, gradient: Float[Tensor, "directions bases"]) -> tuple[Float[Tensor, "directions 3"], None]:
         (directions,) = ctx.saved_tensors
         of_directions = torch.zeros_like(directions)
         _backward(directions.detach().numpy(), gradient.contiguous().numpy(), ctx.num_bands, of_directions.numpy())

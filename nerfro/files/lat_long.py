@@ -31,7 +31,7 @@ def directions(height: int) -> Float[Tensor, "H 2*H 3"]:
     return torch.stack([polar.sin() * azimuth.cos(), polar.sin() * azimuth.sin(), polar.cos()], dim=-1)
 
 
-def sample(rgb: Float[Tensor, "H W 3"], where: Float[Tensor, "P 3"], width: int) -> Float[Tensor, "P 3"]:
+def sample(rgb: Float[Tensor, "H W 3"], where: Float[Tensor, "points 3"], width: int) -> Float[Tensor, "points 3"]:
     """Look up directions bilinearly in a lat-long image, averaged to at most `width` columns against aliasing."""
     image = rgb.permute(2, 0, 1)[None]
     if rgb.shape[1] > width:

@@ -85,7 +85,7 @@ class _Others:
         odd = torch.stack([self._are_met_oddly(points, sign * line) for line in lines for sign in (1, -1)])
         return bool(odd.all(0).any() != (~odd).all(0).any())
 
-    def _are_met_oddly(self, points: Float[Tensor, "P 3"], along: Float[Tensor, "3"]) -> Bool[Tensor, "P"]:
+    def _are_met_oddly(self, points: Float[Tensor, "points 3"], along: Float[Tensor, "3"]) -> Bool[Tensor, " points"]:
         """Return whether the line from each point crosses an odd number of triangles."""
         odd, left = torch.zeros(len(points), dtype=torch.bool), torch.arange(len(points))
         origin = points + _TOUCHING * along

@@ -13,7 +13,7 @@ _DECIMALS = 1e5  # normals at one vertex that agree to 1 / _DECIMALS are one nor
 
 
 def informative_normals(
-    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], normals: Float[np.ndarray, "F 3 3"]
+    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "F 3"], normals: Float[np.ndarray, "F 3 3"]
 ) -> Bool[np.ndarray, "F"]:
     """Find the triangles whose normals in the file say more about the surface than the triangles do.
 
@@ -46,7 +46,7 @@ def informative_normals(
     trusted = (normals * flat).sum(-1) >= _LEAST_COSINE
     patch = np.unique(patches(faces)[0], return_inverse=True)[1]
 
-    def residual(candidate: Float[np.ndarray, "F 3 3"]) -> Float[np.ndarray, "P"]:
+    def residual(candidate: Float[np.ndarray, "F 3 3"]) -> Float[np.ndarray, " corners"]:
         length = np.linalg.norm(forward, axis=-1)
         sums = ((candidate + np.roll(candidate, -1, 1)) * forward).sum(-1)
         cosine = np.divide(

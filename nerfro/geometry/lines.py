@@ -6,7 +6,9 @@ import numpy as np
 from jaxtyping import Float
 
 
-def nearest_point(origins: Float[np.ndarray, "V 3"], directions: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "3"]:
+def nearest_point(
+    origins: Float[np.ndarray, "lines 3"], directions: Float[np.ndarray, "lines 3"]
+) -> Float[np.ndarray, "3"]:
     """Return the point with the least sum of distances to lines, which is robust to outliers.
 
     Solved by iteratively reweighted least squares.

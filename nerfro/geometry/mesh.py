@@ -29,7 +29,7 @@ class TriangleMesh:
             than the triangles; else None.
     """
 
-    vertices: Float[np.ndarray, "V 3"]
+    vertices: Float[np.ndarray, "vertices 3"]
     faces: Int[np.ndarray, "F 3"]
     normals: Float[np.ndarray, "F 3 3"] | None = None
 
@@ -70,7 +70,7 @@ _THINNEST = 1e-4  # world units; boxes are stored with six decimals
 _FAR = 100
 
 
-def local_origin(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "3"]:
+def local_origin(points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "3"]:
     """Return the origin of the coordinate system for tracing, world units.
 
     The result is the origin of the world, unless the object is far away from the origin, as in georeferenced data.
@@ -156,7 +156,7 @@ def _facing_outwards(mesh: TriangleMesh) -> TriangleMesh:
     return TriangleMesh(mesh.vertices, faces, normals)
 
 
-def load_points(path: Path) -> Float[np.ndarray, "P 3"]:
+def load_points(path: Path) -> Float[np.ndarray, "points 3"]:
     """Read the points of a point cloud, or the vertices of a mesh, in any format of trimesh.
 
     Raises:
@@ -175,7 +175,7 @@ def _parse(path: Path) -> Any:
 
 
 def merge_vertices(
-    vertices: Float[np.ndarray, "V 3"],
+    vertices: Float[np.ndarray, "vertices 3"],
     faces: Int[np.ndarray, "F 3"],
     normals: Float[np.ndarray, "F 3 3"] | None = None,
 ) -> TriangleMesh:

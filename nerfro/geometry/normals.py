@@ -57,7 +57,7 @@ def corner_normals(mesh: TriangleMesh) -> Float[np.ndarray, "F 3 3"]:
     return np.where(trusted, mesh.normals, smoothed)
 
 
-def _unit(vectors: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
+def _unit(vectors: Float[np.ndarray, "vectors 3"]) -> Float[np.ndarray, "vectors 3"]:
     """Normalize vectors; zero vectors stay zero."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return vectors / np.where(length > 0, length, 1.0)

@@ -47,7 +47,7 @@ def occupancy_fraction(
 
 def triangles_by_plane(
     triangles: Float[np.ndarray, "F 3 3"], origin: float, spacing: float, num_planes: int, reach: float
-) -> tuple[Int[np.ndarray, "U"], Int[np.ndarray, "Q"]]:
+) -> tuple[Int[np.ndarray, " entries"], Int[np.ndarray, " starts"]]:
     """Return triangles within `reach` of the planes x = origin + i spacing, sorted by plane, with plane starts."""
     low = np.ceil((triangles[:, :, 0].min(1) - reach - origin) / spacing).astype(np.int64).clip(0, num_planes)
     high = np.floor((triangles[:, :, 0].max(1) + reach - origin) / spacing).astype(np.int64).clip(-1, num_planes - 1)

@@ -13,7 +13,7 @@ _NUM_LINES = 5  # per patch
 _BARYCENTRIC, _DEVIATION = np.array([0.23, 0.31, 0.46]), np.array([0.07, 0.11, -0.05])
 
 
-def inward_faces(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> Bool[np.ndarray, "F"]:
+def inward_faces(vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "F 3"]) -> Bool[np.ndarray, "F"]:
     """Find the triangles with the front towards the inside, where the parity along lines defines the inside.
 
     The outer surface of a body should face outwards and the surface of a cavity should face the cavity. Triangles that

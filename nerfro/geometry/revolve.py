@@ -12,7 +12,7 @@ _SECTIONS = 160  # vertices around the axis
 
 
 def revolve(
-    profile: Float[np.ndarray, "K 2"], foot: Float[np.ndarray, "3"], axis: Float[np.ndarray, "3"]
+    profile: Float[np.ndarray, "points 2"], foot: Float[np.ndarray, "3"], axis: Float[np.ndarray, "3"]
 ) -> TriangleMesh:
     """Return the closed mesh of a body of revolution.
 

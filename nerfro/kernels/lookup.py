@@ -30,13 +30,13 @@ class Solids(NamedTuple):
     inverse_spacing: Float[np.ndarray, "K 3"]
     min_step: Float[np.ndarray, "K"]  # shortest step of the search for the body's surface, world units
     # Coefficients of the splines, the first coefficient of each body, and its numbers of vertices.
-    coefficients: Float[np.ndarray, "N"]
+    coefficients: Float[np.ndarray, " coefficients"]
     start: Int[np.ndarray, "K"]
     shape: Int[np.ndarray, "K 3"]
     # Blocks of cells: lowest and highest derivatives of the spline, number of empty blocks around (negative inside the
     # body), the first block of each body, its numbers of blocks, and blocks per world unit.
-    slopes: Float[np.ndarray, "B 3 2"]
-    empty: Int8[np.ndarray, "B"]
+    slopes: Float[np.ndarray, "blocks 3 2"]
+    empty: Int8[np.ndarray, " blocks"]
     block_start: Int[np.ndarray, "K"]
     block_shape: Int[np.ndarray, "K 3"]
     inverse_block: Float[np.ndarray, "K 3"]

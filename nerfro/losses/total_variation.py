@@ -47,7 +47,9 @@ class TotalVariation(Loss):
         return (rgb[_NUM_PAIRS:] - rgb[:_NUM_PAIRS]).abs().mean()
 
 
-def direction_pairs(numbers: Float[Tensor, "N 3"], angle: float) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"]]:
+def direction_pairs(
+    numbers: Float[Tensor, "directions 3"], angle: float
+) -> tuple[Float[Tensor, "directions 3"], Float[Tensor, "directions 3"]]:
     """Map uniform numbers in [0, 1) to pairs of unit directions that are `angle` radians apart.
 
     The first direction is uniform on the sphere, and the second is uniform on the circle around the first.

@@ -36,12 +36,12 @@ def has_creases(surface: Surface) -> bool:
 
 
 def sharpened(
-    vertices: Float[np.ndarray, "V 3"],
+    vertices: Float[np.ndarray, "vertices 3"],
     mesh: MovingMesh,
-    rims_of: Callable[[Float[np.ndarray, "V 3"]], Rims],
+    rims_of: Callable[[Float[np.ndarray, "vertices 3"]], Rims],
     sides: Sides,
     step: Callable[[], None] = lambda: None,
-) -> Float[np.ndarray, "V 3"]:
+) -> Float[np.ndarray, "vertices 3"]:
     """Move vertices in all directions until sides are smooth, edges are sharp, and contours meet the masks.
 
     Marching cubes bevel an edge with a row of triangles. Each triangle first receives a filtered normal m_f, the normal
@@ -67,7 +67,9 @@ def sharpened(
     return vertices
 
 
-def _solved(vertices: Float[np.ndarray, "V 3"], mesh: MovingMesh, rims: Rims, sides: Sides) -> Float[np.ndarray, "V 3"]:
+def _solved(
+    vertices: Float[np.ndarray, "vertices 3"], mesh: MovingMesh, rims: Rims, sides: Sides
+) -> Float[np.ndarray, "vertices 3"]:
     direction, area = _filtered_normals(vertices, mesh)
     weight = np.sqrt(np.repeat(area / area.mean(), 3))
     flat = _projected_differences(
@@ -90,7 +92,7 @@ def _solved(vertices: Float[np.ndarray, "V 3"], mesh: MovingMesh, rims: Rims, si
 
 
 def _filtered_normals(
-    vertices: Float[np.ndarray, "V 3"], mesh: MovingMesh
+    vertices: Float[np.ndarray, "vertices 3"], mesh: MovingMesh
 ) -> tuple[Float[np.ndarray, "F 3"], Float[np.ndarray, "F"]]:
     """Filter the triangle normals without smoothing across sharp edges (guided normal filtering, Zhang et al. 2015).
 
@@ -120,10 +122,10 @@ def _filtered_normals(
 def _projected_differences(
     ends: tuple[np.ndarray, np.ndarray],
     weights: tuple[np.ndarray, np.ndarray],
-    directions: Float[np.ndarray, "R 3"],
+    directions: Float[np.ndarray, "rows 3"],
     num_vertices: int,
 ) -> sparse.csr_matrix:
-    """Build the matrix [R, 3V] that maps vertex coordinates to weighted sums of two vertices along directions."""
+    """Build the matrix that maps vertex coordinates to weighted sums of two vertices along directions, one per row."""
     row = np.tile(np.repeat(np.arange(len(directions)), 3), 2)
     column = np.concatenate([(3 * end[:, None] + np.arange(3)).ravel() for end in ends])
     values = np.concatenate([(weight[:, None] * directions).ravel() for weight in weights])

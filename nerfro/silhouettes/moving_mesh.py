@@ -19,11 +19,11 @@ _SPREADING = 0.5
 class Surface(NamedTuple):
     """Vertices of a mesh with derived normals and creases."""
 
-    vertices: Float[np.ndarray, "V 3"]
-    edges: Int[np.ndarray, "E 2"]
-    normals: Float[np.ndarray, "V 3"]
-    creases: Int[np.ndarray, "C 2"]  # sharp edges
-    beside: Float[np.ndarray, "C 2 3"]  # normals on both sides of the sharp edges
+    vertices: Float[np.ndarray, "vertices 3"]
+    edges: Int[np.ndarray, "edges 2"]
+    normals: Float[np.ndarray, "vertices 3"]
+    creases: Int[np.ndarray, "creases 2"]  # sharp edges
+    beside: Float[np.ndarray, "creases 2 3"]  # normals on both sides of the sharp edges
 
 
 class MovingMesh:
@@ -49,18 +49,18 @@ class MovingMesh:
         degree = np.bincount(both[:, 0], minlength=num_vertices)
         self.mean = sparse.csr_matrix((1 / degree[both[:, 0]], both.T), (num_vertices, num_vertices))
 
-    def face_normals(self, vertices: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "F 3"]:
+    def face_normals(self, vertices: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "F 3"]:
         """Compute triangle normals whose length is twice the area."""
         a, b, c = vertices[self.faces].swapaxes(0, 1)
         return np.cross(b - a, c - a)
 
-    def normals(self, vertices: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V 3"]:
+    def normals(self, vertices: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "vertices 3"]:
         """Compute unit vertex normals as area-weighted means over the adjacent triangles."""
         of_faces = self.face_normals(vertices)
         sums = [np.bincount(self.faces.ravel(), np.repeat(each, 3), len(vertices)) for each in of_faces.T]
         return unit(np.stack(sums, -1))
 
-    def surface(self, vertices: Float[np.ndarray, "V 3"]) -> Surface:
+    def surface(self, vertices: Float[np.ndarray, "vertices 3"]) -> Surface:
         """Compute normals and creases. A single displaced vertex is no crease, because the normals around it agree."""
         normals = self.normals(vertices)
         beside, beyond = unit(self.face_normals(vertices))[self._beside], normals[self._beyond]
@@ -74,23 +74,23 @@ class MovingMesh:
         corners = sparse.csr_matrix((np.ones(len(number)), (number, self.faces.ravel())))
         return ((corners @ corners.T) > 0).astype(np.float64).tocoo()
 
-    def edge_length(self, vertices: Float[np.ndarray, "V 3"]) -> float:
+    def edge_length(self, vertices: Float[np.ndarray, "vertices 3"]) -> float:
         """Return the root mean square edge length."""
         ends = vertices[self.edges]
         return float(np.sqrt(((ends[:, 0] - ends[:, 1]) ** 2).sum(1).mean()))
 
-    def spread(self, vertices: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V 3"]:
+    def spread(self, vertices: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "vertices 3"]:
         """Move vertices tangentially towards the centroid of their neighbours, which equalizes the triangles."""
         normals, towards = self.normals(vertices), self.mean @ vertices - vertices
         return vertices + _SPREADING * (towards - (towards * normals).sum(1, keepdims=True) * normals)
 
 
-def unit(vectors: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
+def unit(vectors: Float[np.ndarray, "vectors 3"]) -> Float[np.ndarray, "vectors 3"]:
     """Normalize vectors; zero vectors stay zero."""
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True).clip(1e-12)
 
 
-def solve_symmetric(system: sparse.spmatrix, right: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N"]:
+def solve_symmetric(system: sparse.spmatrix, right: Float[np.ndarray, " vectors"]) -> Float[np.ndarray, " vectors"]:
     """Solve a sparse symmetric positive definite system, without pivoting and with a fill-reducing ordering."""
     options = {"SymmetricMode": True}
     return splu(system.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0, options=options).solve(right)

@@ -61,16 +61,16 @@ class Profile:
     foot: Float[Tensor, "3"]
     axis: Float[Tensor, "3"]
     height: Float[Tensor, ""]
-    radii: Float[Tensor, "K"]
+    radii: Float[Tensor, " profile"]
     edge: float = 0.0
 
-    def in_plane(self, points: Float[Tensor, "*P 3"]) -> tuple[Float[Tensor, "*P"], Float[Tensor, "*P"]]:
+    def in_plane(self, points: Float[Tensor, "*points 3"]) -> tuple[Float[Tensor, "*points"], Float[Tensor, "*points"]]:
         """Return the distance of points from the axis, and their height above the foot."""
         offset = points - self.foot
         along = offset @ self.axis
         return (offset - along[..., None] * self.axis).square().sum(-1).clamp(min=1e-20).sqrt(), along
 
-    def distance(self, points: Float[Tensor, "*P 3"]) -> Float[Tensor, "*P"]:
+    def distance(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
         """Compute an approximate signed distance, negative inside, with an exact zero level."""
         radius, along = self.in_plane(points)
         step = self.height / (len(self.radii) - 1)
@@ -223,7 +223,7 @@ def _profile_around(
 
 def _rays(
     silhouettes: Silhouettes,
-) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"], Float[Tensor, "P"], Float[Tensor, "P"]]:
+) -> tuple[Float[Tensor, "points 3"], Float[Tensor, "points 3"], Float[Tensor, " points"], Float[Tensor, " points"]]:
     """Sample rays on the outlines of the masks and on both sides.
 
     Returns:
@@ -251,7 +251,7 @@ def _rays(
     return rays.origins.float(), rays.directions.float(), width, torch.cat(sides)
 
 
-def _outline_points(distances: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "P 2"]:
+def _outline_points(distances: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "points 2"]:
     """Find points (row, column) of the outline on the lines between adjacent pixel centres, away from the frame."""
     points = np.concatenate([np.empty((0, 2)), *find_contours(distances, 0)]).astype(np.float32)
     last = np.array(distances.shape) - 1 - _FRAME
@@ -259,7 +259,7 @@ def _outline_points(distances: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "P
 
 
 @torch.no_grad()
-def _nearest_place(body: Profile, origins: Tensor, directions: Tensor) -> Float[Tensor, "P"]:
+def _nearest_place(body: Profile, origins: Tensor, directions: Tensor) -> Float[Tensor, " points"]:
     """Find the arc length along each ray at which the distance to the body is smallest."""
     middle = body.foot + 0.5 * body.height * body.axis
     reach = torch.sqrt((0.5 * body.height) ** 2 + body.radii.max() ** 2)

@@ -34,15 +34,15 @@ class Rims(NamedTuple):
     The surface meets the outline of the mask if it moves by `misfit` along `normal`.
     """
 
-    first: Int[np.ndarray, "K"]
-    second: Int[np.ndarray, "K"]
-    share: Float[np.ndarray, "K"]
-    points: Float[np.ndarray, "K 3"]  # positions of the contour points
-    normal: Float[np.ndarray, "K 3"]  # unit, outwards, perpendicular to the line of sight
-    misfit: Float[np.ndarray, "K"]  # outward distance to the outline of the mask, world units
-    weight: Float[np.ndarray, "K"]  # robust weight of the misfit
-    width: Float[np.ndarray, "K"]  # width of a pixel at the point, world units
-    view: Int[np.ndarray, "K"]
+    first: Int[np.ndarray, " contour"]
+    second: Int[np.ndarray, " contour"]
+    share: Float[np.ndarray, " contour"]
+    points: Float[np.ndarray, "contour 3"]  # positions of the contour points
+    normal: Float[np.ndarray, "contour 3"]  # unit, outwards, perpendicular to the line of sight
+    misfit: Float[np.ndarray, " contour"]  # outward distance to the outline of the mask, world units
+    weight: Float[np.ndarray, " contour"]  # robust weight of the misfit
+    width: Float[np.ndarray, " contour"]  # width of a pixel at the point, world units
+    view: Int[np.ndarray, " contour"]
 
 
 class RimFinder:
@@ -128,7 +128,9 @@ def _turning(surface: Surface, eye: Float[np.ndarray, "3"]) -> tuple[np.ndarray,
     return first, second, share, unit(normal)
 
 
-def _look_up(outline: Int[np.ndarray, "H W"], camera: Cameras, points: Tensor, pixels: int) -> Int[np.ndarray, "P"]:
+def _look_up(
+    outline: Int[np.ndarray, "H W"], camera: Cameras, points: Tensor, pixels: int
+) -> Int[np.ndarray, " points"]:
     """Return the index of the block of pixels x pixels that contains the outline pixel nearest to each point."""
     place = camera.project(points)[0][0].numpy()
     row = place[:, 1].astype(np.int64).clip(0, camera.height - 1)

@@ -132,7 +132,7 @@ class _Found(NamedTuple):
 
     prior: _Prior
     strength: float
-    vertices: Float[np.ndarray, "V 3"]
+    vertices: Float[np.ndarray, "vertices 3"]
     misfit: float
     sides: Sides | None = None  # prior of the sides, for a surface with sharp edges
 
@@ -167,20 +167,20 @@ class _Fit:
         return blunt._replace(vertices=vertices, misfit=self.misfit(vertices, validation), sides=sides)
 
     def sharpened(
-        self, vertices: Float[np.ndarray, "V 3"], sides: Sides, outlines: Outlines, step: Callable[[], None]
-    ) -> Float[np.ndarray, "V 3"]:
+        self, vertices: Float[np.ndarray, "vertices 3"], sides: Sides, outlines: Outlines, step: Callable[[], None]
+    ) -> Float[np.ndarray, "vertices 3"]:
         """Move the vertices until edges are sharp (see `creases.sharpened`)."""
         return sharpened(vertices, self.mesh, lambda moved: self.rims(moved, outlines), sides, step)
 
-    def rims(self, vertices: Float[np.ndarray, "V 3"], outlines: Outlines) -> Rims:
+    def rims(self, vertices: Float[np.ndarray, "vertices 3"], outlines: Outlines) -> Rims:
         """Find the contour points of a surface with the given vertices."""
         return find_rims(self.mesh.surface(vertices), self.silhouettes, outlines)
 
-    def misfit(self, vertices: Float[np.ndarray, "V 3"], outlines: Outlines) -> float:
+    def misfit(self, vertices: Float[np.ndarray, "vertices 3"], outlines: Outlines) -> float:
         """Compute the mean distance of the contour points to the outlines of the masks, in world units."""
         return float(np.abs(self.rims(vertices, outlines).misfit).mean())
 
-    def binary_mask_error(self, vertices: Float[np.ndarray, "V 3"], outlines: Outlines) -> float | None:
+    def binary_mask_error(self, vertices: Float[np.ndarray, "vertices 3"], outlines: Outlines) -> float | None:
         """Compute the mean contour error in pixels for accurate binary masks; None for other masks."""
         if is_antialiased(self.silhouettes.masks.numpy(), self.silhouettes.distances.numpy()):
             return None
@@ -190,14 +190,14 @@ class _Fit:
 
     def moved(
         self,
-        vertices: Float[np.ndarray, "V 3"],
+        vertices: Float[np.ndarray, "vertices 3"],
         outlines: Outlines,
         prior: _Prior,
         strength: float,
         steady: float = 0.0,
         contour_error: float | None = None,
         spread: bool = True,
-    ) -> Float[np.ndarray, "V 3"]:
+    ) -> Float[np.ndarray, "vertices 3"]:
         """Make one least-squares step and return the new vertices.
 
         Args:
@@ -257,11 +257,11 @@ def _split_views(outlines: Outlines) -> tuple[Outlines, Outlines]:
 
 
 def _mean_curvature(
-    vertices: Float[np.ndarray, "V 3"],
-    normals: Float[np.ndarray, "V 3"],
-    edges: Int[np.ndarray, "E 2"],
+    vertices: Float[np.ndarray, "vertices 3"],
+    normals: Float[np.ndarray, "vertices 3"],
+    edges: Int[np.ndarray, "edges 2"],
     mean: sparse.csr_matrix,
-) -> tuple[sparse.csr_matrix, Float[np.ndarray, "V"], Float[np.ndarray, "V"]]:
+) -> tuple[sparse.csr_matrix, Float[np.ndarray, " vertices"], Float[np.ndarray, " vertices"]]:
     """Compute half the mean curvature at vertices times the edge length, negative on a ball.
 
     The mean of the neighbours of a vertex is displaced by r^2 H / 2 along the normal, with the mean squared edge length
@@ -283,11 +283,11 @@ def _mean_curvature(
 
 
 def _along_edges(
-    vertices: Float[np.ndarray, "V 3"],
-    normals: Float[np.ndarray, "V 3"],
-    edges: Int[np.ndarray, "E 2"],
+    vertices: Float[np.ndarray, "vertices 3"],
+    normals: Float[np.ndarray, "vertices 3"],
+    edges: Int[np.ndarray, "edges 2"],
     mean: sparse.csr_matrix,
-) -> Float[np.ndarray, "E"]:
+) -> Float[np.ndarray, " edges"]:
     """Weight edges by their alignment with the direction of smallest curvature: 1 along, 0 across, 1 if undefined."""
     along, turn = (values[edges[:, 1]] - values[edges[:, 0]] for values in (vertices, normals))
     square = (along**2).sum(1)
@@ -305,11 +305,11 @@ def _along_edges(
 
 
 def _typical_curvature(
-    curved: Float[np.ndarray, "V"],
-    vertices: Float[np.ndarray, "V 3"],
-    normals: Float[np.ndarray, "V 3"],
+    curved: Float[np.ndarray, " vertices"],
+    vertices: Float[np.ndarray, "vertices 3"],
+    normals: Float[np.ndarray, "vertices 3"],
     normal_distance: float,
-) -> Float[np.ndarray, "V"]:
+) -> Float[np.ndarray, " vertices"]:
     """Compute the curvature that most neighbours of each vertex exceed, with the sign of their median.
 
     Neighbours are nearest in position and normal, with `normal_distance` per radian, so that the opposite side of a

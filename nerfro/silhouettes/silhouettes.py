@@ -76,7 +76,7 @@ def _level_curvature(values: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W
     return across / np.hypot(down, right).clip(0.3) ** 3
 
 
-def frame_pixels(masks: Float[Tensor, "V H W"]) -> Bool[Tensor, "V P"]:
+def frame_pixels(masks: Float[Tensor, "V H W"]) -> Bool[Tensor, "V Q"]:
     """Test which pixels along the frame of each mask show the object, which may then continue outside the image."""
     inside = masks > 0.5
     return torch.cat([inside[:, [0, -1]].flatten(1), inside[:, :, [0, -1]].flatten(1)], 1)

@@ -58,7 +58,9 @@ class Silhouettes:
         """Select views, in the given order."""
         return Silhouettes(self.cameras.select(views), self.masks[views], self.distances[views], self.cut[views])
 
-    def depth_inside(self, view: int, points: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "P"], Float[Tensor, "P"]]:
+    def depth_inside(
+        self, view: int, points: Float[Tensor, "points 3"]
+    ) -> tuple[Float[Tensor, " points"], Float[Tensor, " points"]]:
         """Compute the distances of points to the outline of one view.
 
         Returns:
@@ -79,7 +81,7 @@ class Silhouettes:
         width = depth / (0.5 * (cameras.fx + cameras.fy))
         return torch.where(unknown, torch.inf, distance), width
 
-    def carve(self, points: Float[Tensor, "P 3"], wrong_masks: int = 0) -> Float[Tensor, "P"]:
+    def carve(self, points: Float[Tensor, "points 3"], wrong_masks: int = 0) -> Float[Tensor, " points"]:
         """Compute an approximate signed distance to the visual hull with an exact zero level.
 
         The value is the maximum over the views of the distance to the cone of the silhouette, or the

@@ -92,7 +92,7 @@ class _Comparison(NamedTuple):
     cameras: Cameras
     origins: Float[Tensor, "R 3"]
     directions: Float[Tensor, "R 3"]
-    masks: Bool[Tensor, "V P"]
+    masks: Bool[Tensor, "V Q"]
 
     @classmethod
     def of(cls, mesh: TriangleMesh, views: Views, origin: Float[np.ndarray, "3"]) -> _Comparison | None:
@@ -113,7 +113,7 @@ class _Comparison(NamedTuple):
         origins, directions = (torch.cat([getattr(ray, name) for ray in rays]) for name in ("origins", "directions"))
         return cls(mesh, -origin, intersector, cameras, origins, directions, masks[useful])
 
-    def silhouettes(self, change: _Change) -> Bool[Tensor, "V P"]:
+    def silhouettes(self, change: _Change) -> Bool[Tensor, "V Q"]:
         """Return the pixels of the changed mesh."""
         inverse = torch.from_numpy(np.linalg.inv(change.matrix))
         origins = (self.origins.double() - torch.from_numpy(change.shift)) @ inverse.T
@@ -161,7 +161,7 @@ class _Comparison(NamedTuple):
             words = [f"scaled by {scale:.3g}"] * (scale != 1) + [turn.description] * bool(turn.description)
             yield _Change(matrix, shift, " and ".join([*words, f"moved by {shift.round(3).tolist()}"]))
 
-    def _middle(self, pixels: Bool[Tensor, "V P"]) -> Float[np.ndarray, "3"]:
+    def _middle(self, pixels: Bool[Tensor, "V Q"]) -> Float[np.ndarray, "3"]:
         """Return the point nearest to the rays through the centres of some pixels in each view."""
         axes = (pixels[..., None] * self.directions.view(*pixels.shape, 3)).sum(1)
         axes = torch.nn.functional.normalize(axes, dim=-1).double()

@@ -166,7 +166,7 @@ class RayBatches:
         """Number of pixels of all views."""
         return len(self._cameras) * self._cameras.height * self._cameras.width
 
-    def rows(self, part: int, num_parts: int) -> Int[Tensor, "P"]:
+    def rows(self, part: int, num_parts: int) -> Int[Tensor, "Q"]:
         """Return the usable pixels of every `num_parts`-th row by number (view, row, column), equal in all processes.
 
         Rows are counted through all views. If masks exclude pixels, a row has the next usable pixels.
@@ -183,7 +183,7 @@ class RayBatches:
             numbers = view * window.height * window.width + pixel
         return self._to_device(numbers)
 
-    def of_each_view(self, num_pixels: int, step: int) -> Int[Tensor, "V P"]:
+    def of_each_view(self, num_pixels: int, step: int) -> Int[Tensor, "V Q"]:
         """Draw random usable pixels of every view; for a view without usable pixels, the first pixel is returned."""
         cameras = self._cameras
         generator = np.random.default_rng([self.seed, step, num_pixels, len(cameras)])
@@ -203,7 +203,7 @@ class RayBatches:
         """Cameras of all views in the data set."""
         return self._cameras
 
-    def photographed(self, pixels: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
+    def photographed(self, pixels: Int[Tensor, "Q"]) -> Float[Tensor, "Q 3"]:
         """Return the colours of pixels by number (view, row, column), sRGB in [0, 1]."""
         return self._pixels[pixels]
 
@@ -277,7 +277,7 @@ class _Usable:
 
     def __init__(self, usable: Iterable[Bool[Tensor, "H W"]], num_views: int, window: Window) -> None:
         num_blocks = -(-window.height * window.width // self._BLOCK)
-        self._bits: UInt8[np.ndarray, "V B 8"] = np.empty((num_views, num_blocks, self._BLOCK // 8), np.uint8)
+        self._bits: UInt8[np.ndarray, "V blocks 8"] = np.empty((num_views, num_blocks, self._BLOCK // 8), np.uint8)
         counts = np.empty((num_views, num_blocks), np.int64)
         for index, view in enumerate(usable):
             blocks = np.zeros((num_blocks, self._BLOCK), bool)
@@ -286,7 +286,7 @@ class _Usable:
         self._before = np.cumsum(counts) - counts.flatten()  # usable pixels before each block
         self.starts: Int[np.ndarray, "V+1"] = np.cumsum([0, *counts.sum(1)])
 
-    def find(self, numbers: Int[np.ndarray, "P"]) -> tuple[Int[np.ndarray, "P"], Int[np.ndarray, "P"]]:
+    def find(self, numbers: Int[np.ndarray, "Q"]) -> tuple[Int[np.ndarray, "Q"], Int[np.ndarray, "Q"]]:
         """Return the views, and the pixels of the window by number (row, column), of usable pixels."""
         block = np.searchsorted(self._before, numbers, side="right") - 1
         view, within = np.divmod(block, self._bits.shape[1])

@@ -41,9 +41,9 @@ class ValidationPixels:
     """
 
     cameras: Cameras
-    index: Int[Tensor, "R"]
-    rgb: Float[Tensor, "R 3"]
-    contrasts: Float[Tensor, "R"]
+    index: Int[Tensor, "Q"]
+    rgb: Float[Tensor, "Q 3"]
+    contrasts: Float[Tensor, "Q"]
 
     @classmethod
     def of(cls, views: Views, seed: int = 0) -> ValidationPixels:
@@ -150,5 +150,5 @@ class OverfittingWarning(Callback):
         self._best = state_dict.get("best", self._best)  # checkpoints of earlier versions have none
 
 
-def _psnr(prediction: Float[Tensor, "P 3"], target: Float[Tensor, "P 3"]) -> Float[Tensor, ""]:
+def _psnr(prediction: Float[Tensor, "Q 3"], target: Float[Tensor, "Q 3"]) -> Float[Tensor, ""]:
     return -10 * torch.log10((prediction - target).square().mean())

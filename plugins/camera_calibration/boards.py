@@ -45,11 +45,11 @@ class Sighting:
         pixels: image positions (column, row); integers are corners of pixels.
     """
 
-    features: Int[np.ndarray, "N"]
-    points: Float[np.ndarray, "N 3"]
-    pixels: Float[np.ndarray, "N 2"]
+    features: Int[np.ndarray, " features"]
+    points: Float[np.ndarray, "features 3"]
+    pixels: Float[np.ndarray, "features 2"]
 
-    def only(self, chosen: Bool[np.ndarray, "N"]) -> Sighting:
+    def only(self, chosen: Bool[np.ndarray, " features"]) -> Sighting:
         """Select points by a mask."""
         return Sighting(self.features[chosen], self.points[chosen], self.pixels[chosen])
 
@@ -194,7 +194,7 @@ def tag_grid(rows: int, columns: int, tag: float) -> TagBoard:
     return TagBoard("tag36h11", module, (Face((0, rows * side * module, 0), (1, 0, 0), (0, -1, 0), ids),))
 
 
-def draw_tag(family: Family, number: int) -> UInt8[np.ndarray, "S S"]:
+def draw_tag(family: Family, number: int) -> UInt8[np.ndarray, "side side"]:
     """Draw a tag with one pixel per module."""
     # The struct apriltag_family of https://github.com/AprilRobotics/apriltag, drawn as its apriltag_to_image does.
     codes = tag_detector(family).tag_families[family].contents
@@ -224,7 +224,7 @@ def tag_detector(family: Family) -> Any:
     return Detector(families=family, nthreads=1, quad_decimate=1.0)
 
 
-def _on_face(face: Face, places: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 3"]:
+def _on_face(face: Face, places: Float[np.ndarray, "features 2"]) -> Float[np.ndarray, "features 3"]:
     """Convert coordinates on a face (lengths to the right and down from the upper left corner) to board coordinates."""
     return np.array(face.origin) + places @ np.array([face.right, face.down], np.float64)
 

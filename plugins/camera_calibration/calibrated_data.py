@@ -40,7 +40,7 @@ def write_calibrated(
     calibration: Calibration,
     splits: dict[str, list[str]],
     target: str,
-    shown: tuple[list[Float[np.ndarray, "4 3"]], Float[np.ndarray, "P 3"]],
+    shown: tuple[list[Float[np.ndarray, "4 3"]], Float[np.ndarray, "points 3"]],
     bounds: dict[str, float],
 ) -> list[str]:
     """Write the data set (see docs/guides/data_formats.md), calibration.json and cameras.png.
@@ -94,7 +94,7 @@ def write_calibrated(
     return [*written, str(out / REPORT), str(out / PLOT)]
 
 
-def ray_range(calibration: Calibration, seen: Float[np.ndarray, "P 3"]) -> dict[str, float]:
+def ray_range(calibration: Calibration, seen: Float[np.ndarray, "points 3"]) -> dict[str, float]:
     """Return bounds `near` and `far` that enclose all points for all cameras; none without points."""
     if len(seen) == 0:
         return {}
@@ -108,7 +108,7 @@ def _plot_cameras(
     poses: Float[np.ndarray, "V 3 4"],
     errors: Float[np.ndarray, "V"],
     quads: Sequence[Float[np.ndarray, "4 3"]],
-    points: Float[np.ndarray, "P 3"],
+    points: Float[np.ndarray, "points 3"],
 ) -> bytes:
     """Plot the cameras from the side and from above, as arrows along the optical axes.
 

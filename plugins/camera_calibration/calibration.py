@@ -132,7 +132,9 @@ def calibrate(sightings: dict[str, Sighting], size: tuple[int, int], model: Lens
     return Calibration(intrinsics, poses, skipped, sum(num_outliers.values()))
 
 
-def _outliers(sighting: Sighting, errors: Float[np.ndarray, "N"], limit: float) -> Bool[np.ndarray, "N"]:
+def _outliers(
+    sighting: Sighting, errors: Float[np.ndarray, " features"], limit: float
+) -> Bool[np.ndarray, " features"]:
     """Select all points of the features whose error exceeds both the limit and half the largest error of the image.
 
     One misread tag disturbs the whole pose, so smaller errors are judged again after the largest ones are removed.
@@ -170,7 +172,7 @@ def _estimate(
 
 def _errors(
     sighting: Sighting, intrinsics: Intrinsics, rotation: Float[np.ndarray, "3"], translation: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "N"]:
+) -> Float[np.ndarray, " features"]:
     """Compute the distances between points and their projections, in pixels."""
     distortion = np.array(intrinsics.distortion) if intrinsics.distortion else None
     projected, _ = opencv().projectPoints(sighting.points, rotation, translation, intrinsics.matrix, distortion)

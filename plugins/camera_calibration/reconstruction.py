@@ -275,7 +275,7 @@ def import_model(folder: Path, images: Sequence[Path], size: tuple[int, int]) ->
         size: width and height of the photographs, in pixels; the lens is scaled to this size.
 
     Returns:
-        Lens and poses, and the 3-D points [P, 3].
+        Lens and poses, and the 3-D points [points, 3].
 
     Raises:
         NerfroError: the model contains none of the images, or more than one camera.

@@ -23,7 +23,7 @@ _OUTLIER_QUANTILE = 0.001
 
 
 def find_bounds(
-    poses: Float[np.ndarray, "V 3 4"], slopes: Float[np.ndarray, "V 2"], points: Float[np.ndarray, "P 3"]
+    poses: Float[np.ndarray, "V 3 4"], slopes: Float[np.ndarray, "V 2"], points: Float[np.ndarray, "points 3"]
 ) -> tuple[float, float]:
     """Estimate the near and far bounds of all cameras.
 
@@ -59,7 +59,7 @@ def find_bounds(
     return _NEAR_FRACTION * float(distances.min()), 2 * float(distances.max())
 
 
-def usable_points(points: Float[np.ndarray, "P 3"], file: Path) -> Float[np.ndarray, "Q 3"]:
+def usable_points(points: Float[np.ndarray, "points 3"], file: Path) -> Float[np.ndarray, "usable 3"]:
     """Return the points of a file within the coordinates that nerfro accepts; outliers may lie beyond these.
 
     Raises:
@@ -71,8 +71,8 @@ def usable_points(points: Float[np.ndarray, "P 3"], file: Path) -> Float[np.ndar
 
 
 def _distances_in_view(
-    points: Float[np.ndarray, "P 3"], pose: Float[np.ndarray, "3 4"], slope: Float[np.ndarray, "2"]
-) -> Float[np.ndarray, "Q"]:
+    points: Float[np.ndarray, "points 3"], pose: Float[np.ndarray, "3 4"], slope: Float[np.ndarray, "2"]
+) -> Float[np.ndarray, " usable"]:
     """Compute the distances of the points inside the view frustum; distortion is neglected."""
     local = (points - pose[:, 3]) @ pose[:, :3]
     inside = (np.abs(local[:, :2]) < -slope * local[:, 2:]).all(1)

@@ -65,7 +65,7 @@ class ColmapModel:
 
     cameras: dict[int, ColmapCamera]
     images: list[ColmapImage]
-    points: Float[np.ndarray, "P 3"]
+    points: Float[np.ndarray, "points 3"]
 
 
 def read_colmap(folder: Path) -> ColmapModel:

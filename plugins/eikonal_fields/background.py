@@ -81,12 +81,12 @@ class Background:
         return trilinear(self.sky, cube, directions)
 
 
-def _vertices(box: Float[Tensor, "2 3"], resolution: int) -> Float[Tensor, "P 3"]:
+def _vertices(box: Float[Tensor, "2 3"], resolution: int) -> Float[Tensor, "points 3"]:
     ticks = torch.linspace(0, 1, resolution, device=box.device)
     return box[0] + torch.cartesian_prod(ticks, ticks, ticks) * (box[1] - box[0])
 
 
-def _mean_radiance(field: Field, positions: Float[Tensor, "P 3"]) -> Float[Tensor, "P 4"]:
+def _mean_radiance(field: Field, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points 4"]:
     total = positions.new_zeros(len(positions), 4)
     axes = torch.cat([torch.eye(3), -torch.eye(3)]).to(positions.device)
     s = positions.new_zeros(len(positions), 1)

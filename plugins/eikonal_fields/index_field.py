@@ -34,7 +34,7 @@ class IndexField(Medium):
     box: Float[Tensor, "2 3"]
     bounds: Float[Tensor, "2 3"]
     frame: Float[Tensor, "26 3"]
-    frequencies: Float[Tensor, "K"]
+    frequencies: Float[Tensor, " frequencies"]
 
     def __init__(
         self,
@@ -115,7 +115,9 @@ class IndexField(Medium):
         gradients = torch.zeros_like(flat).index_copy(0, index, (window[:, None] * slope).to(flat))
         return n.view(positions.shape[:-1]), gradients.view(positions.shape)
 
-    def _network(self, positions: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "P"], Float[Tensor, "P 3"]]:
+    def _network(
+        self, positions: Float[Tensor, "points 3"]
+    ) -> tuple[Float[Tensor, " points"], Float[Tensor, "points 3"]]:
         """Evaluate the index up to a constant, and the gradient."""
         encoded = self._encode(positions)
         state = encoded
@@ -126,7 +128,7 @@ class IndexField(Medium):
         state = _softplus(self.last(state))[..., 0]
         return state[:, 0], state[:, 1:] / self.scale
 
-    def _encode(self, positions: Float[Tensor, "P 3"]) -> Float[Tensor, "P 4 F"]:
+    def _encode(self, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points 4 F"]:
         """Compute the positional encoding and the derivatives along the axes of the unit frame."""
         unit = ((positions - self.bounds.mean(0)) / self.scale).to(self.frequencies)
         angles = (unit[:, None] * self.frequencies[:, None]).flatten(1)
@@ -137,7 +139,7 @@ class IndexField(Medium):
         axes = torch.eye(3, device=unit.device).repeat(1, value.shape[1] // 3)
         return torch.cat([value[:, None], slope[:, None] * axes], 1)
 
-    def _window(self, positions: Float[Tensor, "P 3"]) -> Float[Tensor, "P"]:
+    def _window(self, positions: Float[Tensor, "points 3"]) -> Float[Tensor, " points"]:
         """Compute the window, a product of one cubic step per axis."""
         depth = 0.5 * (self.box[1] - self.box[0]) - (positions - self.bounds.mean(0)).abs()
         t = (depth / self.fade).clamp(0, 1)
@@ -151,12 +153,12 @@ class _Dual(nn.Linear):
         nn.init.xavier_uniform_(self.weight)
         nn.init.zeros_(self.bias)
 
-    def forward(self, state: Float[Tensor, "P 4 I"]) -> Float[Tensor, "P 4 O"]:
+    def forward(self, state: Float[Tensor, "points 4 I"]) -> Float[Tensor, "points 4 O"]:
         product = state @ self.weight.T
         return torch.cat([product[:, :1] + self.bias, product[:, 1:]], 1)
 
 
-def _softplus(state: Float[Tensor, "P 4 O"]) -> Float[Tensor, "P 4 O"]:
+def _softplus(state: Float[Tensor, "points 4 O"]) -> Float[Tensor, "points 4 O"]:
     """Apply softplus to a value and three derivatives."""
     value, slopes = state[:, :1], state[:, 1:]
     return torch.cat([F.softplus(value, _BETA), torch.sigmoid(_BETA * value) * slopes], 1)

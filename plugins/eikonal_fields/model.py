@@ -160,7 +160,7 @@ class EikonalFields(Renderer):
         return [composite(samples, radiance, sky, path)]
 
 
-def radiance_where(field: Field | Ask, samples: Samples, selected: Bool[Tensor, "R N"]) -> Radiance:
+def radiance_where(field: Field | Ask, samples: Samples, selected: Bool[Tensor, "P N"]) -> Radiance:
     """Evaluate a field only at the selected samples; density and colour are zero elsewhere."""
     ray, i = selected.nonzero(as_tuple=True)
     chosen = Samples(
@@ -171,8 +171,8 @@ def radiance_where(field: Field | Ask, samples: Samples, selected: Bool[Tensor, 
         samples.radii[ray],
     )
     found = field(chosen)
-    density: Float[Tensor, "R N"] = torch.zeros_like(samples.s)
-    rgb: Float[Tensor, "R N 3"] = torch.zeros_like(samples.positions)
+    density: Float[Tensor, "P N"] = torch.zeros_like(samples.s)
+    rgb: Float[Tensor, "P N 3"] = torch.zeros_like(samples.positions)
     return Radiance(
         density.index_put((ray, i), found.density[:, 0].to(density)),
         rgb.index_put((ray, i), found.rgb[:, 0].to(rgb)),

@@ -110,7 +110,7 @@ def march_uniform(origins, directions, near, far, voxels, num_steps):
     """Trace rays through a voxel grid by Euler steps of equal arc length.
 
     Returns:
-        positions [R, V, 3], directions [R, V, 3], s [R, V]: V is the number of steps.
+        positions [R, S, 3], directions [R, S, 3], s [R, S]: S is the number of steps.
         refracted [R]: whether the index varied along the path.
     """
     num_rays = origins.shape[0]
@@ -226,7 +226,7 @@ def march_adaptive(origins, directions, near, far, voxels, solids, settings, cap
         capacity: largest number of vertices of a path, V.
 
     Returns:
-        positions [R, V, 3], directions [R, V, 3], s [R, V]: V is the capacity; in the precision of the rays.
+        positions [R, S, 3], directions [R, S, 3], s [R, S]: S is the capacity; in the precision of the rays.
         counts [R]: number of vertices of each path, which may be more than the capacity.
         refracted [R]: whether the index varied along the path.
         exceeded [R]: whether a ray took the largest number of steps, after which the path continues straight.

@@ -65,12 +65,12 @@ class Hierarchical(PointSampler):
 
 @torch.no_grad()
 def _draw(
-    edges: Float[Tensor, "R E"], weights: Float[Tensor, "R E-1"], u: Float[Tensor, "R N"]
-) -> Float[Tensor, "R N"]:
+    edges: Float[Tensor, "P E"], weights: Float[Tensor, "P E-1"], u: Float[Tensor, "P N"]
+) -> Float[Tensor, "P N"]:
     return invert_cdf(edges, weights.to(edges.dtype), u)
 
 
-def blur_weights(weights: Float[Tensor, "R B"], padding: float) -> Float[Tensor, "R B"]:
+def blur_weights(weights: Float[Tensor, "P N"], padding: float) -> Float[Tensor, "P N"]:
     """Apply the max-then-average filter of mip-NeRF (Eqn. 18) and add a constant, so that fewer surfaces are missed."""
     padded = torch.cat([weights[..., :1], weights, weights[..., -1:]], dim=-1)
     highest = torch.maximum(padded[..., :-1], padded[..., 1:])

@@ -61,8 +61,8 @@ class _Linear(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, weight: Float[Tensor, "O I"], bias: Float[Tensor, "O"], *parts: Float[Tensor, "P _"]
-    ) -> Float[Tensor, "P O"]:
+        ctx: Any, weight: Float[Tensor, "O I"], bias: Float[Tensor, "O"], *parts: Float[Tensor, "rows _"]
+    ) -> Float[Tensor, "rows O"]:
         ctx.save_for_backward(weight, *parts)
         first, *others = _split(weight, parts)
         total = _product(parts[0], first, bias)
@@ -72,7 +72,7 @@ class _Linear(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Float[Tensor, "P O"]) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, gradient: Float[Tensor, "rows O"]) -> tuple[Tensor | None, ...]:
         (weight, *parts), gradient = ctx.saved_tensors, gradient.contiguous()
         weight_learns, bias_learns, *parts_learn = ctx.needs_input_grad
         of_weight = None
@@ -85,12 +85,12 @@ class _Linear(torch.autograd.Function):
         return of_weight, gradient.sum(0) if bias_learns else None, *of_parts
 
 
-def _split(weight: Float[Tensor, "O I"], parts: Sequence[Float[Tensor, "P _"]]) -> list[Float[Tensor, "O _"]]:
+def _split(weight: Float[Tensor, "O I"], parts: Sequence[Float[Tensor, "rows _"]]) -> list[Float[Tensor, "O _"]]:
     """Return the columns of a weight for each part of the inputs; oneDNN is slow if they are not contiguous."""
     return [columns.contiguous() for columns in weight.split([part.shape[1] for part in parts], 1)]
 
 
-def _product_of_columns(left: Float[Tensor, "P O"], right: Float[Tensor, "P I"]) -> Float[Tensor, "O I"]:
+def _product_of_columns(left: Float[Tensor, "rows O"], right: Float[Tensor, "rows I"]) -> Float[Tensor, "O I"]:
     """Return left^T @ right, a sum over blocks of rows."""
     total = left.new_zeros(left.shape[1], right.shape[1])
     for rows, other_rows in zip(left.split(_ROWS), right.split(_ROWS), strict=True):
@@ -99,7 +99,7 @@ def _product_of_columns(left: Float[Tensor, "P O"], right: Float[Tensor, "P I"])
 
 
 def _product(
-    rows: Float[Tensor, "P I"], weight: Float[Tensor, "O I"], bias: Float[Tensor, "O"] | None = None
-) -> Float[Tensor, "P O"]:
+    rows: Float[Tensor, "rows I"], weight: Float[Tensor, "O I"], bias: Float[Tensor, "O"] | None = None
+) -> Float[Tensor, "rows O"]:
     """Return rows @ weight^T + bias."""
     return torch.ops.mkldnn._linear_pointwise(rows, weight, bias, "none", [], "")

@@ -58,14 +58,17 @@ class MipNerfField(FieldInBox):
         return Radiance(density, rgb)
 
     def _decode_block(
-        self, mean: Float[Tensor, "P 3"], variance: Float[Tensor, "P 3"], directions: Float[Tensor, "P 3"]
-    ) -> tuple[Float[Tensor, "P"], Float[Tensor, "P 3"]]:
+        self,
+        mean: Float[Tensor, "points 3"],
+        variance: Float[Tensor, "points 3"],
+        directions: Float[Tensor, "points 3"],
+    ) -> tuple[Float[Tensor, " points"], Float[Tensor, "points 3"]]:
         position = integrated_positional_encoding(mean, variance, self.position_degree)
         direction = positional_encoding(directions, DIRECTION_DEGREE)
         return self.mlp(position, direction)
 
 
-def frustum_gaussians(samples: Samples) -> tuple[Float[Tensor, "R N 3"], Float[Tensor, "R N 3"]]:
+def frustum_gaussians(samples: Samples) -> tuple[Float[Tensor, "P N 3"], Float[Tensor, "P N 3"]]:
     """Return mean and diagonal covariance of each sample's conical frustum.
 
     mip-NeRF, Eqns. 7 and 16, in numerically stable form. On a bent path the cone follows the local direction and

@@ -21,7 +21,8 @@ _BLOCK = 2**12
 
 
 def in_blocks(
-    evaluate: Callable[..., tuple[Float[Tensor, "P"], Float[Tensor, "P 3"]]], *points: Float[Tensor, "*batch _"]
+    evaluate: Callable[..., tuple[Float[Tensor, " points"], Float[Tensor, "points 3"]]],
+    *points: Float[Tensor, "*batch _"],
 ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
     """Evaluate densities and colours in blocks of points, whose intermediate results need little memory."""
     batch = points[0].shape[:-1]
@@ -73,7 +74,7 @@ class RadianceMLP(Network):
         self.rgb = glorot_linear(view_width, 3)
 
     def forward(
-        self, position: Float[Tensor, "*batch P"], direction: Float[Tensor, "*batch D"]
+        self, position: Float[Tensor, "*batch I"], direction: Float[Tensor, "*batch D"]
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
         features = self.trunk(position)
         density = F.softplus(self.density(features).squeeze(-1).float() - 1.0)
@@ -81,7 +82,7 @@ class RadianceMLP(Network):
 
     def _view(
         self, features: Float[Tensor, "*batch F"], direction: Float[Tensor, "*batch D"]
-    ) -> Float[Tensor, "*batch V"]:
+    ) -> Float[Tensor, "*batch O"]:
         """Apply bottleneck and view layer as one layer, because no activation lies between the two.
 
         The product of their weights needs fewer operations than the two layers, and no memory for the bottleneck.

@@ -78,8 +78,8 @@ class NerfField(FieldInBox):
         return in_blocks(self._decode_block, positions, directions)
 
     def _decode_block(
-        self, positions: Float[Tensor, "P 3"], directions: Float[Tensor, "P 3"]
-    ) -> tuple[Float[Tensor, "P"], Float[Tensor, "P 3"]]:
+        self, positions: Float[Tensor, "points 3"], directions: Float[Tensor, "points 3"]
+    ) -> tuple[Float[Tensor, " points"], Float[Tensor, "points 3"]]:
         position = positional_encoding(positions, self.position_degree)
         direction = positional_encoding(directions, DIRECTION_DEGREE)
         return self.mlp(position, direction)

@@ -52,7 +52,7 @@ class VoxelGrid(Medium):
 
     table: Float[Tensor, "X Y Z 4"]  # n and grad n (per world unit) at each vertex
     # Lower bound of the distance to the next cell with grad n != 0, for any point of each cell, world units.
-    clearance_grid: Float[Tensor, "U V W"]
+    clearance_grid: Float[Tensor, "x y z"]
     occupancy: Float[Tensor, "X Y Z"]  # fraction inside the mesh, before smoothing
 
     def __init__(
@@ -182,7 +182,7 @@ def gradient(values: Float[Tensor, "X Y Z"], spacing: Float[Tensor, "3"]) -> Flo
 
 def _clearance_of(
     table: Float[Tensor, "X Y Z 4"], spacing: Float[Tensor, "3"], box: Float[Tensor, "2 3"]
-) -> Float[Tensor, "U V W"]:
+) -> Float[Tensor, "x y z"]:
     """Compute `VoxelGrid.clearance_grid`."""
     varies = (table[..., 1:] != 0).any(-1)
     for axis in range(3):

@@ -25,8 +25,8 @@ class PriorInformation:
         information: information matrix, the inverse of the covariance; zero for directions without information.
     """
 
-    numbers: Float[Tensor, "N"]
-    information: Float[Tensor, "N N"]
+    numbers: Float[Tensor, " parameters"]
+    information: Float[Tensor, "parameters parameters"]
 
 
 def axes_across(directions: Float[Tensor, "R 3"]) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R 3"]]:
@@ -42,7 +42,7 @@ def robust_weights(error: Float[Tensor, "R 3"], scale: float) -> Float[Tensor, "
 
 
 def normal_equations(
-    slopes: Float[Tensor, "R C N"],
+    slopes: Float[Tensor, "R C parameters"],
     error: Float[Tensor, "R C"],
     weights: Float[Tensor, "R"],
     view: Int[Tensor, "R"],
@@ -78,12 +78,12 @@ def normal_equations(
 
 
 def with_priors(
-    matrix: Float[Tensor, "N N"],
-    vector: Float[Tensor, "N"],
-    numbers: Float[Tensor, "N"],
+    matrix: Float[Tensor, "parameters parameters"],
+    vector: Float[Tensor, " parameters"],
+    numbers: Float[Tensor, " parameters"],
     variance: Float[Tensor, ""] | float,
     priors: Iterable[PriorInformation],
-) -> tuple[Float[Tensor, "N N"], Float[Tensor, "N"]]:
+) -> tuple[Float[Tensor, "parameters parameters"], Float[Tensor, " parameters"]]:
     """Add priors to normal equations.
 
     Args:

@@ -139,8 +139,8 @@ def _observations(
 
 
 def _without_width(
-    matrix: Float[Tensor, "N N"], vector: Float[Tensor, "N"]
-) -> tuple[Float[Tensor, "N-1 N-1"], Float[Tensor, "N-1"]]:
+    matrix: Float[Tensor, "parameters parameters"], vector: Float[Tensor, " parameters"]
+) -> tuple[Float[Tensor, "parameters-1 parameters-1"], Float[Tensor, " parameters-1"]]:
     """Eliminate the last parameter from normal equations (Schur complement)."""
     column, last = matrix[:-1, -1], matrix[-1, -1]
     return matrix[:-1, :-1] - torch.outer(column, column) / last, vector[:-1] - column * (vector[-1] / last)

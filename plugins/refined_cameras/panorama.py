@@ -91,12 +91,14 @@ def align(
     return PriorInformation(numbers, known.to(numbers))
 
 
-def _solve(matrix: Float[Tensor, "N N"], right: Float[Tensor, "N *K"]) -> Float[Tensor, "N *K"]:
+def _solve(
+    matrix: Float[Tensor, "parameters parameters"], right: Float[Tensor, " parameters *columns"]
+) -> Float[Tensor, " parameters *columns"]:
     """Return the damped Gauss-Newton step for a normal matrix and a gradient."""
     return -torch.linalg.solve(matrix + torch.diag(_DAMPING * matrix.diagonal() + _TINY), right)
 
 
-def _marginalized(matrix: Float[Tensor, "N N"], num: int) -> Float[Tensor, "M M"]:
+def _marginalized(matrix: Float[Tensor, "parameters parameters"], num: int) -> Float[Tensor, "M M"]:
     """Return the information about the first `num` parameters, with the others eliminated (Schur complement)."""
     own, mixed = matrix[:num, :num], matrix[num:, :num]
     return own + mixed.mT @ _solve(matrix[num:, num:], mixed) if len(mixed) else own
@@ -176,7 +178,7 @@ def _overlap(
     if len(view) == 0:
         return None
 
-    def sampled(directions: Float[Tensor, "K 3"]) -> Float[Tensor, "O 3"]:
+    def sampled(directions: Float[Tensor, "directions 3"]) -> Float[Tensor, "O 3"]:
         return _sample(images, view, far.project(directions)[0][visible])
 
     angle = 1 / small.fx.mean()
@@ -205,7 +207,7 @@ def _sample(
 
 def _equations(
     overlap: _Overlap, gains: Float[Tensor, "V 3"], learn_gains: bool
-) -> tuple[Float[Tensor, "N N"], Float[Tensor, "N"], float]:
+) -> tuple[Float[Tensor, "parameters parameters"], Float[Tensor, " parameters"], float]:
     """Compute matrix and gradient of the normal equations with the sky eliminated, and the variance of the colours.
 
     The parameters are three rotations per view, the lens, and, with `learn_gains`, three logarithmic gains per view.

@@ -61,7 +61,7 @@ def even_weights(motions: Float[Tensor, "V 7"]) -> Float[Tensor, "V 6"]:
     return torch.stack([motions[:, :2].mean(1), motions[:, 3:5].mean(1)], -1).repeat_interleave(3, -1)
 
 
-def world_motions(poses: Float[Tensor, "V 3 4"], weights: Float[Tensor, "V 6"]) -> Float[Tensor, "K V 6"]:
+def world_motions(poses: Float[Tensor, "V 3 4"], weights: Float[Tensor, "V 6"]) -> Float[Tensor, "gauge V 6"]:
     """Compute an orthonormal basis of the camera motions that a similarity transformation of the world causes.
 
     Args:
@@ -82,7 +82,7 @@ def world_motions(poses: Float[Tensor, "V 3 4"], weights: Float[Tensor, "V 6"]) 
 
 
 def without_world(
-    motion: Float[Tensor, "V 6"], gauge: Float[Tensor, "K V 6"], weights: Float[Tensor, "V 6"]
+    motion: Float[Tensor, "V 6"], gauge: Float[Tensor, "gauge V 6"], weights: Float[Tensor, "V 6"]
 ) -> Float[Tensor, "V 6"]:
     """Remove the component in the space of `world_motions` (`gauge`) from rotations and translations of cameras."""
     weighted = motion * weights

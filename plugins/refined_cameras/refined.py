@@ -38,7 +38,7 @@ class _Motions(PerView):
     distortion: Float[Tensor, "V 9"]
     units: Float[Tensor, "V 6"]
     weights: Float[Tensor, "V 6"]
-    of_world: Float[Tensor, "K V 6"]
+    of_world: Float[Tensor, "gauge V 6"]
     focal_unit: Float[Tensor, "1"]
     motion: Float[Tensor, "V 6"]
 
@@ -134,7 +134,7 @@ class RefinedCamera(CameraModel):
         view: Int[Tensor, "R"],
         by_origin: Float[Tensor, "R C 3"],
         by_direction: Float[Tensor, "R C 3"],
-    ) -> Float[Tensor, "R C N"]:
+    ) -> Float[Tensor, "R C parameters"]:
         """Convert derivatives by rays to derivatives by camera parameters in pixels.
 
         Args:
@@ -161,11 +161,11 @@ class RefinedCamera(CameraModel):
             by_lens.append((by_direction * (ends[0] - ends[1])[:, None]).sum(-1))
         return torch.cat([by_motion, torch.stack(by_lens, -1)], -1)
 
-    def numbers(self) -> Float[Tensor, "N"]:
+    def numbers(self) -> Float[Tensor, " parameters"]:
         """Return a copy of the parameters of all cameras in pixels, followed by the lens if it is refined."""
         return torch.cat([self.motions.motion.flatten(), *([] if self.lens is None else [self.lens])])
 
-    def split(self, numbers: Shaped[Tensor, "N"]) -> tuple[Shaped[Tensor, "V 6"], Shaped[Tensor, "L"]]:
+    def split(self, numbers: Shaped[Tensor, " parameters"]) -> tuple[Shaped[Tensor, "V 6"], Shaped[Tensor, "L"]]:
         """Split such parameters into motions of the cameras and lens."""
         num = self.motions.motion.numel()
         return numbers[:num].view(-1, 6), numbers[num:]
@@ -176,7 +176,7 @@ class RefinedCamera(CameraModel):
         if self.lens is not None:
             self.lens += lens
 
-    def move_back(self, numbers: Float[Tensor, "N"], worse: Bool[Tensor, "V"], lens: bool) -> None:
+    def move_back(self, numbers: Float[Tensor, " parameters"], worse: Bool[Tensor, "V"], lens: bool) -> None:
         """Restore earlier parameters (see `numbers`) of the cameras `worse`, and of the lens if `lens` is true."""
         motion, old_lens = self.split(numbers)
         self.motions.motion[worse] = motion[worse]

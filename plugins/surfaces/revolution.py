@@ -63,7 +63,7 @@ class RevolutionSurface(MeshSurface):
         self._set(merge_vertices(mesh.vertices, mesh.faces))
 
 
-def meets_itself(points: Float[np.ndarray, "K 2"], is_ring: bool) -> bool:
+def meets_itself(points: Float[np.ndarray, "points 2"], is_ring: bool) -> bool:
     """Test whether two segments of an outline that are not neighbours meet."""
 
     def side(p: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray:

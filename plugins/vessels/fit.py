@@ -152,7 +152,9 @@ def fit_vessel(
     return VesselFit(lengths | {name: typical[name] for name in unknown}, standard_errors, unknown)
 
 
-def _minimum(grid: Float[np.ndarray, "C"], errors: Float[np.ndarray, "B C"]) -> Float[np.ndarray, "B"]:
+def _minimum(
+    grid: Float[np.ndarray, " candidates"], errors: Float[np.ndarray, "resamples candidates"]
+) -> Float[np.ndarray, " resamples"]:
     """Return the minima of the parabolas through the lowest error and its neighbours.
 
     Robust errors have narrow minima, which a parabola through all candidates would miss.

@@ -15,13 +15,13 @@ from nerfro.types import Path, Rays
 
 
 def distance_to_end(
-    far: Float[Tensor, "R"],
+    far: Float[Tensor, "P"],
     box: Float[Tensor, "2 3"],
-    refracted: Bool[Tensor, "R"],
-    positions: Float[Tensor, "R 3"],
-    directions: Float[Tensor, "R 3"],
-    s: Float[Tensor, "R"],
-) -> Float[Tensor, "R"]:
+    refracted: Bool[Tensor, "P"],
+    positions: Float[Tensor, "P 3"],
+    directions: Float[Tensor, "P 3"],
+    s: Float[Tensor, "P"],
+) -> Float[Tensor, "P"]:
     """Return the distance from the last event of each ray to far; bent rays end outside of the box, if farther."""
     _, leave = intersect_box(box, positions, directions)
     out = leave.clamp(min=0) + BEYOND_BOX * (box[1] - box[0]).min()
@@ -83,12 +83,12 @@ class PolylineBuilder:
 
     def append_ends(
         self,
-        far: Float[Tensor, "R"],
+        far: Float[Tensor, "P"],
         box: Float[Tensor, "2 3"],
-        refracted: Bool[Tensor, "R"],
-        positions: Float[Tensor, "R 3"],
-        directions: Float[Tensor, "R 3"],
-        s: Float[Tensor, "R"],
+        refracted: Bool[Tensor, "P"],
+        positions: Float[Tensor, "P 3"],
+        directions: Float[Tensor, "P 3"],
+        s: Float[Tensor, "P"],
     ) -> None:
         """Add the last vertex of every row."""
         ahead = distance_to_end(far, box, refracted, positions, directions, s)

@@ -66,7 +66,7 @@ def smallest_cosine(path: Path, medium: Medium) -> Float[Tensor, "P"]:
         return torch.where((path.surface[:, 1:] >= 0) & normals.any(-1), cosines, 1.0).amin(-1)
 
 
-def indices_of(medium: Medium, like: Tensor) -> Float[Tensor, "M"]:
+def indices_of(medium: Medium, like: Tensor) -> Float[Tensor, " media"]:
     """Return the refractive index of air and of each body, with gradients."""
     bodies = [medium.iors] if isinstance(medium, Solid) else []
     return torch.cat([like.new_ones(1), *(iors.to(like) for iors in bodies)])
@@ -170,7 +170,7 @@ def intersect_solid(medium: Solid, surface: Int[Tensor, "P S"]) -> Intersect:
     return intersect
 
 
-def _of_body(gradients: Float[Tensor, "R K 3"], body: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
+def _of_body(gradients: Float[Tensor, "P K 3"], body: Int[Tensor, "P"]) -> Float[Tensor, "P 3"]:
     return gradients.gather(1, body[:, None, None].expand(-1, 1, 3))[:, 0]
 
 

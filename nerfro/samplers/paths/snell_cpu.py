@@ -51,31 +51,31 @@ class Event(NamedTuple):
 
 
 class TracedRows(NamedTuple):
-    """Polylines of one ray, one row each (B rows, V vertices); fields as in `types.Path`."""
+    """Polylines of one ray, one row each (P rows, S vertices); fields as in `types.Path`."""
 
-    positions: Float[np.ndarray, "B V 3"]
-    directions: Float[np.ndarray, "B V 3"]
-    s: Float[np.ndarray, "B V"]
-    body: Int8[np.ndarray, "B V"]
-    surface: Int8[np.ndarray, "B V"]
-    across: Int8[np.ndarray, "B V"]
-    weight: Float[np.ndarray, "B"]
-    num_vertices: Int[np.ndarray, "B"]
-    num_events: Int[np.ndarray, "B"]
-    exceeded: Bool[np.ndarray, "B"]  # whether the limit of events was met
+    positions: Float[np.ndarray, "P S 3"]
+    directions: Float[np.ndarray, "P S 3"]
+    s: Float[np.ndarray, "P S"]
+    body: Int8[np.ndarray, "P S"]
+    surface: Int8[np.ndarray, "P S"]
+    across: Int8[np.ndarray, "P S"]
+    weight: Float[np.ndarray, "P"]
+    num_vertices: Int[np.ndarray, "P"]
+    num_events: Int[np.ndarray, "P"]
+    exceeded: Bool[np.ndarray, "P"]  # whether the limit of events was met
 
 
 class Pending(NamedTuple):
-    """Stack of reflected branches that are followed later (N entries, K bodies)."""
+    """Stack of reflected branches that are followed later (K bodies)."""
 
-    line: Float[np.ndarray, "N 6"]
-    s: Float[np.ndarray, "N"]
-    weight: Float[np.ndarray, "N"]
-    num_vertices: Int[np.ndarray, "N"]
-    num_events: Int[np.ndarray, "N"]
-    surface: Int[np.ndarray, "N"]  # surface of the reflection
-    across: Int[np.ndarray, "N"]  # body behind this surface
-    inside: Bool[np.ndarray, "N K"]
+    line: Float[np.ndarray, "pending 6"]
+    s: Float[np.ndarray, " pending"]
+    weight: Float[np.ndarray, " pending"]
+    num_vertices: Int[np.ndarray, " pending"]
+    num_events: Int[np.ndarray, " pending"]
+    surface: Int[np.ndarray, " pending"]  # surface of the reflection
+    across: Int[np.ndarray, " pending"]  # body behind this surface
+    inside: Bool[np.ndarray, "pending K"]
 
 
 class Scratch(NamedTuple):
@@ -354,13 +354,13 @@ def trace_snell(origins, directions, near, far, solids, settings, max_vertices, 
         origins, directions, near, far: rays [R, ...].
         solids: bodies, a `kernels.lookup.Solids`.
         settings: settings of the trace.
-        max_vertices: largest number of vertices of a polyline, V.
-        max_polylines: largest number of polylines of a ray, B.
+        max_vertices: largest number of vertices of a polyline, S.
+        max_polylines: largest number of polylines of a ray, P.
 
     Returns:
         rows: `TracedRows` of all rays, with a leading axis R, in the precision of the rays. Entries after the last
             vertex of a polyline are undefined.
-        counts [R, 2]: number of polylines of each ray, and largest number of vertices, which may exceed B and V.
+        counts [R, 2]: number of polylines of each ray, and largest number of vertices, which may exceed P and S.
     """
     num_rays, dtype = origins.shape[0], origins.dtype
     num_bodies, num_pending = len(solids.iors), settings.max_split_events
@@ -396,12 +396,12 @@ def trace_snell(origins, directions, near, far, solids, settings, max_vertices, 
 
 @compiled_parallel
 def polylines_of_width(rows, ray, place, width):
-    """Select polylines with W vertices each; shorter polylines repeat their last vertex.
+    """Select polylines with S vertices each; shorter polylines repeat their last vertex.
 
     Args:
         rows: polylines of all rays, from `trace_snell`.
         ray, place: ray of each selected polyline, and its place among the polylines of the ray.
-        width: number of vertices, W.
+        width: number of vertices, S.
 
     Returns:
         positions, directions, s, body, surface and across.

@@ -51,7 +51,7 @@ def warn_of_thin_walls(sampler: PathSampler, medium: Medium) -> None:
         )
 
 
-def thickness(mesh: TriangleMesh) -> Float[np.ndarray, "P"]:
+def thickness(mesh: TriangleMesh) -> Float[np.ndarray, " points"]:
     """Return the distance to the opposite side at random points of a closed surface, world units."""
     triangles, normals = mesh.triangles, area_vectors(mesh.triangles)
     size = np.linalg.norm(normals, axis=1)

@@ -170,7 +170,7 @@ class Wavefront:
 
     def _split(
         self, rows: Int[Tensor, "A"], share: Float[Tensor, "A"], reflected: Bool[Tensor, "A"]
-    ) -> tuple[Int[Tensor, "B"], Int[Tensor, "B"], Bool[Tensor, "B"]]:
+    ) -> tuple[Int[Tensor, " split"], Int[Tensor, " split"], Bool[Tensor, " split"]]:
         """Duplicate rows whose light splits; the reflected part becomes the next row.
 
         Args:

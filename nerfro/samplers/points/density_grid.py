@@ -50,7 +50,7 @@ class ContractedLength:
         radius: radius of the ball beyond which space is contracted.
     """
 
-    cumulative: Float[Tensor, "P V"]
+    cumulative: Float[Tensor, "P segment_ends"]
     start_length: Float[Tensor, "P S"]
     closest: Float[Tensor, "P S"]
     impact: Float[Tensor, "P S"]
@@ -115,7 +115,7 @@ class DensityGridSampler(PointSampler):
 
     num_levels = 1
     box: Float[Tensor, "2 3"]
-    density: Float[Tensor, "C C C"]
+    density: Float[Tensor, "cells cells cells"]
     inside: Int[Tensor, "M"] | None  # numbers of the cells that updates query; None for all
 
     def __init__(

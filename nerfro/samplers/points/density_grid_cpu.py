@@ -43,24 +43,24 @@ class Settings(NamedTuple):
 
 
 class Drawn(NamedTuple):
-    """Samples on R paths, or on one path without the first axis."""
+    """Samples on P polylines, or on one polyline without the first axis."""
 
-    edges: Float[np.ndarray, "R N+1"]
-    s: Float[np.ndarray, "R N"]  # arc lengths
-    positions: Float[np.ndarray, "R N 3"]
-    directions: Float[np.ndarray, "R N 3"]
-    occupied: Bool[np.ndarray, "R N"]
-    lengths: Float[np.ndarray, "R N"]
-    measure: Float[np.ndarray, "R N+1"]
+    edges: Float[np.ndarray, "P N+1"]
+    s: Float[np.ndarray, "P N"]  # arc lengths
+    positions: Float[np.ndarray, "P N 3"]
+    directions: Float[np.ndarray, "P N 3"]
+    occupied: Bool[np.ndarray, "P N"]
+    lengths: Float[np.ndarray, "P N"]
+    measure: Float[np.ndarray, "P N+1"]
 
 
 class Segments(NamedTuple):
     """The segments of one polyline; `closest`, `impact` and `start_length` are set for contracted space alone."""
 
-    cumulative: Float[np.ndarray, "V"]  # measure (arc length or contracted length) at which the segment begins
-    start_length: Float[np.ndarray, "V"]  # contracted length from the closest approach to the segment's start
-    closest: Float[np.ndarray, "V"]  # arc length of the closest approach to the centre
-    impact: Float[np.ndarray, "V"]  # distance from the centre there (impact parameter)
+    cumulative: Float[np.ndarray, " segment_ends"]  # measure (arc length or contracted length) at the segment's start
+    start_length: Float[np.ndarray, "S"]  # contracted length from the closest approach to the segment's start
+    closest: Float[np.ndarray, "S"]  # arc length of the closest approach to the centre
+    impact: Float[np.ndarray, "S"]  # distance from the centre there (impact parameter)
 
 
 @compiled
@@ -360,10 +360,10 @@ def draw(paths, box, density, random, num_samples, settings):
     """Draw samples in proportion to the weights that the density grid predicts, plus a floor.
 
     Args:
-        paths: positions [R, S, 3], directions [R, S, 3] and arc lengths [R, S] of the vertices of R paths.
+        paths: positions [P, S, 3], directions [P, S, 3] and arc lengths [P, S] of the vertices of P polylines.
         box: lowest and highest corner of the grid; those of contracted space if `settings.radius` is above 0.
         density: densities of the cells, [C, C, C].
-        random: index of each path's ray in the random numbers [R], number of random samples on each path [R], and
+        random: index of each path's ray in the random numbers [P], number of random samples on each path [P], and
             `Draws.counters`. Without indices, samples are evenly spread.
         num_samples: number of samples on each path; beyond the number of random samples, they have no length.
         settings: the `Settings`.

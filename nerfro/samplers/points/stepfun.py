@@ -14,8 +14,8 @@ _MIN_TOTAL_WEIGHT = 1e-5
 
 
 def volume_weights(
-    density: Float[Tensor, "R N"], deltas: Float[Tensor, "R N"]
-) -> tuple[Float[Tensor, "R N"], Float[Tensor, "R"]]:
+    density: Float[Tensor, "P N"], deltas: Float[Tensor, "P N"]
+) -> tuple[Float[Tensor, "P N"], Float[Tensor, "P"]]:
     """Compute the weights w_i = T_i (1 - exp(-sigma_i delta_i)) and the transmittance T_{N+1} (paper, Eqn. 1).
 
     Args:
@@ -47,8 +47,8 @@ def spread_uniform(path: Path, num_samples: int, draws: Draws | None, stream: st
 
 
 def invert_cdf(
-    edges: Float[Tensor, "R E"], weights: Float[Tensor, "R E-1"], u: Float[Tensor, "R N"]
-) -> Float[Tensor, "R N"]:
+    edges: Float[Tensor, "P E"], weights: Float[Tensor, "P E-1"], u: Float[Tensor, "P N"]
+) -> Float[Tensor, "P N"]:
     """Sample a step function by inversion of its cumulative distribution (paper, Eqn. 3).
 
     Args:
@@ -72,6 +72,6 @@ def invert_cdf(
     return left + fraction * (right - left)
 
 
-def midpoints(edges: Float[Tensor, "R E"]) -> Float[Tensor, "R E-1"]:
+def midpoints(edges: Float[Tensor, "P E"]) -> Float[Tensor, "P E-1"]:
     """Return the middle of each interval."""
     return 0.5 * (edges[..., 1:] + edges[..., :-1])

@@ -97,7 +97,7 @@ class Stratified(PointSampler):
         return Samples(positions, directions, s, _edges_from_starts(s), path.radii)
 
 
-def point_samples(path: Path, s: Float[Tensor, "R N"]) -> Samples:
+def point_samples(path: Path, s: Float[Tensor, "P N"]) -> Samples:
     """Create samples at given arc lengths.
 
     Args:
@@ -110,10 +110,10 @@ def point_samples(path: Path, s: Float[Tensor, "R N"]) -> Samples:
     return Samples.along(path, s, _edges_from_starts(s))
 
 
-def cone_samples(path: Path, edges: Float[Tensor, "R E"]) -> Samples:
+def cone_samples(path: Path, edges: Float[Tensor, "P E"]) -> Samples:
     """Create samples at the middle of intervals between ascending edges."""
     return Samples.along(path, 0.5 * (edges[:, 1:] + edges[:, :-1]), edges)
 
 
-def _edges_from_starts(s: Float[Tensor, "R N"]) -> Float[Tensor, "R N+1"]:
+def _edges_from_starts(s: Float[Tensor, "P N"]) -> Float[Tensor, "P N+1"]:
     return torch.cat([s, s[:, -1:] + LAST_DELTA], dim=1)

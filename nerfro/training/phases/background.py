@@ -107,8 +107,8 @@ class Background(Phase):
 
 
 def _divided(
-    run: Run, pixels: Int[Tensor, "P"], box: Float[Tensor, "2 3"]
-) -> tuple[Int[Tensor, "M"], Rays, Int[Tensor, "C"]]:
+    run: Run, pixels: Int[Tensor, "Q"], box: Float[Tensor, "2 3"]
+) -> tuple[Int[Tensor, " beside"], Rays, Int[Tensor, " crossing"]]:
     """Return the pixels whose rays miss a box, with their rays, and the other pixels."""
     beside, rays, crossing = [], [], []
     for chunk in pixels.split(_CHUNK):
@@ -120,7 +120,7 @@ def _divided(
     return torch.cat(beside), Rays.joined(rays), torch.cat(crossing)
 
 
-def _observe_through_object(run: Run, pixels: Int[Tensor, "P"]) -> Observed:
+def _observe_through_object(run: Run, pixels: Int[Tensor, "Q"]) -> Observed:
     """Observe the background along those rays of pixels that cross hardly any content."""
     batches, renderer, scene = run.batches, run.renderer, run.renderer.scene
     view = batches.cameras.view_of(pixels)
@@ -139,7 +139,7 @@ def _observe_through_object(run: Run, pixels: Int[Tensor, "P"]) -> Observed:
     return observed[fraction.amin(-1) >= _BACKGROUND]
 
 
-def _observe_beside_object(run: Run, pixels: Int[Tensor, "P"], rays: Rays, fits_gains: bool = True) -> Observed:
+def _observe_beside_object(run: Run, pixels: Int[Tensor, "Q"], rays: Rays, fits_gains: bool = True) -> Observed:
     """Observe the background along the rays of pixels beside the object, after the exposures are fitted to it."""
     batches, scene = run.batches, run.renderer.scene
     view, rgb, exposure = batches.cameras.view_of(pixels), batches.photographed(pixels), scene.camera.exposure
@@ -149,7 +149,7 @@ def _observe_beside_object(run: Run, pixels: Int[Tensor, "P"], rays: Rays, fits_
     return Observed(rays.directions, _photographed(run, rgb, view), rgb >= 1, torch.ones_like(widths), widths)
 
 
-def _rays(run: Run, pixels: Int[Tensor, "P"]) -> Rays:
+def _rays(run: Run, pixels: Int[Tensor, "Q"]) -> Rays:
     """Make the rays of the estimated cameras through the centres of pixels."""
     batches = run.batches
     return run.renderer.scene.camera(pixel_rays(batches.cameras, pixels), batches.cameras.view_of(pixels))
