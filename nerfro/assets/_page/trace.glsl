@@ -111,8 +111,8 @@ float clearanceAt(vec3 x) {
   return free;
 }
 
-// Returns the number of the innermost body, from 1; 0 in air (media/solid.py).
-int innermost(int inside) {
+// Returns the number of the body that decides at a point, from 1; 0 in air (media/solid.py).
+int decidingBody(int inside) {
   int number = 0;
   for (int body = 0; body < numBodies; ++body) {
     if ((inside >> body & 1) == 1) number = body + 1;
@@ -269,10 +269,10 @@ vec3 pathRadiance(vec3 x, vec3 d) {
   for (int branch = 0; branch < 2; ++branch) {
     for (int segment = 0; segment < MAX_SEGMENTS; ++segment) {
       Hit hit = firstSurface(x, d, inside);
-      int insideAfter = inside, bodyBefore = innermost(inside), bodyAfter = bodyBefore;
+      int insideAfter = inside, bodyBefore = decidingBody(inside), bodyAfter = bodyBefore;
       if (hit.body >= 0) {
         insideAfter = inside ^ (1 << hit.body);
-        bodyAfter = innermost(insideAfter);
+        bodyAfter = decidingBody(insideAfter);
         if (bodyAfter == 0 && bodyBefore > 0) {  // a gap of air thinner than the shortest step counts as closed
           vec3 behind = x + (hit.after + minStep) * d;
           int crossed = 0;
@@ -282,7 +282,7 @@ vec3 pathRadiance(vec3 x, vec3 d) {
           }
           if (crossed != 0) hit.after += minStep;
           insideAfter ^= crossed;
-          bodyAfter = innermost(insideAfter);
+          bodyAfter = decidingBody(insideAfter);
         }
       }
       float n = index[bodyAfter] / index[bodyBefore];
