@@ -221,6 +221,32 @@ def test_water_that_exactly_fills_its_glass_bends_as_in_closed_form(tmp_path: Fi
     assert angle(path.exit_directions, _nested_exit(heights, 0.9, 1.5, 0.7, 1.33)[0]).median() < 0.05
 
 
+@pytest.mark.parametrize("height", [0.0, 1e-4, 1e-3])
+def test_rays_that_begin_just_outside_of_the_triangles_of_a_ball_enter_it(tmp_path: FilePath, height: float) -> None:
+    # The triangles lie up to 0.002 below the ball whose normals they have, and the signed distance is that of the ball.
+    medium = _mesh_medium(trimesh.creation.icosphere(3, 0.8), tmp_path)
+    generator = np.random.default_rng(0)
+    normal, direction = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in generator.normal(size=(2, 100, 3)))
+    direction -= 1.6 * normal
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    rays = _rays((0.8 + height) * normal, direction, near=0.0)
+    path = Snell("mesh")(rays, medium)
+    assert path.refracted.all()
+    assert angle(path.exit_directions, ball_exits(rays, 0.8, 1.5)).median() < 0.1
+
+
+def test_rays_that_begin_beside_an_edge_are_inside_of_their_box(tmp_path: FilePath) -> None:
+    # Signed distances on a grid round the edge off.
+    medium = _mesh_medium(trimesh.creation.box((1, 1, 1)), tmp_path, resolution=16)
+    depth = torch.linspace(0.001, 0.02, 20, dtype=torch.float64)
+    origins = torch.stack([0.5 - depth, 0.49 - 0 * depth, 0 * depth], -1)
+    direction = torch.tensor([math.cos(0.4), 0.0, math.sin(0.4)], dtype=torch.float64)
+    path = Snell("mesh")(_rays(origins, direction.expand(20, 3), near=0.0), medium)
+    sine = 1.5 * math.sin(0.4)
+    expected = torch.tensor([math.sqrt(1 - sine**2), 0.0, sine], dtype=torch.float64)
+    torch.testing.assert_close(path.exit_directions, expected.expand(20, 3), atol=1e-9, rtol=0)
+
+
 @pytest.mark.parametrize("num_plates", [2, 3])
 def test_plates_in_contact_are_one_plate(tmp_path: FilePath, num_plates: int) -> None:
     plates = [trimesh.creation.box((0.2, 2, 2)).apply_translation((0.2 * i, 0, 0)) for i in range(num_plates)]

@@ -182,9 +182,10 @@ def _refined_in_bands(
 def _trace_triangles(rays: Rays, medium: SdfGrid, max_events: int, branching: Branching) -> SnellTrace:
     """Trace rays from triangle to triangle of meshes, on the CPU and in double precision.
 
-    The number of crossings of its surface determines whether a ray is inside a body; the orientation of triangles does
-    not matter. Signed distances determine which rays begin inside, half-way to their first triangle, because they are
-    inaccurate at surfaces.
+    The number of crossings of its surface determines whether a ray is inside a body. A ray begins inside the body of
+    its first triangle if it leaves the body through this triangle. Signed distances half-way to the triangle determine
+    which other bodies contain the beginning. Distances are inaccurate near surfaces, and the smooth surface of convex
+    bodies lies outside of the triangles.
     """
     triangles, scene = medium.triangles, medium.intersector
     box = medium.box.double().cpu()
@@ -195,10 +196,16 @@ def _trace_triangles(rays: Rays, medium: SdfGrid, max_events: int, branching: Br
         x, d = front.x[within], front.d[within]
         front.start[within] = offset  # a ray that begins on a surface does not cross it
         faces = scene.first_hits(x + offset * d, d)
-        lengths = torch.where(faces >= 0, triangles.distance(x[:, None], d[:, None], faces), torch.inf).amin(1)
-        half_way = x + 0.5 * torch.where(lengths < torch.inf, lengths, 0.0)[:, None] * d
-        inside = (medium.signed_distances(half_way.to(medium.box))[0] < 0).cpu()
-        front.inside[within] = inside & (lengths < torch.inf)[:, None]
+        lengths = torch.where(faces >= 0, triangles.distance(x[:, None], d[:, None], faces), torch.inf)
+        length = lengths.amin(1, keepdim=True)
+        half_way = x + 0.5 * torch.where(length < torch.inf, length, 0.0) * d
+        inside = (medium.signed_distances(half_way.to(medium.box))[0] < 0).cpu() & (length < torch.inf)
+        row, layer = ((faces >= 0) & (lengths <= length + offset)).nonzero(as_tuple=True)
+        first = faces[row, layer]
+        leaves = (triangles.areas(first) * d[row]).sum(-1) > 0
+        inside[row, triangles.body[first]] = False
+        inside[row[leaves], triangles.body[first[leaves]]] = True
+        front.inside[within] = inside
     front.add_vertices(front.ray)
     while len(rows := front.moving.nonzero()[:, 0]):
         faces = scene.first_hits(front.x[rows] + front.start[rows, None] * front.d[rows], front.d[rows])
