@@ -77,7 +77,9 @@ def find_mask(root: Path, image: Path, stated: str | None = None) -> Path | None
         if not os.path.isfile(mask):  # False for a name that is too long
             raise NerfroError(f"mask {mask} of {image} does not exist; restore it or remove its path from the data set")
         return mask
-    candidates = [image.with_name(f"mask_{image.stem}{suffix}") for suffix in _SUFFIXES]
+    beside, candidates = mask_beside(image), []
+    if beside is not None:
+        return beside
     if image.is_relative_to(root):
         folder = image.relative_to(root).parent
         folders = [folder]
@@ -86,6 +88,12 @@ def find_mask(root: Path, image: Path, stated: str | None = None) -> Path | None
         for within in folders:
             names = [*(f"{image.stem}{suffix}" for suffix in _SUFFIXES), f"{image.name}.png"]
             candidates += [root / "masks" / within / name for name in names]
+    return next((path for path in candidates if path.is_file()), None)
+
+
+def mask_beside(image: Path) -> Path | None:
+    """Return the file `mask_<stem>.png` beside an image, where `nerfro.mask` writes; None if it does not exist."""
+    candidates = (image.with_name(f"mask_{image.stem}{suffix}") for suffix in _SUFFIXES)
     return next((path for path in candidates if path.is_file()), None)
 
 

@@ -14,7 +14,7 @@ from nerfro.data.base import Frame
 from nerfro.data.frames import SPLITS, check_pose, require_root
 from nerfro.data.image_files import IMAGE_SUFFIXES, read_size
 from nerfro.data.lenses import Lens, read_lens
-from nerfro.data.masks import find_mask
+from nerfro.data.masks import find_mask, mask_beside
 from nerfro.errors import NerfroError, first_of, warn
 from nerfro.files.reading import parse_matrix, read_json
 
@@ -80,7 +80,8 @@ def parse_manifest(path: Path, mask_key: str = "mask_path", skip_missing: bool =
 
     Args:
         path: the file.
-        mask_key: key of a frame's silhouette. With the default key, silhouettes are also searched beside the images.
+        mask_key: key of a frame's silhouette. Without this key, the silhouette is searched as `find_mask` does. With
+            another key than the default, it is only searched beside the image, and `mask_path` is no silhouette.
         skip_missing: skip frames whose image does not exist, with one warning.
 
     Raises:
@@ -133,8 +134,11 @@ def _read_frame(
         )
     # `mask_file_path` is RefRef's key for the silhouette.
     stated = entry.get(mask_key, entry.get("mask_file_path"))
-    has_mask = mask_key == "mask_path" or stated is not None
-    return Frame(name, image, find_mask(root, image, stated) if has_mask else None, pose)
+    if mask_key == "mask_path" or stated is not None:
+        return Frame(name, image, find_mask(root, image, stated), pose)
+    beside, ignored = mask_beside(image), root / (entry.get("mask_path") or "").replace("\\", "/")
+    is_ignored = beside is not None and os.path.abspath(beside) == os.path.abspath(ignored)
+    return Frame(name, image, None if is_ignored else beside, pose)
 
 
 def _candidates(root: Path, name: str) -> list[Path]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -14,6 +15,7 @@ from nerfro.data.base import Frame
 from nerfro.data.frames import Every, FrameSet, PosedImages, list_images
 from nerfro.data.image_files import IMAGE_SUFFIXES
 from nerfro.data.lenses import Lens
+from nerfro.data.masks import find_mask
 from nerfro.errors import NerfroError
 from nerfro.files.reading import load_arrays, parse_matrix
 from nerfro.registry import register
@@ -53,7 +55,7 @@ class IdrData(PosedImages):
 
     def read(self, split: str) -> FrameSet:
         images = list_images(_first_folder(self.root, ("image", "images", "rgb")))
-        masks = _list_masks(self.root, len(images))
+        masks = _list_masks(self.root, images)
         file = self.root / self.cameras
         if not file.is_file():
             raise NerfroError(f"{file} does not exist; set data.cameras to the file with the matrices")
@@ -111,12 +113,13 @@ def _first_folder(root: Path, names: tuple[str, ...]) -> Path:
     return next((root / name for name in names if (root / name).is_dir()), root / names[0])
 
 
-def _list_masks(root: Path, num_images: int) -> list[Path] | list[None]:
-    """List the masks by name; the names may differ from those of the images."""
+def _list_masks(root: Path, images: Sequence[Path]) -> Sequence[Path | None]:
+    """List the masks by name; the names may differ from those of the images. Without a folder, search each mask."""
     folder = _first_folder(root, ("mask", "masks"))
     if not folder.is_dir():
-        return [None] * num_images
-    masks = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
-    if len(masks) != num_images:
-        raise NerfroError(f"{folder} holds {len(masks)} masks for {num_images} images; give one per image, or none")
+        return [find_mask(root, image) for image in images]
+    files = (path for path in folder.iterdir() if not path.name.startswith("."))
+    masks = sorted(path for path in files if path.suffix.lower() in IMAGE_SUFFIXES)
+    if len(masks) != len(images):
+        raise NerfroError(f"{folder} holds {len(masks)} masks for {len(images)} images; give one per image, or none")
     return masks

@@ -12,7 +12,7 @@ from nerfro.data.base import Views
 from tests.conftest import refused
 
 from .formats import SCALE, SHIFT, idr, write_idr
-from .photographs import POINTS
+from .photographs import POINTS, picture, save_mask
 
 IdrData, decompose = idr.IdrData, idr.decompose
 
@@ -39,6 +39,21 @@ def test_the_files_own_world(write):
     torch.testing.assert_close(cameras.project(world)[0], inside[0], rtol=0, atol=1e-3)
     torch.testing.assert_close(cameras.project(world)[1], SCALE * inside[1])
     refused(r"data.world=file needs data.near and data.far", IdrData, str(write()), world="file")
+
+
+def test_masks_lie_beside_the_images_if_there_is_no_folder(tmp_path: Path) -> None:
+    write_idr(tmp_path)
+    for i in range(6):
+        save_mask(tmp_path / "image" / f"mask_{i:06d}.png", i)
+    views = load(tmp_path)
+    assert views.masks is not None
+    np.testing.assert_array_equal(views.masks[0].numpy(), picture(1)[..., 0] > 127)
+
+
+def test_hidden_files_among_the_masks_are_ignored(write: Callable[..., Path]) -> None:
+    root = write()
+    (root / "mask" / "._000.png").write_bytes(b"of another system")
+    assert load(root).masks is not None
 
 
 @pytest.mark.parametrize(

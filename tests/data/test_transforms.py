@@ -29,7 +29,7 @@ from .formats import (
     write_opencv,
     write_transforms,
 )
-from .photographs import HEIGHT, WIDTH, camera_to_world, check_views, picture, save_mask
+from .photographs import CX, CY, FX, FY, HEIGHT, WIDTH, camera_to_world, check_views, picture, save_mask
 
 
 def load(root: Path, split: str = "train", **options: Any) -> Views:
@@ -211,6 +211,19 @@ def test_black_pixels_of_mask_path_are_not_usable(tmp_path: Path) -> None:
     whole = white.reshape(2, HEIGHT // 2, 2, WIDTH // 2, 2).all((2, 4))
     np.testing.assert_array_equal(usable(load(root, downscale=2)), whole)
     assert 0 < whole.sum() < whole.size
+
+
+def test_masks_of_nerfro_beside_the_images_are_silhouettes_unless_they_are_mask_path(tmp_path: Path) -> None:
+    root = write_nerfstudio(tmp_path, seeds=range(3))
+    for i in range(3):
+        save_mask(root / f"images/mask_f_{i}.png", i)
+    views = load(root)
+    check_views(views, [1, 2], lens=(FX, FY, CX, CY), k=K, p=P)
+    assert views.masks is not None
+    write_nerfstudio(tmp_path, seeds=range(3), frame=lambda i: {"mask_path": f"./images/mask_f_{i}.png"})
+    views = load(root)
+    assert views.masks is None
+    assert views.usable is not None
 
 
 def test_grey_of_mask_path_counts_as_the_nearer_level_and_labels_are_0_and_1(tmp_path: Path) -> None:
