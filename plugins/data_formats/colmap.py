@@ -15,7 +15,7 @@ from nerfro.errors import NerfroError
 from nerfro.registry import register
 
 from .bounds import find_bounds, usable_points
-from .colmap_model import lens_of, read_colmap
+from .colmap_model import ColmapImage, ColmapModel, lens_of, read_colmap
 
 _MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "")
 
@@ -54,8 +54,7 @@ class ColmapData(PosedImages):
         near, far = self.near, self.far
         if near is None or far is None:
             poses = np.stack([image.camera_to_world for image in model.images]) * [1.0, -1.0, -1.0, 1.0]
-            cameras = [model.cameras[image.camera] for image in model.images]
-            slopes = np.array([(0.5 * c.width / c.params[0], 0.5 * c.height / c.params[0]) for c in cameras])
+            slopes = np.array([self._slopes(model, image, folder) for image in model.images])
             near, far = find_bounds(poses, slopes, usable_points(model.points, folder))
         images = self.held_out(model.images, self.test_every, split)
         frames = []
@@ -70,6 +69,12 @@ class ColmapData(PosedImages):
             camera, where = model.cameras[image.camera], f"{folder}: camera {image.camera}"
             lenses.append(lens_of(camera, where).resized((camera.width, camera.height), size, where))
         return FrameSet(frames, lenses, "opencv", near, far)
+
+    def _slopes(self, model: ColmapModel, image: ColmapImage, folder: Path) -> tuple[float, float]:
+        """Return half the width and height of an image, divided by the focal lengths."""
+        camera = model.cameras[image.camera]
+        lens = lens_of(camera, f"{folder}: camera {image.camera}")
+        return 0.5 * camera.width / lens.fx, 0.5 * camera.height / lens.fy
 
     def _model_folder(self) -> Path:
         folders = [self.root / name for name in ((self.model,) if self.model is not None else _MODEL_FOLDERS)]

@@ -18,7 +18,7 @@ from nerfro.errors import NerfroError
 from tests.conftest import SMALL, refused
 
 from .formats import BROWN, CAMERA_MODELS, FORMATS, OPENCV, TRAIN, colmap_model, write_colmap
-from .photographs import CX, CY, FX, FY, HEIGHT, POINTS, WIDTH, camera_to_world, check_views, save_picture
+from .photographs import CX, CY, FX, FY, HEIGHT, POINTS, WIDTH, camera_to_world, check_views, project, save_picture
 
 TORCH_POINTS = torch.from_numpy(POINTS).float()
 TINY = [*SMALL, "evaluation.subdivision.side=1", "trainer.max_steps=2"]
@@ -98,6 +98,19 @@ def test_bounds_come_from_the_points_unless_they_are_given(write):
     # The outermost thousandth is left out, so the ends are not quite reached.
     assert views.cameras.near == pytest.approx(0.9 * distance.min(), rel=1e-3)
     assert views.cameras.far == pytest.approx(1.1 * distance.max(), rel=1e-3)
+
+
+def test_bounds_heed_both_focal_lengths(write):
+    lens = (FX, 3 * FX, WIDTH / 2, HEIGHT / 2)
+    cameras = load(write(cameras={1: ("PINHOLE", lens)}), near=None, far=None).cameras
+    in_view = []
+    for seed in range(6):
+        pixels = project(seed, POINTS, lens)
+        inside = ((pixels > 0) & (pixels < [WIDTH, HEIGHT])).all(1)
+        distances = np.linalg.norm(POINTS[inside] - camera_to_world(seed, "opencv")[:3, 3], axis=1)
+        in_view.append(np.quantile(distances, [0.001, 0.999]))
+    assert cameras.near == pytest.approx(0.9 * min(low for low, _ in in_view))
+    assert cameras.far == pytest.approx(1.1 * max(high for _, high in in_view))
 
 
 def test_points_and_poses_beyond_all_coordinates_do_not_give_bounds(write):
