@@ -127,11 +127,15 @@ def mask_file(frame: Frame) -> Path:
     return frame.image.with_name(f"mask_{frame.image.stem}.png")
 
 
-def read_resized(mask: Path, size: tuple[int, int], labels: Sequence[int] | None) -> Bool[np.ndarray, "H W"]:
-    """Read a mask and resize it to the width and height of the loaded images."""
+def read_resized(
+    mask: Path, image: Path, size: tuple[int, int], labels: Sequence[int] | None
+) -> Bool[np.ndarray, "H W"]:
+    """Read the mask of an image file and resize it to the width and height of the loaded images."""
     coverage = to_unit(read_mask(mask, labels))
     height, width = coverage.shape
-    if height * size[0] != width * size[1]:
+    # The sides of downscaled images are rounded, so their aspect ratio may differ slightly.
+    stored = read_size(image)
+    if height * stored[0] != width * stored[1]:
         raise NerfroError(
             f"mask {mask} has {width}x{height} pixels, which is not the aspect ratio of its image; replace the mask"
         )
@@ -242,7 +246,7 @@ class MaskTask:
                 method = method_of(frame.mask)
                 stays = {POLYGON: view not in outlined, TRACKED: tracker is None}
                 if method is None or stays.get(method, False):
-                    kept[view] = read_resized(frame.mask, size, source.mask_labels)
+                    kept[view] = read_resized(frame.mask, frame.image, size, source.mask_labels)
         if not config.view:
             check_start(frames, outlined, kept, config.hull_only)
         return cls(source, cameras, images, frames, kept, config.hull_only or config.view, tracker)
@@ -262,7 +266,8 @@ class MaskTask:
                     f"{name} already has a mask, {self.frames[view].mask}; delete the mask, or set overwrite=true to "
                     "replace all masks"
                 )
-            scaled = np.array(outline, np.float64) * size[0] / read_size(self.frames[view].image)[0]
+            scale = np.divide(size, read_size(self.frames[view].image)[:2])
+            scaled = (np.reshape(outline, (-1, 2)) * scale).reshape(np.shape(outline))
             if scaled.ndim == 2:  # the user's polygon is the mask
                 given[view] = polygon_mask(scaled, size)
             elif self.tracker is not None:

@@ -105,7 +105,7 @@ class OutlinePage:
 
     def _contours(self, view: int, mask: Bool[np.ndarray, "H W"]) -> list[list[list[float]]]:
         """Convert a mask to polygons of (column, row) in pixels of the image file."""
-        scale = self._sizes[view][0] / mask.shape[1]
+        scale = np.divide(self._sizes[view], mask.shape[::-1])
         rings = [
             approximate_polygon(ring, _TOLERANCE) for ring in find_contours(np.pad(mask, 1).astype(np.float32), 0.5)
         ]

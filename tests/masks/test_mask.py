@@ -196,6 +196,14 @@ def test_polygons_are_the_masks_of_their_views(capture: Path, photographs: list,
     assert min(overlap(read(capture, view), photographs[view][1]) for view in range(NUM_VIEWS)) > 0.7
 
 
+def test_masks_are_kept_if_the_sides_of_downscaled_images_are_rounded(
+    capture: Path, photographs: list, mask: Callable[..., str]
+) -> None:
+    for view in (1, 5, 9):
+        Image.fromarray(np.uint8(255 * photographs[view][1])).save(capture / "photos" / f"mask_p_{view}.png")
+    assert "3 existing masks" in mask("hull_only=true", "data.downscale=1.9")  # images of 51 x 38 pixels
+
+
 def test_projections_are_made_again_and_edited_masks_are_kept(
     capture: Path, photographs: list, mask: Callable[..., str]
 ) -> None:
