@@ -11,7 +11,7 @@ from nerfro.data.masks import find_mask, require_used
 from nerfro.errors import NerfroError, warn
 from nerfro.files.atomic import refuse_existing
 from nerfro.files.folder_lock import lock_folder
-from nerfro.overrides import print_next
+from nerfro.overrides import as_overrides, print_next
 from nerfro.paths import relative_path, user_path
 from nerfro.progress import track
 
@@ -94,7 +94,7 @@ def _calibrate(config: DictConfig, out: Path) -> None:
     reach = ray_range(calibration, seen)
     written = write_calibrated(out, images, size, calibration, splits, config.target, (quads, points), reach)
     print(f"wrote {', '.join(written)}")
-    options = ["data=opencv", f"data.root={out}"]
+    options = as_overrides({"data": "opencv", "data.root": out})
     if any(masks):
         print_next("next", "preprocess", [*options, "medium.ior=1.33"])
     else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import subprocess
 import sys
 from collections.abc import Callable, Iterable
@@ -71,6 +72,14 @@ def test_models_are_imported(form: str, tmp_path: Path, command: Callable[..., s
             np.testing.assert_allclose(found[:3, 3], -pose[:, :3].T @ pose[:, 3], atol=1e-6)
             assert error > 0.1
             np.testing.assert_allclose(report["images"][Path(frame["file_path"]).name]["error"], error, atol=1e-3)
+
+
+def test_the_printed_command_quotes_the_folder(tmp_path: Path, command: Callable[..., str]) -> None:
+    out = tmp_path / "DIR [1], (x)"
+    model = synthesized(out / "sparse" / "0", ("SIMPLE_PINHOLE", [1280.0, 512, 384]), 0.0)
+    blank(out / "images", [image.name for image in model.images.values()], (512, 384))
+    printed = command("calibrate", f'images="{out / "images"}"', f'out="{out}"', "target=colmap", "test_every=3")
+    assert shlex.split(printed.splitlines()[-1])[5] == f'data.root="{out}"'
 
 
 def test_features_on_and_near_the_object_are_ignored(tmp_path: Path) -> None:
