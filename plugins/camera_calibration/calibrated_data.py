@@ -80,7 +80,11 @@ def write_calibrated(
         **document,
         "focal_deviation": lens.focal_deviation,
         "images": {
-            name: {"split": split, "error": round(pose.error, 4), "features": pose.num_features}
+            name: {
+                "split": split,
+                "error": round(pose.error, 4) if pose.num_features else None,
+                "features": pose.num_features,
+            }
             for split, names in splits.items()
             for name, pose in ((name, calibration.poses[name]) for name in names)
         },

@@ -48,7 +48,7 @@ class Pose:
     Attributes:
         camera_to_world: [R | centre] in OpenCV's camera axes.
         num_features: number of features that determine the pose.
-        error: root mean square reprojection error, in pixels.
+        error: root mean square reprojection error, in pixels; NaN without features.
     """
 
     camera_to_world: Float[np.ndarray, "3 4"]
@@ -66,16 +66,21 @@ class Calibration:
     num_outliers: int
 
     @property
+    def errors(self) -> list[float]:
+        """Root mean square reprojection errors of the images with features, in pixels."""
+        return [pose.error for pose in self.poses.values() if pose.num_features]
+
+    @property
     def mean_error(self) -> float:
-        """Mean over the images of the root mean square reprojection error, in pixels."""
-        return float(np.nanmean([pose.error for pose in self.poses.values()]))
+        """Mean over the images of the root mean square reprojection error, in pixels; 0 without features."""
+        return float(np.mean(self.errors)) if self.errors else 0.0
 
     def lines(self, feature: str) -> list[str]:
         """Format a report: the error of each image, skipped images, and the lens; `feature` is a noun in the plural."""
         lines = [f"reprojection error in pixels (rms) and number of {feature} by image:"]
         lines += [f"  {pose.error:6.3f}  {pose.num_features:4d}  {name}" for name, pose in sorted(self.poses.items())]
-        largest = np.nanmax([pose.error for pose in self.poses.values()])
-        lines.append(f"  {self.mean_error:6.3f}  mean; {largest:.3f} largest")
+        if self.errors:
+            lines.append(f"  {self.mean_error:6.3f}  mean; {max(self.errors):.3f} largest")
         lines += [f"  skipped: {name}: {reason}" for name, reason in sorted(self.skipped.items())]
         if self.num_outliers:
             lines.append(f"{self.num_outliers} points removed as outliers: misread, or seen through the object")

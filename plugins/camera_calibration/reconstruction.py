@@ -298,17 +298,25 @@ def import_model(folder: Path, images: Sequence[Path], size: tuple[int, int]) ->
     camera, where = parsed.cameras[numbers.pop()], f"{folder}: the camera"
     lens = lens_of(camera, where).resized((camera.width, camera.height), size, where)
     check_lenses([lens], [where], size)
-    errors = _reprojection_errors(pycolmap.Reconstruction(folder), size[0] / camera.width)
+    errors = _reprojection_errors(pycolmap, folder, size[0] / camera.width) if len(parsed.points) else {}
     poses = {}
     for image in registered:
-        error, num_points = errors[image.name]
+        error, num_points = errors.get(image.name, (float("nan"), 0))
         poses[image.name] = Pose(image.camera_to_world, num_points, error)
     skipped = {image.name: "no pose from COLMAP" for image in images if image.name not in poses}
     return Calibration(_intrinsics(lens), poses, skipped, 0), parsed.points
 
 
-def _reprojection_errors(reconstruction: Any, scale: float) -> dict[str, tuple[float, int]]:
-    """Compute the root mean square reprojection error in pixels and the number of points, by image name."""
+def _reprojection_errors(pycolmap: Any, folder: Path, scale: float) -> dict[str, tuple[float, int]]:
+    """Compute the root mean square reprojection error in pixels and the number of points, by image name.
+
+    The error of an image without points is NaN.
+    """
+    try:
+        reconstruction = pycolmap.Reconstruction(folder)
+    except Exception as error:  # COLMAP raises several kinds of exceptions for files that contradict each other
+        reason = str(error).strip().split("\n")[0]
+        raise NerfroError(f"{folder} is not a valid COLMAP model ({reason}); export the model again") from error
     errors = {}
     for image in reconstruction.images.values():
         residuals = []

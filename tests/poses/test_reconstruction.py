@@ -74,12 +74,36 @@ def test_models_are_imported(form: str, tmp_path: Path, command: Callable[..., s
             np.testing.assert_allclose(report["images"][Path(frame["file_path"]).name]["error"], error, atol=1e-3)
 
 
+def test_models_without_points_have_no_reprojection_errors(tmp_path: Path, command: Callable[..., str]) -> None:
+    folder = tmp_path / "sparse" / "0"
+    model = synthesized(folder, ("SIMPLE_PINHOLE", [1280.0, 512, 384]), 0.0)
+    blank(tmp_path / "images", [image.name for image in model.images.values()], (512, 384))
+    (folder / "points3D.txt").unlink()
+    printed = command("calibrate", f"images={tmp_path / 'images'}", f"out={tmp_path}", "target=colmap", "test_every=3")
+    assert "nan  mean" not in printed
+    assert "RuntimeWarning" not in printed
+    report = json.loads((tmp_path / "calibration.json").read_text(), parse_constant=pytest.fail)
+    assert {(image["error"], image["features"]) for image in report["images"].values()} == {(None, 0)}
+
+
 def test_the_printed_command_quotes_the_folder(tmp_path: Path, command: Callable[..., str]) -> None:
     out = tmp_path / "DIR [1], (x)"
     model = synthesized(out / "sparse" / "0", ("SIMPLE_PINHOLE", [1280.0, 512, 384]), 0.0)
     blank(out / "images", [image.name for image in model.images.values()], (512, 384))
     printed = command("calibrate", f'images="{out / "images"}"', f'out="{out}"', "target=colmap", "test_every=3")
     assert shlex.split(printed.splitlines()[-1])[5] == f'data.root="{out}"'
+
+
+def test_models_whose_files_contradict_each_other_are_refused(tmp_path: Path) -> None:
+    model = synthesized(tmp_path / "model", ("SIMPLE_PINHOLE", [1280.0, 512, 384]), 0.0)
+    names = [image.name for image in model.images.values()]
+    blank(tmp_path / "images", names, (512, 384))
+    file = tmp_path / "model" / "images.txt"
+    lines = file.read_text().splitlines()
+    lines[-1] = ""  # features that points refer to
+    file.write_text("\n".join(lines) + "\n")
+    images = [tmp_path / "images" / name for name in names]
+    refused("is not a valid COLMAP model", reconstruction.import_model, tmp_path / "model", images, (512, 384))
 
 
 def test_features_on_and_near_the_object_are_ignored(tmp_path: Path) -> None:
