@@ -26,7 +26,7 @@ from nerfro.pipeline import stages
 from nerfro.pipeline.hypotheses import Hypothesis
 from nerfro.pipeline.stages import terminated_in_one_line
 from tests.ball_photographs import RECONSTRUCTION, RECONSTRUCTION_TRAINING, save_with_masks
-from tests.conftest import Runner, weights_of
+from tests.conftest import Runner, refused, weights_of
 from tests.poses.camera_calibration import collection
 
 
@@ -47,6 +47,46 @@ def test_links_to_deleted_photographs_are_removed(photos: Path, tmp_path: Path) 
     collection.link_photographs(photos, photos.parent / "silhouettes", tmp_path / "out")
     assert sorted(file.name for file in (tmp_path / "out" / "images").iterdir()) == ["IMG_0.png", "IMG_2.png"]
     assert len(list((tmp_path / "out" / "masks").iterdir())) == 3
+
+
+def test_photographs_that_differ_in_their_extension_are_refused(photos: Path, tmp_path: Path) -> None:
+    Image.new("RGB", (8, 8)).save(photos / "IMG_1.jpg")
+    refused("several images named IMG_1", collection.link_photographs, photos, None, tmp_path / "out")
+
+
+def _lying(file: Path, level: int) -> None:
+    """Write a photograph with an EXIF orientation, which is converted."""
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6
+    Image.new("L", (8, 8), level).save(file, exif=exif.tobytes())
+
+
+def test_photographs_and_masks_follow_their_folders_until_the_calibration(photos: Path, tmp_path: Path) -> None:
+    def link(photographs: Path, masks: Path) -> set[str]:
+        collection.link_photographs(photographs, masks, tmp_path / "out")
+        return {file.name for file in (tmp_path / "out" / "images").iterdir()}
+
+    masks = photos.parent / "silhouettes"
+    for name in ("lying", "removed"):
+        _lying(photos / f"{name}.jpg", 50)
+    link(photos, masks)
+    (photos / "removed.jpg").unlink()
+    _lying(photos / "lying.jpg", 200)
+    later = time.time_ns() + 10**9
+    os.utime(photos / "lying.jpg", ns=(later, later))
+    assert link(photos, masks) == {"IMG_0.png", "IMG_1.png", "IMG_2.png", "lying.jpg"}
+    with Image.open(tmp_path / "out" / "images" / "lying.jpg") as copy:
+        assert copy.getpixel((4, 4))[0] > 150
+    for folder in ("more_photos", "more_masks"):
+        save_png(tmp_path / folder / "IMG_0.png", torch.ones(8, 8, 3))
+    assert link(tmp_path / "more_photos", tmp_path / "more_masks") == {"IMG_0.png"}
+    (mask,) = (tmp_path / "out" / "masks").iterdir()
+    assert mask.resolve() == tmp_path / "more_masks" / "IMG_0.png"
+    # The poses belong to the photographs that were calibrated.
+    (tmp_path / "out" / "calibration.json").write_text("{}")
+    link(photos, masks)
+    assert (tmp_path / "out" / "images" / "IMG_0.png").resolve() == tmp_path / "more_photos" / "IMG_0.png"
+    assert (tmp_path / "out" / "masks" / "IMG_0.png").resolve() == masks / "IMG_0.png"
 
 
 @pytest.mark.parametrize("suffix", [".JPG", ".heic"])

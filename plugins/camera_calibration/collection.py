@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+from collections import Counter
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 from omegaconf import DictConfig
@@ -20,6 +23,7 @@ from .photographs import HEIF_SUFFIXES, PHOTOGRAPH_SUFFIXES
 from .video import extract_frames
 
 _QUALITY = 95  # of converted photographs
+_CONVERTED = b"converted by nerfro from "  # comment of converted photographs, before the path of the original
 
 
 def collect_photographs(config: DictConfig, out: Path) -> list[Path]:
@@ -45,21 +49,30 @@ def collect_photographs(config: DictConfig, out: Path) -> list[Path]:
 def link_photographs(photographs: Path, masks: Path | None, out: Path) -> None:
     """Link photographs into `out`/images and masks into `out`/masks, so that no result lies among the originals.
 
-    Existing links and files are kept, except links to deleted files. Photographs in HEIC format and those with an EXIF
-    orientation are converted.
+    Photographs in HEIC format and those with an EXIF orientation are converted. Files of the user in these folders are
+    kept. Links and converted photographs are made again if their originals are not in the given folders or have
+    changed, but after the calibration only links to deleted files and to masks of another folder.
 
     Args:
         photographs: folder of the photographs, which may also contain masks (`mask_*`).
         masks: folder of the masks, `<name>.png`, `<name>.<extension of the photograph>.png` or `mask_<name>.png`.
         out: folder of the data set.
+
+    Raises:
+        NerfroError: a folder does not exist or holds no photograph, or photographs differ only in their extension.
     """
-    list_images(photographs, PHOTOGRAPH_SUFFIXES)  # raises an error for a folder without photographs
-    for link in (*out.glob("images/*"), *out.glob("masks/*")):
-        if not link.exists():
-            link.unlink()
-    for folder in (photographs, *([] if masks is None else [masks])):
-        if not folder.is_dir():
-            raise NerfroError(f"masks={folder} is not a folder; give the folder of the masks of the photographs")
+    _require_one_of_each_name(list_images(photographs, PHOTOGRAPH_SUFFIXES))
+    if masks is not None and not masks.is_dir():
+        raise NerfroError(f"masks={masks} is not a folder; give the folder of the masks of the photographs")
+    folders = (photographs, *([] if masks is None else [masks]))
+    originals = {file.resolve() for folder in folders for file in folder.iterdir()}
+    is_calibrated = (out / REPORT).is_file()
+    for placed in (*out.glob("images/*"), *out.glob("masks/*")):
+        is_mask = placed.parent.name == "masks" or placed.name.startswith("mask_")
+        is_kept = is_calibrated and (masks is None or not is_mask)
+        if not placed.exists() or (not is_kept and _is_outdated(placed, originals)):
+            placed.unlink()
+    for folder in folders:
         suffixes = PHOTOGRAPH_SUFFIXES if folder == photographs else IMAGE_SUFFIXES
         files = (file for file in folder.iterdir() if file.suffix.lower() in suffixes)
         for file in track("linking", sorted(file for file in files if not file.name.startswith("."))):
@@ -73,6 +86,34 @@ def link_photographs(photographs: Path, masks: Path | None, out: Path) -> None:
             stem = Path(file.stem).stem if (photographs / file.stem).is_file() else file.stem
             if not (link := place / f"{stem}{file.suffix}").exists():
                 link.symlink_to(file.resolve())
+
+
+def _require_one_of_each_name(photographs: Sequence[Path]) -> None:
+    """Refuse photographs that differ only in their extension, except a photograph and its converted copy."""
+    counts, originals = Counter(file.stem for file in photographs), {file.resolve() for file in photographs}
+    several = [file for file in photographs if counts[file.stem] > 1 and _converted_from(file) not in originals]
+    repeated = [stem for stem, count in Counter(file.stem for file in several).items() if count > 1]
+    if repeated:
+        raise NerfroError(f"{several[0].parent} contains several images named {repeated[0]}; keep one of each name")
+
+
+def _is_outdated(placed: Path, originals: Collection[Path]) -> bool:
+    """Test whether a link or a converted photograph follows from none of the originals, or from an older version."""
+    if placed.is_symlink():
+        return placed.resolve() not in originals
+    original = _converted_from(placed)
+    if original is None:
+        return False
+    return original not in originals or original.stat().st_mtime_ns > placed.stat().st_mtime_ns
+
+
+def _converted_from(file: Path) -> Path | None:
+    """Return the original of a photograph that nerfro has converted; None for all other files."""
+    if file.suffix != ".jpg" or not file.is_file():
+        return None
+    with open_image(file, upright=False) as (image, _):
+        comment = image.info.get("comment", b"")
+    return Path(os.fsdecode(comment.removeprefix(_CONVERTED))) if comment.startswith(_CONVERTED) else None
 
 
 def _place_photograph(file: Path, folder: Path) -> None:
@@ -93,6 +134,7 @@ def _place_photograph(file: Path, folder: Path) -> None:
         if file.suffix.lower() in HEIF_SUFFIXES or orientation_of(image) in range(2, 9):
             upright = ImageOps.exif_transpose(image).convert("RGB")
             with atomic_file(converted) as output:
-                upright.save(output, "JPEG", quality=_QUALITY, exif=upright.getexif())
+                comment = _CONVERTED + os.fsencode(file.resolve())
+                upright.save(output, "JPEG", quality=_QUALITY, exif=upright.getexif(), comment=comment)
             return
     place.symlink_to(file.resolve())
