@@ -34,7 +34,12 @@ def prints_hints() -> bool:
 
 def print_next(label: str, command: str, options: Sequence[str]) -> None:
     """Print the next command as a hint."""
-    print_hint(f"{label}: {shlex.join(['python', '-m', f'nerfro.{command}', *options])}")
+    print_hint(f"{label}: {command_line(command, options)}")
+
+
+def command_line(command: str, options: Sequence[str]) -> str:
+    """Return the line that runs a command in a shell."""
+    return shlex.join(["python", "-m", f"nerfro.{command}", *options])
 
 
 def is_given(option: str, overrides: Iterable[str]) -> bool:

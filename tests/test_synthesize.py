@@ -1,6 +1,8 @@
 """`nerfro.synthesize`: what it writes, what it keeps and what it refuses; and the scene that ships with the package."""
 
 import json
+import shlex
+from types import SimpleNamespace
 
 import pytest
 from omegaconf import OmegaConf
@@ -12,6 +14,7 @@ from nerfro.data.blender import BlenderData
 from nerfro.geometry.mesh import load_mesh
 from nerfro.light import to_srgb
 from nerfro.paths import ASSETS_DIR, CONF_DIR
+from nerfro.registry import plugin_module
 from nerfro.synthetic import SynthesizeConfig, synthesize
 from nerfro.types import Exits
 from tests.conftest import refused
@@ -49,6 +52,15 @@ def test_embedded_scene_is_complete_and_small():
         for frame in views:
             assert Image.open(EMBEDDED / f"{frame['file_path']}.png").size == (128, 128)
             assert Image.open(EMBEDDED / frame["mask_path"]).mode == "L"
+
+
+@pytest.mark.parametrize("module", ["dataset.Views", "scenes.photographs.Photographs"])
+def test_the_printed_command_quotes_the_folder(module, tmp_path):
+    name, _, kind = module.rpartition(".")
+    data = getattr(plugin_module(f"synthetic_scenes.{name}"), kind)
+    folder = tmp_path / "torus [1]"
+    words = shlex.split(data(configured(), SimpleNamespace(ior=1.5), folder).next_command())
+    assert {f'data.root="{folder}"', f'out="{folder}"'} & set(words)
 
 
 def test_masks_are_the_projected_mesh():

@@ -6,7 +6,6 @@ import contextlib
 import gc
 import itertools
 import os
-import shlex
 import signal
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ import torch
 from nerfro.cli import call
 from nerfro.errors import Interrupted, NerfroError
 from nerfro.failures import EXIT_INTERRUPTED, in_one_line
-from nerfro.overrides import without_hints
+from nerfro.overrides import command_line, without_hints
 
 _SEED = 67280421310721  # of torch in a new process
 
@@ -56,7 +55,7 @@ class Stage:
         if self.is_done:
             print(f"{self.command}: done; {self.result} is kept (delete the file to repeat the stage)", flush=True)
             return
-        print(f"\n{self.command}: {shlex.join(['python', '-m', f'nerfro.{self.command}', *self.options])}", flush=True)
+        print(f"\n{self.command}: {command_line(self.command, self.options)}", flush=True)
         # Training has saved a checkpoint.
         again = "continue" if self.command == "train" else "start this stage again"
         incomplete = f"{self.command} is incomplete; repeat the same command to {again}"

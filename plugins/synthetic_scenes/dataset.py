@@ -24,6 +24,7 @@ from nerfro.files.folder_lock import require_only
 from nerfro.files.images import save_image
 from nerfro.files.reading import read_json
 from nerfro.light import to_srgb
+from nerfro.overrides import as_overrides, command_line
 
 from .path_tracer import Pinhole
 from .scene import Scene, lat_long_texture
@@ -188,8 +189,9 @@ class Views(DataSet):
             write_json(self.folder / f"transforms_{split}.json", content)
 
     def next_command(self) -> str:
-        data = f"data.root={self.folder} medium.mesh={self.folder / 'mesh.ply'} medium.ior={self.scene.ior}"
-        return f"train on it: python -m nerfro.train {data}"
+        mesh = self.folder / "mesh.ply"
+        options = as_overrides({"data.root": self.folder, "medium.mesh": mesh, "medium.ior": self.scene.ior})
+        return f"train on it: {command_line('train', options)}"
 
 
 def fingerprint(scene: Scene) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from nerfro.light import to_srgb
+from nerfro.overrides import as_overrides, command_line
 
 from ..dataset import DataSet, PlannedImage, write_image, write_json
 from ..path_tracer import Pinhole
@@ -75,8 +76,8 @@ class Photographs(DataSet):
         write_json(truth / "transforms_train.json", content)
 
     def next_command(self) -> str:
-        images = self.folder / "images"
-        return f"calibrate it: python -m nerfro.calibrate images={images} target=apriltag out={self.folder}"
+        options = as_overrides({"images": self.folder / "images", "target": "apriltag", "out": self.folder})
+        return f"calibrate it: {command_line('calibrate', options)}"
 
 
 def hand_held(
