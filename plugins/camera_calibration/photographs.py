@@ -11,7 +11,7 @@ from jaxtyping import UInt8
 
 from nerfro.data.frames import list_images
 from nerfro.data.image_files import IMAGE_SUFFIXES, read_mask, read_rgb, read_size, to_unit
-from nerfro.errors import NerfroError
+from nerfro.errors import NerfroError, first_of, warn
 from nerfro.light import to_linear
 from nerfro.progress import track
 
@@ -23,11 +23,22 @@ _LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # of linear sRGB (I
 
 
 def list_photographs(folder: Path) -> tuple[list[Path], tuple[int, int]]:
-    """List the photographs of a folder by name, with their common width and height in pixels."""
+    """List the photographs of a folder by name, with their common width and height in pixels.
+
+    A warning names photographs in HEIC format, which are left out.
+    """
     images = list_images(folder)
-    repeated = [stem for stem, count in Counter(image.stem for image in images).items() if count > 1]
+    counts = Counter(image.stem for image in images)
+    repeated = [stem for stem, count in counts.items() if count > 1]
     if repeated:
         raise NerfroError(f"{folder} contains several images named {repeated[0]}; keep one of each name")
+    others = [file for file in list_images(folder, PHOTOGRAPH_SUFFIXES) if file not in images]
+    left_out = [file.name for file in others if file.stem not in counts]  # others have a converted copy
+    if left_out:
+        warn(
+            f"{len(left_out)} photographs in HEIC format are left out ({first_of(left_out)}); convert them to JPEG, or "
+            "use nerfro.reconstruct, which reads them"
+        )
     shapes = {image: read_size(image)[:2] for image in images}
     ((size, _),) = Counter(shapes.values()).most_common(1)
     odd = [image for image in images if shapes[image] != size]

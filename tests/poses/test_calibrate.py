@@ -13,7 +13,15 @@ pytest.importorskip("cv2")
 pytest.importorskip("pyapriltags")
 
 from nerfro.data.blender import OpenCVData
-from tests.poses.camera_calibration import Sighting, TagBoard, calibrate, luminance, tag_grid, twelve_faces
+from tests.poses.camera_calibration import (
+    Sighting,
+    TagBoard,
+    calibrate,
+    luminance,
+    photographs,
+    tag_grid,
+    twelve_faces,
+)
 from tests.sheet_photographs import angle, around, photograph
 
 SIZE = (640, 480)
@@ -198,3 +206,15 @@ def test_mistakes_are_reported_in_one_line(tmp_path: Path, command: Callable[...
     Image.fromarray(np.full((48, 64), 90, np.uint8)).save(photos / "a.jpg")
     assert "several images named a" in command("calibrate", *common)
     assert (tmp_path / "cameras.png").read_bytes() == b"mine"
+
+
+def test_photographs_that_are_left_out_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("a.jpg", "b.jpg"):
+        Image.new("RGB", (8, 6)).save(tmp_path / name)
+    (tmp_path / "b.HEIC").touch()  # has a converted copy
+    photographs.list_photographs(tmp_path)
+    assert capsys.readouterr().out == ""
+    (tmp_path / "c.heic").touch()
+    images, _ = photographs.list_photographs(tmp_path)
+    assert [image.name for image in images] == ["a.jpg", "b.jpg"]
+    assert "1 photographs in HEIC format are left out (c.heic)" in capsys.readouterr().out
