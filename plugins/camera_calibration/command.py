@@ -96,7 +96,7 @@ def _calibrate(config: DictConfig, out: Path) -> None:
     print(f"wrote {', '.join(written)}")
     options = as_overrides({"data": "opencv", "data.root": out})
     if any(masks):
-        print_next("next", "preprocess", [*options, "medium.ior=1.33"])
+        print_next("next", "preprocess", options)
     else:
         print_next("next", "mask", [*options, "view=true"])
 

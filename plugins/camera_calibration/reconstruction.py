@@ -314,9 +314,9 @@ def _reprojection_errors(pycolmap: Any, folder: Path, scale: float) -> dict[str,
     """
     try:
         reconstruction = pycolmap.Reconstruction(folder)
-    except Exception as error:  # COLMAP raises several kinds of exceptions for files that contradict each other
-        reason = str(error).strip().split("\n")[0]
-        raise NerfroError(f"{folder} is not a valid COLMAP model ({reason}); export the model again") from error
+    except Exception as cause:  # COLMAP raises several kinds of exceptions for files that contradict each other
+        reason = str(cause).strip().split("\n")[0]
+        raise NerfroError(f"{folder} is not a valid COLMAP model ({reason}); export the model again") from cause
     errors = {}
     for image in reconstruction.images.values():
         residuals = []
