@@ -27,7 +27,7 @@ _BLACK = 1e-3
 # Smallest radiance that `fit` tells apart from black: the step of 8-bit images.
 _DARKEST = 1 / 255 / 12.92
 # Largest width of a ray, in texels of a level to which it contributes.
-_MOST_TEXELS = 2.0
+_MAX_TEXELS = 2.0
 # Texels along each side of a face of the levels, if neither a list nor photographs define them.
 _RESOLUTIONS = (4, 8, 16, 32, 64, 128, 256)
 
@@ -163,7 +163,7 @@ class EnvironmentMap(Boundary):
             self.levels.resolutions, self.texels_of_levels(), past_weights.split(self.levels.sizes), strict=True
         )
         for n, (values, of_level), earlier in levels:
-            wide = observed.widths > _MOST_TEXELS * 0.5 * math.pi / n
+            wide = observed.widths > _MAX_TEXELS * 0.5 * math.pi / n
             weights = observed.weights.masked_fill(wide, 0)[:, None].expand(-1, 3)
             place, level = (face, coordinates), cube_map.CubeLevels((n,))
             with torch.enable_grad():

@@ -18,11 +18,11 @@ from nerfro.samplers.paths.snell import Snell
 COMMON_INDICES = {"water": 1.333, "glass": 1.52}
 STRAIGHT, SOLID, VESSEL = "straight rays", "solid body", "vessel"
 _NUM_PIXELS = 6000
-_LEAST_WEIGHT = 0.02
+_MIN_WEIGHT = 0.02
 # A body is supported if it decreases the error of straight rays by this number of standard errors, and by at least this
 # fraction of the decrease of the best body. On the real glass of water, the errors of the solid body and of the vessel
 # differ by 0.014 in the wrong order, and both decrease the error by 0.25 (docs/lab/simulated_glassware.md).
-_SUPPORTED, _LEAST_GAIN = 3.0, 0.75
+_SUPPORTED, _MIN_GAIN = 3.0, 0.75
 
 
 class ObjectErrors:
@@ -37,7 +37,7 @@ class ObjectErrors:
         self._surroundings = observations.surroundings
         self._pixels = observations.through.some(_NUM_PIXELS)
         self._half_weight = half_weight(self._surroundings)
-        self._sampler = Snell(branches="all", least_weight=_LEAST_WEIGHT)
+        self._sampler = Snell(branches="all", least_weight=_MIN_WEIGHT)
         self._progress, self._num_bodies = progress, 0
         self.counts = np.bincount(self._pixels.view, minlength=len(self._pixels.cameras)).astype(np.float64)
         self.samples = bootstrap_weights(self.counts)
@@ -88,7 +88,7 @@ def unsupported_bodies(
         name
         for name in bodies
         if measured.decreases(errors[STRAIGHT], errors[name], _SUPPORTED)
-        and gains[name] > _LEAST_GAIN * max(gains.values())
+        and gains[name] > _MIN_GAIN * max(gains.values())
     ]
     print(f"bodies that these pixels support: {', '.join(supported) or 'none'}")
     return [name for name in bodies if name not in supported]

@@ -12,7 +12,7 @@ from nerfro.geometry.contraction import contracted_box, expand
 # Cells along each side of the grid.
 NUM_CELLS = 64
 # Number of cameras that must see a cell close to a camera.
-_FEWEST_CAMERAS = 3
+_MIN_CAMERAS = 3
 
 
 @torch.no_grad()
@@ -40,5 +40,5 @@ def observed_cells(cameras: Cameras, centre: Float[Tensor, "3"], radius: float) 
         pixels, depth = (values[0] for values in cameras.select([view]).project(positions[near]))
         num_cameras += ((pixels >= 0) & (pixels <= size)).all(-1) & (depth > 0)
     observed = torch.ones_like(near)
-    observed[near] = num_cameras >= min(_FEWEST_CAMERAS, len(cameras))
+    observed[near] = num_cameras >= min(_MIN_CAMERAS, len(cameras))
     return observed.view(NUM_CELLS, NUM_CELLS, NUM_CELLS)

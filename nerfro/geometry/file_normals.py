@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 
 from nerfro.geometry.orientation import area_vectors, patches
 
-_LEAST_COSINE = np.cos(np.radians(30.0))  # between the normals of a corner and of its triangle
+_MIN_COSINE = np.cos(np.radians(30.0))  # between the normals of a corner and of its triangle
 _LARGEST_RATIO = 0.98  # of the residual of the file's normals to that of averages
 _DECIMALS = 1e5  # normals at one vertex that agree to 1 / _DECIMALS are one normal
 
@@ -43,7 +43,7 @@ def informative_normals(
     corner = _numbered(faces, normals)
     facet = _numbered(corner, np.broadcast_to(flat, normals.shape))
     num_coplanar = np.bincount(facet.reshape(-1))[facet]
-    trusted = (normals * flat).sum(-1) >= _LEAST_COSINE
+    trusted = (normals * flat).sum(-1) >= _MIN_COSINE
     patch = np.unique(patches(faces)[0], return_inverse=True)[1]
 
     def residual(candidate: Float[np.ndarray, "F 3 3"]) -> Float[np.ndarray, " corners"]:

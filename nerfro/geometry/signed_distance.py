@@ -15,7 +15,7 @@ from nerfro.geometry.occupancy import PLANES, occupancy_fraction, triangles_by_p
 from nerfro.kernels.compilation import compiled, compiled_parallel
 from nerfro.progress import track
 
-_LEAST_DEPTH = 0.01  # of a vertex inside the mesh, voxels
+_MIN_DEPTH = 0.01  # of a vertex inside the mesh, voxels
 
 
 def signed_distance_grid(
@@ -57,7 +57,7 @@ def signed_distance_grid(
     distance, height = _distance_to(triangles[shown], normals[shown], origin, spacing, resolution, reach)
     inside = occupancy_fraction(mesh, box, resolution, subsamples=1) > 0.5
     # Vertices on a flat mesh can count as inside.
-    require_inside(bool((inside & (distance > _LEAST_DEPTH * spacing.min())).any()))
+    require_inside(bool((inside & (distance > _MIN_DEPTH * spacing.min())).any()))
     if lid is not None:
         inside |= _distance_to(triangles[lid], normals[lid], origin, spacing, resolution, reach)[0] < distance
     return (np.where(inside, -distance, distance) - height).astype(np.float32)

@@ -29,17 +29,17 @@ _NEVERTHELESS = (
     "to use bent rays nevertheless, add trial_steps=0 for a solid body, or train='+experiment=glass_room "
     "medium=vessel' for a fitted vessel"
 )
-_FEWEST = 3  # photographs
+_MIN_PHOTOGRAPHS = 3
 _MASKS = ("masks/*", "masks/*/*", "mask_*", "*/mask_*")  # where loaders search for masks
 
 
 def calibrate(config: DictConfig, data: list[str], out: Path) -> list[str]:
     """Estimate the poses of the photographs, and return the options of the resulting data set."""
     linked = plugin_module("camera_calibration.collection").collect_photographs(config, out)
-    if len(linked) < _FEWEST:
+    if len(linked) < _MIN_PHOTOGRAPHS:
         raise NerfroError(
-            f"{len(linked)} photographs do not determine poses and shape; take at least {_FEWEST}, better 60, from all "
-            "sides"
+            f"{len(linked)} photographs do not determine poses and shape; take at least {_MIN_PHOTOGRAPHS}, "
+            "better 60, from all sides"
         )
     draws = "view=true" in shlex.split(config.mask)
     if not config.outlines and not draws and not any(file for place in _MASKS for file in out.glob(place)):

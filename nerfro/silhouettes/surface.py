@@ -23,7 +23,7 @@ from nerfro.silhouettes.visual_hull import (
     remove_strays,
 )
 
-_FEWEST_VIEWS, _FEW_VIEWS = 3, 12
+_MIN_VIEWS, _FEW_VIEWS = 3, 12
 _COARSE_VOXELS = 64
 # Factors by which the initial box is enlarged if it cuts the hull: wrong masks shift the estimated centre.
 _BOX_FACTORS = (1.0, 1.3, 1.7)
@@ -65,9 +65,9 @@ def read_silhouettes(views: Views, has_box: bool) -> Silhouettes:
             f"{int(inverted.sum())} of {len(views)} masks are inverted: white along the frame of the image, and black "
             "inside; save masks with the object white and everything else black"
         )
-    if len(views) < _FEWEST_VIEWS:
+    if len(views) < _MIN_VIEWS:
         raise NerfroError(
-            f"{len(views)} views do not determine a shape; give masks of at least {_FEWEST_VIEWS} views, better of 30 "
+            f"{len(views)} views do not determine a shape; give masks of at least {_MIN_VIEWS} views, better of 30 "
             "from all sides"
         )
     if len(views) < _FEW_VIEWS:

@@ -10,10 +10,10 @@ from nerfro.cameras import Cameras
 from nerfro.registry import find
 
 # Texels along each side of a face of the coarsest level, and bounds of the finest one.
-_COARSEST, _FEWEST, _MOST = 4, 64, 1024
+_COARSEST, _MIN, _MAX = 4, 64, 1024
 # Bounds of the finest level of gradient descent, whose optimizer visits all texels in each step: with and without finer
 # levels that `phase=background` fits.
-_MOST_BESIDE_FITS, _MOST_ALONE = 256, 512
+_MAX_BESIDE_FITS, _MAX_ALONE = 256, 512
 # Angle between two compared directions, in texels of the finest level of gradient descent.
 _COMPARED_TEXELS = 2
 
@@ -33,9 +33,9 @@ def derive_angular_resolution(config: DictConfig, cameras: Cameras) -> None:
     if config.boundary.get("resolutions") is None:
         fits = config.phase.get("background", {}).get("steps", 0) > 0
         finest = 0.5 * math.pi * float(cameras.fx.double().median())
-        finest = min(max(2 ** round(math.log2(finest)), _FEWEST), _MOST if fits else _MOST_ALONE)
+        finest = min(max(2 ** round(math.log2(finest)), _MIN), _MAX if fits else _MAX_ALONE)
         levels = [2**level for level in range(int(math.log2(_COARSEST)), int(math.log2(finest)) + 1)]
-        descent = [n for n in levels if n <= _MOST_BESIDE_FITS or not fits]
+        descent = [n for n in levels if n <= _MAX_BESIDE_FITS or not fits]
         config.boundary.resolutions = descent
         if config.boundary.get("fitted_resolutions") is None:
             config.boundary.fitted_resolutions = levels[len(descent) :]

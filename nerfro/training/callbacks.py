@@ -130,7 +130,7 @@ class Agreements:
     An exchange makes each process wait for its device and for the other processes. A single process needs no exchange.
     """
 
-    _SECONDS, _MOST_STEPS = 0.5, 1000
+    _SECONDS, _MAX_STEPS = 0.5, 1000
 
     def __init__(self) -> None:
         self._step = self._next = 0
@@ -150,7 +150,7 @@ class Agreements:
             # At most twice as many as before, because the next steps may be slower, as after a fit of the background.
             num_steps = min(int(self._SECONDS * since / max(now - before, 1e-6)), 2 * since)
         self._last = self._step, now
-        wanted = self._step + min(max(num_steps, 1), self._MOST_STEPS)
+        wanted = self._step + min(max(num_steps, 1), self._MAX_STEPS)
         self._next = trainer.strategy.broadcast(wanted)
         return True
 

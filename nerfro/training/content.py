@@ -29,7 +29,7 @@ _NEAR_SHARE = 0.3
 # A detail of one pixel needs two cells of the finest grid along each side (sampling theorem).
 _CELLS_PER_PIXEL = 2
 # Bounds of the number of cells of the finest grid; memory limits the upper one.
-_FEWEST_CELLS, _MOST_CELLS = 128, 4096
+_MIN_CELLS, _MAX_CELLS = 128, 4096
 # Smallest eigenvalue with which the point nearest to all optical axes is determined along an eigenvector.
 _PARALLEL = 0.01
 
@@ -123,7 +123,7 @@ def _derive_ball(content: DictConfig, cameras: Cameras) -> None:
         content.near = float(f"{_NEAR_SHARE * distances.min():.4g}")
     if content.cells is None:
         pixel = np.median(distances / cameras.fx.double().cpu().numpy())
-        content.cells = int(np.clip(math.ceil(_CELLS_PER_PIXEL * 4 * radius / pixel), _FEWEST_CELLS, _MOST_CELLS))
+        content.cells = int(np.clip(math.ceil(_CELLS_PER_PIXEL * 4 * radius / pixel), _MIN_CELLS, _MAX_CELLS))
 
 
 def common_target(

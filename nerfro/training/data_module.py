@@ -32,7 +32,7 @@ NO_IMAGE = -1
 _LARGE = 100_000
 # Threads of PyTorch beside the tracing thread, for networks without large layers. A step on 16 threads took 1.6 times
 # as long as on 8 (docs/lab/threads.md).
-_MOST_THREADS = 7
+_MAX_THREADS = 7
 
 
 class RayDataModule(LightningDataModule):
@@ -128,7 +128,7 @@ class Prefetcher(Generic[Made]):
     Args:
         make: function that makes the batch of a step.
         spare_core: whether to reserve a core for the thread: PyTorch then uses one thread less, and at most
-            `_MOST_THREADS`.
+            `_MAX_THREADS`.
     """
 
     def __init__(self, make: Callable[[int], Made], spare_core: bool = True) -> None:
@@ -140,7 +140,7 @@ class Prefetcher(Generic[Made]):
         self._thread.submit(torch.get_num_threads).result()
         HELPERS.append(self._thread)
         if spare_core:
-            torch.set_num_threads(min(max(1, self._num_threads - 1), _MOST_THREADS))
+            torch.set_num_threads(min(max(1, self._num_threads - 1), _MAX_THREADS))
 
     def __call__(self, step: int) -> Made:
         """Return the batch of a step; errors of the thread are raised here."""

@@ -21,7 +21,7 @@ _FEW = 0.1
 
 # Number of rays that are checked, and bounds of the number of their steps.
 CHECKED_RAYS = 4096
-_FEWEST_STEPS, _MOST_STEPS = 16, 1024
+_MIN_STEPS, _MAX_STEPS = 16, 1024
 
 
 @torch.no_grad()
@@ -44,7 +44,7 @@ def require_reach(renderer: Renderer, batches: RayBatches, first: Batch) -> None
         _require_object(renderer, first.rays)
         return
     missed = 1.0
-    num_steps = min(max(_FEWEST_STEPS, math.ceil(CHECKED_RAYS / batches.batch_size)), _MOST_STEPS)
+    num_steps = min(max(_MIN_STEPS, math.ceil(CHECKED_RAYS / batches.batch_size)), _MAX_STEPS)
     for step in range(num_steps):
         batch = first if step == 0 else batches.batch(step)
         _require_object(renderer, batch.rays)

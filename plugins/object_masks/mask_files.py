@@ -29,7 +29,7 @@ from nerfro.files.reading import read_json
 from nerfro.paths import user_path
 
 from .masking import Segmentation, box_region, check_tracked, grab, polygon_mask, propagate
-from .outline_hull import AGREES, FEWEST_VIEWS
+from .outline_hull import AGREES, MIN_VIEWS
 from .tracking import load_tracker, track_object
 
 _SHEET = "masks.png"
@@ -108,9 +108,9 @@ def check_start(frames: list[Frame], outlined: Collection[int], kept: Collection
             "there is no mask to start from; give the outline of the object in one image, for example "
             f"outlines={{{frames[0].name}:[LEFT,TOP,RIGHT,BOTTOM]}}"
         )
-    if hull_only and len(outlined) + len(kept) < FEWEST_VIEWS:
+    if hull_only and len(outlined) + len(kept) < MIN_VIEWS:
         raise NerfroError(
-            f"hull_only=true needs masks or outlines of at least {FEWEST_VIEWS} images from all sides, and there are "
+            f"hull_only=true needs masks or outlines of at least {MIN_VIEWS} images from all sides, and there are "
             f"{len(outlined) + len(kept)}; outline the object in more images"
         )
     if len(kept) == len(frames):

@@ -17,7 +17,7 @@ from nerfro.cameras import Cameras
 from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import TriangleMesh
 
-from .outline_hull import AGREES, FEWEST_VIEWS, MAX_SIDE, OutlineHull
+from .outline_hull import AGREES, MAX_SIDE, MIN_VIEWS, OutlineHull
 
 _ITERATIONS = 5
 # Margin around the region that provides the background colours of GrabCut, as a fraction of the longer side.
@@ -136,7 +136,7 @@ def check_tracked(
         NerfroError: the masks have no common visual hull.
     """
     outlines = OutlineHull(cameras, {**given, **tracked})
-    hull = outlines.hull() if len(outlines) >= FEWEST_VIEWS else None
+    hull = outlines.hull() if len(outlines) >= MIN_VIEWS else None
     if hull is None:
         raise NerfroError(
             "Segment Anything 2 does not find the same object in several images; outline the object in more images"
@@ -181,16 +181,16 @@ def propagate(
     outlines = OutlineHull(cameras, given)
     body = outlines.revolution() if wanted and 2 <= len(given) <= _FEW else None
     hull_only = hull_only or body is not None
-    if not hull_only and len(given) < FEWEST_VIEWS:
+    if not hull_only and len(given) < MIN_VIEWS:
         _add_reference_views(images, outlines)
-    if body is None and wanted and hull_only and len(outlines) < FEWEST_VIEWS:
+    if body is None and wanted and hull_only and len(outlines) < MIN_VIEWS:
         raise NerfroError(
             f"{len(outlines)} masks or outlines do not determine the shape; outline the object in two views from "
-            f"different directions if it is a body of revolution, otherwise in at least {FEWEST_VIEWS}"
+            f"different directions if it is a body of revolution, otherwise in at least {MIN_VIEWS}"
         )
-    if body is None and wanted and len(outlines) < FEWEST_VIEWS:
+    if body is None and wanted and len(outlines) < MIN_VIEWS:
         raise NerfroError(
-            f"{len(outlines)} of {len(images)} views agree on a shape, {FEWEST_VIEWS} are needed, because the outlined "
+            f"{len(outlines)} of {len(images)} views agree on a shape, {MIN_VIEWS} are needed, because the outlined "
             "object is not found in other images by its colours; outline the whole object in more views from all "
             "sides, or provide masks"
         )
@@ -200,7 +200,7 @@ def propagate(
             "the visual hull of the given masks is empty; correct the masks or the poses, and check the format of the "
             "data set (data=), which determines the camera axes"
         )
-    if not hull_only and FEWEST_VIEWS < len(given) <= _FEW:
+    if not hull_only and MIN_VIEWS < len(given) <= _FEW:
         hull_only = _hull_predicts_better(images, outlines, given)
     found, overlaps = {}, {}
     for view in wanted if not hull_only else []:

@@ -22,7 +22,7 @@ from nerfro.silhouettes.visual_hull import Silhouettes, carve_mesh, centre_lines
 MAX_SIDE = 480
 # Smallest intersection over union of a mask and a hull that agree.
 AGREES = 0.85
-FEWEST_VIEWS = 3
+MIN_VIEWS = 3
 _VOXELS = 80
 # Fraction of the views that may be wrong about any point.
 _WRONG_FRACTION = 0.1

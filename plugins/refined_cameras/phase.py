@@ -23,7 +23,7 @@ from .panorama import align
 from .refined import RefinedCamera
 
 # First and least distance of finite differences in pixels, and its factor from one step to the next.
-_FIRST_DIFFERENCE, _LEAST_DIFFERENCE, _DECAY = 2.0, 0.5, 0.85
+_FIRST_DIFFERENCE, _MIN_DIFFERENCE, _DECAY = 2.0, 0.5, 0.85
 # Number of full steps. The fraction of later steps decreases, so that errors of single steps average out.
 _FULL_STEPS = 10
 # Scale of the robust error (sRGB) per pixel of difference, and maximum motion of a camera in pixels.
@@ -83,7 +83,7 @@ class CameraSteps(Phase):
         def shown(rays: Rays, view: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
             return renderer.scene.colour_space.to_display(renderer.radiance(rays), camera.gains(view))
 
-        difference = max(_LEAST_DIFFERENCE, _FIRST_DIFFERENCE * _DECAY**number)
+        difference = max(_MIN_DIFFERENCE, _FIRST_DIFFERENCE * _DECAY**number)
         fraction = min(1.0, _FULL_STEPS / (number + 1))
         # Errors may increase: the scene fits the current cameras, so they are at a local minimum.
         settings = Step(difference, _ERROR_SCALE * difference, _MAX_PIXELS, fraction)

@@ -19,11 +19,11 @@ from nerfro.samplers.paths.snell import Snell
 
 # Thickness, in voxels, below which the spline of one side of a wall contains the fold of the distances in its middle.
 # Median error of exit directions behind a hollow ball of index 1.5: 0.01 degrees at 4.8 voxels, 0.6 at 3, and 2 at 1.8.
-_LEAST_VOXELS = 5.0
+_MIN_VOXELS = 5.0
 # Share of the surface that may belong to thinner parts, such as the surroundings of a sharp edge.
 _FEW = 0.2
 _NUM_POINTS = 4096
-_MOST_VERTICES = 512  # largest resolution that the warning recommends
+_MAX_VERTICES = 512  # largest resolution that the warning recommends
 
 
 def warn_of_thin_walls(sampler: PathSampler, medium: Medium) -> None:
@@ -38,15 +38,15 @@ def warn_of_thin_walls(sampler: PathSampler, medium: Medium) -> None:
             voxels = thickness(mesh) / float(grid.spacing.max())
         except NerfroError:  # without Embree
             return
-        thin = voxels < _LEAST_VOXELS
+        thin = voxels < _MIN_VOXELS
         if thin.mean() <= _FEW:
             continue
-        factor = _LEAST_VOXELS / float(np.quantile(voxels, _FEW))
+        factor = _MIN_VOXELS / float(np.quantile(voxels, _FEW))
         resolution = math.ceil((len(grid.distances) - 1) * factor) + 1
-        finer = f"raise the resolution of the grid to {resolution}, " if resolution <= _MOST_VERTICES else ""
+        finer = f"raise the resolution of the grid to {resolution}, " if resolution <= _MAX_VERTICES else ""
         warn(
             f"{thin.mean():.0%} of the surface of {name} bounds walls of about {np.median(voxels[thin]):.1f} voxels, "
-            f"which bend rays in wrong directions below {_LEAST_VOXELS:.0f} voxels; {finer}trace triangles "
+            f"which bend rays in wrong directions below {_MIN_VOXELS:.0f} voxels; {finer}trace triangles "
             "(sampler/path=snell with interface=mesh), or describe a cavity as a body of index 1"
         )
 

@@ -33,7 +33,7 @@ from nerfro.types import Path, Rendering, Samples
 # Smallest optical depth, predicted by the grid, of samples at which the field is queried.
 _EMPTY = 0.005
 # In training: number of samples on branches of the smallest weight, and the weight from which all samples are queried.
-_FEWEST, _HEAVY = 8, 0.5
+_MIN_SAMPLES, _HEAVY = 8, 0.5
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ class DensityGridSampler(PointSampler):
         """Number of intervals of each polyline in training."""
         if not path.splits:
             return torch.full_like(path.ray, self.num_samples)
-        return (self.num_samples * _weight(path)).ceil().clamp(min=min(self.num_samples, _FEWEST)).long()
+        return (self.num_samples * _weight(path)).ceil().clamp(min=min(self.num_samples, _MIN_SAMPLES)).long()
 
     @staticmethod
     def _queried(path: Path, samples: Samples) -> Bool[Tensor, "P N"] | None:

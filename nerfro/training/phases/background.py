@@ -22,10 +22,10 @@ from nerfro.training.phases.base import Phase, Run
 from nerfro.types import Exits
 
 # Largest number of pixels of a pass beside the object, relative to the texels of the finest level.
-_MOST_PIXELS = 8
+_MAX_PIXELS = 8
 # Largest number of rays of a pass through the object: relative to the pixels of all training steps so far, which bounds
 # the share of the time, and absolute, which bounds the duration of a step.
-_SHARE, _MOST_RAYS = 0.15, 2**19
+_SHARE, _MAX_RAYS = 0.15, 2**19
 # Rays through the object count if at least this fraction of their light is background.
 _BACKGROUND = 0.7
 # Rays that are made together, which bounds the memory.
@@ -87,7 +87,7 @@ class Background(Phase):
         state["weights"] = state["weights"].to(background.texels.device)
         if part == 0:
             state["weights"].zero_()
-        most_pixels = min(run.batches.num_pixels, _MOST_PIXELS * background.levels.sizes[-1])
+        most_pixels = min(run.batches.num_pixels, _MAX_PIXELS * background.levels.sizes[-1])
         num_parts = self.steps * run.batches.num_pixels // most_pixels
         pixels = run.batches.rows(part * num_parts // self.steps, num_parts)
         beside, rays, crossing = _divided(run, pixels, box)
@@ -99,7 +99,7 @@ class Background(Phase):
         if number_of_pass > 0:
             assert self.start is not None
             num_trained = self.start * 2 ** (number_of_pass - 1) * run.batches.batch_size
-            num_rays = min(_SHARE * num_trained, _MOST_RAYS)
+            num_rays = min(_SHARE * num_trained, _MAX_RAYS)
             crossing = crossing[:: max(1, math.ceil(len(crossing) * self.steps / num_rays))]
             observed += [_observe_through_object(run, chunk) for chunk in crossing.split(run.renderer.chunk_size)]
         state["weights"] += background.fit(Observed.joined(observed), state["weights"])
