@@ -29,11 +29,7 @@ from nerfro.allowed import check_names, check_settings
 from nerfro.composition import RenamingFiles, composed_with
 from nerfro.errors import NerfroError
 from nerfro.failures import errors_in_one_line, in_one_line
-from nerfro.old_names import (
-    full_key,
-    is_old_name,
-    renamed_override,
-)
+from nerfro.old_names import full_key, is_old_name, renamed_override
 from nerfro.options import ADDED_GROUPS, Described, describe_command, recall, remember, usage
 from nerfro.overrides import is_scene_file
 from nerfro.paths import CONF_DIR
@@ -76,37 +72,19 @@ def entry_point(
 
         def start() -> None:
             failures: list[Exception] = []
-
-            @functools.wraps(task)
-            def job(config: DictConfig) -> float | None:
-                if HydraConfig.get().mode != RunMode.MULTIRUN:
-                    try:
-                        with _missing_with_example(config_name):
-                            return task(config)
-                    except Exception as error:  # raised later, because Hydra prints an additional line for it
-                        failures.append(error)
-                        return None
-                return _job_of_sweep(task, config)
-
-            # Otherwise Hydra prints its own report and exits.
-            os.environ["HYDRA_FULL_ERROR"] = "1"
+            os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise, Hydra prints its own report and exits
             with composed_with(check_all):
-                if _HELP & set(sys.argv) and "hydra" in sys.argv:
-                    sys.argv[1:] = ["--hydra-help"]
-                sys.argv[1:] = _flags_first(sys.argv[1:])
                 ConfigStore.instance().store(name=f"{config_name}_schema", node=schema, provider="nerfro")
                 SourcesRegistry.instance().types["file"] = RenamingFiles
                 leave_current_directory()
                 discover()
-                if _HELP & set(sys.argv) or (program() == config_name and recall(config_name) is None):
-                    described = describe_command(config_name, schema, config_dir)
-                    remember(config_name, described)
-                    answer(described, sys.argv[1:])
+                _answer_questions(config_name, schema, config_dir)
                 sys.argv[1:] = [_quoted(renamed_override(argument), verbatim) for argument in sys.argv[1:]]
                 if expand is not None:
                     sys.argv[1:] = expand(sys.argv[1:], [field.name for field in dataclasses.fields(schema)])
                 if config_name == "train":
                     sys.argv[1:] = map(_added, sys.argv[1:])
+                job = _job(task, config_name, failures)
                 with _run_folder():
                     hydra.main(version_base="1.3", config_path=str(config_dir), config_name=config_name)(job)()
             if failures:
@@ -141,6 +119,39 @@ def call(command: str, arguments: list[str]) -> None:
         _STAGES[command]()
     finally:
         sys.argv, main.__spec__, composed.hydra = program, spec, outer
+
+
+def _answer_questions(config_name: str, schema: type, config_dir: Path) -> None:
+    """Answer --help, and refuse misspelt names unless `startup` has done so; flags move before the overrides."""
+    if _HELP & set(sys.argv) and "hydra" in sys.argv:
+        sys.argv[1:] = ["--hydra-help"]
+    sys.argv[1:] = _flags_first(sys.argv[1:])
+    if _HELP & set(sys.argv) or (program() == config_name and recall(config_name) is None):
+        described = describe_command(config_name, schema, config_dir)
+        remember(config_name, described)
+        answer(described, sys.argv[1:])
+
+
+def _job(
+    task: Callable[[DictConfig], float | None], config_name: str, failures: list[Exception]
+) -> Callable[[DictConfig], float | None]:
+    """Return the function that Hydra calls. The error of a single run is appended to `failures`.
+
+    Hydra would print an additional line for an error that is raised.
+    """
+
+    @functools.wraps(task)
+    def job(config: DictConfig) -> float | None:
+        if HydraConfig.get().mode == RunMode.MULTIRUN:
+            return _job_of_sweep(task, config)
+        try:
+            with _missing_with_example(config_name):
+                return task(config)
+        except Exception as error:
+            failures.append(error)
+            return None
+
+    return job
 
 
 def _job_of_sweep(task: Callable[[DictConfig], float | None], config: DictConfig) -> float | None:

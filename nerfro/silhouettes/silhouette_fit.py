@@ -214,39 +214,88 @@ class _Fit:
         normals, rims = surface.normals, find_rims(surface, self.silhouettes, outlines)
         if contour_error is not None:
             rims = by_pixel_sides(rims, self.silhouettes, contour_error)
-        num_rims = len(rims.share)
-        area = strength * num_rims * prior.area
-        bending = strength * num_rims * prior.bending * self.size**2 * (_REDUCED_BENDING if steady else 1)
-        row, column = np.tile(np.arange(num_rims), 2), np.concatenate([rims.first, rims.second])
-        along = (normals[column] * np.tile(rims.normal, (2, 1))).sum(1)
-        shares = along * np.concatenate([1 - rims.share, rims.share])
-        observed = sparse.csr_matrix((shares, (row, column)), (num_rims, len(vertices)))
-        curvature, curved, around = _mean_curvature(vertices, normals, self.edges, self.mesh.mean)
-        typical = (
-            _typical_curvature(curved, vertices, normals, _NORMAL_DISTANCE * self.size)
-            if prior.typical_curvature
-            else 0 * curved
-        )
-        bent = np.abs(curved - typical)
+        curvature = _mean_curvature(vertices, normals, self.edges, self.mesh.mean)
+        typical = np.zeros_like(curvature.value)
+        if prior.typical_curvature:
+            typical = _typical_curvature(curvature.value, vertices, normals, _NORMAL_DISTANCE * self.size)
+        excess = curvature.value - typical
         # While the prior is strong, large curvature may belong to the roofs of the visual hull instead of edges.
-        edge = prior.edge * max(1.0, strength)
-        stiff = 1 / np.hypot(1, 0.5 * (bent + self.mesh.mean @ bent) / edge)
-        stiffness, tension = sparse.diags(stiff), self.across.T @ sparse.diags(stiff[self.edges].prod(1)) @ self.across
-        stretch = sum(n @ tension @ n for n in map(sparse.diags, normals.T))
-        stretched = sum(normals[:, a] * (tension @ vertices[:, a]) for a in range(3))
-        pressure = -self.degree * around / np.sqrt(around.mean()) * typical
-        system = observed.T @ sparse.diags(rims.weight) @ observed + area * stretch
-        system += bending * (curvature.T @ stiffness @ curvature)
-        right = observed.T @ (rims.weight * rims.misfit) - area * (stretched - pressure)
-        right -= bending * (curvature.T @ (stiffness @ (curved - typical)))
+        stiffness = self._stiffness(excess, prior.edge * max(1.0, strength))
+        pressure = -self.degree * curvature.around / np.sqrt(curvature.around.mean()) * typical
+        per_observation = strength * len(rims.share)
+        bending = per_observation * prior.bending * self.size**2 * (_REDUCED_BENDING if steady else 1)
+        terms = [
+            (1.0, _outline_term(rims, normals)),
+            (per_observation * prior.area, self._area_term(vertices, normals, stiffness, pressure)),
+            (bending, _bending_term(curvature, stiffness, excess)),
+        ]
         if steady:
-            alike = sparse.diags(_along_edges(vertices, normals, self.edges, self.mesh.mean))
-            changes = steady * num_rims * self.size**2 * (curvature.T @ self.across.T @ alike @ self.across)
-            system += changes @ curvature
-            right -= changes @ curved
+            changes = steady * len(rims.share) * self.size**2
+            terms.append((changes, self._change_term(vertices, normals, curvature)))
+        system = sum(weight * term.system for weight, term in terms)
+        right = np.sum([weight * term.right for weight, term in terms], axis=0)
         longest = 2 * self.mesh.edge_length(vertices)
         vertices = vertices + solve_symmetric(system, right).clip(-longest, longest)[:, None] * normals
         return self.mesh.spread(vertices) if spread else vertices
+
+    def _stiffness(self, excess: Float[np.ndarray, " vertices"], edge: float) -> Float[np.ndarray, " vertices"]:
+        """Compute the factor of the prior at each vertex, which is small where curvature above `edge` is an edge."""
+        bent = np.abs(excess)
+        return 1 / np.hypot(1, 0.5 * (bent + self.mesh.mean @ bent) / edge)
+
+    def _area_term(
+        self,
+        vertices: Float[np.ndarray, "vertices 3"],
+        normals: Float[np.ndarray, "vertices 3"],
+        stiffness: Float[np.ndarray, " vertices"],
+        pressure: Float[np.ndarray, " vertices"],
+    ) -> _Term:
+        """Sum of squared edge lengths, balanced by a pressure along the normals."""
+        tension = self.across.T @ sparse.diags(stiffness[self.edges].prod(1)) @ self.across
+        system = sum(n @ tension @ n for n in map(sparse.diags, normals.T))
+        stretched = sum(normals[:, axis] * (tension @ vertices[:, axis]) for axis in range(3))
+        return _Term(system, pressure - stretched)
+
+    def _change_term(
+        self, vertices: Float[np.ndarray, "vertices 3"], normals: Float[np.ndarray, "vertices 3"], curvature: _Curvature
+    ) -> _Term:
+        """Sum of squared changes of curvature along edges and flat sides."""
+        alike = sparse.diags(_along_edges(vertices, normals, self.edges, self.mesh.mean))
+        changes = curvature.change.T @ self.across.T @ alike @ self.across
+        return _Term(changes @ curvature.change, -changes @ curvature.value)
+
+
+class _Term(NamedTuple):
+    """Half the second derivative of a term with respect to the displacements, and minus half its gradient."""
+
+    system: sparse.spmatrix
+    right: Float[np.ndarray, " vertices"]
+
+
+class _Curvature(NamedTuple):
+    """Half the mean curvature at vertices times the edge length, negative on a ball."""
+
+    change: sparse.csr_matrix  # derivative with respect to displacements along the normals
+    value: Float[np.ndarray, " vertices"]
+    around: Float[np.ndarray, " vertices"]  # mean squared length of the edges at each vertex
+
+
+def _outline_term(rims: Rims, normals: Float[np.ndarray, "vertices 3"]) -> _Term:
+    """Sum of squared distances of contour points to the outlines of the masks."""
+    num_rims = len(rims.share)
+    row, column = np.tile(np.arange(num_rims), 2), np.concatenate([rims.first, rims.second])
+    along = (normals[column] * np.tile(rims.normal, (2, 1))).sum(1)
+    shares = along * np.concatenate([1 - rims.share, rims.share])
+    observed = sparse.csr_matrix((shares, (row, column)), (num_rims, len(normals)))
+    return _Term(observed.T @ sparse.diags(rims.weight) @ observed, observed.T @ (rims.weight * rims.misfit))
+
+
+def _bending_term(
+    curvature: _Curvature, stiffness: Float[np.ndarray, " vertices"], excess: Float[np.ndarray, " vertices"]
+) -> _Term:
+    """Sum of squared curvatures beyond the typical curvature."""
+    weighted = curvature.change.T @ sparse.diags(stiffness)
+    return _Term(weighted @ curvature.change, -weighted @ excess)
 
 
 def _split_views(outlines: Outlines) -> tuple[Outlines, Outlines]:
@@ -261,15 +310,11 @@ def _mean_curvature(
     normals: Float[np.ndarray, "vertices 3"],
     edges: Int[np.ndarray, "edges 2"],
     mean: sparse.csr_matrix,
-) -> tuple[sparse.csr_matrix, Float[np.ndarray, " vertices"], Float[np.ndarray, " vertices"]]:
-    """Compute half the mean curvature at vertices times the edge length, negative on a ball.
+) -> _Curvature:
+    """Compute the mean curvature H at vertices.
 
     The mean of the neighbours of a vertex is displaced by r^2 H / 2 along the normal, with the mean squared edge length
     r^2.
-
-    Returns:
-        Derivative of the result with respect to displacements along the normals, the result, and the mean squared
-        length of the edges at each vertex.
     """
     both = np.concatenate([edges, edges[:, ::-1]])
     square = ((vertices[both[:, 0]] - vertices[both[:, 1]]) ** 2).sum(1)
@@ -279,7 +324,7 @@ def _mean_curvature(
     scale = sparse.diags(np.sqrt(typical) / around.clip(0.05 * typical))
     umbrella = mean - sparse.identity(len(vertices))
     change = scale @ sum(n @ umbrella @ n for n in map(sparse.diags, normals.T))
-    return change.tocsr(), scale @ (normals * (umbrella @ vertices)).sum(1), around
+    return _Curvature(change.tocsr(), scale @ (normals * (umbrella @ vertices)).sum(1), around)
 
 
 def _along_edges(
