@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import re
+import warnings
 from collections.abc import Sequence
 
 _SHOWN = 3
@@ -38,6 +39,11 @@ def one_line(text: str) -> str:
     """Escape control characters, which names of files may contain, and shorten a line with long values of a file."""
     line = re.sub(r"[\x00-\x1f\x7f]", lambda character: repr(character[0])[1:-1], text)
     return line if len(line) <= _LONGEST_LINE else f"{line[: _LONGEST_LINE // 2]} ... {line[-_LONGEST_LINE // 4 :]}"
+
+
+def warn_of_old_name(old: str, new: str) -> None:
+    """Warn the caller of a function that a Python name has changed."""
+    warnings.warn(f"{old} is called {new}; the next release removes the old name", stacklevel=3)
 
 
 def warn(message: str) -> None:

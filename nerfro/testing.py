@@ -218,18 +218,20 @@ def _check_medium(medium: Medium) -> None:
 
 @torch.no_grad()
 def _check_gradient_of_index(medium: Medium) -> None:
-    """Compare grad n with central differences at random points; the tolerance admits steps of n at surfaces."""
+    """Compare grad n with central differences by the median over random points, so that few are close to a step of n.
+
+    Points where n changes less than its rounding errors do not count.
+    """
     low, high = medium.box
     points = low + torch.rand(5000, 3, generator=torch.Generator().manual_seed(0)).to(low) * (high - low)
     gradient = medium(points)[1]
-    shift = 1e-3 * (high - low).norm()
-    shifts = shift * torch.eye(3).to(low)
-    differences = torch.stack([medium(points + each)[0] - medium(points - each)[0] for each in shifts], -1) / (
-        2 * shift
-    )
-    steepness = gradient.square().sum()
-    ratio = (gradient * differences).sum() / steepness
-    _require(bool(steepness == 0) or 0.5 < float(ratio) < 1.5, "forward returns grad n per world unit")
+    step = 5e-4 * (high - low).norm()
+    shifts = step * torch.eye(3).to(low)
+    differences = torch.stack([medium(points + each)[0] - medium(points - each)[0] for each in shifts], -1) / (2 * step)
+    squared = gradient.square().sum(-1)
+    steep = squared.sqrt() * step > 1e-5
+    ratios = ((gradient * differences).sum(-1) / squared)[steep]
+    _require(not steep.any() or 0.5 < float(ratios.median()) < 1.5, "forward returns grad n per world unit")
 
 
 def _check_surface(surface: Surface) -> None:

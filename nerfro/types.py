@@ -30,6 +30,7 @@ from torch import Tensor
 
 from nerfro.cameras import Cameras
 from nerfro.draws import Draws
+from nerfro.errors import warn_of_old_name
 from nerfro.rays import Rays
 
 __all__ = ["WORLD_ORIGIN", "Batch", "Exits", "Path", "Radiance", "Rays", "Rendering", "Samples"]
@@ -412,6 +413,18 @@ class Batch:
     cameras: Cameras
     draws: Draws
     path: Path | None = None
+
+    @property
+    def pixel(self) -> Int[Tensor, "R"]:
+        """Old name of `ray_pixel`."""
+        warn_of_old_name("Batch.pixel", "Batch.ray_pixel")
+        return self.ray_pixel
+
+    @property
+    def index(self) -> Int[Tensor, "Q"]:
+        """Old name of `pixel_number`."""
+        warn_of_old_name("Batch.index", "Batch.pixel_number")
+        return self.pixel_number
 
     @property
     def ray_view(self) -> Int[Tensor, "R"]:

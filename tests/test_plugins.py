@@ -17,7 +17,7 @@ from omegaconf import DictConfig
 from PIL import Image
 from torch import nn
 
-from nerfro import types
+from nerfro import camera, types
 from nerfro.data.base import DataSource, Views
 from nerfro.data.blender import BlenderData
 from nerfro.losses.base import Loss
@@ -26,8 +26,9 @@ from nerfro.media.surface import Surface
 from nerfro.paths import PLUGINS_DIR
 from nerfro.registry import KINDS, discover, find, plugins, register
 from nerfro.samplers.base import PathSampler, PointSampler
-from nerfro.testing import ContractError, check, check_export
+from nerfro.testing import ContractError, check, check_export, example_batch, example_draws, example_views
 from nerfro.training.phases.base import Phase, Run
+from nerfro.training.ray_batches import RayBatches
 from nerfro.viewing import PLUGIN_EXPORTS
 from nerfro.viewing.exports import Export, find_export
 from nerfro.viewing.trained_scene import TrainedScene
@@ -170,8 +171,20 @@ def lens(factor: float) -> dict[str, object]:
     return {"forward": forward, "box": torch.tensor(CUBE, dtype=torch.float32)}
 
 
-def test_a_medium_of_varying_index_keeps_its_contract() -> None:
-    register("medium", "broken")(type("Lens", (Medium,), {"__doc__": "Lens.", "__module__": __name__, **lens(-2.0)}))
+def ramp(slope: float, start: float) -> dict[str, object]:
+    """Members of a medium with n = start + slope x in a cube, so n has a step at its faces."""
+
+    def forward(medium: Medium, positions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        inside = (positions.abs() <= 1).all(-1)
+        gradient = torch.where(inside[..., None], torch.tensor([slope, 0.0, 0.0]), 0.0)
+        return torch.where(inside, start + slope * positions[..., 0], 1.0), gradient
+
+    return {"forward": forward, "box": torch.tensor(CUBE, dtype=torch.float32)}
+
+
+@pytest.mark.parametrize("members", [lens(-2.0), ramp(0.1, 1.4), ramp(1e-6, 1.4)], ids=["lens", "step", "constant"])
+def test_a_medium_of_varying_index_keeps_its_contract(members: dict[str, object]) -> None:
+    register("medium", "broken")(type("Lens", (Medium,), {"__doc__": "Lens.", "__module__": __name__, **members}))
     check(find("medium", "broken"))
 
 
@@ -223,6 +236,22 @@ def test_check_names_the_broken_contract(kind: str, base: type, members: dict[st
     register(kind, "broken")(type("Broken", (base,), {"__doc__": "Broken.", "__module__": __name__, **members}))
     with pytest.raises(ContractError, match=contract):
         check(find(kind, "broken"))
+
+
+def test_old_names_work_with_a_warning() -> None:
+    batch = example_batch()
+    with pytest.warns(UserWarning, match=r"Batch\.pixel is called Batch\.ray_pixel"):
+        assert batch.pixel is batch.ray_pixel
+    with pytest.warns(UserWarning, match=r"Batch\.pixel_number"):
+        assert batch.index is batch.pixel_number
+    with pytest.warns(UserWarning, match="CameraModel"):
+        assert camera.base.Camera is camera.base.CameraModel
+    with pytest.warns(UserWarning, match="after_step is called update"):
+        old = type("Old", (PointSampler,), {"after_step": lambda sampler, fields, draws: 7, "forward": None})
+    assert old().update([], example_draws()) == 7
+    batches = RayBatches(example_views(), 4)
+    with pytest.warns(UserWarning, match="for_rank"):
+        assert torch.equal(batches.share(1, 2).batch(0).rgb, batches.for_rank(1, 2).batch(0).rgb)
 
 
 def test_views_refuse_a_list_of_images() -> None:

@@ -54,39 +54,58 @@ def test_photographs_that_differ_in_their_extension_are_refused(photos: Path, tm
     refused("several images named IMG_1", collection.link_photographs, photos, None, tmp_path / "out")
 
 
-def _lying(file: Path, level: int) -> None:
+def test_a_photograph_beside_its_heic_original_is_used(photos: Path, tmp_path: Path) -> None:
+    (photos / "IMG_1.heic").touch()
+    collection.link_photographs(photos, None, tmp_path / "out")
+    assert {file.name for file in (tmp_path / "out" / "images").iterdir()} == {f"IMG_{i}.png" for i in range(3)}
+
+
+def _lying(file: Path) -> None:
     """Write a photograph with an EXIF orientation, which is converted."""
     exif = Image.Exif()
     exif[ExifTags.Base.Orientation] = 6
-    Image.new("L", (8, 8), level).save(file, exif=exif.tobytes())
+    Image.new("L", (8, 8)).save(file, exif=exif.tobytes())
 
 
-def test_photographs_and_masks_follow_their_folders_until_the_calibration(photos: Path, tmp_path: Path) -> None:
-    def link(photographs: Path, masks: Path) -> set[str]:
-        collection.link_photographs(photographs, masks, tmp_path / "out")
-        return {file.name for file in (tmp_path / "out" / "images").iterdir()}
-
+def test_links_follow_their_folders_until_the_calibration(photos: Path, tmp_path: Path) -> None:
     masks = photos.parent / "silhouettes"
+    more = {name: tmp_path / name for name in ("more_photos", "more_masks")}
+    for folder in more.values():
+        save_png(folder / "IMG_0.png", torch.ones(8, 8, 3))
+    out = tmp_path / "out"
+    collection.link_photographs(photos, masks, out)
+    collection.link_photographs(more["more_photos"], more["more_masks"], out)
+    assert (out / "images" / "IMG_0.png").resolve() == more["more_photos"] / "IMG_0.png"
+    assert (out / "masks" / "IMG_0.png").resolve() == more["more_masks"] / "IMG_0.png"
+    (out / "calibration.json").write_text("{}")  # the poses belong to the photographs that were calibrated
+    collection.link_photographs(photos, masks, out)
+    assert (out / "images" / "IMG_0.png").resolve() == more["more_photos"] / "IMG_0.png"
+    assert (out / "masks" / "IMG_0.png").resolve() == masks / "IMG_0.png"
+
+
+def test_other_photographs_are_named_and_no_file_is_deleted(
+    photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Converted photographs may be the only copy, and an own photograph may have any name."""
+    out = tmp_path / "out"
     for name in ("lying", "removed"):
-        _lying(photos / f"{name}.jpg", 50)
-    link(photos, masks)
+        _lying(photos / f"{name}.jpg")
+    collection.link_photographs(photos, None, out)
+    (out / "images" / "._hidden.jpg").touch()
+    save_png(out / "images" / "mine.png", torch.ones(8, 8, 3))
+    before = sorted((out / "images").iterdir())
+    capsys.readouterr()
     (photos / "removed.jpg").unlink()
-    _lying(photos / "lying.jpg", 200)
     later = time.time_ns() + 10**9
     os.utime(photos / "lying.jpg", ns=(later, later))
-    assert link(photos, masks) == {"IMG_0.png", "IMG_1.png", "IMG_2.png", "lying.jpg"}
-    with Image.open(tmp_path / "out" / "images" / "lying.jpg") as copy:
-        assert copy.getpixel((4, 4))[0] > 150
-    for folder in ("more_photos", "more_masks"):
-        save_png(tmp_path / folder / "IMG_0.png", torch.ones(8, 8, 3))
-    assert link(tmp_path / "more_photos", tmp_path / "more_masks") == {"IMG_0.png"}
-    (mask,) = (tmp_path / "out" / "masks").iterdir()
-    assert mask.resolve() == tmp_path / "more_masks" / "IMG_0.png"
-    # The poses belong to the photographs that were calibrated.
-    (tmp_path / "out" / "calibration.json").write_text("{}")
-    link(photos, masks)
-    assert (tmp_path / "out" / "images" / "IMG_0.png").resolve() == tmp_path / "more_photos" / "IMG_0.png"
-    assert (tmp_path / "out" / "masks" / "IMG_0.png").resolve() == masks / "IMG_0.png"
+    collection.link_photographs(photos, None, out)
+    printed = capsys.readouterr().out
+    assert "not in" in printed
+    assert "mine.png, removed.jpg" in printed
+    assert "older than those in" in printed
+    assert ": lying.jpg" in printed
+    collection.link_photographs(out / "images", None, out)
+    assert sorted((out / "images").iterdir()) == before
 
 
 @pytest.mark.parametrize("suffix", [".JPG", ".heic"])

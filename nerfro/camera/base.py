@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from typing import Any
 
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from nerfro.camera.exposure import Exposure
 from nerfro.cameras import Cameras
+from nerfro.errors import warn_of_old_name
 from nerfro.rays import Rays
 
 
@@ -63,3 +65,10 @@ class CameraModel(nn.Module, ABC):
     def measurements(self) -> dict[str, float]:
         """Return estimated physical quantities by name, for the log."""
         return {} if self.exposure is None else {"cameras.gain_spread": self.exposure.spread}
+
+
+def __getattr__(name: str) -> Any:
+    if name == "Camera":
+        warn_of_old_name("nerfro.camera.base.Camera", "nerfro.camera.base.CameraModel")
+        return CameraModel
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

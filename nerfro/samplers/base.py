@@ -10,6 +10,7 @@ from jaxtyping import Bool
 from torch import Tensor, nn
 
 from nerfro.draws import Draws
+from nerfro.errors import warn_of_old_name
 from nerfro.fields.base import Field
 from nerfro.media.base import Medium
 from nerfro.samplers.paths.branching import ONE_PATH
@@ -67,6 +68,12 @@ class PointSampler(nn.Module, ABC):
     """
 
     num_levels: int
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        if (old := cls.__dict__.get("after_step")) is not None:
+            warn_of_old_name(f"{cls.__name__}.after_step", "update")
+            cls.update = old  # type: ignore[method-assign]
 
     @abstractmethod
     def forward(self, path: Path, previous: Rendering | None, draws: Draws | None = None) -> Samples:

@@ -311,10 +311,10 @@ def _mean_curvature(
     edges: Int[np.ndarray, "edges 2"],
     mean: sparse.csr_matrix,
 ) -> _Curvature:
-    """Compute the mean curvature H at vertices.
+    """Compute the curvature at vertices, see `_Curvature`.
 
-    The mean of the neighbours of a vertex is displaced by r^2 H / 2 along the normal, with the mean squared edge length
-    r^2.
+    The mean of the neighbours of a vertex is displaced by r^2 H / 2 along the normal, with the mean curvature H and the
+    mean squared edge length r^2.
     """
     both = np.concatenate([edges, edges[:, ::-1]])
     square = ((vertices[both[:, 0]] - vertices[both[:, 1]]) ** 2).sum(1)

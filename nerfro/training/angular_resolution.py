@@ -10,7 +10,7 @@ from nerfro.cameras import Cameras
 from nerfro.registry import find
 
 # Texels along each side of a face of the coarsest level, and bounds of the finest one.
-_COARSEST, _MIN, _MAX = 4, 64, 1024
+_COARSEST, _MIN_TEXELS, _MAX_TEXELS = 4, 64, 1024
 # Bounds of the finest level of gradient descent, whose optimizer visits all texels in each step: with and without finer
 # levels that `phase=background` fits.
 _MAX_BESIDE_FITS, _MAX_ALONE = 256, 512
@@ -33,7 +33,7 @@ def derive_angular_resolution(config: DictConfig, cameras: Cameras) -> None:
     if config.boundary.get("resolutions") is None:
         fits = config.phase.get("background", {}).get("steps", 0) > 0
         finest = 0.5 * math.pi * float(cameras.fx.double().median())
-        finest = min(max(2 ** round(math.log2(finest)), _MIN), _MAX if fits else _MAX_ALONE)
+        finest = min(max(2 ** round(math.log2(finest)), _MIN_TEXELS), _MAX_TEXELS if fits else _MAX_ALONE)
         levels = [2**level for level in range(int(math.log2(_COARSEST)), int(math.log2(finest)) + 1)]
         descent = [n for n in levels if n <= _MAX_BESIDE_FITS or not fits]
         config.boundary.resolutions = descent

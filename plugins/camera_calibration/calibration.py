@@ -78,7 +78,9 @@ class Calibration:
     def lines(self, feature: str) -> list[str]:
         """Format a report: the error of each image, skipped images, and the lens; `feature` is a noun in the plural."""
         lines = [f"reprojection error in pixels (rms) and number of {feature} by image:"]
-        lines += [f"  {pose.error:6.3f}  {pose.num_features:4d}  {name}" for name, pose in sorted(self.poses.items())]
+        for name, pose in sorted(self.poses.items()):
+            error = f"{pose.error:6.3f}" if pose.num_features else f"{'-':>6}"
+            lines.append(f"  {error}  {pose.num_features:4d}  {name}")
         if self.errors:
             lines.append(f"  {self.mean_error:6.3f}  mean; {max(self.errors):.3f} largest")
         lines += [f"  skipped: {name}: {reason}" for name, reason in sorted(self.skipped.items())]

@@ -36,8 +36,8 @@ def list_photographs(folder: Path) -> tuple[list[Path], tuple[int, int]]:
     left_out = [file.name for file in others if file.stem not in counts]  # others have a converted copy
     if left_out:
         warn(
-            f"{len(left_out)} photographs in HEIC format are left out ({first_of(left_out)}); convert them to JPEG, or "
-            "use nerfro.reconstruct, which reads them"
+            f"photographs in HEIC format are left out: {first_of(left_out)}; convert them to JPEG, or use "
+            "nerfro.reconstruct, which reads them"
         )
     shapes = {image: read_size(image)[:2] for image in images}
     ((size, _),) = Counter(shapes.values()).most_common(1)

@@ -61,7 +61,7 @@ def test_gradient_is_the_derivative_of_the_index(medium: Medium) -> None:
         assert (gradient == 0).all()
 
 
-def test_the_innermost_body_decides_the_index() -> None:
+def test_the_last_body_decides_the_index() -> None:
     medium = _nested_balls()
     n, gradient = medium(torch.tensor([[0.0, 0.0, 0.0], [0.7, 0.0, 0.0], [0.0, 1.2, 0.0], [0.5, 0.0, 0.0]]))
     torch.testing.assert_close(n, torch.tensor([1.33, 1.5, 1.0, 1.415]), atol=2e-3, rtol=0)

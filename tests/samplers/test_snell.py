@@ -247,6 +247,19 @@ def test_rays_that_begin_beside_an_edge_are_inside_of_their_box(tmp_path: FilePa
     torch.testing.assert_close(path.exit_directions, expected.expand(20, 3), atol=1e-9, rtol=0)
 
 
+@pytest.mark.parametrize("inverted", [False, True])
+def test_the_winding_of_an_open_mesh_does_not_decide_where_rays_begin(tmp_path: FilePath, inverted: bool) -> None:
+    """The winding of a mesh with a hole cannot be corrected."""
+    dome = trimesh.creation.icosphere(4, 0.8)
+    dome.update_faces(dome.triangles_center[:, 2] > -0.6)
+    if inverted:
+        dome.invert()
+    dome.export(tmp_path / "dome.ply")
+    medium = SdfGrid(str(tmp_path / "dome.ply"), 1.5, resolution=48, accept_open_mesh=True, cache=False)
+    rays = _rays([[0.0, 0.0, 1.0], [0.1, 0.0, 0.3]], [[0.0, 0.6, -0.8], [0.6, 0.0, 0.8]], near=0.0)
+    assert Snell("mesh")(rays, medium).body[:, 0].tolist() == [0, 1]
+
+
 @pytest.mark.parametrize("num_plates", [2, 3])
 def test_plates_in_contact_are_one_plate(tmp_path: FilePath, num_plates: int) -> None:
     plates = [trimesh.creation.box((0.2, 2, 2)).apply_translation((0.2 * i, 0, 0)) for i in range(num_plates)]

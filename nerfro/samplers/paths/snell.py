@@ -182,10 +182,10 @@ def _refined_in_bands(
 def _trace_triangles(rays: Rays, medium: SdfGrid, max_events: int, branching: Branching) -> SnellTrace:
     """Trace rays from triangle to triangle of meshes, on the CPU and in double precision.
 
-    The number of crossings of its surface determines whether a ray is inside a body. A ray begins inside the body of
-    its first triangle if it leaves the body through this triangle. Signed distances half-way to the triangle determine
-    which other bodies contain the beginning. Distances are inaccurate near surfaces, and the smooth surface of convex
-    bodies lies outside of the triangles.
+    The number of crossings of its surface determines whether a ray is inside a body. Signed distances half-way to the
+    first triangle determine which bodies contain the beginning. The smooth surface of the distances differs from the
+    triangles. Therefore, if the distance to the body of the first triangle is less than a voxel, a ray begins inside
+    this body if it leaves the body through the triangle.
     """
     triangles, scene = medium.triangles, medium.intersector
     box = medium.box.double().cpu()
@@ -199,9 +199,13 @@ def _trace_triangles(rays: Rays, medium: SdfGrid, max_events: int, branching: Br
         lengths = torch.where(faces >= 0, triangles.distance(x[:, None], d[:, None], faces), torch.inf)
         length = lengths.amin(1, keepdim=True)
         half_way = x + 0.5 * torch.where(length < torch.inf, length, 0.0) * d
-        inside = (medium.signed_distances(half_way.to(medium.box))[0] < 0).cpu() & (length < torch.inf)
+        phi = medium.signed_distances(half_way.to(medium.box))[0].cpu()
+        inside = (phi < 0) & (length < torch.inf)
+        is_near = phi.abs() < torch.stack([grid.spacing.max() for grid in medium.grids]).cpu()
         row, layer = ((faces >= 0) & (lengths <= length + offset)).nonzero(as_tuple=True)
         first = faces[row, layer]
+        decides = is_near[row, triangles.body[first]]
+        row, first = row[decides], first[decides]
         leaves = (triangles.areas(first) * d[row]).sum(-1) > 0
         inside[row, triangles.body[first]] = False
         inside[row[leaves], triangles.body[first[leaves]]] = True
