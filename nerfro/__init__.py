@@ -30,7 +30,9 @@ def __getattr__(name: str) -> Any:
     if name == "__version__":
         return _version()
     if name == "Scene":
-        warnings.warn("nerfro.Scene is called nerfro.TrainedScene; the next release removes the old name", stacklevel=2)
+        from nerfro.errors import warn_of_old_name
+
+        warn_of_old_name("nerfro.Scene", "nerfro.TrainedScene")
         name = "TrainedScene"
     return _plugin(name) if name in _PLUGINS else _public(name)
 

@@ -9,12 +9,12 @@ from typing import cast
 from omegaconf import DictConfig, OmegaConf
 
 from nerfro.errors import NerfroError, warn
+from nerfro.paths import PLUGINS_PACKAGE
 
-_PLUGINS = "nerfro_plugins"
 # Former and present places of classes; configurations of earlier releases name the former ones.
 MOVED_CLASSES = (
     {
-        f"nerfro.data.{module}.{name}": f"{_PLUGINS}.data_formats.{module}.{name}"
+        f"nerfro.data.{module}.{name}": f"{PLUGINS_PACKAGE}.data_formats.{module}.{name}"
         for module, name in (
             ("idr", "IdrData"),
             ("llff", "LlffData"),
@@ -33,12 +33,12 @@ MOVED_CLASSES = (
         )
     }
     | {
-        f"{package}.{module}.{name}": f"{_PLUGINS}.paper.{module}.{name}"
+        f"{package}.{module}.{name}": f"{PLUGINS_PACKAGE}.paper.{module}.{name}"
         for module, name, packages in (
             ("eikonal", "Eikonal", ("nerfro.samplers", "nerfro.samplers.paths")),
             ("hierarchical", "Hierarchical", ("nerfro.samplers", "nerfro.samplers.points")),
-            ("mip_nerf", "MipNerfField", ("nerfro.fields", _PLUGINS)),
-            ("mip_nerf", "MipNerfModel", ("nerfro.models", _PLUGINS)),
+            ("mip_nerf", "MipNerfField", ("nerfro.fields", PLUGINS_PACKAGE)),
+            ("mip_nerf", "MipNerfModel", ("nerfro.models", PLUGINS_PACKAGE)),
             ("nerf", "NerfField", ("nerfro.fields",)),
             ("skybox", "Skybox", ("nerfro.boundaries",)),
             ("voxel_grid", "VoxelGrid", ("nerfro.media",)),
@@ -46,12 +46,12 @@ MOVED_CLASSES = (
         for package in packages
     }
     | {
-        "nerfro.camera.refined.RefinedCamera": f"{_PLUGINS}.refined_cameras.refined.RefinedCamera",
-        "nerfro.training.phases.cameras.CameraSteps": f"{_PLUGINS}.refined_cameras.phase.CameraSteps",
+        "nerfro.camera.refined.RefinedCamera": f"{PLUGINS_PACKAGE}.refined_cameras.refined.RefinedCamera",
+        "nerfro.training.phases.cameras.CameraSteps": f"{PLUGINS_PACKAGE}.refined_cameras.phase.CameraSteps",
         "nerfro.data.opencv.OpenCVData": "nerfro.data.blender.OpenCVData",
-        "nerfro.losses.distortion.Distortion": f"{_PLUGINS}.distortion.Distortion",
-        "nerfro.media.vessel.SdfVessel": f"{_PLUGINS}.vessels.vessel.SdfVessel",
-        "nerfro.losses.smoothness.Smoothness": f"{_PLUGINS}.paper.smoothness.Smoothness",
+        "nerfro.losses.distortion.Distortion": f"{PLUGINS_PACKAGE}.distortion.Distortion",
+        "nerfro.media.vessel.SdfVessel": f"{PLUGINS_PACKAGE}.vessels.vessel.SdfVessel",
+        "nerfro.losses.smoothness.Smoothness": f"{PLUGINS_PACKAGE}.paper.smoothness.Smoothness",
     }
 )
 

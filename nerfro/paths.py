@@ -12,6 +12,7 @@ ASSETS_DIR = PACKAGE_DIR / "assets"
 _PROJECT_DIR = PACKAGE_DIR / "_project" if (PACKAGE_DIR / "_project").is_dir() else PACKAGE_DIR.parent
 CONF_DIR = _PROJECT_DIR / "conf"
 PLUGINS_DIR = CONF_DIR.parent / "plugins"
+PLUGINS_PACKAGE = "nerfro_plugins"  # Python package with the modules of this folder
 
 EMBEDDED_PREFIX = "embedded:"
 

@@ -30,7 +30,7 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from nerfro.allowed import Names, Range, check, checked
 from nerfro.errors import NerfroError
 from nerfro.old_names import MOVED_CLASSES
-from nerfro.paths import PLUGINS_DIR
+from nerfro.paths import PLUGINS_DIR, PLUGINS_PACKAGE
 
 KINDS = (
     "model", "camera", "medium", "surface", "sampler/path", "sampler/points", "field", "boundary", "loss", "phase",
@@ -45,7 +45,6 @@ _BUILT_IN = (
     "evaluation.image_metrics",
     "training.phases",
 )  # fmt: skip
-_LOCAL_PACKAGE = "nerfro_plugins"
 ENTRY_POINTS = "nerfro.plugins"
 
 # Objects of Lightning that a configuration may name as Hydra's `_target_`, beside registered classes.
@@ -338,7 +337,7 @@ def plugin_module(name: str) -> types.ModuleType:
         NerfroError: the plugin is not installed.
     """
     discover()
-    plugin, full_name = name.partition(".")[0], f"{_LOCAL_PACKAGE}.{name}"
+    plugin, full_name = name.partition(".")[0], f"{PLUGINS_PACKAGE}.{name}"
     try:
         return importlib.import_module(full_name)
     except ModuleNotFoundError as error:
@@ -369,13 +368,13 @@ def _import_folder(folder: Path) -> None:
             return
         raise NerfroError(f"plugin folder {folder} does not exist; correct NERFRO_PLUGINS")
     # A real parent package, so that `_target_` can be located by name.
-    parent = sys.modules.get(_LOCAL_PACKAGE)
+    parent = sys.modules.get(PLUGINS_PACKAGE)
     if parent is None:
-        parent = sys.modules[_LOCAL_PACKAGE] = types.ModuleType(_LOCAL_PACKAGE, "Parent of the local plugins.")
+        parent = sys.modules[PLUGINS_PACKAGE] = types.ModuleType(PLUGINS_PACKAGE, "Parent of the local plugins.")
         parent.__path__ = []
     parent.__path__.append(str(folder))
     for module in pkgutil.iter_modules([str(folder)]):
-        name = f"{_LOCAL_PACKAGE}.{module.name}"
+        name = f"{PLUGINS_PACKAGE}.{module.name}"
         where = folder / (module.name if module.ispkg else f"{module.name}.py")
         loaded = sys.modules.get(name)  # possibly imported by another plugin of this folder
         if loaded is not None and Path(str(loaded.__file__)) not in (where, where / "__init__.py"):

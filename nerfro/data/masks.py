@@ -77,9 +77,9 @@ def find_mask(root: Path, image: Path, stated: str | None = None) -> Path | None
         if not os.path.isfile(mask):  # False for a name that is too long
             raise NerfroError(f"mask {mask} of {image} does not exist; restore it or remove its path from the data set")
         return mask
-    beside, candidates = mask_beside(image), []
-    if beside is not None:
+    if (beside := mask_beside(image)) is not None:
         return beside
+    candidates = []
     if image.is_relative_to(root):
         folder = image.relative_to(root).parent
         folders = [folder]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -18,7 +17,7 @@ from nerfro.paths import user_path
 from nerfro.progress import track
 
 from .calibrated_data import REPORT
-from .photographs import HEIF_SUFFIXES, PHOTOGRAPH_SUFFIXES
+from .photographs import HEIF_SUFFIXES, PHOTOGRAPH_SUFFIXES, one_of_each_pair, require_one_of_each_name
 from .video import extract_frames
 
 _QUALITY = 95  # of converted photographs
@@ -59,12 +58,12 @@ def link_photographs(photographs: Path, masks: Path | None, out: Path) -> None:
     Raises:
         NerfroError: a folder does not exist or holds no photograph, or photographs differ only in their extension.
     """
-    given = _one_of_each_pair(list_images(photographs, PHOTOGRAPH_SUFFIXES))
+    given = one_of_each_pair(list_images(photographs, PHOTOGRAPH_SUFFIXES))
     if masks is not None and not masks.is_dir():
         raise NerfroError(f"masks={masks} is not a folder; give the folder of the masks of the photographs")
     is_calibrated = (out / REPORT).is_file()
     if not is_calibrated:
-        _require_one_of_each_name(given)
+        require_one_of_each_name(given)
     for link in (*out.glob("images/*"), *out.glob("masks/*")):
         if not link.exists():
             link.unlink()
@@ -81,20 +80,6 @@ def link_photographs(photographs: Path, masks: Path | None, out: Path) -> None:
         _link(place / f"{stem}{file.suffix}", file)
     if not is_calibrated:
         _warn_of_others(given, out / "images")
-
-
-def _one_of_each_pair(photographs: Sequence[Path]) -> list[Path]:
-    """Leave out photographs in HEIC format beside a photograph of the same name in another format."""
-    others = {file.stem for file in photographs if file.suffix.lower() not in HEIF_SUFFIXES}
-    return [file for file in photographs if file.suffix.lower() not in HEIF_SUFFIXES or file.stem not in others]
-
-
-def _require_one_of_each_name(photographs: Sequence[Path]) -> None:
-    """Refuse photographs that differ only in their extension."""
-    counts = Counter(file.stem for file in photographs)
-    repeated = [stem for stem, count in counts.items() if count > 1]
-    if repeated:
-        raise NerfroError(f"{photographs[0].parent} contains several images named {repeated[0]}; keep one of each name")
 
 
 def _warn_of_others(given: Sequence[Path], folder: Path) -> None:
@@ -115,9 +100,14 @@ def _warn_of_others(given: Sequence[Path], folder: Path) -> None:
             )
 
 
+def _links_to_other(link: Path, file: Path) -> bool:
+    """Return whether a path is a link to another file than the given one."""
+    return link.is_symlink() and link.resolve() != file.resolve()
+
+
 def _link(link: Path, file: Path) -> None:
     """Link a file, unless there is another file of the name; replaces a link to another file."""
-    if link.is_symlink() and link.resolve() != file.resolve():
+    if _links_to_other(link, file):
         link.unlink()
     if not link.exists():
         link.symlink_to(file.resolve())
@@ -139,7 +129,7 @@ def _place_photograph(file: Path, folder: Path, replaces: bool) -> None:
         pillow_heif.register_heif_opener()
     place, converted = folder / file.name, folder / f"{file.stem}.jpg"
     for existing in (place, converted):
-        if existing.exists() and not (replaces and existing.is_symlink() and existing.resolve() != file.resolve()):
+        if existing.exists() and not (replaces and _links_to_other(existing, file)):
             return
         existing.unlink(missing_ok=True)
     with open_image(file, upright=False) as (image, _):

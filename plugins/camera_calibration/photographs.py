@@ -28,12 +28,9 @@ def list_photographs(folder: Path) -> tuple[list[Path], tuple[int, int]]:
     A warning names photographs in HEIC format, which are left out.
     """
     images = list_images(folder)
-    counts = Counter(image.stem for image in images)
-    repeated = [stem for stem, count in counts.items() if count > 1]
-    if repeated:
-        raise NerfroError(f"{folder} contains several images named {repeated[0]}; keep one of each name")
-    others = [file for file in list_images(folder, PHOTOGRAPH_SUFFIXES) if file not in images]
-    left_out = [file.name for file in others if file.stem not in counts]  # others have a converted copy
+    require_one_of_each_name(images)
+    # Other photographs in HEIC format have a converted copy.
+    left_out = [file.name for file in one_of_each_pair(list_images(folder, PHOTOGRAPH_SUFFIXES)) if file not in images]
     if left_out:
         warn(
             f"photographs in HEIC format are left out: {first_of(left_out)}; convert them to JPEG, or use "
@@ -53,6 +50,24 @@ def list_photographs(folder: Path) -> tuple[list[Path], tuple[int, int]]:
     for image in track("reading", images):
         read_rgb(image, "drop")  # raises an error for a damaged file before the long work starts
     return images, size
+
+
+def one_of_each_pair(photographs: Sequence[Path]) -> list[Path]:
+    """Leave out photographs in HEIC format beside a photograph of the same name in another format."""
+    others = {file.stem for file in photographs if file.suffix.lower() not in HEIF_SUFFIXES}
+    return [file for file in photographs if file.suffix.lower() not in HEIF_SUFFIXES or file.stem not in others]
+
+
+def require_one_of_each_name(photographs: Sequence[Path]) -> None:
+    """Refuse photographs of a folder that differ only in their extension.
+
+    Raises:
+        NerfroError: two photographs have the same name.
+    """
+    counts = Counter(file.stem for file in photographs)
+    repeated = [stem for stem, count in counts.items() if count > 1]
+    if repeated:
+        raise NerfroError(f"{photographs[0].parent} contains several images named {repeated[0]}; keep one of each name")
 
 
 def luminance(image: Path) -> UInt8[np.ndarray, "H W"]:

@@ -8,7 +8,7 @@ from functools import partial
 from typing import Annotated, Any, Literal
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import one_hot
 
@@ -182,10 +182,7 @@ def _refined_in_bands(
 def _trace_triangles(rays: Rays, medium: SdfGrid, max_events: int, branching: Branching) -> SnellTrace:
     """Trace rays from triangle to triangle of meshes, on the CPU and in double precision.
 
-    The number of crossings of its surface determines whether a ray is inside a body. Signed distances half-way to the
-    first triangle determine which bodies contain the beginning. The smooth surface of the distances differs from the
-    triangles. Therefore, if the distance to the body of the first triangle is less than a voxel, a ray begins inside
-    this body if it leaves the body through the triangle.
+    The number of crossings of its surface determines whether a ray is inside a body.
     """
     triangles, scene = medium.triangles, medium.intersector
     box = medium.box.double().cpu()
@@ -195,21 +192,7 @@ def _trace_triangles(rays: Rays, medium: SdfGrid, max_events: int, branching: Br
     if len(within):
         x, d = front.x[within], front.d[within]
         front.start[within] = offset  # a ray that begins on a surface does not cross it
-        faces = scene.first_hits(x + offset * d, d)
-        lengths = torch.where(faces >= 0, triangles.distance(x[:, None], d[:, None], faces), torch.inf)
-        length = lengths.amin(1, keepdim=True)
-        half_way = x + 0.5 * torch.where(length < torch.inf, length, 0.0) * d
-        phi = medium.signed_distances(half_way.to(medium.box))[0].cpu()
-        inside = (phi < 0) & (length < torch.inf)
-        is_near = phi.abs() < torch.stack([grid.spacing.max() for grid in medium.grids]).cpu()
-        row, layer = ((faces >= 0) & (lengths <= length + offset)).nonzero(as_tuple=True)
-        first = faces[row, layer]
-        decides = is_near[row, triangles.body[first]]
-        row, first = row[decides], first[decides]
-        leaves = (triangles.areas(first) * d[row]).sum(-1) > 0
-        inside[row, triangles.body[first]] = False
-        inside[row[leaves], triangles.body[first[leaves]]] = True
-        front.inside[within] = inside
+        front.inside[within] = _inside_at_start(medium, x, d, offset)
     front.add_vertices(front.ray)
     while len(rows := front.moving.nonzero()[:, 0]):
         faces = scene.first_hits(front.x[rows] + front.start[rows, None] * front.d[rows], front.d[rows])
@@ -229,6 +212,39 @@ def _trace_triangles(rays: Rays, medium: SdfGrid, max_events: int, branching: Br
         normal = triangles.normal(front.x[rows] + length[:, None] * front.d[rows], faces[:, 0])
         front.apply_interface(rows, length, length, body, normal, faces)
     return front.finish(rays)
+
+
+def _inside_at_start(
+    medium: SdfGrid, x: Float[Tensor, "P 3"], d: Float[Tensor, "P 3"], offset: float
+) -> Bool[Tensor, "P K"]:
+    """Return which bodies contain the starts of rays, given by triangles.
+
+    Signed distances half-way to the first triangle determine the bodies. The smooth surface of the distances differs
+    from the triangles. Therefore, if the distance to the body of the first triangle is less than a voxel, a ray begins
+    inside this body if it leaves the body through the triangle.
+
+    Args:
+        medium: bodies with meshes.
+        x, d: starts of the rays, and unit directions.
+        offset: distance from the start at which the search for triangles begins; triangles within this distance of the
+            first one count as well.
+    """
+    triangles = medium.triangles
+    faces = medium.intersector.first_hits(x + offset * d, d)
+    lengths = torch.where(faces >= 0, triangles.distance(x[:, None], d[:, None], faces), torch.inf)
+    length = lengths.amin(1, keepdim=True)
+    half_way = x + 0.5 * torch.where(length < torch.inf, length, 0.0) * d
+    phi = medium.signed_distances(half_way.to(medium.box))[0].cpu()
+    inside = (phi < 0) & (length < torch.inf)
+    is_near = phi.abs() < torch.stack([grid.spacing.max() for grid in medium.grids]).cpu()
+    row, layer = ((faces >= 0) & (lengths <= length + offset)).nonzero(as_tuple=True)
+    first = faces[row, layer]
+    decides = is_near[row, triangles.body[first]]
+    row, first = row[decides], first[decides]
+    leaves = (triangles.areas(first) * d[row]).sum(-1) > 0
+    inside[row, triangles.body[first]] = False
+    inside[row[leaves], triangles.body[first[leaves]]] = True
+    return inside
 
 
 def trace_interfaces(rays: Rays, medium: Solid, max_events: int, branching: Branching = ONE_PATH) -> SnellTrace:
