@@ -46,7 +46,7 @@ def render_frames(
         NerfroError: the folder contains frames of another request that must not be replaced.
     """
     files = [folder / f"{name}{suffix}" for name in shots.names]
-    _remove_other_frames(folder, files, _fingerprint(shots, request), overwrite)
+    _remove_other_frames(folder, files, suffix, _fingerprint(shots, request), overwrite)
     missing = [frame for frame, file in enumerate(files) if not file.exists()]
     if len(missing) < len(files):
         print(f"nerfro: {len(files) - len(missing)} of {len(files)} frames exist already")
@@ -62,24 +62,24 @@ def render_frames(
     return files
 
 
-def _remove_other_frames(folder: Path, files: Sequence[Path], fingerprint: str, overwrite: bool) -> None:
-    """Record the request in the folder, and remove frames of another request if `overwrite` is set."""
+def _remove_other_frames(folder: Path, files: Sequence[Path], suffix: str, fingerprint: str, overwrite: bool) -> None:
+    """Record the request of the frames with a suffix, and remove frames of another request if `overwrite` is set."""
     record = folder / _RECORD
-    existing = [file for file in files if file.exists()]
-    if _recorded_request(record) != fingerprint:
+    existing, requests = [file for file in files if file.exists()], _recorded_requests(record)
+    if requests.get(suffix) != fingerprint:
         if existing and not overwrite:
             raise NerfroError(f"{existing[0]} belongs to another rendering; give another out=... or overwrite=true")
         for file in existing:
             file.unlink()
-    write_atomically(record, json.dumps({"request": fingerprint}) + "\n")
+    write_atomically(record, json.dumps({"requests": {**requests, suffix: fingerprint}}) + "\n")
 
 
-def _recorded_request(record: Path) -> object:
-    """Return the fingerprint in a record; None if the record is missing or damaged."""
+def _recorded_requests(record: Path) -> dict[str, object]:
+    """Return the fingerprints in a record by suffix of the frames; empty if the record is missing or damaged."""
     try:
-        return read_json(record, "")["request"]
-    except (NerfroError, KeyError, TypeError, IndexError):
-        return None
+        return dict(read_json(record, "")["requests"])
+    except (NerfroError, KeyError, TypeError, ValueError, IndexError):
+        return {}
 
 
 def _fingerprint(shots: Shots, request: Sequence[object]) -> str:

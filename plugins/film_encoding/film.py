@@ -18,6 +18,8 @@ from nerfro.files.atomic import atomic_file, write_atomically
 
 # Constant rate factor of H.264: 0 is lossless, 18 is visually lossless, 51 is the worst.
 _QUALITY = 18
+# Shortest duration of a frame of a GIF, in hundredths of a second; of faster films, some frames are left out.
+_MIN_GIF_DURATION = 2
 
 
 def write_film(file: Path, frames: Sequence[Path], seconds: float) -> None:
@@ -32,7 +34,7 @@ def write_film(file: Path, frames: Sequence[Path], seconds: float) -> None:
         NerfroError: no ffmpeg is installed, or encoding fails.
     """
     writer = {".mp4": _write_mp4, ".gif": _write_gif}[file.suffix]
-    writer(file, frames, len(frames) / seconds)
+    writer(file, frames, seconds)
 
 
 def find_ffmpeg() -> str:
@@ -54,8 +56,8 @@ def find_ffmpeg() -> str:
         ) from error
 
 
-def _write_mp4(file: Path, frames: Sequence[Path], rate: float) -> None:
-    height, width = _read_even(frames[0]).shape[:2]
+def _write_mp4(file: Path, frames: Sequence[Path], seconds: float) -> None:
+    (height, width), rate = _read_even(frames[0]).shape[:2], len(frames) / seconds
     with tempfile.TemporaryDirectory() as folder:
         encoded = Path(folder, file.name)
         pixels = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(rate), "-i", "-"]
@@ -73,12 +75,15 @@ def _write_mp4(file: Path, frames: Sequence[Path], rate: float) -> None:
         write_atomically(file, encoded.read_bytes())
 
 
-def _write_gif(file: Path, frames: Sequence[Path], rate: float) -> None:
-    images = _quantized(frames)
-    # The unit of the format is a hundredth of a second, and viewers replace durations below two units.
-    duration = max(20, 10 * round(100 / rate))
+def _write_gif(file: Path, frames: Sequence[Path], seconds: float) -> None:
+    # The unit of the format is a hundredth of a second, and viewers replace durations below two units. The ends of the
+    # frames are rounded and not the durations, whose errors would add up.
+    num_shown = max(1, min(len(frames), int(100 * seconds / _MIN_GIF_DURATION)))
+    ends = np.round(100 * seconds * np.arange(num_shown + 1) / num_shown).astype(int)
+    images = _quantized([frames[i * len(frames) // num_shown] for i in range(num_shown)])
+    durations = [10 * int(duration) for duration in np.diff(ends)]  # milliseconds
     with atomic_file(file) as stream:
-        next(images).save(stream, "GIF", save_all=True, append_images=images, duration=duration, loop=0)
+        next(images).save(stream, "GIF", save_all=True, append_images=images, duration=durations, loop=0)
 
 
 def _quantized(frames: Sequence[Path]) -> Iterator[Image.Image]:

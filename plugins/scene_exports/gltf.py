@@ -77,7 +77,10 @@ def _glass_material(
     """Describe glass by the extensions KHR_materials_transmission, _ior, _volume and _dispersion (Khronos)."""
     volume: dict[str, Any] = {"thicknessFactor": float(mesh.extents.min())}
     if absorption.any():
-        volume |= {"attenuationDistance": 1.0, "attenuationColor": np.exp(-absorption).tolist()}
+        # At a distance of 1 / max(absorption), no channel underflows, whatever the world unit.
+        distance = 1 / float(absorption.max())
+        colour = np.exp(-absorption.astype(np.float64) * distance).tolist()
+        volume |= {"attenuationDistance": distance, "attenuationColor": colour}
     extensions: dict[str, Any] = {
         "KHR_materials_transmission": {"transmissionFactor": 1.0},
         "KHR_materials_ior": {"ior": ior},

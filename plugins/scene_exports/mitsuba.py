@@ -29,7 +29,10 @@ from nerfro.viewing.trained_scene import TrainedScene
 from .meshes import glass_meshes, inside_mesh
 
 MITSUBA_FILES = ("_glass.ply", "_inside.ply", "_sky.hdr")  # endings of the files beside the .xml
-_MAX_DEPTH, _SAMPLES = 64, 64
+_MAX_DEPTH = 64  # events of a light path that the file proposes
+_NUM_SAMPLES = 64  # samples per pixel that the file proposes
+# Clip distances of the sensors, relative to the largest distance between a camera and a corner of the object's bounds.
+_NEAR_CLIP, _FAR_CLIP = 1e-4, 1e2
 _MIN_SKY_HEIGHT = 1024
 _SQUARE = 1e-3  # relative difference of the focal lengths up to which pixels count as square
 # The y axis is up in an environment map of Mitsuba, and the z axis in nerfro.
@@ -62,14 +65,20 @@ def write_mitsuba(scene: TrainedScene, out: Path, config: DictConfig) -> str:
         "integrator": {"type": "volpath" if absorption.any() else "path", "max_depth": _MAX_DEPTH},
         "sky": {"type": "envmap", "filename": sky_file.name, "to_world": _Y_UP_TO_Z_UP},
     }
-    _write_sky(sky_file, scene)
     glass_files = [glass_file, *(out.with_name(f"{out.stem}_glass_{body}.ply") for body in range(1, len(glass)))]
     refuse_existing(glass_files[1:], config.overwrite)
+    corners = torch.from_numpy(trimesh.bounds.corners(scene.bounds.numpy())).float()
+    reach = float(torch.cdist(cameras.camera_to_world[..., 3].float(), corners).max())
+    _write_sky(sky_file, scene)
     for body, (mesh, file) in enumerate(zip(glass, glass_files, strict=False)):
-        shape = {**_write_shape(file, mesh), "bsdf": {"type": "$glass", "int_ior": float(scene.ior[body])}}
+        bsdf = {"type": "$glass", "int_ior": float(scene.ior[body]), "ext_ior": 1.0}
+        shape = {**_write_shape(file, mesh), "bsdf": bsdf}
         if absorption[body].any():
-            sigma_t = tuple(absorption[body].tolist())
-            shape["interior"] = {"type": "homogeneous", "sigma_t": sigma_t, "albedo": (0.0, 0.0, 0.0)}
+            # Mitsuba accepts colours up to 1 only, and multiplies them by the scale.
+            scale = float(absorption[body].max())
+            sigma_t = tuple((absorption[body] / scale).tolist())
+            medium = {"type": "homogeneous", "sigma_t": sigma_t, "scale": scale, "albedo": (0.0, 0.0, 0.0)}
+            shape["interior"] = medium
         objects[f"glass_{body}" if body else "glass"] = shape
     if inside is not None:
         radiance = np.asarray(inside.vertex_attributes.pop("radiance"))
@@ -79,7 +88,7 @@ def write_mitsuba(scene: TrainedScene, out: Path, config: DictConfig) -> str:
         light = {"type": "area", "radiance": {"type": "mesh_attribute", "name": "vertex_color"}}
         objects["inside"] = {**_write_shape(inside_file, inside), "bsdf": black, "emitter": light}
     _warn_of_lenses(cameras)
-    objects |= {f"{split}_{view:03d}": _sensor(cameras, view) for view in range(len(cameras))}
+    objects |= {f"{split}_{view:03d}": _sensor(cameras, view, reach) for view in range(len(cameras))}
     root = ElementTree.Element("scene", version="3.0.0")
     ElementTree.SubElement(root, "default", name="glass", value="dielectric")
     for name, value in objects.items():
@@ -125,8 +134,8 @@ def _warn_of_lenses(cameras: Cameras) -> None:
         )
 
 
-def _sensor(cameras: Cameras, view: int) -> dict[str, Any]:
-    """Describe a pinhole camera with square pixels; lens distortion is omitted."""
+def _sensor(cameras: Cameras, view: int, reach: float) -> dict[str, Any]:
+    """Describe a pinhole camera with square pixels, at most `reach` from the object; lens distortion is omitted."""
     # Mitsuba's cameras look along +z with x to the left, and nerfro's cameras along -z with x to the right.
     to_world = np.eye(4)
     to_world[:3] = cameras.camera_to_world[view].double().numpy() * [-1, 1, -1, 1]
@@ -134,13 +143,13 @@ def _sensor(cameras: Cameras, view: int) -> dict[str, Any]:
         "type": "perspective",
         "fov_axis": "x",
         "fov": math.degrees(2 * math.atan(0.5 * cameras.width / float(cameras.fx[view]))),
-        "near_clip": 0.01,
-        "far_clip": 1000.0,
+        "near_clip": _NEAR_CLIP * reach,
+        "far_clip": _FAR_CLIP * reach,
         "principal_point_offset_x": 0.5 - float(cameras.cx[view]) / cameras.width,
         "principal_point_offset_y": 0.5 - float(cameras.cy[view]) / cameras.height,
         "to_world": to_world,
         "film": {"type": "hdrfilm", "width": cameras.width, "height": cameras.height, "rfilter": {"type": "box"}},
-        "sampler": {"type": "independent", "sample_count": _SAMPLES},
+        "sampler": {"type": "independent", "sample_count": _NUM_SAMPLES},
     }
 
 

@@ -17,8 +17,9 @@ def register_materials(variant: str) -> None:
     transmitted by Snell's law without loss: there is neither partial Fresnel reflection nor scaling by n^2. The scaling
     cancels, because both ends of every path lie in air. Above the critical angle, a ray is reflected totally. With
     `fresnel`, the material also reflects partially, like Mitsuba's dielectric.
-    Parameters: `int_ior` (float, inside over outside), `tint` (linear RGB factor per transmission), `fresnel` (bool),
-    and `absorption` (RGB per world unit), which attenuates light that reaches the surface from inside.
+    Parameters: `int_ior` and `ext_ior` (floats; the latter is 1 by default), `tint` (linear RGB factor for each
+    transmission), `fresnel` (bool), and `absorption` (RGB per world unit), which attenuates light that reaches the
+    surface from inside.
 
     `embedded_in_glass` is the nested BSDF of an object inside the body, attenuated in the same way (`absorption`).
     Together, the two materials attenuate every segment of a path inside the body at its end.
@@ -34,7 +35,7 @@ def _transmitting_glass(mi: Any, dr: Any) -> type:
     class TransmittingGlass(mi.BSDF):
         def __init__(self, properties: mi.Properties) -> None:
             super().__init__(properties)
-            self.ior = mi.Float(properties.get("int_ior", 1.5))
+            self.ior = mi.Float(properties.get("int_ior", 1.5) / properties.get("ext_ior", 1.0))
             self.tint = mi.Color3f(properties.get("tint", mi.ScalarColor3f(1.0)))
             self.absorption = mi.Color3f(properties.get("absorption", mi.ScalarColor3f(0.0)))
             self.fresnel = bool(properties.get("fresnel", False))

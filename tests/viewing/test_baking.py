@@ -1,4 +1,4 @@
-"""What a page is made of stands for what the model traces and shows, and comes back from pictures as it was."""
+"""Baked data of a page match the model, and survive their encoding as images."""
 
 import base64
 import io
@@ -29,7 +29,7 @@ def gl_face(direction: np.ndarray) -> tuple[int, float, float]:
     return face, (s / m + 1) / 2, (t / m + 1) / 2
 
 
-def test_cube_directions_lie_where_opengl_looks_them_up() -> None:
+def test_cube_map_directions_match_opengl() -> None:
     size = 5
     for number, direction in enumerate(cube_directions(size).double().numpy()):
         # The shader's way from a direction to the place in the cube: equal angles.
@@ -39,7 +39,7 @@ def test_cube_directions_lie_where_opengl_looks_them_up() -> None:
         assert (face, s, t) == pytest.approx(expected, abs=1e-6)
 
 
-def test_sky_is_the_boundary() -> None:
+def test_baked_sky_matches_the_boundary() -> None:
     boundary = EnvironmentMap([2, 8])
     torch.nn.init.normal_(boundary.texels, std=3, generator=torch.Generator().manual_seed(0))
     baked = bake_sky(boundary, torch.device("cpu"))
@@ -70,7 +70,7 @@ def test_pack_keeps_every_byte(shape: tuple[int, ...]) -> None:
     assert not found[..., shape[3] :].any()
 
 
-def test_shared_exponent_is_as_near_as_nine_bits_are() -> None:
+def test_shared_exponent_has_nine_bits_of_precision() -> None:
     radiance = np.random.default_rng(0).lognormal(0, 3, (1000, 3))
     radiance = np.concatenate([radiance, [[0, 0, 0], [1, 1, 1], [0.99999, 0.5, 0], [1e-9, 0, 0], [65408, 1, 0]]])
     upper, rest = shared_exponent(radiance)

@@ -1,4 +1,4 @@
-"""Cameras that fly around an object, and those of other programs."""
+"""Camera paths around an object, and camera paths of other programs."""
 
 import json
 import math
@@ -22,7 +22,7 @@ def around(scene: TrainedScene) -> CaptureGeometry:
 
 
 @pytest.mark.parametrize("name", sorted(PATHS))
-def test_all_cameras_look_at_the_middle_upright(name: str, around: CaptureGeometry) -> None:
+def test_all_cameras_look_at_the_centre_upright(name: str, around: CaptureGeometry) -> None:
     cameras = path_cameras(around, name, OrbitPosition(30, 20, 5.0), 16)
     pixels, depth = cameras.project(CENTRE[None])
     torch.testing.assert_close(pixels[:, 0], torch.full((16, 2), 16.0), atol=1e-3, rtol=0)
@@ -38,7 +38,7 @@ def test_all_cameras_look_at_the_middle_upright(name: str, around: CaptureGeomet
     assert cameras.far >= distances.max() - around.distance + around.camera.far - 1e-4
 
 
-def test_an_orbit_is_a_circle_that_does_not_repeat_its_beginning(around: CaptureGeometry) -> None:
+def test_orbit_is_a_circle_that_does_not_repeat_its_first_camera(around: CaptureGeometry) -> None:
     cameras = path_cameras(around, "orbit", OrbitPosition(0, 30, 5.0), 8)
     offsets = cameras.camera_to_world[:, :, 3] - CENTRE
     torch.testing.assert_close(offsets.norm(dim=-1), torch.full((8,), 5.0))
@@ -48,7 +48,7 @@ def test_an_orbit_is_a_circle_that_does_not_repeat_its_beginning(around: Capture
     torch.testing.assert_close(steps, steps[:1].expand(8), atol=1e-5, rtol=0)
 
 
-def test_a_dolly_comes_nearer_and_a_spiral_rises(around: CaptureGeometry) -> None:
+def test_dolly_approaches_and_spiral_rises(around: CaptureGeometry) -> None:
     near = path_cameras(around, "dolly", OrbitPosition(0, 0, 4.0), 5).camera_to_world[:, :, 3] - CENTRE
     torch.testing.assert_close(near.norm(dim=-1)[[0, -1]], torch.tensor([6.0, 3.0]))
     heights = (path_cameras(around, "spiral", OrbitPosition(0, 40, 4.0), 9).camera_to_world[:, :, 3] - CENTRE)[:, 2]
@@ -57,7 +57,7 @@ def test_a_dolly_comes_nearer_and_a_spiral_rises(around: CaptureGeometry) -> Non
 
 
 @pytest.mark.parametrize("elevation", [90, -90])
-def test_an_orbit_above_or_below_turns_the_image(elevation: float, around: CaptureGeometry) -> None:
+def test_orbit_above_or_below_rotates_the_image(elevation: float, around: CaptureGeometry) -> None:
     poses, nearly = (
         path_cameras(around, "orbit", OrbitPosition(10, share * elevation, 5.0), 8).camera_to_world
         for share in (1.0, 0.9999)
@@ -68,7 +68,7 @@ def test_an_orbit_above_or_below_turns_the_image(elevation: float, around: Captu
 
 
 @pytest.mark.parametrize("up", [[0.0, 0.0, 1.0], [1.0, 1.0, 1.0]])
-def test_a_camera_above_its_target_looks_down(up: list[float], around: CaptureGeometry) -> None:
+def test_camera_above_its_target_looks_down(up: list[float], around: CaptureGeometry) -> None:
     vertical = torch.nn.functional.normalize(torch.tensor(up), dim=0)
     cameras = replace(around, up=vertical).look_at((CENTRE + 4 * vertical)[None], CENTRE)
     rotation = cameras.camera_to_world[0, :, :3]
@@ -76,7 +76,7 @@ def test_a_camera_above_its_target_looks_down(up: list[float], around: CaptureGe
     torch.testing.assert_close(rotation[:, 2], vertical, atol=1e-5, rtol=0)
 
 
-def test_up_is_what_is_up_in_the_photographs(scene: TrainedScene) -> None:
+def test_up_direction_matches_the_photographs(scene: TrainedScene) -> None:
     cameras = scene.cameras("train")
     turn = torch.tensor([[1.0, 0, 0], [0, 0.0, 1], [0, -1, 0]])  # z to y
     turned = cameras._each(lambda values: turn @ values if values.ndim == 3 else values)
@@ -99,7 +99,7 @@ def test_nerfstudios_camera_path_is_read(around: CaptureGeometry, tmp_path: Path
         torch.testing.assert_close(pixels[0, 0], torch.tensor([50.0, 0.0]), atol=1e-3, rtol=0)
 
 
-def test_transforms_are_read_without_their_pictures(around: CaptureGeometry, tmp_path: Path) -> None:
+def test_transforms_are_read_without_their_images(around: CaptureGeometry, tmp_path: Path) -> None:
     pose = torch.eye(4)
     pose[2, 3] = 3.0
     frames = [{"file_path": "gone.png", "transform_matrix": pose.tolist()}]

@@ -36,7 +36,7 @@ def write(scene: TrainedScene, what: str, out: Path, **options: object) -> str:
     return find_export(what, out).write(scene, out, OmegaConf.merge(config, {"resolution": 48, **options}))
 
 
-def test_glb_holds_glass_as_glass_and_the_inside_as_light(scene: TrainedScene, tmp_path: Path) -> None:
+def test_glb_contains_glass_as_dielectric_and_the_content_as_emission(scene: TrainedScene, tmp_path: Path) -> None:
     write(scene, "mesh", tmp_path / "ball.glb")
     loaded = trimesh.load(tmp_path / "ball.glb", process=False)
     glass, inside = (loaded.geometry[name] for name in ("glass_0", "inside"))
@@ -76,7 +76,7 @@ def two_bodies(scene: TrainedScene, tmp_path: Path) -> TrainedScene:
     return replace(scene, renderer=with_changed_scene(scene.renderer, medium=medium))
 
 
-def test_glb_holds_each_body_with_its_material(two_bodies: TrainedScene, tmp_path: Path) -> None:
+def test_glb_contains_each_body_with_its_material(two_bodies: TrainedScene, tmp_path: Path) -> None:
     write(two_bodies, "mesh", tmp_path / "two.glb")
     loaded = trimesh.load(tmp_path / "two.glb", process=False)
     for number, x in enumerate((-0.7, 0.7)):
@@ -88,13 +88,53 @@ def test_glb_holds_each_body_with_its_material(two_bodies: TrainedScene, tmp_pat
     assert water["KHR_materials_dispersion"]["dispersion"] == pytest.approx(20 / 55.8, rel=2e-3)
     assert water["KHR_materials_ior"]["ior"] == pytest.approx(1.3334, abs=1e-4)
     assert "KHR_materials_dispersion" not in tinted
-    np.testing.assert_allclose(
-        tinted["KHR_materials_volume"]["attenuationColor"], np.exp([-0.5, -0.1, -0.2]), rtol=1e-6
-    )
+    volume = tinted["KHR_materials_volume"]
+    transmitted = np.array(volume["attenuationColor"]) ** (1 / volume["attenuationDistance"])
+    np.testing.assert_allclose(transmitted, np.exp([-0.5, -0.1, -0.2]), rtol=1e-6)
     assert "KHR_materials_dispersion" in document["extensionsUsed"]
 
 
-def test_mitsuba_scenes_hold_bodies_that_are_apart(two_bodies: TrainedScene, tmp_path: Path) -> None:
+def test_glb_keeps_strong_absorption(scene: TrainedScene, tmp_path: Path) -> None:
+    absorption = np.array([20.0, 120.0, 200.0])
+    write(scene.with_(absorption=absorption.tolist()), "mesh", tmp_path / "dark.glb")
+    content = (tmp_path / "dark.glb").read_bytes()
+    document = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
+    volume = document["materials"][0]["extensions"]["KHR_materials_volume"]
+    transmitted = np.array(volume["attenuationColor"]) ** (0.01 / volume["attenuationDistance"])
+    np.testing.assert_allclose(transmitted, np.exp(-0.01 * absorption), rtol=1e-5)
+
+
+def test_mitsuba_accepts_strong_absorption(scene: TrainedScene, tmp_path: Path) -> None:
+    write(scene.with_(absorption=[0.5, 1.0, 2.0]), "mitsuba", tmp_path / "dark.xml")
+    medium = ElementTree.parse(tmp_path / "dark.xml").getroot().find("shape/medium")
+    assert medium is not None
+    numbers = {child.get("name"): np.array(str(child.get("value")).split(), float) for child in medium}
+    assert numbers["sigma_t"].max() <= 1  # Mitsuba refuses larger colours
+    np.testing.assert_allclose(numbers["sigma_t"] * numbers["scale"], [0.5, 1.0, 2.0], rtol=1e-6)
+
+
+def test_mitsuba_scenes_need_no_glass(scene: TrainedScene, tmp_path: Path) -> None:
+    box = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+    write(replace(scene.with_(glass=False), content=box), "mitsuba", tmp_path / "straight.xml")
+    root = ElementTree.parse(tmp_path / "straight.xml").getroot()
+    assert [shape.get("id") for shape in root.findall("shape")] == ["inside"]
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
+def test_mitsuba_sensors_see_the_object_in_any_world_unit(
+    scene: TrainedScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, factor: float
+) -> None:
+    cameras, box = scene.cameras("test"), factor * torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+    poses = torch.cat([cameras.camera_to_world[..., :3], factor * cameras.camera_to_world[..., 3:]], -1)
+    monkeypatch.setattr(TrainedScene, "cameras", lambda self, split: replace(cameras, camera_to_world=poses))
+    write(replace(scene.with_(glass=False, inside=False), content=box), "mitsuba", tmp_path / "far.xml")
+    for sensor in ElementTree.parse(tmp_path / "far.xml").getroot().findall("sensor"):
+        clip = {child.get("name"): float(str(child.get("value"))) for child in sensor.findall("float")}
+        assert clip["near_clip"] < factor * 2
+        assert clip["far_clip"] > factor * 6
+
+
+def test_mitsuba_scenes_contain_separate_bodies(two_bodies: TrainedScene, tmp_path: Path) -> None:
     write(two_bodies, "mitsuba", tmp_path / "two.xml")
     shapes = ElementTree.parse(tmp_path / "two.xml").getroot().findall("shape")
     indices = {shape.get("id"): shape.find("bsdf/float[@name='int_ior']").get("value") for shape in shapes[:2]}  # type: ignore[union-attr]
@@ -145,7 +185,7 @@ def test_glb_passes_khronos_validator(scene: TrainedScene, tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("suffix", [".hdr", ".exr", ".png"])
-def test_the_sky_is_read_by_other_programs(scene: TrainedScene, suffix: str, tmp_path: Path) -> None:
+def test_exported_sky_is_read_by_other_programs(scene: TrainedScene, suffix: str, tmp_path: Path) -> None:
     write(scene, "sky", tmp_path / f"sky{suffix}")
     if suffix == ".exr":
         picture = OpenImageIO.ImageBuf(str(tmp_path / "sky.exr")).get_pixels()
@@ -160,7 +200,7 @@ def test_the_sky_is_read_by_other_programs(scene: TrainedScene, suffix: str, tmp
     np.testing.assert_allclose(picture[10, 20], sky_of(torch.tensor(towards)), atol=6e-3)
 
 
-def test_the_volume_is_the_field_at_the_vertices_of_a_grid(scene: TrainedScene, tmp_path: Path) -> None:
+def test_exported_volume_is_the_field_at_the_vertices_of_a_grid(scene: TrainedScene, tmp_path: Path) -> None:
     write(scene, "volume", tmp_path / "inside.npz")
     with np.load(tmp_path / "inside.npz") as file:
         density, rgb, box = (file[name] for name in ("density", "rgb", "box"))
@@ -174,7 +214,7 @@ def test_the_volume_is_the_field_at_the_vertices_of_a_grid(scene: TrainedScene, 
 @pytest.mark.parametrize(
     ("what", "suffix"), [("page", ".html"), ("volume", ".npz"), ("mesh", ".glb"), ("mitsuba", ".xml")]
 )
-def test_a_volume_has_at_least_two_vertices_along_each_side(
+def test_exported_volume_has_at_least_two_vertices_along_each_side(
     scene: TrainedScene, what: str, suffix: str, tmp_path: Path
 ) -> None:
     out = tmp_path / f"out{suffix}"
@@ -186,7 +226,7 @@ def test_a_volume_has_at_least_two_vertices_along_each_side(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("glass", "least"), [("dielectric", 25), ("transmitting_glass", 32)])
-def test_mitsuba_renders_the_same_picture(
+def test_mitsuba_renders_the_same_image(
     scene: TrainedScene, mitsuba: ModuleType, glass: str, least: float, tmp_path: Path
 ) -> None:
     write(scene, "mitsuba", tmp_path / "ball.xml")

@@ -1,4 +1,4 @@
-"""A page that follows a model: baked when somebody looks, within its share of the time, and shown in the browser."""
+"""The live page of a training: baking on demand, its share of the time, and the display in a browser."""
 
 import json
 import re
@@ -29,7 +29,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return now
 
 
-def test_bakes_take_their_share_of_the_time(scene: TrainedScene, server: PageServer, clock: list[float]) -> None:
+def test_bakes_take_a_bounded_share_of_the_time(scene: TrainedScene, server: PageServer, clock: list[float]) -> None:
     page = LivePage(server, scene, scene.views(), "test", resolution=24)
 
     def version() -> int:
@@ -50,7 +50,7 @@ def test_bakes_take_their_share_of_the_time(scene: TrainedScene, server: PageSer
     assert version() == 2, "nobody has looked for a long time"
 
 
-def test_training_mode_and_weights_stay(scene: TrainedScene, server: PageServer) -> None:
+def test_bakes_keep_training_mode_and_weights(scene: TrainedScene, server: PageServer) -> None:
     scene.renderer.train()
     page = LivePage(server, scene, scene.views(), "test", resolution=8)
     page.show()

@@ -1,4 +1,4 @@
-"""The page of a scene shows in a browser what nerfro renders, and its controls change what they say."""
+"""The page of a scene agrees with renderings of nerfro in a browser, and its controls take effect."""
 
 import base64
 import io
@@ -102,7 +102,7 @@ def test_five_cameras_of_a_cube_with_bodies_inside_agree_with_nerfro(glass_cube:
 
 
 @needs_chromium
-def test_a_vessel_agrees_with_nerfro(scene: TrainedScene, tmp_path: Path) -> None:
+def test_vessel_agrees_with_nerfro(scene: TrainedScene, tmp_path: Path) -> None:
     vessel = spherical_vessel(tmp_path, level=0.9, resolution=64, absorption=[0.3, 1.0, 2.0, 1.0, 0.0, 0.5])
     vessel_scene = in_embedded_scene(scene, vessel)
     # Dyed walls of index 1 absorb, another liquid changes the picture, and air has no index to change.
@@ -159,7 +159,7 @@ def test_contracted_surroundings_are_shown(scene: TrainedScene, tmp_path: Path) 
 
 
 @needs_chromium
-def test_controls_change_what_they_say(scene: TrainedScene, tmp_path: Path) -> None:
+def test_controls_change_index_glass_reflection_tint_and_sky(scene: TrainedScene, tmp_path: Path) -> None:
     lamp = lat_long.directions(32)
     lamp = 4 * (lamp[..., 2:] > 0.5) * torch.tensor([1.0, 0.5, 0.1]) + 0.1
     write_radiance(tmp_path / "lamp.hdr", lamp.numpy())
@@ -193,11 +193,11 @@ def test_controls_change_what_they_say(scene: TrainedScene, tmp_path: Path) -> N
     assert agrees("sky", scene.with_(sky=lamp))
     torch.testing.assert_close(shots["end"], shots["start"])
     _check_reflection(scene, to_linear(shots["start"]), to_linear(shots["reflection"]))
-    met = scene.render(scene.cameras("test"), Subdivision()).normals[0].any(-1)
-    left = (to_linear(shots["tint"]) / to_linear(shots["start"]))[met].mean(0)
+    on_glass = scene.render(scene.cameras("test"), Subdivision()).normals[0].any(-1)
+    left = (to_linear(shots["tint"]) / to_linear(shots["start"]))[on_glass].mean(0)
     assert left[0] > left[1] > left[2]
     assert left[0] < 0.9
-    torch.testing.assert_close(shots["tint"][~met], shots["start"][~met])
+    torch.testing.assert_close(shots["tint"][~on_glass], shots["start"][~on_glass])
     assert (found["camera"], found["photograph"], found["alt"], found["unnamed"]) == (1, True, "photograph test_001", 0)
 
 
@@ -215,10 +215,10 @@ def _check_reflection(scene: TrainedScene, without: torch.Tensor, with_it: torch
     mirrored = sky_of(rays.directions + 2 * cosine[:, None] * normal)
     expected = (1 - share) * without.view(-1, 3) + share * mirrored
     # Not on the rim, where neighbouring pixels differ by all of F.
-    met = (squared > 0) & (cosine > 0.2)
-    assert met.sum() > 100
-    torch.testing.assert_close(with_it.view(-1, 3)[met], expected[met], atol=0.01, rtol=0)
-    assert share[met].max() > 0.1
+    inner = (squared > 0) & (cosine > 0.2)
+    assert inner.sum() > 100
+    torch.testing.assert_close(with_it.view(-1, 3)[inner], expected[inner], atol=0.01, rtol=0)
+    assert share[inner].max() > 0.1
 
 
 @needs_chromium
@@ -236,7 +236,7 @@ def test_fragment_shows_one_camera_alone(scene: TrainedScene, tmp_path: Path) ->
 
 
 @needs_chromium
-def test_browser_without_webgl2_is_told(scene: TrainedScene, tmp_path: Path) -> None:
+def test_missing_webgl2_is_reported(scene: TrainedScene, tmp_path: Path) -> None:
     with Browser(make_page(scene, 8), tmp_path, "--disable-3d-apis") as browser:
         assert "This page needs WebGL2" in browser.evaluate("$('message').textContent")
 
@@ -249,7 +249,7 @@ def test_page_loads_nothing_and_names_its_cameras(scene: TrainedScene) -> None:
 
 
 @pytest.mark.parametrize(("branches", "begins"), [("none", "false"), ("all", "true")])
-def test_page_begins_with_the_light_that_the_model_follows(scene: TrainedScene, branches: str, begins: str) -> None:
+def test_page_starts_with_the_branches_of_the_model(scene: TrainedScene, branches: str, begins: str) -> None:
     scene = replace(scene, renderer=variant(scene.renderer, path_sampler=Snell(branches=branches)))
     assert f'"reflection": {begins}' in make_page(scene, 8)
 

@@ -94,7 +94,7 @@ def test_keys_turn_zoom_and_go_back(browser: Browser) -> None:
     assert browser.evaluate("page.orbit.azimuth") == 0.6
 
 
-def test_a_test_camera_is_chosen_with_the_keyboard_and_left_by_dragging(browser: Browser) -> None:
+def test_test_camera_is_selected_with_the_keyboard_and_left_by_dragging(browser: Browser) -> None:
     browser.evaluate("document.querySelector('#cameras button[value=\"1\"]').focus()")
     browser.press(" ")
     chosen = browser.evaluate(VIEW)
@@ -106,7 +106,7 @@ def test_a_test_camera_is_chosen_with_the_keyboard_and_left_by_dragging(browser:
     assert browser.evaluate("$('photograph').hidden")
 
 
-def test_a_chosen_camera_has_its_place_before_the_next_frame(browser: Browser) -> None:
+def test_selected_camera_is_applied_before_the_next_frame(browser: Browser) -> None:
     browser.wait_for("page.rays > 0")
     at_once = browser.evaluate(f"(page.show(1), {PLACE})")
     browser.wait_for("page.rays > 0")
@@ -118,7 +118,7 @@ def test_a_chosen_camera_has_its_place_before_the_next_frame(browser: Browser) -
 
 
 @pytest.mark.parametrize("suffix", [".png", ".hdr"])
-def test_a_dropped_picture_is_the_sky(browser: Browser, scene: TrainedScene, suffix: str, tmp_path: Path) -> None:
+def test_dropped_image_replaces_the_sky(browser: Browser, scene: TrainedScene, suffix: str, tmp_path: Path) -> None:
     directions = lat_long.directions(64)
     lat_long.save_lat_long(tmp_path / f"sky{suffix}", 0.5 + 0.3 * directions.roll(1, -1))
     before = picture(browser.evaluate(f"(() => {{ {SHOT} return shot(0, 32); }})()"))
@@ -133,7 +133,7 @@ def test_a_dropped_picture_is_the_sky(browser: Browser, scene: TrainedScene, suf
     assert not browser.evaluate("page.tracer.skyIsPicture")
 
 
-def test_a_dropped_file_that_is_no_picture_is_told(browser: Browser, tmp_path: Path) -> None:
+def test_dropped_file_without_an_image_is_reported(browser: Browser, tmp_path: Path) -> None:
     (tmp_path / "notes.hdr").write_text(json.dumps("no picture"))
     browser.drop(tmp_path / "notes.hdr", middle(browser))
     browser.wait_for("$('message').textContent.startsWith('notes.hdr cannot be shown as a sky')")

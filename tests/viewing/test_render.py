@@ -1,7 +1,8 @@
-"""`python -m nerfro.render`: its frames and films, what it goes on with, and what it refuses."""
+"""`python -m nerfro.render`: its frames and films, resumption, and refused options."""
 
 import functools
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import cv2
@@ -13,6 +14,7 @@ from PIL import Image
 
 import nerfro.render
 from nerfro.files.lat_long import save_lat_long
+from nerfro.registry import discover
 from nerfro.subdivision import Subdivision
 from nerfro.viewing.trained_scene import TrainedScene
 from tests.conftest import Runner
@@ -46,7 +48,7 @@ def psnr(one: np.ndarray, other: np.ndarray) -> float:
     return float(-10 * np.log10(((one - other) / 255).__pow__(2).mean()))
 
 
-def test_an_orbit_becomes_frames_and_films(render: Runner) -> None:
+def test_orbit_is_written_as_frames_and_films(render: Runner) -> None:
     render("path=orbit", "frames=4", "seconds=2", "film=[mp4,gif]", "resolution=[34,25]")
     stills = [read(f"O/frame_{number:04d}.png") for number in range(4)]
     assert {still.shape for still in stills} == {(25, 34, 3)}
@@ -61,7 +63,31 @@ def test_an_orbit_becomes_frames_and_films(render: Runner) -> None:
         assert psnr(np.asarray(gif.convert("RGB"), float), stills[3]) > 25
 
 
-def test_an_interrupted_rendering_goes_on_and_another_is_not_mixed_in(render: Runner) -> None:
+@pytest.mark.parametrize("num_frames", [1, 90, 150, 200, 400])
+def test_gif_has_the_requested_duration(num_frames: int, tmp_path: Path) -> None:
+    frames = [tmp_path / f"{number}.png" for number in range(num_frames)]
+    for number, frame in enumerate(frames):
+        Image.new("RGB", (2, 2), (number % 256, number // 256, 0)).save(frame)
+    discover()
+    import_module("nerfro_plugins.film_encoding.film").write_film(tmp_path / "film.gif", frames, 5.0)
+    with Image.open(tmp_path / "film.gif") as gif:
+        durations = []
+        for number in range(gif.n_frames):  # type: ignore[attr-defined]
+            gif.seek(number)
+            durations.append(gif.info["duration"])
+    assert sum(durations) == 5000
+    assert min(durations) >= 20  # browsers slow down faster films
+
+
+def test_frames_of_another_layer_are_refused_after_a_rendering_in_another_format(render: Runner) -> None:
+    render("path=arc", "frames=2", "film=[]")
+    render("path=arc", "frames=2", "what=depth", "format=exr")
+    refused = render("path=arc", "frames=2", "what=depth", "film=[]", code=1).error
+    assert "frame_0000.png belongs to another rendering" in refused
+    assert "2 of 2 frames exist already" in render("path=arc", "frames=2", "film=[]").out
+
+
+def test_interrupted_rendering_is_resumed_and_not_mixed_with_another(render: Runner) -> None:
     render("path=arc", "frames=3")
     whole = read("O/frame_0001.png")
     Path("O/frame_0001.png").unlink()
@@ -78,7 +104,7 @@ def test_an_interrupted_rendering_goes_on_and_another_is_not_mixed_in(render: Ru
     assert not np.array_equal(read("O/frame_0001.png"), whole)
 
 
-def test_a_still_from_numbers_shows_what_lies_there(render: Runner) -> None:
+def test_still_from_numbers_shows_the_expected_content(render: Runner) -> None:
     render("position=[0,0,5]", "target=[0,0,0]", "fov=10", "what=inside", "resolution=8")
     # The ball's top is at z = 0.35, and its colour is 0.4 + 0.5 of the place.
     linear = np.array([0.4, 0.4, 0.4 + 0.5 * 0.34])
@@ -87,7 +113,7 @@ def test_a_still_from_numbers_shows_what_lies_there(render: Runner) -> None:
 
 
 @pytest.mark.parametrize("what", ["depth", "normals", "opacity", "exits", "glass", "inside", "sky"])
-def test_every_layer_is_drawn_and_written_as_it_is(what: str, render: Runner, scene: TrainedScene) -> None:
+def test_every_layer_is_written_as_image_and_as_values(what: str, render: Runner, scene: TrainedScene) -> None:
     for form in ("png", "exr"):
         render("views=test:1", f"what={what}", f"format={form}")
     values = OpenImageIO.ImageBuf("O/test_001.exr").get_pixels().squeeze()
@@ -101,7 +127,7 @@ def test_every_layer_is_drawn_and_written_as_it_is(what: str, render: Runner, sc
     assert shown.std() > 5
 
 
-def test_another_sky_replaces_the_scenes(render: Runner) -> None:
+def test_another_sky_replaces_the_sky_of_the_scene(render: Runner) -> None:
     save_lat_long("light.hdr", torch.full((16, 32, 3), 0.5))
     render("views=test:0", "what=sky", "sky=light.hdr")
     np.testing.assert_allclose(read("O/test_000.png"), 255 * (1.055 * 0.5 ** (1 / 2.4) - 0.055), atol=2)
@@ -127,14 +153,12 @@ def test_another_sky_replaces_the_scenes(render: Runner) -> None:
         (["path=orbit", "fov=190"], "fov=190.0 is not allowed; take more than 0 and less than 180"),
     ],
 )
-def test_what_cannot_be_rendered_is_refused_in_one_line(arguments: list[str], message: str, render: Runner) -> None:
+def test_impossible_renderings_are_refused_in_one_line(arguments: list[str], message: str, render: Runner) -> None:
     assert message in render(*arguments, code=1).error
     assert not Path("O").exists()
 
 
-def test_a_missing_ffmpeg_is_reported_before_frames_are_rendered(
-    render: Runner, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_missing_ffmpeg_is_reported_before_frames_are_rendered(render: Runner, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shutil.which", lambda name: None)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     refused = render("path=orbit", "frames=2", "resolution=16", code=1).error

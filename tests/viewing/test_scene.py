@@ -1,4 +1,4 @@
-"""A scene is rendered as in closed form, and its parts are changed without changing it."""
+"""Renderings of a scene match closed forms, and changed copies do not change the scene."""
 
 from dataclasses import replace
 
@@ -20,7 +20,7 @@ def rays_of(scene: TrainedScene) -> tuple[torch.Tensor, torch.Tensor]:
     return rays.origins, rays.directions
 
 
-def test_glass_bends_as_in_closed_form_and_shows_the_sky_behind(scene: TrainedScene) -> None:
+def test_glass_refracts_as_in_closed_form_and_shows_the_sky(scene: TrainedScene) -> None:
     rays = scene.cameras().image_rays(0)
     directions, exits = rays.directions, ball_exits(rays, RADIUS, IOR)
     impact = torch.linalg.cross(rays.origins, directions).norm(dim=-1)
@@ -36,7 +36,7 @@ def test_glass_bends_as_in_closed_form_and_shows_the_sky_behind(scene: TrainedSc
     assert not rendered.opacity.any()
 
 
-def test_normals_are_those_of_the_first_surface(scene: TrainedScene) -> None:
+def test_normals_belong_to_the_first_surface(scene: TrainedScene) -> None:
     origins, directions = rays_of(scene)
     towards = -(origins * directions).sum(-1)
     impact = (origins + towards[:, None] * directions).norm(dim=-1)
@@ -47,7 +47,7 @@ def test_normals_are_those_of_the_first_surface(scene: TrainedScene) -> None:
     assert not normals[impact > 1.05 * RADIUS].any()
 
 
-def test_without_glass_things_lie_where_straight_rays_meet_them(scene: TrainedScene) -> None:
+def test_content_without_glass_lies_on_straight_rays(scene: TrainedScene) -> None:
     origins, directions = rays_of(scene)
     offset = origins - torch.tensor(INSIDE_CENTRE)
     towards = -(offset * directions).sum(-1)
@@ -64,7 +64,7 @@ def test_without_glass_things_lie_where_straight_rays_meet_them(scene: TrainedSc
     assert not rendered.normals.any()
 
 
-def test_a_changed_scene_leaves_the_first_as_it_was(scene: TrainedScene) -> None:
+def test_changed_scene_does_not_change_the_original(scene: TrainedScene) -> None:
     camera = scene.cameras().select([0])
     before = scene.render(camera).rgb
     changed = scene.with_(ior=1.7, sky=torch.full((8, 16, 3), 0.2))
@@ -75,7 +75,7 @@ def test_a_changed_scene_leaves_the_first_as_it_was(scene: TrainedScene) -> None
     assert changed.renderer.scene.fields is scene.renderer.scene.fields, "what is not changed is shared"
 
 
-def test_the_sky_has_the_detail_of_the_background(scene: TrainedScene) -> None:
+def test_sky_has_the_detail_of_the_background(scene: TrainedScene) -> None:
     stripes = torch.full((1200, 2400, 3), 0.2)
     stripes[:, ::2] = 0.6
     sky = scene.with_(sky=stripes.double()).sky
@@ -83,7 +83,7 @@ def test_the_sky_has_the_detail_of_the_background(scene: TrainedScene) -> None:
     torch.testing.assert_close(sky[590:610, 80:520], stripes[590:610, 80:520], atol=0.02, rtol=0)
 
 
-def test_the_sky_is_read_and_replaced_as_linear_radiance(scene: TrainedScene, tmp_path) -> None:
+def test_sky_is_read_and_replaced_as_linear_radiance(scene: TrainedScene, tmp_path) -> None:
     torch.testing.assert_close(scene.sky, sky_of(lat_long.directions(512)), atol=5e-3, rtol=0)
     # A lamp that no picture of eight bits could hold.
     sky = torch.full((64, 128, 3), 0.25)
@@ -104,7 +104,7 @@ class Bounded(SolidBall):
 
 
 @pytest.mark.parametrize(("branches", "glass"), [("none", True), ("all", True), ("none", False)])
-def test_rays_that_pass_the_object_are_not_sampled_and_look_the_same(
+def test_rays_that_miss_the_object_are_not_sampled_and_render_equally(
     scene: TrainedScene, branches: str, glass: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fields = torch.nn.ModuleList([Bounded()])
@@ -125,7 +125,7 @@ def test_rays_that_pass_the_object_are_not_sampled_and_look_the_same(
     assert (skipped.opacity > 0.9).any()
 
 
-def test_images_of_no_camera_are_refused(scene: TrainedScene) -> None:
+def test_rendering_without_cameras_is_refused(scene: TrainedScene) -> None:
     refused("no cameras to render", scene.render, scene.cameras().select([]))
 
 
@@ -142,10 +142,10 @@ def test_images_of_no_camera_are_refused(scene: TrainedScene) -> None:
     ],
 )
 @pytest.mark.usefixtures("unchecked")
-def test_what_a_scene_cannot_be_is_refused_in_one_line(scene: TrainedScene, changes: dict, message: str) -> None:
+def test_invalid_changes_of_a_scene_are_refused_in_one_line(scene: TrainedScene, changes: dict, message: str) -> None:
     refused(message, scene.with_, **changes)
 
 
-def test_the_index_of_a_scene_without_glass_cannot_be_set(scene: TrainedScene) -> None:
+def test_index_of_a_scene_without_glass_cannot_be_set(scene: TrainedScene) -> None:
     assert len(scene.with_(glass=False, ior=1.4).ior) == 0
     refused("no bodies on which rays bend", lambda: scene.with_(glass=False).with_(ior=1.4))

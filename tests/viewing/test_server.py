@@ -1,4 +1,4 @@
-"""The page's server answers the page's own browser alone, and reads no files."""
+"""The server of the page answers only requests of the page, and reads no files."""
 
 import http.client
 import json
@@ -20,7 +20,7 @@ def get(server: PageServer, path: str, **headers: str) -> tuple[int, str]:
     return answer.status, answer.read().decode()
 
 
-def test_page_and_its_updates(server: PageServer) -> None:
+def test_page_and_its_updates_are_served(server: PageServer) -> None:
     assert "being made" in get(server, "/")[1]
     server.open("<p>page")
     assert get(server, "/") == (200, "<p>page")
@@ -36,7 +36,7 @@ def test_page_and_its_updates(server: PageServer) -> None:
 
 
 @pytest.mark.parametrize("path", ["/../pyproject.toml", "/etc/passwd", "/%2e%2e/pyproject.toml", "/index.html"])
-def test_nothing_else_is_served(server: PageServer, path: str) -> None:
+def test_other_paths_are_not_served(server: PageServer, path: str) -> None:
     assert get(server, path)[0] == 404
 
 
@@ -52,7 +52,7 @@ def test_other_origins_are_refused(server: PageServer) -> None:
     assert get(server, "/", Host=f"[::1]:{port}")[0] == 200
 
 
-def test_requests_of_the_page_alone_are_answered() -> None:
+def test_only_requests_of_the_page_are_answered() -> None:
     def answer(value: object) -> object:
         if value == "wrong":
             raise NerfroError("this is wrong")
@@ -80,11 +80,11 @@ def test_requests_of_the_page_alone_are_answered() -> None:
     server.close()
 
 
-def test_taken_port_is_told(server: PageServer) -> None:
+def test_occupied_port_is_refused(server: PageServer) -> None:
     refused("is not available", PageServer, "localhost", int(server.url.rpartition(":")[2]))
 
 
-def test_a_thousand_requests_of_any_kind_leave_the_page_as_it_is(
+def test_thousand_invalid_requests_do_not_change_the_page(
     server: PageServer, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(_Handler, "timeout", 0.5)

@@ -7,7 +7,7 @@ from pathlib import Path
 from tests.forked import Command
 
 
-def test_a_run_is_served_until_ctrl_c(trained_run: Path, tmp_path: Path) -> None:
+def test_run_is_served_until_ctrl_c(trained_run: Path, tmp_path: Path) -> None:
     options = [f"checkpoint={trained_run}", "port=0", "open=false", "resolution=8", "device=cpu"]
     served = Command("view", options, tmp_path / "log")
     try:
