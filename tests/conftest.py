@@ -1,4 +1,4 @@
-"""What all tests share."""
+"""Fixtures and helpers of all tests."""
 
 import functools
 import importlib
@@ -273,10 +273,10 @@ def repaint(scene: Path, root: Path, paint: Callable[[np.ndarray], np.ndarray]) 
     return root
 
 
-def write_tiny_scene(root: Path) -> Path:
+def write_tiny_scene(root: Path, scale: float = 1.0) -> Path:
     """A Blender-format folder: a ball in front of a sky that is a linear function of direction, 16x16 pixels."""
     root.mkdir()
-    trimesh.creation.icosphere(2, 0.6).export(root / "mesh.ply")
+    trimesh.creation.icosphere(2, 0.6 * scale).export(root / "mesh.ply")
     for split, num_views in (("train", 3), ("val", 2), ("test", 2)):
         (root / split).mkdir()
         frames = []
@@ -285,7 +285,7 @@ def write_tiny_scene(root: Path) -> Path:
             pose[:3, :3] = Rotation.from_euler(
                 "zx", [137.5 * i + 40 * num_views, 60 + 20 * i], degrees=True
             ).as_matrix()
-            pose[:3, 3] = 4 * pose[:3, 2]  # cameras look along -z, at the origin
+            pose[:3, 3] = 4 * scale * pose[:3, 2]  # cameras look along -z, at the origin
             column, row = np.meshgrid(np.arange(16) + 0.5, np.arange(16) + 0.5)
             directions = np.stack([(column - 8) / 20, -(row - 8) / 20, -np.ones_like(row)], -1) @ pose[:3, :3].T
             directions /= np.linalg.norm(directions, axis=-1, keepdims=True)

@@ -12,7 +12,7 @@ from nerfro.paths import CONF_DIR
 from nerfro.registry import build, discover
 from nerfro.training.config import build_model
 from nerfro.training.module import TrainingModule
-from tests.conftest import QUIET, Runner, composed
+from tests.conftest import QUIET, Runner, composed, write_tiny_scene
 
 discover()
 
@@ -69,6 +69,28 @@ def test_experiment_trains_for_two_steps(experiment: str, train_here: Runner, tm
     assert OmegaConf.load(tmp_path / "config.yaml").name == experiment
 
 
+@pytest.mark.parametrize(
+    "experiment", ["refractive", "glass", "glass_room", "unknown", "straight", "mipnerf_sky", "nerf"]
+)
+def test_training_is_independent_of_the_world_unit(experiment: str, train_here: Runner, tmp_path: Path) -> None:
+    small, scores = shrunk(composed(f"+experiment={experiment}")), []
+    for scale in (1, 1024):  # a power of two, so that products are exact
+        scene, run = write_tiny_scene(tmp_path / f"scene_{scale}", scale), tmp_path / f"run_{scale}"
+        given = [
+            f"data.root={scene}",
+            f"medium.mesh={scene}/mesh.ply",
+            f"data.near={2 * scale}",
+            f"data.far={6 * scale}",
+        ]
+        given = [option for option in given if "mesh" not in option or experiment not in ("mipnerf_sky", "nerf")]
+        box = [f"content.box_{end}={[sign * scale] * 3}" for end, sign in (("min", -1), ("max", 1))]
+        train_here(
+            f"+experiment={experiment}", *SMALL[1:], *small, *given, *box, "trainer.max_steps=8", f"hydra.run.dir={run}"
+        )
+        scores.append(json.loads((run / "metrics.json").read_text())["test"]["psnr"])
+    assert scores[0] == pytest.approx(scores[1], abs=0.02)
+
+
 @pytest.mark.parametrize("experiment", ABLATIONS)
 def test_ablation_composes_and_builds(experiment: str) -> None:
     config = composed(f"+experiment={experiment}", *SMALL, *shrunk(composed(f"+experiment={experiment}")))
@@ -77,7 +99,7 @@ def test_ablation_composes_and_builds(experiment: str) -> None:
 
 
 @pytest.mark.parametrize("scene", SCENES)
-def test_scene_composes_with_every_papers_experiment(scene: str) -> None:
+def test_scene_composes_with_every_experiment_of_the_paper(scene: str) -> None:
     own = OmegaConf.load(CONF_DIR / "scene" / f"{scene}.yaml")
     both_orders = (["+scene={0}", "+experiment={1}"], ["+experiment={1}", "+scene={0}"])
     for experiment in ("paper_refractive", "paper_ablation_noBD", "paper_mipnerf"):
@@ -94,17 +116,17 @@ def test_scene_composes_with_every_papers_experiment(scene: str) -> None:
                 assert config.loss.boundary.weight == weight
 
 
-def test_the_papers_eight_scenes_are_there() -> None:
+def test_eight_scenes_of_the_paper_exist() -> None:
     assert set(SCENES) == {"torus", "ship", "deerglobe", "starlamp", "dolphin", "ball", "glass", "pen"}
 
 
 @pytest.mark.parametrize("experiment", ["nerf", "paper_ablation_noH", "mipnerf_sky", "glass_room", "eikonal_fields"])
-def test_an_experiment_takes_another_point_sampler(experiment: str) -> None:
+def test_experiment_accepts_another_point_sampler(experiment: str) -> None:
     config = composed(f"+experiment={experiment}", "sampler/points=logarithmic", "sampler.points.num_samples=7")
     assert {key: value for key, value in config.sampler.points.items() if key != "_target_"} == {"num_samples": 7}
 
 
-def test_experiments_stack() -> None:
+def test_experiments_can_be_combined() -> None:
     config = composed("+experiment=[ablation_noH,ablation_noBD]")
     assert "num_samples" in config.sampler.points
     assert config.loss.boundary.weight == 0
@@ -134,7 +156,7 @@ def test_experiments_stack() -> None:
         ),
     ],
 )
-def test_an_ablation_changes_its_part_alone(experiment: str, ablation: str, changed: set[str]) -> None:
+def test_ablation_changes_only_its_component(experiment: str, ablation: str, changed: set[str]) -> None:
     one, other = (OmegaConf.to_container(composed(f"+experiment={name}")) for name in (experiment, ablation))
     for key in ("name", *changed):
         *groups, setting = key.split(".")
@@ -151,7 +173,7 @@ def test_experiments_of_glass_learn_all_bodies_without_their_own_settings(experi
     assert [list(material.learned()) for material in medium.materials] == [["ior"], learned]
 
 
-def test_papers_recipe_is_the_authors() -> None:
+def test_settings_of_the_paper_match_the_authors() -> None:
     assert composed("+experiment=paper_ablation_noH").sampler.points.num_samples == 256
     config = composed("+experiment=paper_refractive")
     assert config.loss.boundary.weight == 0.025

@@ -9,6 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -17,7 +18,8 @@ from torch.nn.functional import softplus
 
 from nerfro.errors import NerfroError, nearest_of
 
-# Initial value of a learned absorption, per world unit. With a larger value, the absorption would explain the content.
+# Initial optical depth of a learned absorption across half of the body. With a larger value, the absorption would
+# explain the content.
 _ALMOST_CLEAR = 0.02
 # Wavelengths of the lines d, F and C, nm.
 _LINE_D, _LINE_F, _LINE_C = 587.56, 486.13, 656.27
@@ -165,9 +167,14 @@ class Material(nn.Module):
         dispersion: dependence of the index on the wavelength; None for one index at all wavelengths.
         learn: quantities that are learned: `ior`, `absorption`. Absorption starts from the given values, or from almost
             none.
+
+    Attributes:
+        absorption_length: if the absorption is learned, length in world units over which softplus of the parameter is
+            an optical depth. It makes the training independent of the world unit, see `scale_absorption`.
     """
 
     ior: Float[Tensor, ""]
+    absorption_length: Float[Tensor, ""]
     _absorption: Float[Tensor, "3"] | None  # a parameter is passed through softplus
 
     def __init__(
@@ -181,15 +188,35 @@ class Material(nn.Module):
         self.dispersion = dispersion
         # Double precision, as the kernels need; scalar tensors do not promote float32 operands.
         index = torch.tensor(ior, dtype=torch.float64)
-        given = torch.tensor(absorption, dtype=torch.float32)
+        given = self._given_absorption = torch.tensor(absorption, dtype=torch.float32)
         if "ior" in learn:
             self.ior = nn.Parameter(index)
         else:
             self.register_buffer("ior", index, persistent=False)
         if "absorption" in learn:
-            self._absorption = nn.Parameter(given.clamp(min=_ALMOST_CLEAR).expm1().log())
+            self._absorption = nn.Parameter(given.clone())
+            self.register_buffer("absorption_length", torch.tensor(1.0))
+            self.scale_absorption(1.0)
         else:
             self.register_buffer("_absorption", given if given.any() else None, persistent=False)
+
+    @torch.no_grad()
+    def scale_absorption(self, length: float) -> None:
+        """Set the parameter of a learned absorption to its initial value.
+
+        Args:
+            length: half of the longest side of the body, world units.
+        """
+        if isinstance(self._absorption, nn.Parameter):
+            depth = (self._given_absorption * length).clamp(min=_ALMOST_CLEAR)
+            self._absorption.copy_(depth + torch.log(-torch.expm1(-depth)))  # inverse of softplus
+            self.absorption_length.fill_(length)
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
+        if isinstance(self._absorption, nn.Parameter):
+            # In checkpoints of earlier releases, softplus of the parameter is the absorption per world unit.
+            state_dict.setdefault(f"{prefix}absorption_length", torch.tensor(1.0))
+        super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def learned(self) -> dict[str, nn.Parameter]:
         """Return the parameters of the learned quantities, `ior` and `absorption`."""
@@ -206,7 +233,9 @@ class Material(nn.Module):
         """Absorption coefficients of red, green and blue, per world unit."""
         if self._absorption is None:
             return torch.zeros(3, device=self.ior.device)
-        return softplus(self._absorption) if isinstance(self._absorption, nn.Parameter) else self._absorption
+        if not isinstance(self._absorption, nn.Parameter):
+            return self._absorption
+        return softplus(self._absorption) / self.absorption_length
 
     def ior_at(self, wavelength: float) -> Float[Tensor, ""]:
         """Return the refractive index at a wavelength in nm, with gradients."""

@@ -125,6 +125,7 @@ class SdfGrid(Solid):
                 )
             grids.append(DistanceGrid(torch.from_numpy(distances).float(), relative))
         self._set_grids(grids)
+        self.scale_absorption(torch.from_numpy(surface.bounds) for surface in surfaces)
 
     @classmethod
     def from_distances(
@@ -149,6 +150,7 @@ class SdfGrid(Solid):
         medium.meshes, medium._content_box = [], None
         boxes = [boxes] * len(iors) if isinstance(boxes, Tensor) else boxes
         medium._set_grids(DistanceGrid(values, box) for values, box in zip(distances, boxes, strict=True))
+        medium.scale_absorption(grid.box for grid in medium.grids)
         return medium
 
     def _set_grids(self, grids: Iterable[DistanceGrid]) -> None:

@@ -41,6 +41,7 @@ class Ball(Solid):
         abbe: Sequence[Positive] = (),
     ) -> None:
         super().__init__([ior], shell, absorption, learn_absorption, abbe)
+        self.scale_absorption([torch.tensor([[-radius] * 3, [radius] * 3])])
         self.radius = radius
         side = radius * (1 + _MARGIN) + shell
         self.register_buffer("box", torch.tensor([[-side] * 3, [side] * 3]), persistent=False)

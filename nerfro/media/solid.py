@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import TypeVar
 
@@ -79,6 +79,14 @@ class Solid(Medium):
             )
         self.materials = nn.ModuleList(materials)  # type: ignore[assignment]
         self.names = list(names) or body_names(len(materials))
+
+    def scale_absorption(self, bounds: Iterable[Float[Tensor, "2 3"]]) -> None:
+        """Set learned absorptions to their initial values, from the bounds of each body in world units.
+
+        Constructors call this method once, so that the training is independent of the world unit.
+        """
+        for material, box in zip(self.materials, bounds, strict=True):
+            material.scale_absorption(0.5 * float((box[1] - box[0]).max()))
 
     def __repr__(self) -> str:
         size = " x ".join(f"{side:.3g}" for side in (self.box[1] - self.box[0]).tolist())

@@ -68,7 +68,7 @@ class Scene(nn.Module):
 
         Returns:
             `fields.*` and `background.*` (weights by their attributes), `bodies.NAME.material.ior` and
-            `bodies.NAME.material.absorption` (before softplus), `medium.*` (parameters of media without bodies),
+            `bodies.NAME.material.absorption` (see `Material`), `medium.*` (parameters of media without bodies),
             `cameras.exposure`, and further parameters of cameras.
         """
         parts = {"fields": self.fields, "background": self.boundary}

@@ -1,4 +1,4 @@
-"""The space of the fields: the box of the object, or all of space around the common point of the optical axes."""
+"""Space and unit of the fields: the box of the object, or all of space around the common point of the optical axes."""
 
 from __future__ import annotations
 
@@ -30,6 +30,8 @@ _NEAR_SHARE = 0.3
 _CELLS_PER_PIXEL = 2
 # Bounds of the number of cells of the finest grid; memory limits the upper one.
 _MIN_CELLS, _MAX_CELLS = 128, 4096
+# Distance from near to far in the scenes of NeRF, for whose world unit its encoding of positions is made.
+_RANGE_OF_RAYS = 4.0
 # Smallest eigenvalue with which the point nearest to all optical axes is determined along an eigenvector.
 _PARALLEL = 0.01
 
@@ -53,7 +55,7 @@ class ContentConfig:
 
 
 def derive_content(config: DictConfig, medium: Medium, cameras: Cameras | None = None) -> None:
-    """Derive the missing settings of `config.content`.
+    """Derive the missing settings of `config.content`, and the missing unit of a field that encodes positions.
 
     Args:
         config: configuration of a run, see `TrainConfig`; it is changed.
@@ -74,8 +76,16 @@ def derive_content(config: DictConfig, medium: Medium, cameras: Cameras | None =
             content.box_min, content.box_max = box.tolist()
         elif content.space == "box":
             _require_no_box(config)
-    if content.space == "all" and None in (content.box_min, content.radius, content.near, content.cells):
-        _derive_ball(content, build(config.data).load("train").cameras if cameras is None else cameras)
+    lacks_ball = content.space == "all" and None in (content.box_min, content.radius, content.near, content.cells)
+    field = OmegaConf.select(config, "field")  # None if no field is selected
+    lacks_unit = field is not None and field.get("unit", 1) is None
+    if not (lacks_ball or lacks_unit):
+        return
+    cameras = build(config.data).load("train").cameras if cameras is None else cameras
+    if lacks_ball:
+        _derive_ball(content, cameras)
+    if lacks_unit:
+        config.field.unit = (cameras.far - cameras.near) / _RANGE_OF_RAYS
 
 
 def require_contraction(config: DictConfig) -> None:

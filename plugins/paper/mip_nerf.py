@@ -12,7 +12,7 @@ from typing import Literal
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerfro.allowed import AnyNumber, Depth, Width
+from nerfro.allowed import AnyNumber, Depth, Positive, Width
 from nerfro.draws import Draws
 from nerfro.fields.selection import inside_box
 from nerfro.registry import register
@@ -33,6 +33,7 @@ class MipNerfField(FieldInBox):
         position_degree: number of octaves of the integrated encoding, which damps octaves finer than the frustum.
         box_min, box_max: opposite corners of the bounds of the scene, world units. The field is empty outside. With
             infinite corners, it covers all of space.
+        unit: see `field=nerf`.
     """
 
     def __init__(
@@ -44,8 +45,9 @@ class MipNerfField(FieldInBox):
         position_degree: Depth = 16,
         box_min: list[AnyNumber] = (-inf, -inf, -inf),  # type: ignore[assignment]
         box_max: list[AnyNumber] = (inf, inf, inf),  # type: ignore[assignment]
+        unit: Positive | None = 1.0,
     ) -> None:
-        super().__init__(box_min, box_max)
+        super().__init__(box_min, box_max, unit)
         self.position_degree = position_degree
         num_position, num_direction = 6 * position_degree, 3 * (1 + 2 * DIRECTION_DEGREE)
         self.mlp = RadianceMLP(num_position, num_direction, width, depth, skip, view_width)
@@ -63,9 +65,10 @@ class MipNerfField(FieldInBox):
         variance: Float[Tensor, "points 3"],
         directions: Float[Tensor, "points 3"],
     ) -> tuple[Float[Tensor, " points"], Float[Tensor, "points 3"]]:
-        position = integrated_positional_encoding(mean, variance, self.position_degree)
+        position = integrated_positional_encoding(mean / self.unit, variance / self.unit**2, self.position_degree)
         direction = positional_encoding(directions, DIRECTION_DEGREE)
-        return self.mlp(position, direction)
+        density, rgb = self.mlp(position, direction)
+        return density / self.unit, rgb
 
 
 def frustum_gaussians(samples: Samples) -> tuple[Float[Tensor, "P N 3"], Float[Tensor, "P N 3"]]:

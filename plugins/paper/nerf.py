@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.allowed import AnyNumber, Depth, Range, Width, corners_of_box
+from nerfro.allowed import AnyNumber, Depth, Positive, Range, Width, corners_of_box
 from nerfro.fields.base import Field
 from nerfro.fields.selection import evaluate_selected, inside_box
 from nerfro.registry import register
@@ -25,12 +25,14 @@ class FieldInBox(Field):
 
     Args:
         box_min, box_max: opposite corners, world units; with infinite corners, the field covers all of space.
+        unit: length of the encoded positions and of the density, world units.
     """
 
     box: Float[Tensor, "2 3"]
 
-    def __init__(self, box_min: Sequence[float], box_max: Sequence[float]) -> None:
+    def __init__(self, box_min: Sequence[float], box_max: Sequence[float], unit: float | None) -> None:
         super().__init__()
+        self.unit = 1.0 if unit is None else unit
         box = corners_of_box(box_min, box_max, bounded=False)
         self.register_buffer("box", torch.from_numpy(box).float(), persistent=False)
         self.everywhere = not self.box.isfinite().any()
@@ -49,6 +51,8 @@ class NerfField(FieldInBox):
         position_degree: number of octaves of the encoding of positions.
         box_min, box_max: opposite corners of the bounds of the scene, world units. The field is empty outside, and
             samples there are not evaluated. With infinite corners, all samples are evaluated, as in the authors' code.
+        unit: length of the encoded positions and of the density, world units. The authors use 1. In a configuration,
+            None takes a quarter of the distance from near to far, so that the world unit is irrelevant.
     """
 
     def __init__(
@@ -60,8 +64,9 @@ class NerfField(FieldInBox):
         position_degree: Annotated[int, Range(at_least=0, at_most=64)] = 10,
         box_min: list[AnyNumber] = (-inf, -inf, -inf),  # type: ignore[assignment]
         box_max: list[AnyNumber] = (inf, inf, inf),  # type: ignore[assignment]
+        unit: Positive | None = 1.0,
     ) -> None:
-        super().__init__(box_min, box_max)
+        super().__init__(box_min, box_max, unit)
         self.position_degree = position_degree
         num_position, num_direction = 3 * (1 + 2 * position_degree), 3 * (1 + 2 * DIRECTION_DEGREE)
         self.mlp = RadianceMLP(num_position, num_direction, width, depth, skip, view_width)
@@ -80,6 +85,7 @@ class NerfField(FieldInBox):
     def _decode_block(
         self, positions: Float[Tensor, "points 3"], directions: Float[Tensor, "points 3"]
     ) -> tuple[Float[Tensor, " points"], Float[Tensor, "points 3"]]:
-        position = positional_encoding(positions, self.position_degree)
+        position = positional_encoding(positions / self.unit, self.position_degree)
         direction = positional_encoding(directions, DIRECTION_DEGREE)
-        return self.mlp(position, direction)
+        density, rgb = self.mlp(position, direction)
+        return density / self.unit, rgb

@@ -118,6 +118,7 @@ class SdfVessel(SdfGrid):
         for name, values in (("_outer", outer), ("_side", side), ("_heights", heights.float())):
             self.register_buffer(name, values, persistent=False)
         self._set_distances(torch.from_numpy(box).float())
+        self.scale_absorption([torch.from_numpy(surface.bounds)] * len(self.materials))
         if not ((outer < 0) & (self.grids[1].distances < 0)).any():
             deepest = -float(side[outer < 0].min()) / self.unit
             raise NerfroError(

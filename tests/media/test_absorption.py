@@ -1,4 +1,4 @@
-"""Tint along paths: Beer-Lambert in closed form, what is seen through it, what learns, and what is refused."""
+"""Absorption along paths: the Beer-Lambert law in closed form, gradients, and refused settings."""
 
 from dataclasses import replace
 from pathlib import Path as FilePath
@@ -27,7 +27,7 @@ def _path(heights: list[float]) -> Path:
     return medium.with_absorption(Snell()(beam(torch.tensor(heights, dtype=torch.float64)), medium))
 
 
-def test_what_lies_behind_a_ball_is_attenuated_by_its_chord() -> None:
+def test_background_behind_a_ball_is_attenuated_by_its_chord() -> None:
     heights = torch.tensor([0.0, 0.3, 0.7, 0.9], dtype=torch.float64)
     path = _path(heights.tolist())
     chord = torch.where(heights < 0.8, 1.6 * (1 - (heights / 1.2).square()).sqrt(), 0.0)
@@ -36,7 +36,7 @@ def test_what_lies_behind_a_ball_is_attenuated_by_its_chord() -> None:
     assert (expected[-1] == 1).all()
 
 
-def test_what_lies_inside_is_attenuated_by_the_glass_before_it() -> None:
+def test_content_inside_is_attenuated_by_the_glass_before_it() -> None:
     path = _path([0.0])
     # From 3 units before the middle to the surface; then 0.5 in glass; then behind the ball.
     s = torch.tensor([[1.0, 2.2, 2.7, 3.8, 5.0]], dtype=torch.float64)
@@ -51,7 +51,7 @@ def test_what_lies_inside_is_attenuated_by_the_glass_before_it() -> None:
     torch.testing.assert_close(empty.rgb, expected[None, -1], rtol=1e-6, atol=0)
 
 
-def test_a_reflection_past_the_ball_is_not_tinted() -> None:
+def test_reflection_at_the_outside_of_a_ball_is_not_tinted() -> None:
     medium = Ball(0.8, 1.5, absorption=SIGMA).double()
     path = medium.with_absorption(Snell(branches="first")(beam(torch.tensor([0.5]).double()), medium))
     through, reflected = path.transmitted(path.far[:, None])[:, 0]
@@ -85,7 +85,7 @@ def _chord(rays: Rays, centre: list[float], radius: float) -> Tensor:
     return 2 * (radius**2 - distance.square()).clamp(min=0).sqrt()
 
 
-def test_absorption_learns_without_tracing_again() -> None:
+def test_absorption_has_gradients_without_new_paths() -> None:
     model = RefractiveModel(replace(example_components(), medium=Ball(learn_absorption=True), path_sampler=Snell()))
     assert not model.paths_learn, "paths may be traced ahead"
     absorption = "bodies.object.material.absorption"
@@ -96,7 +96,32 @@ def test_absorption_learns_without_tracing_again() -> None:
     (gradient,) = torch.autograd.grad(renderings[-1].rgb.sum(), parameter)
     assert (gradient != 0).all()
     names = [f"{absorption}.{colour}" for colour in ("red", "green", "blue")]
-    assert model.scene.measurements() == dict.fromkeys(names, pytest.approx(0.02))
+    assert model.scene.measurements() == dict.fromkeys(names, pytest.approx(0.02 / model.scene.medium.radius))
+
+
+@pytest.mark.parametrize("radius", [0.8 / 1024, 0.8 * 1024])
+def test_learned_absorption_is_independent_of_the_world_unit(radius: float) -> None:
+    one, other = (Ball(size, learn_absorption=True).materials[0] for size in (0.8, radius))
+    for material in (one, other):
+        (gradient,) = torch.autograd.grad(material.absorption.sum(), material.learned()["absorption"])
+        with torch.no_grad():
+            material.learned()["absorption"] += 0.05 * gradient.sign()  # a step of Adam
+    assert torch.equal(one.absorption * 0.8, other.absorption * radius)
+
+
+def test_learned_absorption_starts_from_a_given_one_of_any_size() -> None:
+    for coefficient in (0.1, 30.0, 3000.0):
+        started = Ball(0.8, absorption=[coefficient], learn_absorption=True).absorption
+        torch.testing.assert_close(started, torch.full((1, 3), coefficient))
+
+
+def test_checkpoints_with_absorption_per_world_unit_are_read() -> None:
+    learning = Ball(0.8, learn_absorption=True)
+    name = "materials.0._absorption"
+    assert name in learning.state_dict()
+    learning.load_state_dict({name: torch.tensor([-1.0, 0.0, 1.0])})
+    expected = torch.nn.functional.softplus(torch.tensor([[-1.0, 0.0, 1.0]]))
+    torch.testing.assert_close(learning.absorption, expected)
 
 
 def test_absorption_is_given_for_all_bodies_or_for_each() -> None:

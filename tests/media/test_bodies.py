@@ -1,4 +1,4 @@
-"""Several bodies: apart, touching, overlapping; their settings by name, and the catalogue of materials."""
+"""Separate, touching and overlapping bodies, their settings by name, and the catalogue of materials."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_light_passes_from_one_touching_body_to_the_other(gap: float, upper_firs
         assert angle(path.directions[0, 2], expected) < 0.01
 
 
-def test_a_gap_is_air_from_both_sides_if_the_smaller_body_resolves_it(tmp_path: Path) -> None:
+def test_gap_is_air_from_both_sides_if_the_smaller_body_resolves_it(tmp_path: Path) -> None:
     """Light can be followed backwards, although the searches for the two surfaces have steps of different lengths."""
     gap = 4e-4  # between the steps, 2e-4 and 1e-3
     for name, side, z in (("small", 0.5, 0.25 + gap), ("large", 4.0, -2.0)):
@@ -123,7 +123,7 @@ def test_priority_or_order_decides_where_bodies_overlap(
     assert float(n) == pytest.approx(settings[owner]["ior"], abs=1e-6)
 
 
-def test_the_index_of_one_body_and_the_absorption_of_the_other_are_learned_together(tmp_path: Path) -> None:
+def test_index_and_absorption_of_two_bodies_are_learned_together(tmp_path: Path) -> None:
     files = [_ball(tmp_path, centre) for centre in CENTRES]
     medium = _medium(
         resolution=32,
@@ -141,7 +141,7 @@ def test_the_index_of_one_body_and_the_absorption_of_the_other_are_learned_toget
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.96)
 
     def refined(rays: Rays) -> RayPath:
-        return medium.with_absorption(sampler.refine(sampler(rays, medium), rays, medium))
+        return medium.with_absorption(sampler.replay(sampler(rays, medium), rays, medium))
 
     for _ in range(120):
         path = refined(tinted)

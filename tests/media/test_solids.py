@@ -61,7 +61,7 @@ def test_gradient_is_the_derivative_of_the_index(medium: Medium) -> None:
         assert (gradient == 0).all()
 
 
-def test_the_last_body_decides_the_index() -> None:
+def test_last_body_decides_the_index() -> None:
     medium = _nested_balls()
     n, gradient = medium(torch.tensor([[0.0, 0.0, 0.0], [0.7, 0.0, 0.0], [0.0, 1.2, 0.0], [0.5, 0.0, 0.0]]))
     torch.testing.assert_close(n, torch.tensor([1.33, 1.5, 1.0, 1.415]), atol=2e-3, rtol=0)
@@ -70,7 +70,7 @@ def test_the_last_body_decides_the_index() -> None:
     assert gradient[3, 0] > 0.5
 
 
-def test_a_nested_body_is_only_within_those_before_it() -> None:
+def test_nested_body_lies_within_the_bodies_before_it() -> None:
     medium = _half_full_ball()
     places = torch.tensor([[0.0, 0.0, -0.3], [0.0, 0.0, 0.3], [0.7, 0.0, -0.2], [0.7, 0.0, 0.0], [1.2, 0.0, -0.5]])
     n, gradient = medium(places)
@@ -115,7 +115,7 @@ def test_coarse_slopes_bound_all_derivatives() -> None:
     assert (bounds[bounded, 0, :, 1] - bounds[bounded, 0, :, 0]).median() < 0.9
 
 
-def test_no_surface_is_in_blocks_that_are_said_to_be_empty() -> None:
+def test_empty_blocks_contain_no_surface() -> None:
     medium = _nested_balls(43)
     block = SURFACE_BLOCK * 3 / 42
     empty = medium.grids[0].empty_blocks()
@@ -159,9 +159,7 @@ def test_bad_solids_are_named(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("sides", [(2.0, 2.0, 2.0), (3.0, 1.0, 0.6)])
 @pytest.mark.parametrize("resolution", [12, 33])
-def test_the_grid_that_is_found_holds_the_object_and_little_else(
-    sides: tuple[float, ...], resolution: int, tmp_path: Path
-) -> None:
+def test_default_box_encloses_the_object_tightly(sides: tuple[float, ...], resolution: int, tmp_path: Path) -> None:
     trimesh.creation.box(sides, trimesh.transformations.translation_matrix([5, -7, 9])).export(tmp_path / "box.ply")
     medium = SdfGrid(str(tmp_path / "box.ply"), resolution=resolution, cache=False)
     spacing = (medium.box[1] - medium.box[0]) / (resolution - 1)

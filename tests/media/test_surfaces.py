@@ -94,7 +94,7 @@ def test_distances_are_those_of_the_closed_form(
     assert (medium.origin == origin_of({"bodies": {"body": {"surface": surface, "ior": 1.5}}})).all()
 
 
-def test_light_through_a_slab_leaves_in_its_direction_shifted_as_by_snells_law() -> None:
+def test_light_through_a_slab_is_shifted_as_by_snells_law() -> None:
     medium = _medium({"name": "box", "sides": [3.0, 3.0, 0.3]}, 64)
     sine = torch.linspace(0.0, 0.7, 8).double()
     directions = torch.stack([sine, torch.zeros_like(sine), -(1 - sine**2).sqrt()], -1)
@@ -152,5 +152,5 @@ def test_wrong_surfaces_are_refused(surface: Any, message: str) -> None:
     refused(message, _medium, surface)
 
 
-def test_the_origin_of_a_mesh_without_a_file_is_refused() -> None:
+def test_origin_of_a_mesh_without_a_file_is_refused() -> None:
     refused("surface=mesh needs file", origin_of, {"bodies": {"body": {"surface": {"name": "mesh"}, "ior": 1.5}}})

@@ -1,4 +1,4 @@
-"""Vessels: rays through walls and liquids against formulas, openings, and what is refused."""
+"""Vessels: rays through walls and liquids against closed forms, openings, and refused settings."""
 
 from pathlib import Path
 
@@ -43,7 +43,7 @@ def _errors(vessel: SdfVessel, wall: float, surface: float | None) -> torch.Tens
 
 @pytest.mark.parametrize("wall", [WALL, 0.008], ids=["thick", "thinner than a voxel"])
 @pytest.mark.parametrize("full", [True, False], ids=["full", "half full"])
-def test_rays_through_a_spherical_vessel_leave_as_formulas_say(tmp_path: Path, wall: float, full: bool) -> None:
+def test_rays_through_a_spherical_vessel_match_closed_forms(tmp_path: Path, wall: float, full: bool) -> None:
     # The level in the ruler's unit: this ball is 160 high.
     half_full = {"wall": 100 * wall, "foot": 100 * wall, "level": 90.0, "height": 160.0}
     vessel = spherical_vessel(tmp_path, **({"wall": wall} if full else half_full))
@@ -63,7 +63,7 @@ def _glass(folder: Path, **options: object) -> SdfVessel:
 
 
 @pytest.mark.parametrize("closed", [False, True], ids=["open", "closed"])
-def test_the_inner_wall_is_the_outer_one_moved_in_and_an_opening_has_none(tmp_path: Path, closed: bool) -> None:
+def test_inner_wall_is_an_offset_of_the_outer_wall_with_an_opening(tmp_path: Path, closed: bool) -> None:
     vessel = _glass(tmp_path, closed=closed)
     slope = np.arctan2(ABOVE - BELOW, HEIGHT)
     turn, z = (torch.from_numpy(values) for values in np.meshgrid(np.linspace(0, 6, 40), np.linspace(-0.5, 0.6, 12)))
@@ -77,7 +77,7 @@ def test_the_inner_wall_is_the_outer_one_moved_in_and_an_opening_has_none(tmp_pa
     assert bool(vessel.signed_distances(below_the_brim)[0][0, 1] > 0) == closed
 
 
-def test_a_fillet_is_a_circle_that_touches_wall_and_foot(tmp_path: Path) -> None:
+def test_fillet_is_a_circle_tangent_to_wall_and_foot(tmp_path: Path) -> None:
     trimesh.creation.cylinder(0.5, HEIGHT, sections=256).export(tmp_path / "cylinder.ply")
     wall, foot, fillet, box = 0.05, 0.2, 0.15, {"box_min": [-1.0] * 3, "box_max": [1.0] * 3}
     vessel = SdfVessel(str(tmp_path / "cylinder.ply"), wall, foot, resolution=96, cache=False, fillet=fillet, **box)
@@ -124,7 +124,7 @@ def test_paths_through_a_glass_have_gradients_by_its_indices(tmp_path: Path) -> 
     learning = vessel.with_indices(iors)
     path = sampler(rays, learning)
     weights = torch.randn(80, 3, generator=random, dtype=torch.float64) * sampler.steady(path, learning)[:, None]
-    (found,) = torch.autograd.grad((sampler.refine(path, rays, learning).exit_directions * weights).sum(-1).sum(), iors)
+    (found,) = torch.autograd.grad((sampler.replay(path, rays, learning).exit_directions * weights).sum(-1).sum(), iors)
     for body in (0, 2):
         change = step * torch.nn.functional.one_hot(torch.tensor(body), 3)
         low, high = (sampler(rays, vessel.with_indices(vessel.iors + sign * change)) for sign in (-1, 1))
@@ -136,7 +136,7 @@ def test_paths_through_a_glass_have_gradients_by_its_indices(tmp_path: Path) -> 
         assert found[body].item() == pytest.approx(expected.item(), rel=0.02)
 
 
-def test_surfaces_are_those_of_what_is_there(tmp_path: Path) -> None:
+def test_cavity_and_liquid_surfaces_have_their_volumes(tmp_path: Path) -> None:
     vessel = spherical_vessel(tmp_path, level=0.9)
     inner, top = RADIUS - WALL, 0.1
     below = np.pi * (2 / 3 * inner**3 + inner**2 * top - top**3 / 3)  # of a ball, under a plane
@@ -146,7 +146,7 @@ def test_surfaces_are_those_of_what_is_there(tmp_path: Path) -> None:
     assert liquid.bounds[1, 2] == pytest.approx(top, abs=0.01)
 
 
-def test_a_lid_is_what_looks_up_around_the_highest_place(tmp_path: Path) -> None:
+def test_lid_consists_of_upward_faces_around_the_highest_point(tmp_path: Path) -> None:
     _glass(tmp_path, resolution=40)
     mesh = load_mesh(tmp_path / "glass.ply")
     lid = mesh.triangles[find_lid(mesh, np.array([0.0, 0.0, 1.0]))]
@@ -186,11 +186,11 @@ def test_tint_and_dispersion_are_those_of_wall_and_liquid(tmp_path: Path) -> Non
         ({"absorption": [1.0, 2.0]}, r"give red, green and blue of each body \(6 numbers\), or one for all"),
     ],
 )
-def test_what_no_vessel_has_is_refused_in_one_line(tmp_path: Path, options: dict[str, object], message: str) -> None:
+def test_impossible_vessels_are_refused_in_one_line(tmp_path: Path, options: dict[str, object], message: str) -> None:
     refused(message, spherical_vessel, tmp_path, 2, resolution=40, **options)
 
 
-def test_a_vessel_that_grows_keeps_its_wall(tmp_path: Path) -> None:
+def test_grown_vessel_keeps_its_wall_thickness(tmp_path: Path) -> None:
     vessel = spherical_vessel(tmp_path, wall=WALL)
     larger = vessel.grown(torch.full_like(vessel.grids[0].distances, 0.02))
     torch.testing.assert_close(larger.grids[0].distances, vessel.grids[0].distances - 0.02)

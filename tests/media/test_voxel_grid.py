@@ -45,7 +45,7 @@ def test_index_is_that_of_object_inside_and_air_outside(sphere: str) -> None:
     assert grad[3, [0, 2]].abs().max() < 0.1
 
 
-def test_clearance_holds_no_gradient() -> None:
+def test_clearance_region_has_no_gradient() -> None:
     medium = VoxelGrid.from_occupancy(_ball_occupancy(32), BOX, 1.5, 5, 1.0)
     positions = torch.rand(500, 3) * 3 - 1.5
     clearance = medium.clearance(positions)
@@ -69,7 +69,7 @@ def test_grids_are_not_in_checkpoints() -> None:
     assert not VoxelGrid.from_occupancy(_ball_occupancy(16), BOX, 1.5, 3, 1.0).state_dict()
 
 
-def test_the_box_that_the_margin_message_names_is_accepted(sphere: str) -> None:
+def test_box_suggested_by_the_margin_error_is_accepted(sphere: str) -> None:
     small: dict[str, list[float]] = {"box_min": [-0.8] * 3, "box_max": [0.8] * 3}
     message = refused("voxels of air", VoxelGrid, sphere, resolution=64, cache=False, **small)
     low, high = (part.split("[")[1].split("]")[0] for part in message.split("medium.box_")[1:])
@@ -79,5 +79,5 @@ def test_the_box_that_the_margin_message_names_is_accepted(sphere: str) -> None:
         VoxelGrid(sphere, resolution=32, smoothing_size=3, box_max=[1.0, 0.8, 1.0], cache=False)
 
 
-def test_a_grid_without_margin_is_refused() -> None:
+def test_grid_without_margin_is_refused() -> None:
     refused("touches the grid's border", VoxelGrid.from_occupancy, torch.ones(8, 8, 8), BOX, 1.5, 3, 1.0)

@@ -50,8 +50,8 @@ def exit_direction(
                 hits += [(-b + sign * np.sqrt(b * b - c), radius) for sign in (-1, 1)]
         if surface is not None and d[2] != 0:
             hits.append(((surface - x[2]) / d[2], 0.0))  # of no radius, the plane
-        met = ((length, of) for length, of in sorted(hits, key=lambda hit: hit[0]) if length > 1e-9)
-        both = ((index(x + (length - 1e-9) * d), index(x + (length + 1e-9) * d), length, of) for length, of in met)
+        ahead = ((length, of) for length, of in sorted(hits, key=lambda hit: hit[0]) if length > 1e-9)
+        both = ((index(x + (length - 1e-9) * d), index(x + (length + 1e-9) * d), length, of) for length, of in ahead)
         hit = next((hit for hit in both if hit[0] != hit[1]), None)
         if hit is None:
             return d, events
