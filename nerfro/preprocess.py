@@ -54,7 +54,7 @@ def _preprocess(config: DictConfig, request: Request) -> None:
     views, silhouettes = masked_views(source.load("train")), None
     outlined = with_other_splits(views, source, "train")
     if mesh is None or outlined.masks is not None:
-        mesh, outlined, silhouettes = _reconstruct(request, outlined, mesh)
+        mesh, outlined, silhouettes = _fit_surface(request, outlined, mesh)
     location = config.mesh or str(request.folder / MESH)
     settings = surface_settings(request, views.cameras, mesh, source.origin)
     medium = initial_medium(request, location, settings)
@@ -86,7 +86,7 @@ def _preprocess(config: DictConfig, request: Request) -> None:
     write_scene(request, scene, views.cameras, mesh)
 
 
-def _reconstruct(request: Request, views: Views, mesh: TriangleMesh | None) -> tuple[TriangleMesh, Views, Silhouettes]:
+def _fit_surface(request: Request, views: Views, mesh: TriangleMesh | None) -> tuple[TriangleMesh, Views, Silhouettes]:
     """Carve and fit the surface unless a mesh is given, and compare it with the masks.
 
     Masks that are projections of a hull carry the shape of this hull, but are no evidence about the object.

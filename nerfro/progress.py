@@ -54,7 +54,7 @@ def track(description: str, items: Iterable[Item], total: int | None = None, **o
 
 
 @contextmanager
-def bar(description: str) -> Iterator[Callable[[float], None]]:
+def fraction_bar(description: str) -> Iterator[Callable[[float], None]]:
     """Show a progress bar; the yielded function sets the completed fraction in [0, 1]."""
     with progress_bar(description, 1.0) as progress:
         yield lambda done: progress.update(done - progress.n)

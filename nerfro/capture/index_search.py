@@ -1,8 +1,10 @@
 """Estimation of the refractive indices of bodies from the directions in which their rays leave.
 
 For each candidate, rays through pixels of the object are traced, and the colours of the pixels are compared with the
-known surroundings in the exit directions. The error has one wide valley around the true index: for a ball, an index
-error of 0.1 turns the exit direction by some degrees, and by more at larger impact parameters.
+known surroundings in the exit directions. The error has one wide valley around the true index, because exit directions
+change slowly with the index. A ball of index n turns an exit direction by 2 tan(t) / n radians per unit of the index,
+where t is the angle of refraction. For example, an index error of 0.01 at n = 1.5 turns a ray with an impact parameter
+of half the radius by 0.27 degrees.
 """
 
 from __future__ import annotations
@@ -16,16 +18,25 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Num
+from jaxtyping import Bool, Float
 
+from nerfro.capture.grid_search import (
+    MIN_VIEWS,
+    Minimum,
+    bootstrap_weights,
+    mean_errors,
+    quadratic_minimum,
+    standard_error,
+)
 from nerfro.capture.preprocess_options import INDEX, Request, build_medium, index_settings
-from nerfro.capture.surroundings import Observations, Pixels, Room, Surroundings, half_weight, robust
+from nerfro.capture.surroundings import Observations, Pixels, Room, Surroundings, robust_scale
 from nerfro.errors import NerfroError, warn
 from nerfro.files.atomic import write_atomically
 from nerfro.media.base import Medium
 from nerfro.media.solid import Solid, body_names
-from nerfro.progress import bar
+from nerfro.progress import fraction_bar
 from nerfro.rendering.scene_file import Provenance
+from nerfro.robust import geman_mcclure, geman_mcclure_weight
 from nerfro.samplers.paths.snell import Snell
 
 LOWEST, HIGHEST = 1.0, 2.5  # range of the search
@@ -41,6 +52,11 @@ class _Plan(NamedTuple):
     fine_radii: tuple[float, ...]  # one for each refinement
     fine_pixels: int
 
+    def num_rays(self, num_bodies: int) -> int:
+        """Estimate the number of rays to trace."""
+        fine = _TYPICAL_GRIDS * self.fine_steps**num_bodies * self.fine_pixels
+        return self.coarse_steps**num_bodies * self.coarse_pixels + fine
+
 
 # By number of bodies.
 _PLANS = {1: _Plan(31, 12_000, 9, (1 / 30, 1 / 75), 60_000), 2: _Plan(13, 4_000, 5, (1 / 75, 1 / 75), 20_000)}
@@ -52,8 +68,6 @@ _MAX_GRIDS, _TYPICAL_GRIDS = 10, 4
 _MAX_ELONGATION, _SLOPE_PIXELS, _DIFFERENCE = 6.0, 6_000, 1 / 300
 # Rays with more events, or more than two per surface, are left out: small errors of the surface turn them far.
 _MAX_EVENTS = 4
-_NUM_BOOTSTRAP = 200
-_MIN_VIEWS = 5  # with pixels, for a standard error: resampling of fewer views underestimates the error
 # Limits of a reliable estimate: depth of the valley relative to the error of unrelated colours, standard error and
 # distance from the ends of the search relative to the range, and fraction of the pixels with known surroundings.
 _MIN_DEPTH, _MAX_STANDARD_ERROR, _MIN_DISTANCE_FROM_END, _MIN_KNOWN = 0.03, 0.02, 1 / 150, 0.1
@@ -109,35 +123,79 @@ def find_indices(
     plan = _PLANS[num_bodies]
     if isinstance(surroundings.boundary, Room):
         plan = plan._replace(coarse_pixels=_NEAR_PIXELS // 4, fine_pixels=_NEAR_PIXELS)
-    coarse, offsets = (_grid(steps, num_bodies) for steps in (plan.coarse_steps, plan.fine_steps))
-    coarse = 0.5 * (LOWEST + HIGHEST + _RANGE * coarse)
-    work = len(coarse) * plan.coarse_pixels + _TYPICAL_GRIDS * len(offsets) * plan.fine_pixels
-    search = _Search(medium, through.some(plan.fine_pixels), surroundings, lambda done: progress(min(1, done / work)))
-    coarse_errors = mean_errors(*search.errors(coarse, plan.coarse_pixels, False))
-    middle = coarse[coarse_errors.argmin()]
+    num_rays = plan.num_rays(num_bodies)
+    search = _Search(
+        medium, through.some(plan.fine_pixels), surroundings, lambda traced: progress(min(1, traced / num_rays))
+    )
+    coarse, coarse_errors = _coarse_search(search, plan, num_bodies)
+    values, grid = _refine_minimum(search, plan, coarse[coarse_errors.argmin()])
+    progress(1.0)
+    names = ["index"] if num_bodies == 1 else [f"index of body {body + 1}" for body in range(num_bodies)]
+    standard_errors = grid.standard_errors()
+    doubts = _doubts(names, values, standard_errors, grid, search)
+    return Estimate(names, values, standard_errors, np.column_stack([coarse, coarse_errors]), doubts)
+
+
+def _coarse_search(
+    search: _Search, plan: _Plan, num_bodies: int
+) -> tuple[Float[np.ndarray, "candidates indices"], Float[np.ndarray, " candidates"]]:
+    """Compute the mean errors of candidates over the whole range of the search."""
+    candidates = 0.5 * (LOWEST + HIGHEST + _RANGE * _grid(plan.coarse_steps, num_bodies))
+    return candidates, mean_errors(*search.errors(candidates, plan.coarse_pixels, False))[0]
+
+
+class _FineGrid(NamedTuple):
+    """Errors of a grid of candidates around the minimum.
+
+    Attributes:
+        candidates: points of the grid.
+        axes: half axes of the grid, in columns.
+        sums: sums of the errors by view.
+        counts: number of pixels of each view.
+    """
+
+    candidates: Float[np.ndarray, "candidates indices"]
+    axes: Float[np.ndarray, "indices indices"]
+    sums: Float[np.ndarray, "candidates V"]
+    counts: Float[np.ndarray, "V"]
+
+    def minimum(self) -> Minimum:
+        """Find the minimum of the mean errors."""
+        return quadratic_minimum(self.candidates, mean_errors(self.sums, self.counts), self.axes)
+
+    def standard_errors(self) -> Float[np.ndarray, " indices"]:
+        """Estimate the standard errors of the minimum from random samples of the views."""
+        errors = mean_errors(self.sums, self.counts, bootstrap_weights(self.counts))
+        return standard_error(quadratic_minimum(self.candidates, errors, self.axes).values, self.counts)
+
+
+def _refine_minimum(
+    search: _Search, plan: _Plan, start: Float[np.ndarray, " indices"]
+) -> tuple[Float[np.ndarray, " indices"], _FineGrid]:
+    """Follow the minimum with grids of decreasing radius.
+
+    Args:
+        search: errors of candidates.
+        plan: sizes of the grids.
+        start: best candidate of the coarse search.
+
+    Returns:
+        The minimum, and the last grid.
+    """
+    offsets, values = _grid(plan.fine_steps, len(start)), start
     for radius in plan.fine_radii:
         num_pixels = plan.fine_pixels // (1 if radius == plan.fine_radii[-1] else 3)
         for _ in range(_MAX_GRIDS):
-            axes = radius * _RANGE * search.valley(middle)
+            axes = radius * _RANGE * search.valley(values)
             extent = np.abs(axes).sum(1)
-            middle = middle.clip(LOWEST + extent, HIGHEST - extent)
-            fine = middle + offsets @ axes.T
-            sums, counts = search.errors(fine, num_pixels, True)
-            errors = mean_errors(sums, counts)
-            minimum, curvature = _minimum(fine, errors, axes)
-            converged = (np.abs(np.linalg.solve(axes, minimum[0] - middle)) < 0.5).all()
-            middle = minimum[0].clip(LOWEST, HIGHEST)
-            if converged:
+            centre = values.clip(LOWEST + extent, HIGHEST - extent)
+            candidates = centre + offsets @ axes.T
+            grid = _FineGrid(candidates, axes, *search.errors(candidates, num_pixels, True))
+            minimum = grid.minimum().values[0]
+            values = minimum.clip(LOWEST, HIGHEST)
+            if (np.abs(np.linalg.solve(axes, minimum - centre)) < 0.5).all():
                 break
-    progress(1.0)
-    weights = bootstrap_weights(counts)
-    standard_errors = standard_error(_minimum(fine, mean_errors(sums, counts, weights), axes)[0], counts)
-    names = ["index"] if num_bodies == 1 else [f"index of body {body + 1}" for body in range(num_bodies)]
-    depth, known = 1 - errors.min() / search.unrelated, counts.sum() / search.num_pixels
-    doubts = _doubts(names, middle, np.where(curvature[0] > 0, standard_errors, np.inf), depth, known)
-    if (num_views := np.count_nonzero(counts)) < _MIN_VIEWS:
-        doubts.append(f"{num_views} views are too few for a standard error; photograph from more sides")
-    return Estimate(names, middle, standard_errors, np.column_stack([coarse, coarse_errors.T]), doubts)
+    return values, grid
 
 
 def _grid(steps: int, num_axes: int) -> Float[np.ndarray, "candidates indices"]:
@@ -145,66 +203,18 @@ def _grid(steps: int, num_axes: int) -> Float[np.ndarray, "candidates indices"]:
     return np.array(list(itertools.product(np.linspace(-1, 1, steps), repeat=num_axes)))
 
 
-def bootstrap_weights(counts: Float[np.ndarray, "V"]) -> Float[np.ndarray, "resamples V"]:
-    """Return how often each view is drawn in random samples of the views with pixels."""
-    num_views = int(np.count_nonzero(counts))
-    drawn = np.random.default_rng(0).multinomial(num_views, (counts > 0) / max(1, num_views), _NUM_BOOTSTRAP)
-    return drawn.astype(np.float64)
-
-
-def standard_error(
-    samples: Float[np.ndarray, " resamples *indices"], counts: Float[np.ndarray, "V"]
-) -> Float[np.ndarray, "*indices"]:
-    """Compute the standard deviation of estimates from random samples of the views; infinite for too few views."""
-    return np.where(np.count_nonzero(counts) < _MIN_VIEWS, np.inf, samples.std(0))
-
-
-def mean_errors(
-    sums: Float[np.ndarray, "candidates V"],
-    counts: Float[np.ndarray, "V"],
-    weights: Num[np.ndarray, "resamples V"] | int = 1,
-) -> Float[np.ndarray, "resamples candidates"]:
-    """Average errors that are summed by view over all pixels, optionally for several weightings of the views."""
-    weights = np.atleast_2d(weights * np.ones_like(counts))
-    return (weights @ sums.T) / (weights @ counts)[:, None].clip(1)
-
-
-def _minimum(
-    candidates: Float[np.ndarray, "candidates indices"],
-    errors: Float[np.ndarray, "resamples candidates"],
-    axes: Float[np.ndarray, "indices indices"],
-) -> tuple[Float[np.ndarray, "resamples indices"], Float[np.ndarray, "resamples indices"]]:
-    """Fit a quadratic function to the errors of a grid of candidates, and find its minimum.
-
-    Args:
-        candidates: points of the grid.
-        errors: one set of errors for each weighting.
-        axes: half axes of the grid, in columns.
-
-    Returns:
-        The minima, or the best candidates for functions without a minimum near the grid; and the second derivatives of
-        the function by each index.
-    """
-    count, middle = candidates.shape[1], candidates.mean(0)
-    inverse = np.linalg.inv(axes)
-    x = (candidates - middle) @ inverse.T
-    pairs = list(itertools.combinations_with_replacement(range(count), 2))
-    terms = np.stack([np.ones(len(x)), *x.T, *(x[:, i] * x[:, j] for i, j in pairs)], 1)
-    fitted = errors @ np.linalg.pinv(terms).T
-    hessian = np.zeros((len(errors), count, count))
-    for (i, j), factor in zip(pairs, fitted[:, 1 + count :].T, strict=True):
-        hessian[:, i, j] += factor
-        hessian[:, j, i] += factor
-    convex = np.linalg.eigvalsh(hessian)[:, 0] > 1e-9
-    invertible = np.where(convex[:, None, None], hessian, np.eye(count))
-    minimum = -np.linalg.solve(invertible, fitted[:, 1 : 1 + count, None])[..., 0]
-    near = convex & (np.abs(minimum).max(1) < 1.5)
-    minimum = np.where(near[:, None], minimum, x[errors.argmin(1)])
-    return middle + minimum @ axes.T, np.diagonal(inverse.T @ hessian @ inverse, axis1=1, axis2=2)
-
-
-def _doubts(names: list[str], values: np.ndarray, standard_errors: np.ndarray, depth: float, known: float) -> list[str]:
+def _doubts(
+    names: list[str],
+    values: Float[np.ndarray, " indices"],
+    standard_errors: Float[np.ndarray, " indices"],
+    grid: _FineGrid,
+    search: _Search,
+) -> list[str]:
     """List the reasons why the photographs do not determine the indices."""
+    depth = 1 - float(mean_errors(grid.sums, grid.counts).min()) / search.unrelated
+    known, num_views = grid.counts.sum() / search.num_pixels, np.count_nonzero(grid.counts)
+    # Without a valley, the spread of the minima does not show whether the views agree.
+    standard_errors = np.where(grid.minimum().curvatures[0] > 0, standard_errors, np.inf)
     doubts = []
     if known < _MIN_KNOWN:
         doubts.append(f"for {1 - known:.0%} of the object's pixels no photograph shows the origin of the light")
@@ -221,6 +231,8 @@ def _doubts(names: list[str], values: np.ndarray, standard_errors: np.ndarray, d
             doubts.append(f"the {name} has a standard error of {error:.2g}: the views do not agree")
     if LOWEST + end < values[0] < _LOWEST_MATERIAL:
         doubts.append(f"no liquid or solid has an index of {values[0]:.3g}: the object may be opaque or hollow")
+    if num_views < MIN_VIEWS:
+        doubts.append(f"{num_views} views are too few for a standard error; photograph from more sides")
     return doubts
 
 
@@ -241,9 +253,9 @@ class _Search:
                 "no ray of the object's pixels meets the surface; check that mesh, masks and poses belong together"
             )
         colours = surroundings.colours
-        self._half_weight = half_weight(surroundings)
+        self._scale = robust_scale(surroundings)
         other = colours[torch.randint(len(colours), (len(self._pixels),), generator=torch.Generator().manual_seed(1))]
-        self.unrelated = float(robust(other - self._pixels.radiance, self._half_weight).mean())
+        self.unrelated = float(geman_mcclure(other - self._pixels.radiance, self._scale).mean())
 
     def valley(self, values: Float[np.ndarray, " indices"]) -> Float[np.ndarray, "indices indices"]:
         """Return directions across and along the valley of the error, in columns, elongated along the valley.
@@ -263,7 +275,7 @@ class _Search:
             )
             slopes.append(after - before)
             known &= known_after & known_before
-        weights = (self._half_weight**2 / (residuals.square().mean(-1) + self._half_weight**2)).square()
+        weights = geman_mcclure_weight(residuals, self._scale)
         jacobian = torch.stack(slopes, -1)[known].double()
         products = torch.einsum("p,pci,pcj->ij", weights[known].double(), jacobian, jacobian).numpy()
         eigenvalues, directions = np.linalg.eigh(products)
@@ -301,7 +313,7 @@ class _Search:
         for values in candidates:
             residuals, known = self._residuals(pixels, values)
             known_for_all &= known
-            errors.append(torch.where(known, robust(residuals, self._half_weight), self.unrelated))
+            errors.append(torch.where(known, geman_mcclure(residuals, self._scale), self.unrelated))
             self._num_traced += len(pixels)
             self._progress(self._num_traced)
         used = known_for_all if common else torch.ones_like(known_for_all)
@@ -378,7 +390,7 @@ def _search_index(observations: Observations, medium: Solid, folder: Path) -> Es
         folder: output folder.
     """
     through, surroundings = observations.through, observations.surroundings
-    with bar("search") as progress:
+    with fraction_bar("search") as progress:
         found = find_indices(medium, through, surroundings, progress)
     for name, value, error in zip(found.names, found.values, found.standard_errors, strict=True):
         # At an end of the search range, all samples of the views have the same minimum.

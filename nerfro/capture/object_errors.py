@@ -8,10 +8,11 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from nerfro.capture.index_search import bootstrap_weights, mean_errors, standard_error
-from nerfro.capture.surroundings import Observations, half_weight, robust
+from nerfro.capture.grid_search import bootstrap_weights, mean_errors, standard_error
+from nerfro.capture.surroundings import Observations, robust_scale
 from nerfro.media.base import Medium
 from nerfro.media.solid import Solid
+from nerfro.robust import geman_mcclure
 from nerfro.samplers.paths.snell import Snell
 
 # Indices of water and of soda-lime glass, for photographs that do not determine the index.
@@ -36,7 +37,7 @@ class ObjectErrors:
     def __init__(self, observations: Observations, progress: Callable[[int], None] = lambda count: None) -> None:
         self._surroundings = observations.surroundings
         self._pixels = observations.through.some(_NUM_PIXELS)
-        self._half_weight = half_weight(self._surroundings)
+        self._scale = robust_scale(self._surroundings)
         self._sampler = Snell(branches="all", least_weight=_MIN_WEIGHT)
         self._progress, self._num_bodies = progress, 0
         self.counts = np.bincount(self._pixels.view, minlength=len(self._pixels.cameras)).astype(np.float64)
@@ -46,7 +47,7 @@ class ObjectErrors:
         """Sum the robust errors over the pixels of each view."""
         path = self._sampler(self._pixels.rays, body)
         radiance = path.per_ray(self._surroundings.boundary(path.exits())).clamp(max=1)
-        error = robust(radiance - self._pixels.radiance, self._half_weight).double()
+        error = geman_mcclure(radiance - self._pixels.radiance, self._scale).double()
         self._num_bodies += 1
         self._progress(self._num_bodies)
         return np.bincount(self._pixels.view, error, len(self.counts))

@@ -32,14 +32,15 @@ from nerfro.boundaries.cube_map import texel_directions
 from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.capture.preprocess_options import FIGURES
 from nerfro.capture.room_panorama import RoomPanorama, panorama_of
-from nerfro.capture.surroundings import Observations, Pixels, Room, Surroundings, robust
+from nerfro.capture.surroundings import Observations, Pixels, Room, Surroundings
 from nerfro.errors import NerfroError, warn
 from nerfro.files.atomic import write_atomically
 from nerfro.geometry.interpolation import bspline_basis, smooth
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
-from nerfro.progress import bar
+from nerfro.progress import fraction_bar
+from nerfro.robust import geman_mcclure
 from nerfro.samplers.paths.snell import Snell
 from nerfro.silhouettes.pose_conventions import overlap
 from nerfro.silhouettes.rims import RimFinder
@@ -48,8 +49,8 @@ from nerfro.silhouettes.visual_hull import Silhouettes
 from nerfro.types import Exits, Path
 
 _MAX_VALIDATION_PIXELS = 20_000
-# Residual of linear radiance at which a pixel has half weight.
-_HALF_WEIGHT = 0.1
+# Scale of the Geman-McClure loss, linear radiance: residual at which the loss is 1/2 of its maximum and the weight 1/4.
+_ROBUST_SCALE = 0.1
 # Standard deviation of contours in pixels, and weights of contours and of roughness. Chosen as in RefinementSettings.
 _CONTOUR_DEVIATION, _CONTOUR_WEIGHT, _ROUGHNESS_WEIGHT = 0.25, 0.1, 0.1
 _NUM_CONTOUR_POINTS = 4000  # in each step
@@ -61,10 +62,15 @@ _MAX_INCREASE = 0.03
 # 0.009 for worse ones (docs/lab/surface_refinement.md).
 _MIN_GAIN = 0.01
 _BLUR_SAMPLES = 32
+# Resolution of blurred surroundings, texels per standard deviation of the blur, and minimum texels per side of a face.
+_TEXELS_PER_DEVIATION, _MIN_TEXELS = 1.5, 16
+# Newton steps of the projection onto a surface, and smallest length of the gradient of the distance that they use. On
+# ridges, where the gradient nearly vanishes, the steps would be too long.
+_NEWTON_STEPS, _MIN_GRADIENT = 5, 0.5
 
 
 @dataclass(frozen=True)
-class Stage:
+class DescentStage:
     """A number of steps with one learning rate schedule.
 
     Attributes:
@@ -83,8 +89,8 @@ class RefinementSettings:
     """Settings of the refinement. docs/lab/surface_refinement.md describes how the defaults were chosen.
 
     Attributes:
-        stages: stages of the descent. Each stage starts with the surface of the smallest validation error. The first
-            stages are too coarse for an accurate surface, and end early if the error increases.
+        stages: stages of the descent. Each stage starts with the surface of the smallest validation error, and ends
+            early if the validation error exceeds the smallest one by 3 %.
         num_pixels: number of pixels in each step.
         levels: numbers of control points along each side of the splines that displace the surface.
         smoothings: standard deviations of the tested smoothings, as fractions of the object's size.
@@ -92,16 +98,35 @@ class RefinementSettings:
             error a little even where it cuts edges. Infinite for silhouettes that are no masks.
     """
 
-    stages: tuple[Stage, ...] = (
-        Stage(200, 2e-4, (3.0, 1.4)),
-        Stage(300, 1.5e-4, (1.4, 0.5)),
-        Stage(150, 4e-5, (0.7, 0.35)),
-        Stage(100, 1e-5, (0.0, 0.0)),
+    stages: tuple[DescentStage, ...] = (
+        DescentStage(200, 2e-4, (3.0, 1.4)),
+        DescentStage(300, 1.5e-4, (1.4, 0.5)),
+        DescentStage(150, 4e-5, (0.7, 0.35)),
+        DescentStage(100, 1e-5, (0.0, 0.0)),
     )
     num_pixels: int = 6000
     levels: tuple[int, ...] = (12, 24, 48)
     smoothings: tuple[float, ...] = (0.005, 0.007, 0.01, 0.014)
     max_overlap_loss: float = 0.003
+
+
+@dataclass(frozen=True)
+class RefinementProblem:
+    """A surface and the photographs that it must explain.
+
+    Attributes:
+        mesh: the surface.
+        medium: the bodies with estimated indices; the mesh is the surface of the first one. Refraction is achromatic.
+        silhouettes: silhouettes of the surface, whose outlines are kept.
+        through: pixels inside the silhouette of the object.
+        surroundings: known surroundings, near or distant.
+    """
+
+    mesh: TriangleMesh
+    medium: SdfGrid
+    silhouettes: Silhouettes
+    through: Pixels
+    surroundings: Surroundings
 
 
 @dataclass(frozen=True)
@@ -111,8 +136,9 @@ class Refined:
     Attributes:
         mesh: the refined surface; the given one without a significant improvement.
         medium: medium of the surface.
-        steps, errors: number of steps and mean robust error of the validation pixels at each validation: 0 for exact
-            colours, 1 for outliers. The first error is that of the given surface.
+        steps: number of steps at each validation, which starts with 0, 0 for the given surface and for the smoothed
+            one. The last number is repeated for the surface of the smallest error after its final smoothing.
+        errors: mean robust error of the validation pixels at each validation: 0 for exact colours, 1 for outliers.
     """
 
     mesh: TriangleMesh
@@ -122,11 +148,7 @@ class Refined:
 
 
 def refine_surface(
-    mesh: TriangleMesh,
-    medium: SdfGrid,
-    silhouettes: Silhouettes,
-    through: Pixels,
-    surroundings: Surroundings,
+    problem: RefinementProblem,
     learn_index: bool = False,
     progress: Callable[[float], None] = lambda done: None,
     settings: RefinementSettings = RefinementSettings(),
@@ -134,11 +156,7 @@ def refine_surface(
     """Refine the surface of the first body of a medium by the refractions in photographs.
 
     Args:
-        mesh: the surface.
-        medium: the bodies with estimated indices; refraction is achromatic.
-        silhouettes: silhouettes of the surface, whose outlines are kept.
-        through: pixels inside the silhouette of the object.
-        surroundings: known surroundings, near or distant.
+        problem: the surface and the photographs.
         learn_index: whether to refine the indices together with the surface.
         progress: called with the completed fraction.
         settings: settings of the descent.
@@ -146,7 +164,7 @@ def refine_surface(
     Raises:
         NerfroError: no pixel shows known surroundings through the object.
     """
-    descent = _Descent(mesh, medium, silhouettes, through, surroundings, learn_index, settings)
+    descent = _Descent(problem, learn_index, settings)
     error = descent.initial_error
     smoothed = descent.smooth_start(error)
     steps, errors, best = [0, 0], [error, smoothed], descent.values()
@@ -169,8 +187,8 @@ def refine_surface(
     progress(1.0)
     steps, errors = [*steps, steps[-1]], [*errors, smoothed]
     if smoothed > (1 - _MIN_GAIN) * error or not descent.keeps_outlines(refined):
-        return Refined(mesh, medium, steps, errors)
-    return Refined(_project_onto(mesh, refined), refined, steps, errors)
+        return Refined(problem.mesh, problem.medium, steps, errors)
+    return Refined(_project_onto(problem.mesh, refined), refined, steps, errors)
 
 
 def refine(
@@ -201,9 +219,10 @@ def refine(
         silhouettes = Silhouettes.of(cameras, mesh_silhouettes(start, cameras, 1).float())
     else:
         silhouettes = replace(silhouettes, cameras=silhouettes.cameras.relative_to(observations.shift))
+    problem = RefinementProblem(start, medium, silhouettes, through, surroundings)
     try:
-        with bar("surface") as progress:
-            refined = refine_surface(start, medium, silhouettes, through, surroundings, learn_index, progress, settings)
+        with fraction_bar("surface") as progress:
+            refined = refine_surface(problem, learn_index, progress, settings)
     except NerfroError as reason:  # keep the results of the other steps
         warn(f"surface unchanged: {reason}")
         return mesh
@@ -257,36 +276,29 @@ class Displacement(nn.Module):
 class _Descent:
     """Displacements and indices with their optimizer, training pixels and validation pixels."""
 
-    def __init__(
-        self,
-        mesh: TriangleMesh,
-        medium: SdfGrid,
-        silhouettes: Silhouettes,
-        through: Pixels,
-        surroundings: Surroundings,
-        learn_index: bool,
-        settings: RefinementSettings,
-    ) -> None:
-        self.settings, self.given, self.start, self.surroundings = settings, medium, medium, surroundings
+    def __init__(self, problem: RefinementProblem, learn_index: bool, settings: RefinementSettings) -> None:
+        self.problem, self.settings = problem, settings
+        mesh, medium, silhouettes = problem.mesh, problem.medium, problem.silhouettes
+        self.start = medium  # from which the displacements count
         self.iors = nn.Parameter(medium.iors.clone(), requires_grad=learn_index)
         # Rays with internal reflections are left out: small errors of the surface turn them far.
         self.sampler = Snell(max_events=2 * len(medium.iors))
         self.size = float(np.ptp(mesh.bounds, axis=0).max())
         self.offsets = Displacement(tuple(medium.grids[0].distances.shape), self.size, settings.levels)
         self.learned = [*self.offsets.levels, self.iors]
-        self.training, validation = through.split()
+        self.training, validation = problem.through.split()
         self.validation = validation.some(_MAX_VALIDATION_PIXELS)
         errors, known = self._validation_errors(medium)
         if not known.any():
             raise NerfroError("no pixel shows known surroundings through the object; remove refine=true")
         self.validation, self.initial_errors = self.validation[known], errors[known]
-        self.mesh, self.silhouettes, self.overlap = mesh, silhouettes, overlap(mesh, silhouettes).mean()
+        self.overlap = overlap(mesh, silhouettes).mean()
         rims, cameras = RimFinder(mesh, silhouettes).find(), silhouettes.cameras
         self.rims = torch.from_numpy(rims.points).float()
         middle = torch.from_numpy(mesh.bounds.mean(0)).float()
         distance = (cameras.camera_to_world[:, :, 3] - middle).norm(dim=-1)
         self.contour_deviation = _CONTOUR_DEVIATION * float((distance / cameras.fx).mean())
-        boundary = surroundings.boundary
+        boundary = problem.surroundings.boundary
         self.panorama = panorama_of(boundary, medium, middle) if isinstance(boundary, Room) else boundary
 
     @torch.no_grad()
@@ -309,7 +321,7 @@ class _Descent:
         self.optimizer = torch.optim.Adam(self.learned, betas=(0.9, 0.99), eps=1e-12)
         self.generator = torch.Generator().manual_seed(seed)
 
-    def step(self, stage: Stage, step: int) -> None:
+    def step(self, stage: DescentStage, step: int) -> None:
         """Make one step of a stage."""
         done = step / stage.steps
         if step % _VALIDATE_EVERY == 0:
@@ -326,11 +338,11 @@ class _Descent:
         pixels = self.training[chosen]
         path, usable = self._traced(pixels, medium)
         rays = pixels.rays[usable]
-        path = self.sampler.refine(path[usable], rays, medium)
+        path = self.sampler.replay(path[usable], rays, medium)
         residual = self.blurred(path.exits()).clamp(max=1) - pixels.radiance[usable]
-        photometric = robust(residual, _HALF_WEIGHT).sum() / max(1, len(rays))
+        photometric = geman_mcclure(residual, _ROBUST_SCALE).sum() / max(1, len(rays))
         rims = self.rims[torch.randint(len(self.rims), (_NUM_CONTOUR_POINTS,), generator=self.generator)]
-        current, given = (each.grids[0](rims)[0] for each in (medium, self.given))
+        current, given = (each.grids[0](rims)[0] for each in (medium, self.problem.medium))
         square = ((current - given) / self.contour_deviation).square()
         contours = (square / (1 + square)).mean()
         return photometric + _CONTOUR_WEIGHT * contours + _ROUGHNESS_WEIGHT * self.offsets.roughness()
@@ -360,10 +372,10 @@ class _Descent:
         return best, error
 
     def keeps_outlines(self, medium: SdfGrid) -> bool:
-        """Return whether the silhouettes of a medium overlap with the given ones as well as those of the surface."""
+        """Test that the overlap with the masks falls by at most `max_overlap_loss`."""
         if self.settings.max_overlap_loss == math.inf:
             return True
-        after = overlap(_project_onto(self.mesh, medium), self.silhouettes).mean()
+        after = overlap(_project_onto(self.problem.mesh, medium), self.problem.silhouettes).mean()
         return bool(self.overlap - after <= self.settings.max_overlap_loss)
 
     @property
@@ -384,15 +396,15 @@ class _Descent:
     def _validation_errors(self, medium: SdfGrid) -> tuple[Float[Tensor, "Q"], Bool[Tensor, "Q"]]:
         """Compute the robust errors of the validation pixels, and whether their surroundings are known."""
         trace = self.sampler.trace(self.validation.rays, medium)
-        radiance, known = self.surroundings.radiance(trace.path.exits())
-        errors = robust(radiance - self.validation.radiance, _HALF_WEIGHT)
+        radiance, known = self.problem.surroundings.radiance(trace.path.exits())
+        errors = geman_mcclure(radiance - self.validation.radiance, _ROBUST_SCALE)
         return errors, known & ~trace.exceeded & trace.path.refracted
 
     @torch.no_grad()
     def _traced(self, pixels: Pixels, medium: SdfGrid) -> tuple[Path, Tensor]:
         """Trace pixels, and select refracted paths with known surroundings and reliable derivatives."""
         trace = self.sampler.trace(pixels.rays, medium)
-        usable = self.surroundings.known(trace.path.exits()) & ~trace.exceeded & trace.path.refracted
+        usable = self.problem.surroundings.known(trace.path.exits()) & ~trace.exceeded & trace.path.refracted
         return trace.path, usable & self.sampler.steady(trace.path, medium)
 
 
@@ -403,7 +415,8 @@ def _blurred(panorama: EnvironmentMap | RoomPanorama, degrees: float) -> Boundar
         return panorama
     sky = panorama.colours if isinstance(panorama, RoomPanorama) else panorama
     generator = torch.Generator().manual_seed(0)
-    directions = texel_directions(max(16, round(135 / degrees)))
+    side = round(_TEXELS_PER_DEVIATION * 90 / degrees)  # a face of the cube spans 90 degrees
+    directions = texel_directions(max(_MIN_TEXELS, side))
     total = torch.zeros_like(directions)
     for _ in range(_BLUR_SAMPLES):
         turned = directions + math.radians(degrees) * torch.randn(3, generator=generator)
@@ -417,8 +430,8 @@ def _project_onto(mesh: TriangleMesh, medium: SdfGrid) -> TriangleMesh:
     vertices = torch.from_numpy(mesh.vertices).float()
     grid = medium.grids[0]
     spacing = float(grid.spacing.min())
-    for _ in range(5):
+    for _ in range(_NEWTON_STEPS):
         phi, gradient = grid(vertices)
-        square = gradient.square().sum(-1, keepdim=True).clamp(min=0.25)
+        square = gradient.square().sum(-1, keepdim=True).clamp(min=_MIN_GRADIENT**2)
         vertices = vertices - (phi[:, None] * gradient / square).clamp(-spacing, spacing)
     return TriangleMesh(vertices.double().numpy(), mesh.faces)

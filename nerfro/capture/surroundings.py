@@ -23,7 +23,7 @@ from nerfro.errors import NerfroError
 from nerfro.fields.hash_grid import HashGridField
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.light import to_linear
-from nerfro.progress import bar
+from nerfro.progress import fraction_bar
 from nerfro.rays import Rays
 from nerfro.rendering import composite
 from nerfro.samplers.paths.straight import straight_path
@@ -45,9 +45,12 @@ _MIN_VARIANCE = 1e-4
 # Resolution of the map of observed directions: maximum texels per side of a face, and training pixels per texel, chosen
 # so that the map has no holes where photographs cover the surroundings.
 _SEEN_TEXELS, _SEEN_PIXELS = 64, 8
-# Residuals have half weight at this fraction of the standard deviation of the surroundings, because opaque objects
-# inside the body spoil many pixels.
-_HALF_WEIGHT = 0.5
+# Scale of the Geman-McClure loss as a fraction of the standard deviation of the surroundings: residual at which the
+# loss is 1/2 of its maximum and the weight 1/4. The loss is robust, because opaque objects inside the body spoil many
+# pixels.
+_SCALE_FRACTION = 0.5
+# Lower bound of this scale, linear radiance.
+_MIN_SCALE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -90,15 +93,9 @@ class Pixels:
         return self[chosen.sort().values]
 
 
-def robust(residual: Float[Tensor, "Q 3"], half: float) -> Float[Tensor, "Q"]:
-    """Compute the Geman-McClure error r^2 / (r^2 + half^2), r^2 the mean square over channels: 0 exact, 1 outlier."""
-    square = residual.square().mean(-1)
-    return square / (square + half**2)
-
-
-def half_weight(surroundings: Surroundings) -> float:
-    """Return the residual at which a pixel has half the weight."""
-    return max(_HALF_WEIGHT * float(surroundings.colours.std(0).mean()), 1e-3)
+def robust_scale(surroundings: Surroundings) -> float:
+    """Return the scale of the Geman-McClure loss for residuals against the surroundings, linear radiance."""
+    return max(_SCALE_FRACTION * float(surroundings.colours.std(0).mean()), _MIN_SCALE)
 
 
 def divide_pixels(views: Views, mesh: TriangleMesh) -> tuple[Pixels, Pixels]:
@@ -123,10 +120,11 @@ def divide_pixels(views: Views, mesh: TriangleMesh) -> tuple[Pixels, Pixels]:
     parts: list[list[tuple[Tensor, Tensor]]] = [[], []]
     for view in range(len(views)):
         radiance = blocks.mean(to_linear(views.images[view])).view(-1, 3)
-        share = blocks.mean(views.masks[view]) if silhouettes is None else silhouettes[view]  # type: ignore[index]
-        most, least = (functional.max_pool2d(x[None, None], 3, 1, 1)[0, 0] for x in (share, 1 - share))
-        usable = torch.ones_like(share) if views.usable is None else blocks.mean(views.usable[view])
-        for part, wanted in zip(parts, (most < 1e-3, least < 1e-3), strict=True):
+        coverage = blocks.mean(views.masks[view]) if silhouettes is None else silhouettes[view]  # type: ignore[index]
+        # Largest fractions of the object and of the background in a neighbourhood of 3x3 pixels.
+        covered, uncovered = (functional.max_pool2d(x[None, None], 3, 1, 1)[0, 0] for x in (coverage, 1 - coverage))
+        usable = torch.ones_like(coverage) if views.usable is None else blocks.mean(views.usable[view])
+        for part, wanted in zip(parts, (covered < 1e-3, uncovered < 1e-3), strict=True):
             where = (wanted & (usable == 1)).flatten().nonzero()[:, 0]
             part.append((view * blocks.height * blocks.width + where, radiance[where]))
     beside, through = (Pixels(cameras, *(torch.cat(values) for values in zip(*part, strict=True))) for part in parts)
@@ -236,7 +234,7 @@ class Observations:
     @cached_property
     def surroundings(self) -> Surroundings:
         """Reconstructed surroundings; prints their type and accuracy."""
-        with bar("surroundings") as progress:
+        with fraction_bar("surroundings") as progress:
             found = learn_surroundings(self._divided[0], self._mesh, self._room, progress)
         distance = "near" if isinstance(found.boundary, Room) else "far away"
         print(f"surroundings: {distance}; {1 - found.unexplained:.1%} of the variance of validation views is explained")

@@ -23,8 +23,8 @@ _SPLIT_FOLDERS = ("train", "val", "test")
 # Lossless format first. Cameras and networks write suffixes in lower or upper case.
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 
-# Key of the text in the PNG file of a derived mask: the method and a checksum of the pixels. The method is the shape
-# whose projection the mask is, POLYGON for an outline, or TRACKED for Segment Anything 2.
+# Key of the text in the PNG file of a mask that nerfro made: the method and a checksum of the pixels. The method is the
+# shape whose projection the mask is, POLYGON for an outline, or TRACKED for Segment Anything 2.
 METHOD, POLYGON, TRACKED, REVOLUTION = "nerfro", "polygon", "sam2", "body of revolution"
 EVIDENCE = (None, POLYGON, TRACKED)  # methods whose masks show the object in the photograph
 
@@ -46,7 +46,10 @@ def checksum(image: Image.Image) -> int:
 
 
 def method_of(mask: Path) -> str | None:
-    """Return how nerfro derived a mask from others; None for all other masks, and for masks edited since."""
+    """Return the method with which nerfro made a mask; None if the file states no method, or was edited since.
+
+    The method is the shape whose projection the mask is, POLYGON or TRACKED. Masks by GrabCut state no method.
+    """
     with open_image(mask) as (image, _):
         method, _, expected = str(image.info.get(METHOD, "")).partition(":")
         return method if expected and expected == str(checksum(image)) else None
@@ -177,7 +180,8 @@ def masked_views(views: Views) -> Views:
 def with_other_splits(views: Views, source: DataSource, split: str) -> Views:
     """Append the views of all other splits that have masks, each image once, if their images have the same size.
 
-    Views whose mask is an empty projection of a hull are left out, because they do not show the object.
+    Views are left out if their mask is empty and was made by nerfro (a projection, a polygon or a mask of Segment
+    Anything 2, see `method_of`), because they do not show the object.
     """
     for other in source.splits:
         if other == split:

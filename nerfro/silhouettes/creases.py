@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import sparse
 
-from nerfro.silhouettes.moving_mesh import MovingMesh, Surface, solve_symmetric, unit
+from nerfro.silhouettes.moving_mesh import MeshGeometry, MovingMesh, solve_symmetric, unit
 from nerfro.silhouettes.rims import Rims
 
 # Number of smoothing rounds of the triangle normals, and angular width of the filter, in radians.
@@ -29,7 +29,7 @@ class Sides(NamedTuple):
 FACETS, CURVED = Sides(flat=1.0, staying=1e-5), Sides(flat=0.05, staying=1e-4)
 
 
-def has_creases(surface: Surface) -> bool:
+def has_creases(surface: MeshGeometry) -> bool:
     """Test whether the total length of the sharp edges exceeds twice the size of the body."""
     ends = surface.vertices[surface.creases]
     return bool(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).sum() > 2 * np.ptp(surface.vertices, axis=0).max())
@@ -79,9 +79,9 @@ def _solved(
         len(vertices),
     )
     observed = _projected_differences(
-        (rims.first, rims.second), (1 - rims.share, rims.share), rims.normal, len(vertices)
+        (rims.first, rims.second), (1 - rims.fraction, rims.fraction), rims.normal, len(vertices)
     )
-    flatness, staying = len(rims.share) * sides.flat, len(rims.share) * sides.staying
+    flatness, staying = len(rims.fraction) * sides.flat, len(rims.fraction) * sides.staying
     system = observed.T @ sparse.diags(rims.weight) @ observed + flatness * (flat.T @ flat)
     system += staying * sparse.identity(3 * len(vertices))
     right = observed.T @ (rims.weight * rims.misfit) - flatness * (flat.T @ (flat @ vertices.ravel()))

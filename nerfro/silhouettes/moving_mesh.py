@@ -16,7 +16,7 @@ _CREASE = np.cos(np.radians(30))
 _SPREADING = 0.5
 
 
-class Surface(NamedTuple):
+class MeshGeometry(NamedTuple):
     """Vertices of a mesh with derived normals and creases."""
 
     vertices: Float[np.ndarray, "vertices 3"]
@@ -60,12 +60,12 @@ class MovingMesh:
         sums = [np.bincount(self.faces.ravel(), np.repeat(each, 3), len(vertices)) for each in of_faces.T]
         return unit(np.stack(sums, -1))
 
-    def surface(self, vertices: Float[np.ndarray, "vertices 3"]) -> Surface:
+    def geometry(self, vertices: Float[np.ndarray, "vertices 3"]) -> MeshGeometry:
         """Compute normals and creases. A single displaced vertex is no crease, because the normals around it agree."""
         normals = self.normals(vertices)
         beside, beyond = unit(self.face_normals(vertices))[self._beside], normals[self._beyond]
         sharp = (beside.prod(1).sum(1) < _CREASE) & (beyond.prod(1).sum(1) < _CREASE)
-        return Surface(vertices, self.edges, normals, self.edges[sharp], beside[sharp])
+        return MeshGeometry(vertices, self.edges, normals, self.edges[sharp], beside[sharp])
 
     @cached_property
     def touching(self) -> sparse.coo_matrix:

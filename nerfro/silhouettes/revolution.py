@@ -17,6 +17,7 @@ from torch.nn.functional import normalize
 
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.geometry.revolve import revolve
+from nerfro.robust import geman_mcclure_weight
 from nerfro.silhouettes.upright import body_axis
 from nerfro.silhouettes.visual_hull import Silhouettes
 
@@ -29,8 +30,8 @@ _OUTER_QUANTILE, _INNER_QUANTILE = 0.8, 0.1
 _END = 4  # knots at each end whose initial radii are extrapolated, because the visual hull is inaccurate there
 # Samples per mask: points on the outline, and pixels inside and outside at distances in this range, in pixels.
 _OUTLINE_POINTS, _SIDE_POINTS, _NEAR, _FAR = 100, 40, 3.0, 40.0
-# Iterations, and the distance in pixels at which the weight of an observation is one half, first and last.
-_ITERATIONS, _HALF_WEIGHT = 24, (8.0, 1.0)
+# Iterations, and scale of the Geman-McClure loss in pixels (distance at which the weight is 1/4), first and last.
+_ITERATIONS, _ROBUST_SCALE = 24, (8.0, 1.0)
 # Weight of bending relative to pixels; longest step and smallest radius, as fractions of the height.
 _BENDING, _MAX_STEP, _MIN_RADIUS = 2.0, 0.03, 1e-3
 _EDGE = 0.5  # radius of the rounded edges, in pixels
@@ -42,8 +43,8 @@ _CORNER = 0.002
 # A cone below the foot is cut if its slope exceeds this fraction of the slope that no camera sees as an outline, and if
 # the slope decreases by at least this factor at the edge of the foot.
 _HIDDEN_SLOPE, _EDGE_RATIO = 0.4, 0.6
-# Number of samples along a ray, of samples in each refinement, and width in pixels of the ignored frame.
-_PLACES, _CLOSER, _FRAME = 48, 12, 2
+# Number of samples along a ray, of samples in each refinement, and width in pixels of the ignored image border.
+_PLACES, _CLOSER, _BORDER = 48, 12, 2
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,7 @@ class Profile:
 def fit_revolution(
     mesh: TriangleMesh,
     silhouettes: Silhouettes,
-    progress: Callable[[float], None] = lambda share: None,
+    progress: Callable[[float], None] = lambda done: None,
     axis: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]] | None = None,
 ) -> TriangleMesh | None:
     """Fit a body of revolution to the outlines of the masks.
@@ -141,10 +142,10 @@ def fit_revolution(
     bends[-_END:] *= _END_BENDING
     for iteration in range(_ITERATIONS):
         done = min(1.0, iteration / (_ITERATIONS - 6))
-        half_weight = _HALF_WEIGHT[0] * (_HALF_WEIGHT[1] / _HALF_WEIGHT[0]) ** done
+        scale = _ROBUST_SCALE[0] * (_ROBUST_SCALE[1] / _ROBUST_SCALE[0]) ** done
         place = _nearest_place(body(numbers), origins, directions)
         misfit, slopes = misfits(numbers).double(), jacfwd(misfits)(numbers).double()
-        weight = 1 / (1 + (misfit / half_weight).square()).square()
+        weight = geman_mcclure_weight(misfit[:, None], scale)
         smooth = 1 / (1 + (bends @ numbers / _CORNER).square()).square()  # corners have little weight
         smooth[-_END:] = 1  # the upper end would flare
         stiff = (_BENDING * pixels) ** 2 * len(misfit) / _KNOTS * (bends.T @ (smooth[:, None] * bends)).double()
@@ -252,10 +253,10 @@ def _rays(
 
 
 def _outline_points(distances: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "points 2"]:
-    """Find points (row, column) of the outline on the lines between adjacent pixel centres, away from the frame."""
+    """Find points (row, column) of the outline on the lines between adjacent pixel centres, away from the border."""
     points = np.concatenate([np.empty((0, 2)), *find_contours(distances, 0)]).astype(np.float32)
-    last = np.array(distances.shape) - 1 - _FRAME
-    return points[((points >= _FRAME) & (points <= last)).all(1)]
+    last = np.array(distances.shape) - 1 - _BORDER
+    return points[((points >= _BORDER) & (points <= last)).all(1)]
 
 
 @torch.no_grad()

@@ -14,7 +14,7 @@ from torch import Tensor
 from nerfro.cameras import Cameras
 from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.silhouettes.moving_mesh import MovingMesh, Surface, unit
+from nerfro.silhouettes.moving_mesh import MeshGeometry, MovingMesh, unit
 from nerfro.silhouettes.visual_hull import Silhouettes
 
 # By view: the index of the outline pixel nearest to each pixel.
@@ -29,14 +29,14 @@ _MAX_MISFIT, _HALF_WEIGHT, _MIN_SCALE = 3.0, 0.7, 0.3
 
 
 class Rims(NamedTuple):
-    """Contour points on edges (first, second) of a mesh, at the fraction `share` of the way from first to second.
+    """Contour points on edges (first, second) of a mesh, at a fraction of the way from first to second.
 
     The surface meets the outline of the mask if it moves by `misfit` along `normal`.
     """
 
     first: Int[np.ndarray, " contour"]
     second: Int[np.ndarray, " contour"]
-    share: Float[np.ndarray, " contour"]
+    fraction: Float[np.ndarray, " contour"]
     points: Float[np.ndarray, "contour 3"]  # positions of the contour points
     normal: Float[np.ndarray, "contour 3"]  # unit, outwards, perpendicular to the line of sight
     misfit: Float[np.ndarray, " contour"]  # outward distance to the outline of the mask, world units
@@ -54,7 +54,7 @@ class RimFinder:
     """
 
     def __init__(self, mesh: TriangleMesh, silhouettes: Silhouettes) -> None:
-        self._surface = MovingMesh(mesh.faces).surface(mesh.vertices)
+        self._surface = MovingMesh(mesh.faces).geometry(mesh.vertices)
         self._silhouettes, self._outlines = silhouettes, outlines_of(silhouettes)
 
     def find(self, cameras: Cameras | None = None) -> Rims:
@@ -68,7 +68,7 @@ def outlines_of(silhouettes: Silhouettes) -> Outlines:
     return {view: _nearest_outline_pixel(mask) for view, mask in enumerate((silhouettes.masks > 0.5).numpy())}
 
 
-def find_rims(surface: Surface, silhouettes: Silhouettes, outlines: Outlines) -> Rims:
+def find_rims(surface: MeshGeometry, silhouettes: Silhouettes, outlines: Outlines) -> Rims:
     """Find the outermost contour point near each pixel of the outlines of the masks.
 
     On a smooth surface, the contour crosses edges of the mesh along which the vertex normals turn away from the camera.
@@ -83,8 +83,8 @@ def find_rims(surface: Surface, silhouettes: Silhouettes, outlines: Outlines) ->
     parts = []
     for view, outline in outlines.items():
         eye = cameras.camera_to_world[view, :, 3].double().numpy()
-        first, second, share, normal = _turning(surface, eye)
-        points = vertices[first] + share[:, None] * (vertices[second] - vertices[first])
+        first, second, fraction, normal = _turning(surface, eye)
+        points = vertices[first] + fraction[:, None] * (vertices[second] - vertices[first])
         places = torch.from_numpy(points).float()
         inside, width = (values.double().numpy() for values in silhouettes.depth_inside(view, places))
         known = np.flatnonzero(np.isfinite(inside))
@@ -96,7 +96,7 @@ def find_rims(surface: Surface, silhouettes: Silhouettes, outlines: Outlines) ->
         order = np.lexsort((inside[known], cell))
         outermost = known[order[np.diff(cell[order], prepend=-1) != 0]]
         of_view = np.full(len(outermost), view)
-        of_points = (first, second, share, points, normal, inside, width)
+        of_points = (first, second, fraction, points, normal, inside, width)
         parts.append((*(values[outermost] for values in of_points), of_view))
     if not parts:
         raise NerfroError("no view sees the surface; check that surface, poses and masks belong together")
@@ -107,25 +107,27 @@ def find_rims(surface: Surface, silhouettes: Silhouettes, outlines: Outlines) ->
     return Rims(*(each[near] for each in (*edges, misfit * width, weight, width, views)))
 
 
-def _turning(surface: Surface, eye: Float[np.ndarray, "3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _turning(
+    surface: MeshGeometry, eye: Float[np.ndarray, "3"]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Find the contour of a surface seen from a point: ends of edges, fractions along the edges, and normals."""
     vertices, edges, normals, creases, beside = surface
     facing = (normals * (vertices - eye)).sum(1)[edges]
     smooth = np.flatnonzero((facing[:, 0] > 0) != (facing[:, 1] > 0))
-    shares = facing[smooth, 0] / (facing[smooth, 0] - facing[smooth, 1])
+    fractions = facing[smooth, 0] / (facing[smooth, 0] - facing[smooth, 1])
     away = (beside * (vertices[creases[:, 0]] - eye)[:, None]).sum(-1) > 0
     sharp = creases[away[:, 0] != away[:, 1]]
 
-    (first, second), share = np.r_[edges[smooth], sharp].T, np.r_[shares, np.full(len(sharp), 0.5)]
+    (first, second), fraction = np.r_[edges[smooth], sharp].T, np.r_[fractions, np.full(len(sharp), 0.5)]
     along = vertices[second] - vertices[first]
-    look = unit(vertices[first] + share[:, None] * along - eye)
-    normal = (1 - share[:, None]) * normals[first] + share[:, None] * normals[second]
+    look = unit(vertices[first] + fraction[:, None] * along - eye)
+    normal = (1 - fraction[:, None]) * normals[first] + fraction[:, None] * normals[second]
     # Only the motion of a sharp edge perpendicular to itself is visible, whatever the normals of the adjacent sides.
     across = np.cross(look, along)
     across *= np.sign((across * normal).sum(1, keepdims=True))
     normal -= (normal * look).sum(1, keepdims=True) * look
     normal[len(smooth) :] = across[len(smooth) :]
-    return first, second, share, unit(normal)
+    return first, second, fraction, unit(normal)
 
 
 def _look_up(

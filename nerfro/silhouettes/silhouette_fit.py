@@ -65,7 +65,7 @@ def fit_surface(
     mesh: TriangleMesh,
     silhouettes: Silhouettes,
     smoothing: float = 1.0,
-    progress: Callable[[float], None] = lambda share: None,
+    progress: Callable[[float], None] = lambda done: None,
 ) -> TriangleMesh:
     """Fit a smooth surface whose contours meet the outlines of the masks.
 
@@ -106,7 +106,7 @@ def fit_surface(
 
     fit, outlines = _Fit(mesh, silhouettes), outlines_of(silhouettes)
     found = [fit.search(prior, outlines, step) for prior in (_ROUND, _FLAT)]
-    if has_creases(fit.mesh.surface(found[1].vertices)):
+    if has_creases(fit.mesh.geometry(found[1].vertices)):
         total = 2 * _STEPS + 3 * STEPS
         facets, curved = (fit.with_creases(found[1], sides, outlines, step) for sides in (FACETS, CURVED))
         found.append(facets if facets.misfit <= _TOLERANCE * curved.misfit else curved)
@@ -174,7 +174,7 @@ class _Fit:
 
     def rims(self, vertices: Float[np.ndarray, "vertices 3"], outlines: Outlines) -> Rims:
         """Find the contour points of a surface with the given vertices."""
-        return find_rims(self.mesh.surface(vertices), self.silhouettes, outlines)
+        return find_rims(self.mesh.geometry(vertices), self.silhouettes, outlines)
 
     def misfit(self, vertices: Float[np.ndarray, "vertices 3"], outlines: Outlines) -> float:
         """Compute the mean distance of the contour points to the outlines of the masks, in world units."""
@@ -210,7 +210,7 @@ class _Fit:
             spread: also equalize the triangles by tangential motion. For adjacent small and large triangles, as
                 marching cubes produces, the mean of the neighbours is a poor estimate of curvature.
         """
-        surface = self.mesh.surface(vertices)
+        surface = self.mesh.geometry(vertices)
         normals, rims = surface.normals, find_rims(surface, self.silhouettes, outlines)
         if contour_error is not None:
             rims = by_pixel_sides(rims, self.silhouettes, contour_error)
@@ -222,7 +222,7 @@ class _Fit:
         # While the prior is strong, large curvature may belong to the roofs of the visual hull instead of edges.
         stiffness = self._stiffness(excess, prior.edge * max(1.0, strength))
         pressure = -self.degree * curvature.around / np.sqrt(curvature.around.mean()) * typical
-        per_observation = strength * len(rims.share)
+        per_observation = strength * len(rims.fraction)
         bending = per_observation * prior.bending * self.size**2 * (_REDUCED_BENDING if steady else 1)
         terms = [
             (1.0, _outline_term(rims, normals)),
@@ -230,7 +230,7 @@ class _Fit:
             (bending, _bending_term(curvature, stiffness, excess)),
         ]
         if steady:
-            changes = steady * len(rims.share) * self.size**2
+            changes = steady * len(rims.fraction) * self.size**2
             terms.append((changes, self._change_term(vertices, normals, curvature)))
         system = sum(weight * term.system for weight, term in terms)
         right = np.sum([weight * term.right for weight, term in terms], axis=0)
@@ -282,11 +282,11 @@ class _Curvature(NamedTuple):
 
 def _outline_term(rims: Rims, normals: Float[np.ndarray, "vertices 3"]) -> _Term:
     """Sum of squared distances of contour points to the outlines of the masks."""
-    num_rims = len(rims.share)
+    num_rims = len(rims.fraction)
     row, column = np.tile(np.arange(num_rims), 2), np.concatenate([rims.first, rims.second])
     along = (normals[column] * np.tile(rims.normal, (2, 1))).sum(1)
-    shares = along * np.concatenate([1 - rims.share, rims.share])
-    observed = sparse.csr_matrix((shares, (row, column)), (num_rims, len(normals)))
+    weights = along * np.concatenate([1 - rims.fraction, rims.fraction])
+    observed = sparse.csr_matrix((weights, (row, column)), (num_rims, len(normals)))
     return _Term(observed.T @ sparse.diags(rims.weight) @ observed, observed.T @ (rims.weight * rims.misfit))
 
 

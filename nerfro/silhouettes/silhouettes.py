@@ -36,7 +36,7 @@ def outline_distance(mask: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]
 
     Near a straight outline, a blurred mask equals Phi(distance / blur) with the normal distribution function Phi.
     The inverse of Phi gives the distance with subpixel accuracy, for binary and antialiased masks. The blur shrinks
-    curved outlines; the result is corrected for this bias if the mask is antialiased. The frame of the image is not
+    curved outlines; the result is corrected for this bias if the mask is antialiased. The image border is not
     an outline.
 
     Args:
@@ -76,8 +76,8 @@ def _level_curvature(values: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W
     return across / np.hypot(down, right).clip(0.3) ** 3
 
 
-def frame_pixels(masks: Float[Tensor, "V H W"]) -> Bool[Tensor, "V Q"]:
-    """Test which pixels along the frame of each mask show the object, which may then continue outside the image."""
+def border_pixels(masks: Float[Tensor, "V H W"]) -> Bool[Tensor, "V Q"]:
+    """Test which pixels along the border of each mask show the object, which may then continue outside the image."""
     inside = masks > 0.5
     return torch.cat([inside[:, [0, -1]].flatten(1), inside[:, :, [0, -1]].flatten(1)], 1)
 

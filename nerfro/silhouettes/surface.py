@@ -9,11 +9,11 @@ from jaxtyping import Float
 from nerfro.data.base import Views
 from nerfro.errors import NerfroError, first_of, warn
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.progress import bar
+from nerfro.progress import fraction_bar
 from nerfro.silhouettes.pose_conventions import overlap
 from nerfro.silhouettes.revolution import Symmetry, fit_revolution
 from nerfro.silhouettes.silhouette_fit import fit_surface
-from nerfro.silhouettes.silhouettes import frame_pixels
+from nerfro.silhouettes.silhouettes import border_pixels
 from nerfro.silhouettes.visual_hull import (
     Silhouettes,
     carve_grid,
@@ -41,10 +41,10 @@ def read_silhouettes(views: Views, has_box: bool) -> Silhouettes:
 
     Args:
         views: views with masks.
-        has_box: whether the user gives a box, which bounds the hull where masks are cut by the frame.
+        has_box: whether the user gives a box, which bounds the hull where the image border cuts masks.
 
     Raises:
-        NerfroError: masks are missing, empty, full, inverted, too few, or all cut by the frame.
+        NerfroError: masks are missing, empty, full, inverted, too few, or all cut by the image border.
     """
     if views.masks is None:
         raise NerfroError(
@@ -59,10 +59,10 @@ def read_silhouettes(views: Views, has_box: bool) -> Silhouettes:
                 f"{_names(views, wrong)}: the mask is {state}; draw the object white and everything else black, "
                 "choose its labels with data.mask_labels, or remove the view"
             )
-    inverted = (frame_pixels(masks).float().mean(1) > 0.9) & (coverage < 1)
+    inverted = (border_pixels(masks).float().mean(1) > 0.9) & (coverage < 1)
     if inverted.float().mean() > 0.5:
         raise NerfroError(
-            f"{int(inverted.sum())} of {len(views)} masks are inverted: white along the frame of the image, and black "
+            f"{int(inverted.sum())} of {len(views)} masks are inverted: white along the image border, and black "
             "inside; save masks with the object white and everything else black"
         )
     if len(views) < _MIN_VIEWS:
@@ -75,11 +75,14 @@ def read_silhouettes(views: Views, has_box: bool) -> Silhouettes:
     silhouettes = Silhouettes.of(views.cameras, masks)
     if silhouettes.cut.all() and not has_box:
         raise NerfroError(
-            f"the frame cuts the object in all {len(views)} views, so no outline is complete; photograph the object "
-            "from farther away, or give box_min= and box_max= to bound the hull"
+            f"the image border cuts the object in all {len(views)} views, so no outline is complete; photograph the "
+            "object from farther away, or give box_min= and box_max= to bound the hull"
         )
     if silhouettes.cut.any():
-        warn(f"{_names(views, silhouettes.cut)}: the frame cuts the object; the surface outside the frame is unknown")
+        warn(
+            f"{_names(views, silhouettes.cut)}: the image border cuts the object; the surface outside the image is "
+            "unknown"
+        )
     return silhouettes
 
 
@@ -110,14 +113,14 @@ def make_mesh(
             fitted if the hull has no axis.
     """
     box = _object_box(silhouettes, wrong_masks) if corners is None else corners
-    with bar("carving") as progress:
+    with fraction_bar("carving") as progress:
         distances, corner, spacing = carve_grid(silhouettes, box, resolution, wrong_masks, progress)
     num_parts, num_kept = remove_strays(distances, keep)
     mesh, revolution = extract_surface(distances, corner, spacing), None
     if symmetry is not None and is_revolution:
         revolution = _revolution(mesh, silhouettes)
     if revolution is None and smoothing > 0:
-        with bar("fitting") as progress:
+        with fraction_bar("fitting") as progress:
             mesh = fit_surface(mesh, silhouettes, smoothing, progress)
     if revolution is not None:
         mesh = revolution
@@ -132,7 +135,7 @@ def make_mesh(
 
 
 def _revolution(mesh: TriangleMesh, silhouettes: Silhouettes) -> TriangleMesh | None:
-    with bar("finding the axis") as progress:
+    with fraction_bar("finding the axis") as progress:
         return fit_revolution(mesh, silhouettes, progress)
 
 

@@ -17,7 +17,7 @@ from nerfro.cameras import Cameras
 from nerfro.errors import NerfroError
 from nerfro.geometry.lines import nearest_point
 from nerfro.geometry.mesh import TriangleMesh, merge_vertices
-from nerfro.silhouettes.silhouettes import frame_pixels, outline_distance
+from nerfro.silhouettes.silhouettes import border_pixels, outline_distance
 
 # Number of refinements. Each halves the voxels and evaluates only voxels near the surface of the coarser level.
 _LEVELS = 2
@@ -37,7 +37,7 @@ class Silhouettes:
         cameras: cameras of the views.
         masks: fraction of each pixel that the object covers.
         distances: signed distances of the pixel centres to the outlines, in pixels, positive inside.
-        cut: views in which the frame cuts the object, so that nothing is known outside the frame.
+        cut: views in which the image border cuts the object, so that nothing is known outside the image.
     """
 
     cameras: Cameras
@@ -49,7 +49,7 @@ class Silhouettes:
     def of(cls, cameras: Cameras, masks: Float[Tensor, "V H W"]) -> Silhouettes:
         """Compute the outlines of masks."""
         distances = np.stack([outline_distance(mask.numpy()) for mask in masks])
-        return cls(cameras, masks, torch.from_numpy(distances.astype(np.float32)), frame_pixels(masks).any(1))
+        return cls(cameras, masks, torch.from_numpy(distances.astype(np.float32)), border_pixels(masks).any(1))
 
     def __len__(self) -> int:
         return len(self.masks)
@@ -65,7 +65,8 @@ class Silhouettes:
 
         Returns:
             Signed distance in pixels, positive inside; infinite where the view gives no information, which means
-            behind the camera and outside a frame that cuts the object. Width of a pixel at the point, in world units.
+            behind the camera and outside an image whose border cuts the object. Width of a pixel at the point, in
+            world units.
         """
         cameras = self.cameras.select([view])
         pixels, depth = (values[0] for values in cameras.project(points))
@@ -138,7 +139,7 @@ def carve_grid(
     box: Float[np.ndarray, "2 3"],
     resolution: int,
     wrong_masks: int = 0,
-    progress: Callable[[float], None] = lambda share: None,
+    progress: Callable[[float], None] = lambda done: None,
 ) -> tuple[Float[np.ndarray, "X Y Z"], Float[np.ndarray, "3"], float]:
     """Evaluate the visual hull on a grid, coarse to fine near the surface.
 

@@ -36,26 +36,31 @@ LAYOUTS: dict[Family, Layout] = {"tag36h11": Layout(10, 1), "tagStandard41h12": 
 
 
 @dataclass(frozen=True)
-class Sighting:
-    """Points of a board that were detected in one image.
+class TagDetections:
+    """Corners of the tags of a board that were detected in one image.
 
     Attributes:
-        features: number of the tag of each point.
-        points: positions in the frame and unit of the board.
-        pixels: image positions (column, row); integers are corners of pixels.
+        tag_ids: number of the tag of each corner.
+        board_points: positions in the frame and unit of the board.
+        image_points: image positions (column, row); integers are corners of pixels.
     """
 
-    features: Int[np.ndarray, " features"]
-    points: Float[np.ndarray, "features 3"]
-    pixels: Float[np.ndarray, "features 2"]
+    tag_ids: Int[np.ndarray, " corners"]
+    board_points: Float[np.ndarray, "corners 3"]
+    image_points: Float[np.ndarray, "corners 2"]
 
-    def only(self, chosen: Bool[np.ndarray, " features"]) -> Sighting:
-        """Select points by a mask."""
-        return Sighting(self.features[chosen], self.points[chosen], self.pixels[chosen])
+    def select(self, chosen: Bool[np.ndarray, " corners"]) -> TagDetections:
+        """Select corners by a mask."""
+        return TagDetections(self.tag_ids[chosen], self.board_points[chosen], self.image_points[chosen])
+
+    def of_same_tags(self, chosen: Bool[np.ndarray, " corners"]) -> Bool[np.ndarray, " corners"]:
+        """Extend a mask to all corners of the tags that it touches."""
+        return np.isin(self.tag_ids, self.tag_ids[chosen])
 
     @property
-    def num_features(self) -> int:
-        return len(np.unique(self.features))
+    def num_tags(self) -> int:
+        """Number of different tags."""
+        return len(np.unique(self.tag_ids))
 
 
 @dataclass(frozen=True)
@@ -115,7 +120,7 @@ class TagBoard:
             for (row, column), number in np.ndenumerate(face.ids)
         }
 
-    def find(self, image: UInt8[np.ndarray, "H W"]) -> Sighting:
+    def detect(self, image: UInt8[np.ndarray, "H W"]) -> TagDetections:
         """Detect the corners of the tags in a grey image."""
         # The library counts pixels from the corner of the image, as nerfro does, and orders the corners of a tag
         # anticlockwise from the lower left one.
@@ -123,7 +128,7 @@ class TagBoard:
         tags = [tag for tag in tag_detector(self.family).detect(image) if tag.tag_id in corners]
         counts = Counter(tag.tag_id for tag in tags)
         tags = [tag for tag in tags if counts[tag.tag_id] == 1]  # one of two equal tags is a reflection or misread
-        return Sighting(
+        return TagDetections(
             np.repeat(np.array([tag.tag_id for tag in tags], int), 4),
             np.concatenate([np.empty((0, 3)), *(corners[tag.tag_id] for tag in tags)]),
             np.concatenate([np.empty((0, 2)), *(tag.corners[::-1] for tag in tags)]),
@@ -224,7 +229,7 @@ def tag_detector(family: Family) -> Any:
     return Detector(families=family, nthreads=1, quad_decimate=1.0)
 
 
-def _on_face(face: Face, places: Float[np.ndarray, "features 2"]) -> Float[np.ndarray, "features 3"]:
+def _on_face(face: Face, places: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "points 3"]:
     """Convert coordinates on a face (lengths to the right and down from the upper left corner) to board coordinates."""
     return np.array(face.origin) + places @ np.array([face.right, face.down], np.float64)
 

@@ -82,14 +82,14 @@ def write_calibrated(
         "images": {
             name: {
                 "split": split,
-                "error": round(pose.error, 4) if pose.num_features else None,
-                "features": pose.num_features,
+                "error": round(pose.error, 4) if pose.num_observations else None,
+                "num_observations": pose.num_observations,
             }
             for split, names in splits.items()
             for name, pose in ((name, calibration.poses[name]) for name in names)
         },
         "skipped": calibration.skipped,
-        "points_taken_out": calibration.num_outliers,
+        "num_outliers": calibration.num_outliers,
     }
     write_atomically(out / REPORT, json.dumps(report, indent=1) + "\n")
     poses = list(calibration.poses.values())

@@ -1,4 +1,4 @@
-"""Estimation of lens and poses from the points of a known board."""
+"""Estimation of lens and poses from the detected tags of a known board."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from jaxtyping import Bool, Float
 
 from nerfro.errors import NerfroError
 
-from .boards import Sighting
+from .boards import TagDetections
 from .opencv import opencv
 
 LensModel = Literal["pinhole", "radial", "opencv"]
 
-# A point is an outlier (a misread tag, or a tag seen through the glass) if its error exceeds so many standard
+# A corner is an outlier (of a misread tag, or of a tag seen through the glass) if its error exceeds so many standard
 # deviations and so many pixels. The median of 2-D normal errors is 1.18 standard deviations.
 _OUTLIER_DEVIATIONS, _MIN_OUTLIER_ERROR = 5.0, 1.0
-_ROUNDS = 10
+_MAX_ESTIMATES = 10
 # Images with fewer tags are skipped; the paper's authors require twelve corners, four for each tag. Fewer images do
 # not determine the lens.
 _MIN_TAGS, _MIN_IMAGES = 3, 3
@@ -47,40 +47,51 @@ class Pose:
 
     Attributes:
         camera_to_world: [R | centre] in OpenCV's camera axes.
-        num_features: number of features that determine the pose.
-        error: root mean square reprojection error, in pixels; NaN without features.
+        num_observations: number of tags, or of 3-D points of COLMAP, that determine the pose.
+        error: root mean square reprojection error, in pixels; NaN without observations.
     """
 
     camera_to_world: Float[np.ndarray, "3 4"]
-    num_features: int
+    num_observations: int
     error: float
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Estimated lens and poses."""
+    """Estimated lens and poses.
+
+    Attributes:
+        intrinsics: the lens.
+        poses: poses by image name.
+        skipped: reason by name, for images without a pose.
+        num_outliers: number of corners of tags that were removed as outliers; 0 for a model of COLMAP.
+    """
 
     intrinsics: Intrinsics
-    poses: dict[str, Pose]  # by image name
-    skipped: dict[str, str]  # reason by name, for images without a pose
+    poses: dict[str, Pose]
+    skipped: dict[str, str]
     num_outliers: int
 
     @property
     def errors(self) -> list[float]:
-        """Root mean square reprojection errors of the images with features, in pixels."""
-        return [pose.error for pose in self.poses.values() if pose.num_features]
+        """Root mean square reprojection errors of the images with observations, in pixels."""
+        return [pose.error for pose in self.poses.values() if pose.num_observations]
 
     @property
     def mean_error(self) -> float:
-        """Mean over the images of the root mean square reprojection error, in pixels; 0 without features."""
+        """Mean over the images of the root mean square reprojection error, in pixels; 0 without observations."""
         return float(np.mean(self.errors)) if self.errors else 0.0
 
-    def lines(self, feature: str) -> list[str]:
-        """Format a report: the error of each image, skipped images, and the lens; `feature` is a noun in the plural."""
-        lines = [f"reprojection error in pixels (rms) and number of {feature} by image:"]
+    def lines(self, observations: str) -> list[str]:
+        """Format a report: the error of each image, skipped images, and the lens.
+
+        Args:
+            observations: noun for the observations, in the plural.
+        """
+        lines = [f"reprojection error in pixels (rms) and number of {observations} by image:"]
         for name, pose in sorted(self.poses.items()):
-            error = f"{pose.error:6.3f}" if pose.num_features else f"{'-':>6}"
-            lines.append(f"  {error}  {pose.num_features:4d}  {name}")
+            error = f"{pose.error:6.3f}" if pose.num_observations else f"{'-':>6}"
+            lines.append(f"  {error}  {pose.num_observations:4d}  {name}")
         if self.errors:
             lines.append(f"  {self.mean_error:6.3f}  mean; {max(self.errors):.3f} largest")
         lines += [f"  skipped: {name}: {reason}" for name, reason in sorted(self.skipped.items())]
@@ -92,13 +103,13 @@ class Calibration:
         return [*lines, lens + ("" if deviation is None else f"; standard deviation of fx {deviation:.2f}")]
 
 
-def calibrate(sightings: dict[str, Sighting], size: tuple[int, int], model: LensModel) -> Calibration:
+def calibrate(detections: dict[str, TagDetections], size: tuple[int, int], model: LensModel) -> Calibration:
     """Minimize the reprojection error over all poses and the lens.
 
-    Estimation and removal of outliers alternate until no outliers remain.
+    Estimation and removal of outliers alternate until no outliers remain, for at most ten estimates.
 
     Args:
-        sightings: detected points by image name.
+        detections: detected tags by image name.
         size: width and height of the images, in pixels.
         model: distortion coefficients to estimate.
 
@@ -106,52 +117,51 @@ def calibrate(sightings: dict[str, Sighting], size: tuple[int, int], model: Lens
         NerfroError: too few images have enough tags, or the lens cannot be estimated.
     """
     skipped: dict[str, str] = {}
-    num_outliers = dict.fromkeys(sightings, 0)
-    current = dict(sightings)
-    for _ in range(_ROUNDS):
-        kept = {name: sighting for name, sighting in current.items() if sighting.num_features >= _MIN_TAGS}
-        for name, sighting in current.items():
+    num_outliers = dict.fromkeys(detections, 0)
+    current = dict(detections)
+    for number in range(1, _MAX_ESTIMATES + 1):
+        kept = {name: each for name, each in current.items() if each.num_tags >= _MIN_TAGS}
+        for name, each in current.items():
             if name not in kept:
                 removed = f" ({num_outliers[name]} points removed as outliers)" if num_outliers[name] else ""
-                skipped[name] = f"{sighting.num_features} tags found, {_MIN_TAGS} needed{removed}"
+                skipped[name] = f"{each.num_tags} tags found, {_MIN_TAGS} needed{removed}"
         if len(kept) < _MIN_IMAGES:
             raise NerfroError(
-                f"{len(kept)} of {len(sightings)} images show at least {_MIN_TAGS} tags of the board, {_MIN_IMAGES} "
+                f"{len(kept)} of {len(detections)} images show at least {_MIN_TAGS} tags of the board, {_MIN_IMAGES} "
                 "are needed; check board=, and that the board is sharp and large enough in the images"
             )
         intrinsics, extrinsics = _estimate(list(kept.values()), size, model)
         located = dict(zip(kept, extrinsics, strict=True))
-        errors = {name: _errors(sighting, intrinsics, *located[name]) for name, sighting in kept.items()}
+        errors = {name: _errors(each, intrinsics, *located[name]) for name, each in kept.items()}
         deviation = float(np.median(np.concatenate(list(errors.values())))) / 1.18
         limit = max(_MIN_OUTLIER_ERROR, _OUTLIER_DEVIATIONS * deviation)
         outliers = {name: _outliers(kept[name], error, limit) for name, error in errors.items()}
-        if not any(chosen.any() for chosen in outliers.values()):
+        if number == _MAX_ESTIMATES or not any(chosen.any() for chosen in outliers.values()):
             break
         for name, chosen in outliers.items():
             num_outliers[name] += int(chosen.sum())
-        current = {name: kept[name].only(~chosen) for name, chosen in outliers.items()}
+        current = {name: kept[name].select(~chosen) for name, chosen in outliers.items()}
     poses = {}
     for name, (rotation, translation) in located.items():
         camera_axes = opencv().Rodrigues(rotation)[0].T
         error = float(np.sqrt((errors[name] ** 2).mean()))
         pose = np.column_stack([camera_axes, -camera_axes @ translation])
-        poses[name] = Pose(pose, kept[name].num_features, error)
+        poses[name] = Pose(pose, kept[name].num_tags, error)
     return Calibration(intrinsics, poses, skipped, sum(num_outliers.values()))
 
 
 def _outliers(
-    sighting: Sighting, errors: Float[np.ndarray, " features"], limit: float
-) -> Bool[np.ndarray, " features"]:
-    """Select all points of the features whose error exceeds both the limit and half the largest error of the image.
+    detections: TagDetections, errors: Float[np.ndarray, " corners"], limit: float
+) -> Bool[np.ndarray, " corners"]:
+    """Select all corners of the tags of which an error exceeds the limit and half the largest error of the image.
 
     One misread tag disturbs the whole pose, so smaller errors are judged again after the largest ones are removed.
     """
-    exceeds = errors > max(limit, 0.5 * errors.max())
-    return np.isin(sighting.features, sighting.features[exceeds])
+    return detections.of_same_tags(errors > max(limit, 0.5 * errors.max()))
 
 
 def _estimate(
-    sightings: list[Sighting], size: tuple[int, int], model: LensModel
+    detections: list[TagDetections], size: tuple[int, int], model: LensModel
 ) -> tuple[Intrinsics, list[tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]]]:
     """Estimate the lens, and for each image the rotation vector and translation from world to camera."""
     cv2 = opencv()
@@ -163,8 +173,8 @@ def _estimate(
     focal = _INITIAL_FOCAL * max(size)
     guess = np.array([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1]])
     _, matrix, distortion, rotations, translations, deviations, _, _ = cv2.calibrateCameraExtended(
-        [sighting.points.astype(np.float32) for sighting in sightings],
-        [sighting.pixels.astype(np.float32) for sighting in sightings],
+        [each.board_points.astype(np.float32) for each in detections],
+        [each.image_points.astype(np.float32) for each in detections],
         size,
         guess,
         np.zeros(5),
@@ -178,9 +188,12 @@ def _estimate(
 
 
 def _errors(
-    sighting: Sighting, intrinsics: Intrinsics, rotation: Float[np.ndarray, "3"], translation: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, " features"]:
-    """Compute the distances between points and their projections, in pixels."""
+    detections: TagDetections,
+    intrinsics: Intrinsics,
+    rotation: Float[np.ndarray, "3"],
+    translation: Float[np.ndarray, "3"],
+) -> Float[np.ndarray, " corners"]:
+    """Compute the distances between corners and their projections, in pixels."""
     distortion = np.array(intrinsics.distortion) if intrinsics.distortion else None
-    projected, _ = opencv().projectPoints(sighting.points, rotation, translation, intrinsics.matrix, distortion)
-    return np.linalg.norm(projected.reshape(-1, 2) - sighting.pixels, axis=1)
+    projected, _ = opencv().projectPoints(detections.board_points, rotation, translation, intrinsics.matrix, distortion)
+    return np.linalg.norm(projected.reshape(-1, 2) - detections.image_points, axis=1)

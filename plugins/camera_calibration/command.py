@@ -18,8 +18,8 @@ from nerfro.progress import track
 from .boards import TagBoard, print_sheets, tag_grid, twelve_faces
 from .calibrated_data import FILES, ray_range, split_views, write_calibrated
 from .calibration import Calibration, calibrate
-from .photographs import list_photographs, luminance, outside
-from .reconstruction import SfmSettings, find_model, import_model
+from .photographs import list_photographs, luminance, outside_mask
+from .structure_from_motion import SfmSettings, find_model, import_model
 
 # Limits above which a warning is printed: reprojection error in pixels, and relative deviation of the focal length.
 _MAX_ERROR, _MAX_FOCAL_DEVIATION = 0.7, 0.02
@@ -80,11 +80,11 @@ def _calibrate(config: DictConfig, out: Path) -> None:
         calibration, points = import_model(model, images, size)
         quads, seen = [], points
     else:
-        sightings = {
-            image.name: outside(board.find(luminance(image)), mask, config.mask_labels)
+        detections = {
+            image.name: outside_mask(board.detect(luminance(image)), mask, config.mask_labels)
             for image, mask in zip(track("detecting tags", images), masks, strict=True)
         }
-        calibration = calibrate(sightings, size, config.lens)
+        calibration = calibrate(detections, size, config.lens)
         quads, points = [sheet.corners for sheet in board.sheets()], np.empty((0, 3))
         seen = np.concatenate(quads)
     # With an existing model, the option has no effect.
@@ -109,8 +109,8 @@ def _write_board(board: TagBoard | None, out: Path, overwrite: bool) -> None:
     print(f"wrote {files[0]} ({len(files) - 1} pages, in true size if the unit is a metre) and the pages as PNG")
 
 
-def _report(calibration: Calibration, feature: str, may_distort: bool, out: Path) -> None:
-    print("\n".join(calibration.lines(feature)))
+def _report(calibration: Calibration, observations: str, may_distort: bool, out: Path) -> None:
+    print("\n".join(calibration.lines(observations)))
     lens = calibration.intrinsics
     if calibration.mean_error > _MAX_ERROR and may_distort and not lens.distortion:
         warn(

@@ -15,7 +15,7 @@ from nerfro.errors import NerfroError, first_of, warn
 from nerfro.light import to_linear
 from nerfro.progress import track
 
-from .boards import Sighting
+from .boards import TagDetections
 
 HEIF_SUFFIXES = (".heic", ".heif")
 PHOTOGRAPH_SUFFIXES = (*IMAGE_SUFFIXES, *HEIF_SUFFIXES)
@@ -81,10 +81,10 @@ def luminance(image: Path) -> UInt8[np.ndarray, "H W"]:
     return np.uint8(np.rint(255 * np.minimum(light / white, 1.0)))
 
 
-def outside(sighting: Sighting, mask: Path | None, labels: Sequence[int] | None = None) -> Sighting:
-    """Remove features that are seen through the object or overlap the mask of the object."""
-    if mask is None or len(sighting.points) == 0:
-        return sighting
+def outside_mask(detections: TagDetections, mask: Path | None, labels: Sequence[int] | None = None) -> TagDetections:
+    """Remove tags that are seen through the object or overlap the mask of the object."""
+    if mask is None or len(detections.tag_ids) == 0:
+        return detections
     inside = to_unit(read_mask(mask, labels)) > 0.5
-    columns, rows = np.clip(sighting.pixels.astype(int), 0, np.array(inside.shape[::-1]) - 1).T
-    return sighting.only(~np.isin(sighting.features, sighting.features[inside[rows, columns]]))
+    columns, rows = np.clip(detections.image_points.astype(int), 0, np.array(inside.shape[::-1]) - 1).T
+    return detections.select(~detections.of_same_tags(inside[rows, columns]))

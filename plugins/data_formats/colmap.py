@@ -15,9 +15,7 @@ from nerfro.errors import NerfroError
 from nerfro.registry import register
 
 from .bounds import find_bounds, usable_points
-from .colmap_model import ColmapImage, ColmapModel, lens_of, read_colmap
-
-_MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "")
+from .colmap_model import MODEL_FOLDERS, ColmapImage, ColmapModel, find_model_folder, lens_of, read_colmap
 
 
 @register("data", "colmap")
@@ -77,9 +75,11 @@ class ColmapData(PosedImages):
         return 0.5 * camera.width / lens.fx, 0.5 * camera.height / lens.fy
 
     def _model_folder(self) -> Path:
-        folders = [self.root / name for name in ((self.model,) if self.model is not None else _MODEL_FOLDERS)]
-        for folder in folders:
-            if any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
-                return folder
-        tried = ", ".join(map(str, folders))
-        raise NerfroError(f"there is no COLMAP model (cameras.bin or .txt) in {tried}; set data.model to its folder")
+        folders = [self.root / name for name in ((self.model,) if self.model is not None else MODEL_FOLDERS)]
+        found = find_model_folder(folders)
+        if found is None:
+            tried = ", ".join(map(str, folders))
+            raise NerfroError(
+                f"there is no COLMAP model (cameras.bin or .txt) in {tried}; set data.model to its folder"
+            )
+        return found

@@ -7,7 +7,7 @@ points3D.bin. Tracks of 3-D points are skipped.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -38,6 +38,8 @@ CAMERA_MODELS = (
     ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
 )
 _NUM_PARAMS = dict(CAMERA_MODELS)
+# Usual places of a model below the folder of a data set, in the order of the search.
+MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "")
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,14 @@ class ColmapModel:
     cameras: dict[int, ColmapCamera]
     images: list[ColmapImage]
     points: Float[np.ndarray, "points 3"]
+
+
+def find_model_folder(folders: Iterable[Path]) -> Path | None:
+    """Return the first folder with a model, that is, with the file cameras.bin or cameras.txt."""
+    return next(
+        (folder for folder in folders if any((folder / name).is_file() for name in ("cameras.bin", "cameras.txt"))),
+        None,
+    )
 
 
 def read_colmap(folder: Path) -> ColmapModel:

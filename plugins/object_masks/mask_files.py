@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, UInt8
 from nerfro_plugins.camera_calibration.opencv import opencv
 from nerfro_plugins.camera_calibration.photographs import PHOTOGRAPH_SUFFIXES
-from nerfro_plugins.camera_calibration.reconstruction import numeric_order
+from nerfro_plugins.camera_calibration.structure_from_motion import numeric_order
 from omegaconf import DictConfig, OmegaConf
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
@@ -28,7 +28,7 @@ from nerfro.files.images import save_image
 from nerfro.files.reading import read_json
 from nerfro.paths import user_path
 
-from .masking import Segmentation, box_region, check_tracked, grab, polygon_mask, propagate
+from .masking import Segmentation, box_region, check_tracked, grab_cut, polygon_mask, propagate
 from .outline_hull import AGREES, MIN_VIEWS
 from .tracking import load_tracker, track_object
 
@@ -274,7 +274,7 @@ class MaskTask:
                 boxes[view] = scaled.tolist()
             else:
                 region = box_region(scaled, size)
-                given[view] = grab(self.images[view], region, region)
+                given[view] = grab_cut(self.images[view], region, region)
         for view, mask in given.items():
             if not mask.any():
                 raise NerfroError(f"{self.frames[view].name}: the outline or mask is empty; draw it around the object")

@@ -30,7 +30,7 @@ _FEW = 12
 _NUM_COMPONENTS = 5
 
 
-def grab(
+def grab_cut(
     image: UInt8[np.ndarray, "H W 3"],
     likely: Bool[np.ndarray, "H W"],
     possible: Bool[np.ndarray, "H W"],
@@ -108,10 +108,11 @@ class Segmentation:
     Attributes:
         masks: by view, the given masks included.
         overlaps: by view, intersection over union of the segmented mask and the visual hull.
-        by_hull: views whose mask is the projection of the visual hull, because the segmented mask disagrees with the
-            hull or there is none.
+        by_hull: views whose mask is the projection of the shape, because there is no segmented mask, or because it
+            disagrees with the visual hull.
         shape: shape that the projections show.
         agreement: by view of a given mask, intersection over union of the mask and this shape.
+        segmenter: method that made all masks that are neither given nor projections, for messages.
     """
 
     masks: dict[int, Bool[np.ndarray, "H W"]]
@@ -179,43 +180,82 @@ def propagate(
     """
     wanted = [view for view in range(len(images)) if view not in given]
     outlines = OutlineHull(cameras, given)
+    strategy = _choose_strategy(images, outlines, given, wanted, hull_only)
+    accepted, overlaps = {}, {}
+    if strategy.uses_grab_cut:
+        for view in wanted:
+            region, cut = _guided(images[view], outlines, view, strategy.surface)
+            overlaps[view] = _overlap(cut, region)
+            if overlaps[view] >= AGREES:
+                accepted[view] = cut
+            progress()
+    surface = OutlineHull(cameras, {**given, **accepted}).hull() if accepted else strategy.surface
+    by_hull = [view for view in wanted if view not in accepted]
+    projections = outlines.seen_from([*by_hull, *given], surface)
+    masks = {**given, **accepted, **{view: projections[view] for view in by_hull}}
+    agreement = {view: _overlap(mask, projections[view]) for view, mask in given.items()}
+    return Segmentation(masks, overlaps, by_hull, strategy.shape, agreement)
+
+
+@dataclass(frozen=True)
+class _Strategy:
+    """How missing masks are made.
+
+    Attributes:
+        surface: surface whose projections guide GrabCut, or are the masks; None only if no mask is missing.
+        shape: shape of the surface.
+        uses_grab_cut: whether GrabCut segments the views.
+    """
+
+    surface: TriangleMesh | None
+    shape: Shape
+    uses_grab_cut: bool
+
+
+def _choose_strategy(
+    images: Sequence[UInt8[np.ndarray, "H W 3"]],
+    outlines: OutlineHull,
+    given: Mapping[int, Bool[np.ndarray, "H W"]],
+    wanted: Sequence[int],
+    hull_only: bool,
+) -> _Strategy:
+    """Choose between projections and GrabCut, and between a body of revolution and the visual hull (see `propagate`).
+
+    Args:
+        images: 8-bit sRGB images of all views.
+        outlines: visual hull of the given masks, to which reference views may be added.
+        given: known masks by view.
+        wanted: views without a given mask.
+        hull_only: do not use GrabCut.
+
+    Raises:
+        NerfroError: too few views agree with the given masks.
+    """
     body = outlines.revolution() if wanted and 2 <= len(given) <= _FEW else None
-    hull_only = hull_only or body is not None
+    if body is not None:
+        return _Strategy(body, "body of revolution", uses_grab_cut=False)
     if not hull_only and len(given) < MIN_VIEWS:
         _add_reference_views(images, outlines)
-    if body is None and wanted and hull_only and len(outlines) < MIN_VIEWS:
-        raise NerfroError(
-            f"{len(outlines)} masks or outlines do not determine the shape; outline the object in two views from "
-            f"different directions if it is a body of revolution, otherwise in at least {MIN_VIEWS}"
-        )
-    if body is None and wanted and len(outlines) < MIN_VIEWS:
+    if wanted and len(outlines) < MIN_VIEWS:
+        if hull_only:
+            raise NerfroError(
+                f"{len(outlines)} masks or outlines do not determine the shape; outline the object in two views from "
+                f"different directions if it is a body of revolution, otherwise in at least {MIN_VIEWS}"
+            )
         raise NerfroError(
             f"{len(outlines)} of {len(images)} views agree on a shape, {MIN_VIEWS} are needed, because the outlined "
             "object is not found in other images by its colours; outline the whole object in more views from all "
             "sides, or provide masks"
         )
-    common = outlines.hull() if body is None else body
-    if wanted and common is None:
+    hull = outlines.hull()
+    if wanted and hull is None:
         raise NerfroError(
             "the visual hull of the given masks is empty; correct the masks or the poses, and check the format of the "
             "data set (data=), which determines the camera axes"
         )
-    if not hull_only and MIN_VIEWS < len(given) <= _FEW:
-        hull_only = _hull_predicts_better(images, outlines, given)
-    found, overlaps = {}, {}
-    for view in wanted if not hull_only else []:
-        region, cut = _guided(images[view], outlines, view, common)
-        overlaps[view] = _overlap(cut, region)
-        if overlaps[view] >= AGREES:
-            found[view] = cut
-        progress()
-    by_hull = [view for view in wanted if view not in found]
-    hull = OutlineHull(cameras, {**given, **found}).hull() if found else common
-    seen = outlines.seen_from([*by_hull, *given], hull)
-    found |= {view: seen[view] for view in by_hull}
-    agreement = {view: _overlap(mask, seen[view]) for view, mask in given.items()}
-    shape: Shape = "visual hull" if body is None else "body of revolution"
-    return Segmentation({**given, **found}, overlaps, by_hull, shape, agreement)
+    are_few = MIN_VIEWS < len(given) <= _FEW
+    uses_grab_cut = not hull_only and not (are_few and _hull_predicts_better(images, outlines, given))
+    return _Strategy(hull, "visual hull", uses_grab_cut)
 
 
 def _guided(
@@ -224,7 +264,7 @@ def _guided(
     """Return the projection of the hull of all other views, and the mask of GrabCut that starts from the projection."""
     region = outlines.seen_from([view], outlines.hull(without=view) if view in outlines else hull)[view]
     core = _distance(region) > _CORE * _diameter(region)
-    return region, grab(image, region, _dilate(region, _REACH), core)
+    return region, grab_cut(image, region, _dilate(region, _REACH), core)
 
 
 def _hull_predicts_better(
@@ -249,7 +289,7 @@ def _add_reference_views(images: Sequence[UInt8[np.ndarray, "H W 3"]], outlines:
     refused: list[int] = []
     while (view := outlines.next_view(refused)) is not None:
         region = outlines.seen_from([view], outlines.hull())[view]
-        if not outlines.add_if_agreed(view, grab(images[view], region, _dilate(region, _REACH))):
+        if not outlines.add_if_agreed(view, grab_cut(images[view], region, _dilate(region, _REACH))):
             refused.append(view)
 
 

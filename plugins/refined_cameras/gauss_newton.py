@@ -42,7 +42,7 @@ class Step:
 
     Attributes:
         difference_pixels: distance of the finite differences in pixels.
-        scale: scale of the robust error, sRGB.
+        scale: scale of the robust loss, see `robust_weights`, sRGB.
         max_pixels: maximum motion of a camera, and maximum change of the lens, in pixels.
         fraction: fraction of the step that is applied.
     """
@@ -85,11 +85,11 @@ def gauss_newton_step(
     weights = robust_weights(error, step.scale) / (1 + (slopes[..., :6] / _STEEP_SLOPE).square().sum((1, 2)))
     matrix, vector = normal_equations(slopes.double(), error.double(), weights.double(), view, len(cameras))
     variance = (weights[:, None] * error.square()).sum() / (3 * weights.sum()).clamp(min=_TINY)
-    matrix, vector = with_priors(matrix, vector, camera.numbers(), variance, priors)
+    matrix, vector = with_priors(matrix, vector, camera.parameter_vector(), variance, priors)
     motion, lens = camera.split(-torch.linalg.solve(matrix, vector))
     motion, lens = (
-        numbers * (step.max_pixels / numbers.norm(dim=-1, keepdim=True).clamp(min=_TINY)).clamp(max=1)
-        for numbers in (motion, lens)
+        change * (step.max_pixels / change.norm(dim=-1, keepdim=True).clamp(min=_TINY)).clamp(max=1)
+        for change in (motion, lens)
     )
     camera.move(step.fraction * motion.to(angle), step.fraction * lens.to(angle))
 
@@ -134,9 +134,9 @@ def _differences(
     by_origin, by_direction = (d.new_zeros(len(d), 3, 3) for _ in range(2))
     for axis in axes_across(d):
         step = (sign * angle)[:, None]
-        turned = render(replace(rays, directions=normalize(d + step * axis, dim=-1)), view)
-        by_direction += ((turned - rendered) / step)[:, :, None] * axis[:, None]
+        rotated = render(replace(rays, directions=normalize(d + step * axis, dim=-1)), view)
+        by_direction += ((rotated - rendered) / step)[:, :, None] * axis[:, None]
         step = step * distances[:, None]
-        shifted = render(replace(rays, origins=rays.origins + step * axis), view)
-        by_origin += ((shifted - rendered) / step)[:, :, None] * axis[:, None]
+        translated = render(replace(rays, origins=rays.origins + step * axis), view)
+        by_origin += ((translated - rendered) / step)[:, :, None] * axis[:, None]
     return rendered, by_origin, by_direction

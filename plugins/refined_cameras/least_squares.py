@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -9,6 +10,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize, one_hot
+
+from nerfro.robust import geman_mcclure_weight
 
 # Damping of the normal equations, relative to the mean of the diagonal.
 DAMPING = 1e-3
@@ -20,12 +23,12 @@ class PriorInformation:
     """Gaussian prior of the parameters of all cameras.
 
     Attributes:
-        numbers: mean of the parameters in pixels: six per camera, followed by the lens if it is refined (see
-            `RefinedCamera.numbers`).
+        mean: mean of the parameters in pixels: six per camera, followed by the lens if it is refined (see
+            `RefinedCamera.parameter_vector`).
         information: information matrix, the inverse of the covariance; zero for directions without information.
     """
 
-    numbers: Float[Tensor, " parameters"]
+    mean: Float[Tensor, " parameters"]
     information: Float[Tensor, "parameters parameters"]
 
 
@@ -37,8 +40,12 @@ def axes_across(directions: Float[Tensor, "R 3"]) -> tuple[Float[Tensor, "R 3"],
 
 
 def robust_weights(error: Float[Tensor, "R 3"], scale: float) -> Float[Tensor, "R"]:
-    """Compute Geman-McClure weights, which reduce the influence of errors above `scale`."""
-    return 1 / (1 + (error / scale).square().sum(-1)).square()
+    """Compute Geman-McClure weights of errors of three channels.
+
+    In contrast to `nerfro.robust`, `scale` refers to the Euclidean norm over the channels, not to their root mean
+    square, which is smaller by the square root of 3.
+    """
+    return geman_mcclure_weight(error, scale / math.sqrt(error.shape[-1]))
 
 
 def normal_equations(
@@ -80,7 +87,7 @@ def normal_equations(
 def with_priors(
     matrix: Float[Tensor, "parameters parameters"],
     vector: Float[Tensor, " parameters"],
-    numbers: Float[Tensor, " parameters"],
+    parameters: Float[Tensor, " parameters"],
     variance: Float[Tensor, ""] | float,
     priors: Iterable[PriorInformation],
 ) -> tuple[Float[Tensor, "parameters parameters"], Float[Tensor, " parameters"]]:
@@ -88,7 +95,7 @@ def with_priors(
 
     Args:
         matrix, vector: matrix and gradient of the normal equations.
-        numbers: current parameters in pixels.
+        parameters: current parameters in pixels.
         variance: variance of the residuals, which scales the priors.
         priors: priors of the parameters.
     """
@@ -96,5 +103,5 @@ def with_priors(
         # Checkpoints are read to the CPU.
         information = variance * prior.information.to(matrix)
         matrix = matrix + information
-        vector = vector + information @ (numbers - prior.numbers.to(numbers)).to(vector)
+        vector = vector + information @ (parameters - prior.mean.to(parameters)).to(vector)
     return matrix, vector

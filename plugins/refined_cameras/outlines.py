@@ -86,8 +86,8 @@ def align_to_outlines(
         The information that the outlines give about the cameras. None if the surface does not fit its masks; the
         cameras are then unchanged.
     """
-    numbers = camera.numbers()
-    weak = PriorInformation(numbers, torch.eye(len(numbers)).to(numbers) / _PRIOR_DEVIATION**2)
+    initial = camera.parameter_vector()
+    weak = PriorInformation(initial, torch.eye(len(initial)).to(initial) / _PRIOR_DEVIATION**2)
     finder = RimFinder(mesh, silhouettes)
     for step in track("outlines", range(_STEPS + 1)):
         slopes, error, weights, view = _observations(camera, cameras, downscaled, finder)
@@ -95,17 +95,18 @@ def align_to_outlines(
         if step < _STEPS:
             matrix, vector = normal_equations(slopes, error, weights, view, len(cameras))
             matrix, vector = _without_width(matrix, vector)
-            matrix, vector = with_priors(matrix, vector, camera.numbers(), _CORRELATED * variance, [*priors, weak])
+            parameters = camera.parameter_vector()
+            matrix, vector = with_priors(matrix, vector, parameters, _CORRELATED * variance, [*priors, weak])
             motion, lens = camera.split(-torch.linalg.solve(matrix, vector).to(camera.motions.motion))
             camera.move(motion * (_MAX_STEP / motion.norm(dim=-1, keepdim=True).clamp(min=_MAX_STEP)), lens)
     distance = float((error - error.median()).abs().median())
     if distance > _MAX_DISTANCE:
-        camera.move_back(numbers, worse=torch.ones(len(cameras), dtype=torch.bool), lens=True)
+        camera.restore(initial, torch.ones(len(cameras), dtype=torch.bool), lens=True)
         print(f"outlines: the surface is {distance:.2f} pixels off its masks at best, so the cameras are not aligned")
         return None
     matrix, vector = normal_equations(slopes, error, weights, view, len(cameras), damping=0.0)
     information = _without_width(matrix, vector)[0] / (_CORRELATED * variance)
-    return PriorInformation(camera.numbers(), information.to(numbers))
+    return PriorInformation(camera.parameter_vector(), information.to(initial))
 
 
 def _observations(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -29,11 +30,23 @@ from .refined import RefinedCamera
 
 # Photographs are downscaled to this width in pixels; the alignment is accurate to a few hundredths of a pixel.
 _WIDTH = 256
-# Per step: standard deviation of the blur relative to the width, and number of directions per photograph.
-_STEPS = ((1 / 32, 150),) * 4 + ((1 / 64, 150),) * 3 + ((1 / 128, 200),) * 3 + ((0.0, 300),) * 3
+
+
+class _Level(NamedTuple):
+    """Gauss-Newton steps with one blur of the photographs."""
+
+    blur: float  # standard deviation, as a fraction of the image width
+    num_directions: int  # that each photograph contributes
+    repetitions: int  # number of steps
+
+
+# Coarse to fine: the blur limits the details, and thereby the distance over which derivatives are valid.
+_LEVELS = (_Level(1 / 32, 150, 4), _Level(1 / 64, 150, 3), _Level(1 / 128, 200, 3), _Level(0.0, 300, 3))
 _MIN_BLUR = 0.7  # pixels
-# Minimum fraction of sky in a blurred pixel, and scale of the robust error.
+# Minimum fraction of sky in a blurred pixel, and scale of the robust loss (see `robust_weights`) in square roots of
+# linear radiance.
 _MIN_SKY, _SCALE = 0.9, 0.1
+_REWEIGHTINGS = 2
 # Damping relative to the diagonal, which keeps cameras fixed that share no direction with others.
 _DAMPING = 1e-2
 # Minimum variance of colours: the square of half an 8-bit level.
@@ -63,32 +76,36 @@ def align(
     images = _downscaled_roots(cameras, photographed)
     gains, generator = images.new_ones(len(cameras), 3), torch.Generator().manual_seed(0)
     information = None
-    for relative_blur, num in track("panorama", _STEPS):
-        blur = max(relative_blur * images.shape[-1], _MIN_BLUR)
-        overlap = _overlap(camera, cameras, images, of_sky, blur, num, generator)
+    steps = [level for level in _LEVELS for _ in range(level.repetitions)]
+    for level in track("panorama", steps):
+        blur = max(level.blur * images.shape[-1], _MIN_BLUR)
+        overlap = _find_overlap(camera, cameras, images, of_sky, blur, level.num_directions, generator)
         if overlap is None:
             continue  # if little sky is visible, strongly blurred pixels always contain other objects
         matrix, vector, variance = _equations(overlap, gains, learn_gains=camera.exposure is not None)
-        num_turns, num_lens = 3 * len(cameras), overlap.lens.shape[-1]
+        num_rotations, num_lens = 3 * len(cameras), overlap.by_lens.shape[-1]
         step = _solve(matrix, vector).to(images)
-        turns, lens, log_gains = step.split([num_turns, num_lens, len(step) - num_turns - num_lens])
+        rotations, lens, log_gains = step.split([num_rotations, num_lens, len(step) - num_rotations - num_lens])
         gains = gains * log_gains.exp().view(-1, 3) if len(log_gains) else gains
-        turns, max_pixels = turns.view(-1, 3), 2 * blur * cameras.width / images.shape[-1]
-        turns = turns * (max_pixels / turns.norm(dim=-1, keepdim=True).clamp(min=_TINY)).clamp(max=1)
-        camera.move(F.pad(turns, (0, 3)), lens)
-        information = _marginalized(matrix, num_turns + num_lens) / max(variance, _MIN_VARIANCE)
-    if information is None:
-        return None
+        rotations, max_pixels = rotations.view(-1, 3), 2 * blur * cameras.width / images.shape[-1]
+        rotations = rotations * (max_pixels / rotations.norm(dim=-1, keepdim=True).clamp(min=_TINY)).clamp(max=1)
+        camera.move(F.pad(rotations, (0, 3)), lens)
+        information = _marginalized(matrix, num_rotations + num_lens) / max(variance, _MIN_VARIANCE)
+    return None if information is None else _prior(camera, information)
+
+
+def _prior(camera: RefinedCamera, information: Float[Tensor, "M M"]) -> PriorInformation:
+    """Convert information about all rotations and the lens to a prior of all parameters."""
     # The photographs do not determine a common rotation of all cameras.
     common = camera.motions.common_rotations().to(information)
     projection = torch.eye(len(information)).to(information)
     projection[: len(common), : len(common)] -= common @ common.mT
-    numbers = camera.numbers()
-    motions, lens = camera.split(torch.arange(len(numbers), device=information.device))
+    mean = camera.parameter_vector()
+    motions, lens = camera.split(torch.arange(len(mean), device=information.device))
     index = torch.cat([motions[:, :3].flatten(), lens])
-    known = information.new_zeros(len(numbers), len(numbers))
+    known = information.new_zeros(len(mean), len(mean))
     known[index[:, None], index] = projection @ information @ projection
-    return PriorInformation(numbers, known.to(numbers))
+    return PriorInformation(mean, known.to(mean))
 
 
 def _solve(
@@ -133,19 +150,19 @@ class _Overlap:
         view: index of the camera of each observation.
         direction: index of the direction of each observation.
         colour: blurred colours.
-        turns: derivatives of the colours by the rotation of the camera.
-        lens: derivatives of the colours by the lens.
+        by_rotation: derivatives of the colours by the rotation of the camera.
+        by_lens: derivatives of the colours by the lens.
     """
 
     num_views: int
     view: Int[Tensor, "O"]
     direction: Int[Tensor, "O"]
     colour: Float[Tensor, "O 3"]
-    turns: Float[Tensor, "O 3 3"]
-    lens: Float[Tensor, "O 3 L"]
+    by_rotation: Float[Tensor, "O 3 3"]
+    by_lens: Float[Tensor, "O 3 L"]
 
 
-def _overlap(
+def _find_overlap(
     camera: RefinedCamera,
     cameras: Cameras,
     images: Float[Tensor, "V 3 h w"],
@@ -154,34 +171,36 @@ def _overlap(
     num: int,
     generator: torch.Generator,
 ) -> _Overlap | None:
-    """Draw directions of the sky in each photograph, and find their colours in all photographs that show these."""
-    (height, width), num_views = images.shape[-2:], len(images)
-    small = camera.estimated(cameras).resized(width, height)
-    sky = torch.stack([of_sky(small.image_rays(view)) for view in range(num_views)]).view(num_views, 1, height, width)
-    fraction = _blurred(sky.to(images), blur)
-    images = _blurred(images * sky, blur) / fraction.clamp(min=_TINY)
-    usable = sky & (fraction > _MIN_SKY)
-    # The same number of pixels is drawn from each view, if the view has enough.
-    order = torch.rand(num_views, height * width, generator=generator).to(images) + ~usable.flatten(1)
-    drawn = order.argsort(1)[:, :num]
-    views = torch.arange(num_views, device=drawn.device)[:, None]
-    pixels = (views * height * width + drawn)[usable.flatten(1).gather(1, drawn)]
-    directions = pixel_rays(small, pixels).directions
-    far = replace(small, camera_to_world=F.pad(small.camera_to_world[..., :3], (0, 1)))
-    position, depth = far.project(directions)
-    column, row = position.floor().long().unbind(-1)
-    visible = (depth > 0) & (column >= 1) & (column < width - 1) & (row >= 1) & (row < height - 1)
-    column, row = column.clamp(0, width - 1), row.clamp(0, height - 1)
-    visible &= usable[views, 0, row, column]
-    visible &= visible.sum(0) > 1
+    """Draw directions of the sky in each photograph, and find their colours in all photographs that show these.
+
+    Args:
+        camera: estimated cameras.
+        cameras: cameras of the data set.
+        images: downscaled photographs.
+        of_sky: whether rays reach the sky without meeting the object.
+        blur: standard deviation of the blur, in pixels of these images.
+        num: number of directions per photograph.
+        generator: random numbers.
+
+    Returns:
+        The observations; None if no direction is visible in two photographs.
+    """
+    height, width = images.shape[-2:]
+    estimated = camera.estimated(cameras).resized(width, height)
+    images, usable = _blurred_sky(estimated, images, of_sky, blur)
+    directions = _draw_directions(estimated, usable, num, generator)
+    # The sky is infinitely far away, so the positions of the cameras do not matter.
+    distant = replace(estimated, camera_to_world=F.pad(estimated.camera_to_world[..., :3], (0, 1)))
+    position, depth = distant.project(directions)
+    visible = _visible(position, depth, usable)
     view, direction = visible.nonzero(as_tuple=True)
     if len(view) == 0:
         return None
 
     def sampled(directions: Float[Tensor, "directions 3"]) -> Float[Tensor, "O 3"]:
-        return _sample(images, view, far.project(directions)[0][visible])
+        return _sample(images, view, distant.project(directions)[0][visible])
 
-    angle = 1 / small.fx.mean()
+    angle = 1 / estimated.fx.mean()  # of a pixel
     by_direction = images.new_zeros(len(view), 3, 3)
     for axis in axes_across(directions):
         ends = [sampled(directions + side * angle * axis) for side in (0.5, -0.5)]
@@ -191,7 +210,41 @@ def _overlap(
     pixel = position.floor()
     rays = cameras.rays(view, pixel[:, 1], pixel[:, 0], position - pixel)
     slopes = -camera.slopes(rays, view, torch.zeros_like(by_direction), by_direction)
-    return _Overlap(num_views, view, direction, sampled(directions), slopes[..., :3], slopes[..., 6:])
+    return _Overlap(len(images), view, direction, sampled(directions), slopes[..., :3], slopes[..., 6:])
+
+
+def _blurred_sky(
+    cameras: Cameras, images: Float[Tensor, "V 3 h w"], of_sky: Callable[[Rays], Bool[Tensor, "R"]], blur: float
+) -> tuple[Float[Tensor, "V 3 h w"], Bool[Tensor, "V 1 h w"]]:
+    """Blur the sky in images without mixing it with the object; also returns which pixels show enough of the sky."""
+    size = len(images), 1, *images.shape[-2:]
+    sky = torch.stack([of_sky(cameras.image_rays(view)) for view in range(len(images))]).view(size)
+    fraction = _blurred(sky.to(images), blur)
+    return _blurred(images * sky, blur) / fraction.clamp(min=_TINY), sky & (fraction > _MIN_SKY)
+
+
+def _draw_directions(
+    cameras: Cameras, usable: Bool[Tensor, "V 1 h w"], num: int, generator: torch.Generator
+) -> Float[Tensor, "directions 3"]:
+    """Draw at most `num` usable pixels of each view without repetition, and return the directions of their rays."""
+    flat = usable.flatten(1)
+    # Unusable pixels come last.
+    order = torch.rand(*flat.shape, generator=generator).to(flat.device) + ~flat
+    drawn = order.argsort(1)[:, :num]
+    views = torch.arange(len(flat), device=drawn.device)[:, None]
+    return pixel_rays(cameras, (views * flat.shape[1] + drawn)[flat.gather(1, drawn)]).directions
+
+
+def _visible(
+    position: Float[Tensor, "V directions 2"], depth: Float[Tensor, "V directions"], usable: Bool[Tensor, "V 1 h w"]
+) -> Bool[Tensor, "V directions"]:
+    """Test whether directions are seen at usable pixels away from the border, and in at least two views."""
+    height, width = usable.shape[-2:]
+    column, row = position.floor().long().unbind(-1)
+    visible = (depth > 0) & (column >= 1) & (column < width - 1) & (row >= 1) & (row < height - 1)
+    views = torch.arange(len(usable), device=usable.device)[:, None]
+    visible &= usable[views, 0, row.clamp(0, height - 1), column.clamp(0, width - 1)]
+    return visible & (visible.sum(0) > 1)
 
 
 def _sample(
@@ -210,20 +263,30 @@ def _equations(
 ) -> tuple[Float[Tensor, "parameters parameters"], Float[Tensor, " parameters"], float]:
     """Compute matrix and gradient of the normal equations with the sky eliminated, and the variance of the colours.
 
+    The objective is the sum of w |g_v I_v(d_k) - c_k|^2 over all observations, minimized over the colours c_k of the
+    sky, where I_v(d_k) is the colour of direction d_k in view v, g_v the gain of the view, and w a robust weight. The
+    optimal c_k are weighted means. With the derivatives J of g_v I_v by the parameters and the matrix 1 that assigns
+    observations to directions, their elimination gives
+
+        J^T W J - J^T W 1 (1^T W 1)^-1 1^T W J
+
+    and the gradient J^T W r with r = g_v I_v(d_k) - c_k. Weights and means alternate (iteratively reweighted least
+    squares). The gradient uses the means of the previous weights, for which 1^T W r vanishes only approximately.
+
     The parameters are three rotations per view, the lens, and, with `learn_gains`, three logarithmic gains per view.
     """
     view, direction, num = overlap.view, overlap.direction, len(overlap.view)
     colour, weight, num_directions = overlap.colour * gains[view], gains.new_ones(num), int(direction.max()) + 1
-    for _ in range(2):
+    for _ in range(_REWEIGHTINGS):
         total = weight.new_zeros(num_directions).index_add(0, direction, weight).clamp(min=_TINY)
         mean = colour.new_zeros(num_directions, 3).index_add(0, direction, weight[:, None] * colour) / total[:, None]
         error = colour - mean[direction]
         weight = robust_weights(error, _SCALE)
     total = weight.new_zeros(num_directions).index_add(0, direction, weight).clamp(min=_TINY)
 
-    of_view, num_lens = torch.arange(3, device=view.device) + 3 * view[:, None], overlap.lens.shape[-1]
+    of_view, num_lens = torch.arange(3, device=view.device) + 3 * view[:, None], overlap.by_lens.shape[-1]
     of_lens = 3 * overlap.num_views + torch.arange(num_lens, device=view.device)
-    slopes, indices = [torch.cat([overlap.turns, overlap.lens], -1) * gains[view][..., None]], [of_view]
+    slopes, indices = [torch.cat([overlap.by_rotation, overlap.by_lens], -1) * gains[view][..., None]], [of_view]
     indices.append(of_lens.expand(num, -1))
     if learn_gains:
         slopes.append(torch.diag_embed(colour))
@@ -235,12 +298,13 @@ def _equations(
     jacobian = sparse.csr_matrix((values.flatten(), (rows.flatten(), columns.flatten())), size)
 
     weight, total, direction = (tensor.cpu() for tensor in (weight.double(), total.double(), direction))
-    root = np.repeat(weight.sqrt().numpy(), 3)
-    share = np.repeat((weight / total[direction].sqrt()).numpy(), 3)
+    root = np.repeat(weight.sqrt().numpy(), 3)  # W^1/2
+    sky_weights = np.repeat((weight / total[direction].sqrt()).numpy(), 3)
     channels = (3 * direction[:, None] + torch.arange(3)).flatten()
-    means = sparse.csr_matrix((share, (channels, np.arange(3 * num))), (3 * num_directions, 3 * num))
-    own, common = sparse.diags(root) @ jacobian, means @ jacobian
-    matrix = torch.from_numpy((own.T @ own - common.T @ common).toarray())
-    residual = error.double().cpu().flatten().numpy()
-    variance = float((root * residual) @ (root * residual) / (root @ root))
-    return matrix, torch.from_numpy(own.T @ (root * residual)), variance
+    # (1^T W 1)^-1/2 1^T W
+    eliminated = sparse.csr_matrix((sky_weights, (channels, np.arange(3 * num))), (3 * num_directions, 3 * num))
+    weighted, common = sparse.diags(root) @ jacobian, eliminated @ jacobian
+    matrix = torch.from_numpy((weighted.T @ weighted - common.T @ common).toarray())
+    residual = root * error.double().cpu().flatten().numpy()
+    variance = float(residual @ residual / (root @ root))
+    return matrix, torch.from_numpy(weighted.T @ residual), variance

@@ -14,7 +14,7 @@ from nerfro.rays import Rays
 from nerfro.registry import register
 from nerfro.subdivision import pixel_rays
 from nerfro.training.phases.background import occupied_box
-from nerfro.training.phases.base import Phase, Run
+from nerfro.training.phases.base import Phase, TrainingRun
 
 from .gauss_newton import Step, gauss_newton_step, informative_pixels
 from .least_squares import PriorInformation
@@ -48,7 +48,7 @@ class CameraSteps(Phase):
     def __init__(self, start: Natural = 50, every: Count = 50, num_pixels: Count = 300) -> None:
         self.start, self.every, self.num_pixels = start, every, num_pixels
 
-    def begin(self, run: Run) -> dict[str, Any]:
+    def begin(self, run: TrainingRun) -> dict[str, Any]:
         """Align the cameras; returns the prior information about the cameras by source."""
         scene, box = run.renderer.scene, occupied_box(run.renderer)
         camera = scene.camera
@@ -62,7 +62,7 @@ class CameraSteps(Phase):
         return 0 if training_step < self.start else 1 + (training_step - self.start) // self.every
 
     @torch.no_grad()
-    def step(self, run: Run, number: int, state: dict[str, Any]) -> bool:
+    def step(self, run: TrainingRun, number: int, state: dict[str, Any]) -> bool:
         """Take a Gauss-Newton step of all cameras with newly drawn pixels of high contrast.
 
         If the panorama has aligned the rotations, pixels of the background are not used for rotations, because the
@@ -85,8 +85,14 @@ class CameraSteps(Phase):
 
         difference = max(_MIN_DIFFERENCE, _FIRST_DIFFERENCE * _DECAY**number)
         fraction = min(1.0, _FULL_STEPS / (number + 1))
-        # Errors may increase: the scene fits the current cameras, so they are at a local minimum.
+        # The step is accepted even if the error rises, because the scene was trained with the current cameras, which
+        # are therefore a local minimum.
         settings = Step(difference, _ERROR_SCALE * difference, _MAX_PIXELS, fraction)
-        priors = [PriorInformation(**prior) for prior in state.values()]
+        priors = [_prior(prior) for prior in state.values()]
         gauss_newton_step(camera, batches.cameras, pixels, batches.photographed, shown, settings, priors)
         return True
+
+
+def _prior(state: dict[str, Tensor]) -> PriorInformation:
+    """Read a prior of the state of the phase; checkpoints of earlier releases call the mean `numbers`."""
+    return PriorInformation(state["mean"] if "mean" in state else state["numbers"], state["information"])

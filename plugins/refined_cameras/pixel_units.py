@@ -61,8 +61,8 @@ def even_weights(motions: Float[Tensor, "V 7"]) -> Float[Tensor, "V 6"]:
     return torch.stack([motions[:, :2].mean(1), motions[:, 3:5].mean(1)], -1).repeat_interleave(3, -1)
 
 
-def world_motions(poses: Float[Tensor, "V 3 4"], weights: Float[Tensor, "V 6"]) -> Float[Tensor, "gauge V 6"]:
-    """Compute an orthonormal basis of the camera motions that a similarity transformation of the world causes.
+def gauge_basis(poses: Float[Tensor, "V 3 4"], weights: Float[Tensor, "V 6"]) -> Float[Tensor, "gauge V 6"]:
+    """Compute an orthonormal basis of the gauge freedom: camera motions by similarity transformations of the world.
 
     Args:
         poses: camera-to-world matrices, world units.
@@ -81,10 +81,10 @@ def world_motions(poses: Float[Tensor, "V 3 4"], weights: Float[Tensor, "V 6"]) 
     return u[:, values > _RANK_TOLERANCE * values.max()].T.unflatten(-1, (len(poses), 6))
 
 
-def without_world(
-    motion: Float[Tensor, "V 6"], gauge: Float[Tensor, "gauge V 6"], weights: Float[Tensor, "V 6"]
+def project_out_gauge(
+    motion: Float[Tensor, "V 6"], basis: Float[Tensor, "gauge V 6"], weights: Float[Tensor, "V 6"]
 ) -> Float[Tensor, "V 6"]:
-    """Remove the component in the space of `world_motions` (`gauge`) from rotations and translations of cameras."""
+    """Remove the component in the space of `gauge_basis` from rotations and translations of cameras."""
     weighted = motion * weights
-    common = torch.einsum("kvi,vi->k", gauge, weighted)
-    return (weighted - torch.einsum("kvi,k->vi", gauge, common)) / weights
+    common = torch.einsum("kvi,vi->k", basis, weighted)
+    return (weighted - torch.einsum("kvi,k->vi", basis, common)) / weights

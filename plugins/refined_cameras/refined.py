@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int, Shaped
@@ -17,7 +18,7 @@ from nerfro.lens import distort, undistort
 from nerfro.rays import Rays
 from nerfro.registry import register
 
-from .pixel_units import even_weights, object_distances, pixel_motions, without_world, world_motions
+from .pixel_units import even_weights, gauge_basis, object_distances, pixel_motions, project_out_gauge
 
 
 class _Motions(PerView):
@@ -28,7 +29,7 @@ class _Motions(PerView):
         focal, distortion: focal lengths and distortion coefficients of the data set.
         units: rotation or translation that moves the image by one pixel, for each parameter.
         weights: weights of the parameters for the gauge.
-        of_world: basis of the camera motions that a similarity transformation of the world causes, or empty.
+        gauge_basis: basis of the gauge freedom (see `pixel_units.gauge_basis`); empty if the gauge is not fixed.
         focal_unit: change of the logarithmic focal length that moves the image by one pixel.
         motion: parameters in pixels.
     """
@@ -38,15 +39,20 @@ class _Motions(PerView):
     distortion: Float[Tensor, "V 9"]
     units: Float[Tensor, "V 6"]
     weights: Float[Tensor, "V 6"]
-    of_world: Float[Tensor, "gauge V 6"]
+    gauge_basis: Float[Tensor, "gauge V 6"]
     focal_unit: Float[Tensor, "1"]
     motion: Float[Tensor, "V 6"]
 
     def __init__(self, fix_gauge: bool = True) -> None:
         super().__init__()
         self.fix_gauge = fix_gauge
-        for name in ("motion", "poses", "focal", "distortion", "units", "weights", "of_world", "focal_unit"):
+        for name in ("motion", "poses", "focal", "distortion", "units", "weights", "gauge_basis", "focal_unit"):
             self.register_buffer(name, torch.zeros(0))
+
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
+        if prefix + "of_world" in state_dict:  # old name, in checkpoints of earlier releases
+            state_dict[prefix + "gauge_basis"] = state_dict.pop(prefix + "of_world")
+        super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def begin(self, cameras: Cameras) -> None:
         poses = cameras.camera_to_world.double().cpu()
@@ -60,7 +66,7 @@ class _Motions(PerView):
             "distortion": distortion,
             "units": 1 / pixels[:, :6],
             "weights": weights,
-            "of_world": world_motions(poses, weights) if self.fix_gauge else weights.new_zeros(0, *weights.shape),
+            "gauge_basis": gauge_basis(poses, weights) if self.fix_gauge else weights.new_zeros(0, *weights.shape),
             "focal_unit": 1 / pixels[:, 6].square().mean().sqrt()[None],
         }
         for name, tensor in found.items():
@@ -69,11 +75,11 @@ class _Motions(PerView):
     def forward(self) -> tuple[Float[Tensor, "V 3 3"], Float[Tensor, "V 3"]]:
         """Return rotation and translation of each camera, in the given camera axes."""
         motion = self.fixed()
-        return rotations(motion[:, :3]), motion[:, 3:]
+        return rotation_matrices(motion[:, :3]), motion[:, 3:]
 
     def fixed(self) -> Float[Tensor, "V 6"]:
-        """Return rotations (radians) and translations (world units), without the motion of the world."""
-        return without_world(self.motion * self.units, self.of_world, self.weights)
+        """Return rotations (radians) and translations (world units), without the gauge freedom."""
+        return project_out_gauge(self.motion * self.units, self.gauge_basis, self.weights)
 
     def common_rotations(self) -> Float[Tensor, "M 3"]:
         """Return an orthonormal basis of common rotations of all cameras, each about its centre; units of pixels."""
@@ -82,23 +88,22 @@ class _Motions(PerView):
 
     def moved(self) -> Float[Tensor, "V 3 4"]:
         """Return the estimated poses."""
-        turns, shifts = self()
+        rotations, translations = self()
         axes = self.poses[..., :3]
-        return torch.cat([axes @ turns, self.poses[..., 3:] + axes @ shifts[..., None]], -1)
+        return torch.cat([axes @ rotations, self.poses[..., 3:] + axes @ translations[..., None]], -1)
 
 
 @register("camera", "refined")
 class RefinedCamera(CameraModel):
     """Refine the pose of each training camera, and optionally the common lens, during training.
 
-    The phase `cameras` moves the cameras. The motion that a similarity
-    transformation of the world would cause is removed to first order, so that the world and the surface keep their
-    place.
+    The phase `cameras` moves the cameras. The motion that a similarity transformation of the world would cause (gauge
+    freedom) is removed to first order, so that the world and the surface keep their place.
 
     Args:
         lens: whether to refine the focal length and the principal point, which all views share.
         exposure: whether to estimate a gain for each training view and colour channel.
-        fix_gauge: whether to remove the motion of the world. Disable this for cameras of a scene that is fixed.
+        fix_gauge: whether to remove the gauge freedom. Disable this for cameras of a scene that is fixed.
     """
 
     moves = True
@@ -119,13 +124,13 @@ class RefinedCamera(CameraModel):
         self.motions.begin(cameras)
 
     def forward(self, rays: Rays, view: Int[Tensor, "R"]) -> Rays:
-        turns, shifts = self.motions()
+        rotations, translations = self.motions()
         axes = self.motions.poses[view, :, :3]
         local = (rays.directions[:, None] @ axes)[:, 0]
         if self.lens is not None:
             local = self._through_lens(local, view)
-        directions = (axes @ (turns[view] @ local[..., None]))[..., 0]
-        origins = rays.origins + (axes @ shifts[view, :, None])[..., 0]
+        directions = (axes @ (rotations[view] @ local[..., None]))[..., 0]
+        origins = rays.origins + (axes @ translations[view, :, None])[..., 0]
         return replace(rays, origins=origins, directions=normalize(directions, dim=-1))
 
     def slopes(
@@ -161,14 +166,14 @@ class RefinedCamera(CameraModel):
             by_lens.append((by_direction * (ends[0] - ends[1])[:, None]).sum(-1))
         return torch.cat([by_motion, torch.stack(by_lens, -1)], -1)
 
-    def numbers(self) -> Float[Tensor, " parameters"]:
+    def parameter_vector(self) -> Float[Tensor, " parameters"]:
         """Return a copy of the parameters of all cameras in pixels, followed by the lens if it is refined."""
         return torch.cat([self.motions.motion.flatten(), *([] if self.lens is None else [self.lens])])
 
-    def split(self, numbers: Shaped[Tensor, " parameters"]) -> tuple[Shaped[Tensor, "V 6"], Shaped[Tensor, "L"]]:
-        """Split such parameters into motions of the cameras and lens."""
+    def split(self, parameters: Shaped[Tensor, " parameters"]) -> tuple[Shaped[Tensor, "V 6"], Shaped[Tensor, "L"]]:
+        """Split a vector of parameters (see `parameter_vector`) into motions of the cameras and lens."""
         num = self.motions.motion.numel()
-        return numbers[:num].view(-1, 6), numbers[num:]
+        return parameters[:num].view(-1, 6), parameters[num:]
 
     def move(self, motion: Float[Tensor, "V 6"], lens: Float[Tensor, "L"]) -> None:
         """Add to the parameters of cameras and lens, in pixels."""
@@ -176,10 +181,10 @@ class RefinedCamera(CameraModel):
         if self.lens is not None:
             self.lens += lens
 
-    def move_back(self, numbers: Float[Tensor, " parameters"], worse: Bool[Tensor, "V"], lens: bool) -> None:
-        """Restore earlier parameters (see `numbers`) of the cameras `worse`, and of the lens if `lens` is true."""
-        motion, old_lens = self.split(numbers)
-        self.motions.motion[worse] = motion[worse]
+    def restore(self, parameters: Float[Tensor, " parameters"], views: Bool[Tensor, "V"], lens: bool) -> None:
+        """Restore earlier parameters (see `parameter_vector`) of some views, and of the lens if `lens` is true."""
+        motion, old_lens = self.split(parameters)
+        self.motions.motion[views] = motion[views]
         if lens and self.lens is not None:
             self.lens.copy_(old_lens)
 
@@ -232,7 +237,7 @@ class RefinedCamera(CameraModel):
         return found
 
 
-def rotations(vectors: Float[Tensor, "V 3"]) -> Float[Tensor, "V 3 3"]:
+def rotation_matrices(vectors: Float[Tensor, "V 3"]) -> Float[Tensor, "V 3 3"]:
     """Convert rotation vectors (axis times angle in radians) to rotation matrices."""
     x, y, z = vectors.unbind(-1)
     zero = torch.zeros_like(x)

@@ -12,15 +12,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
-from nerfro.capture.index_search import mean_errors, standard_error
+from nerfro.capture.grid_search import mean_errors, parabola_minimum, standard_error
 from nerfro.capture.object_errors import COMMON_INDICES, ObjectErrors
 from nerfro.capture.surroundings import Observations
 from nerfro.errors import NerfroError, warn
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.media.sdf_grid import SdfGrid
-from nerfro.progress import bar
+from nerfro.progress import fraction_bar
 from nerfro.silhouettes.upright import find_up
 
 from .vessel import SdfVessel
@@ -89,7 +88,7 @@ def find_vessel(
         )
 
     try:
-        with bar("vessel") as progress:
+        with fraction_bar("vessel") as progress:
             fit = fit_vessel(build, float(np.ptp(across, axis=0).max()), observations, progress)
         lengths = {name: float(f"{length:.4g}") for name, length in fit.lengths.items()}
         liquid_ior = _WATER if "level" in lengths else 1.0
@@ -142,26 +141,12 @@ def fit_vessel(
             grid = middle + half_width * _GRID
             values = grid.clip(max=highest) if is_level else np.exp(grid)
             sums = np.stack([search.of(vessel.with_lengths(lengths | {name: value})) for value in values.tolist()])
-            found = _minimum(grid, mean_errors(sums, search.counts))[0]
-            minima = _minimum(grid, mean_errors(sums, search.counts, search.samples))
+            # Robust errors have narrow minima, which a quadratic function through all candidates would miss.
+            found = parabola_minimum(grid, mean_errors(sums, search.counts))[0]
+            minima = parabola_minimum(grid, mean_errors(sums, search.counts, search.samples))
             spread = float(standard_error(minima, search.counts))
             lengths[name] = float(min(found, highest) if is_level else np.exp(found))
             standard_errors[name] = spread if is_level else spread * lengths[name]
     unknown = [name for name in typical if standard_errors[name] > _MAX_STANDARD_ERROR * lengths[name]]
     progress(1.0)
     return VesselFit(lengths | {name: typical[name] for name in unknown}, standard_errors, unknown)
-
-
-def _minimum(
-    grid: Float[np.ndarray, " candidates"], errors: Float[np.ndarray, "resamples candidates"]
-) -> Float[np.ndarray, " resamples"]:
-    """Return the minima of the parabolas through the lowest error and its neighbours.
-
-    Robust errors have narrow minima, which a parabola through all candidates would miss.
-    """
-    lowest = errors.argmin(1).clip(1, len(grid) - 2)
-    before, at, after = (errors[np.arange(len(errors)), lowest + offset] for offset in (-1, 0, 1))
-    curvature = before - 2 * at + after
-    offset = 0.5 * (before - after) / np.where(curvature > 0, curvature, 1)
-    offset = np.where(curvature > 0, offset.clip(-1, 1), np.sign(before - after))
-    return grid[lowest] + offset * (grid[1] - grid[0])

@@ -5,8 +5,8 @@ from importlib import import_module
 from nerfro.registry import discover
 
 discover()
-_NAMES = ("gauss_newton", "least_squares", "outlines", "panorama", "pixel_units", "refined")
+_NAMES = ("gauss_newton", "least_squares", "outlines", "panorama", "phase", "pixel_units", "refined")
 _MODULES = [import_module(f"nerfro_plugins.refined_cameras.{name}") for name in _NAMES]
-gauss_newton, least_squares, outlines, panorama, pixel_units, refined = _MODULES
+gauss_newton, least_squares, outlines, panorama, phase, pixel_units, refined = _MODULES
 PriorInformation, RefinedCamera = least_squares.PriorInformation, refined.RefinedCamera
 align, align_to_outlines = panorama.align, outlines.align_to_outlines

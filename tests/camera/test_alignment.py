@@ -1,4 +1,4 @@
-"""Cameras, and the lens that they share, are moved until they agree with a known scene, its sky and its masks."""
+"""Alignment of cameras and their shared lens to a known scene, its sky and its masks."""
 
 import math
 from dataclasses import replace
@@ -38,7 +38,7 @@ def photographed(pixels: Tensor) -> Tensor:
     return PHOTOGRAPHS[pixels]
 
 
-def looked_at(step: int, num: int = 300) -> Tensor:
+def pixels_of_step(step: int, num: int = 300) -> Tensor:
     generator = torch.Generator().manual_seed(step)
     drawn = torch.randint(SIZE * SIZE, (NUM_VIEWS, 2 * num), generator=generator)
     pixels = drawn + SIZE * SIZE * torch.arange(NUM_VIEWS)[:, None]
@@ -47,12 +47,12 @@ def looked_at(step: int, num: int = 300) -> Tensor:
 
 def steps(camera: RefinedCamera, given: Cameras, num: int) -> None:
     camera.begin(given)
-    how = gauss_newton.Step(difference_pixels=0.5, scale=0.3, max_pixels=3.0)
+    settings = gauss_newton.Step(difference_pixels=0.5, scale=0.3, max_pixels=3.0)
     for step in range(num):
-        gauss_newton.gauss_newton_step(camera, given, looked_at(step), photographed, shown, how)
+        gauss_newton.gauss_newton_step(camera, given, pixels_of_step(step), photographed, shown, settings)
 
 
-def test_disturbed_cameras_find_back_by_what_is_seen_through_the_ball() -> None:
+def test_photometric_steps_recover_disturbed_cameras() -> None:
     camera = RefinedCamera(fix_gauge=False)
     steps(camera, DISTURBED, 6)
     before = motion_between(TRUE.camera_to_world, DISTURBED.camera_to_world)
@@ -61,7 +61,7 @@ def test_disturbed_cameras_find_back_by_what_is_seen_through_the_ball() -> None:
         assert float(new.median()) < 0.06 * float(old.median())
 
 
-def test_the_lens_that_all_share_is_found_with_them() -> None:
+def test_photometric_steps_recover_the_shared_lens() -> None:
     given = replace(TRUE, fx=1.02 * TRUE.fx, fy=1.02 * TRUE.fy, cx=TRUE.cx + 0.5, cy=TRUE.cy - 0.3)
     camera = RefinedCamera(lens=True, fix_gauge=False)
     steps(camera, given, 8)
@@ -71,7 +71,7 @@ def test_the_lens_that_all_share_is_found_with_them() -> None:
     assert float(found.cy[0]) == pytest.approx(float(TRUE.cy[0]), abs=0.1)
 
 
-def test_steps_vanish_at_the_truth_and_have_a_limit() -> None:
+def test_steps_are_zero_at_the_true_cameras_and_bounded() -> None:
     camera = RefinedCamera(fix_gauge=False)
     camera.begin(TRUE)
     wrong = 1 - PHOTOGRAPHS
@@ -80,14 +80,16 @@ def test_steps_vanish_at_the_truth_and_have_a_limit() -> None:
         return wrong[pixels]
 
     far = gauss_newton.Step(difference_pixels=0.5, scale=10.0, max_pixels=0.25)
-    gauss_newton.gauss_newton_step(camera, TRUE, looked_at(0), inverted, shown, far)
+    gauss_newton.gauss_newton_step(camera, TRUE, pixels_of_step(0), inverted, shown, far)
     assert float(camera.motions.motion.norm(dim=-1).max()) == pytest.approx(0.25, rel=1e-4)
     camera.begin(TRUE)
-    gauss_newton.gauss_newton_step(camera, TRUE, looked_at(0), photographed, shown, gauss_newton.Step(0.5, 0.3, 3.0))
+    gauss_newton.gauss_newton_step(
+        camera, TRUE, pixels_of_step(0), photographed, shown, gauss_newton.Step(0.5, 0.3, 3.0)
+    )
     assert float(camera.motions.motion.abs().max()) < 1e-4
 
 
-def test_pixels_with_contrast_are_looked_at_first() -> None:
+def test_informative_pixels_have_contrast() -> None:
     pictures = PHOTOGRAPHS.view(NUM_VIEWS, SIZE, SIZE, 3).clone()
     pictures[:, :, : SIZE // 2] = 0.5
     flat = pictures.view(-1, 3)
@@ -98,15 +100,15 @@ def test_pixels_with_contrast_are_looked_at_first() -> None:
     assert float((chosen % SIZE >= SIZE // 2 - 1).float().mean()) > 0.95
 
 
-def test_a_resumed_step_on_a_gpu_uses_what_the_checkpoint_holds_on_the_cpu() -> None:
+def test_resumed_step_on_a_gpu_uses_the_prior_of_a_cpu_checkpoint() -> None:
     """A camera whose prior is certain stays."""
     camera = RefinedCamera(fix_gauge=False)
     camera.begin(TRUE)
-    size = camera.numbers().numel()
+    size = camera.parameter_vector().numel()
     prior = PriorInformation(torch.zeros(size), 1e12 * torch.eye(size).double())
     with PretendedGpu():
         camera, given = camera.to(GPU), TRUE.to(GPU)
-        pixels, pictures = looked_at(0, 20).to(GPU), 1 - PHOTOGRAPHS.to(GPU)
+        pixels, pictures = pixels_of_step(0, 20).to(GPU), 1 - PHOTOGRAPHS.to(GPU)
         sky_alone = lambda rays, view: to_srgb(sky(rays.directions))  # noqa: E731
         step = gauss_newton.Step(difference_pixels=0.5, scale=10.0, max_pixels=0.25)
         gauss_newton.gauss_newton_step(camera, given, pixels, lambda chosen: pictures[chosen], sky_alone, step, [prior])
@@ -125,8 +127,8 @@ def panorama(
     return align(camera, given, photographed, lambda rays: misses(box, rays))
 
 
-def turned(camera: RefinedCamera) -> Tensor:
-    """By how many degrees each camera is off, after the turn of all that fits best."""
+def rotation_errors(camera: RefinedCamera) -> Tensor:
+    """Rotation errors of the cameras in degrees, without the common rotation."""
     axes, true = (poses[..., :3].double() for poses in (camera.motions.moved(), TRUE.camera_to_world))
     u, _, vt = torch.linalg.svd((axes @ true.mT).mean(0))
     between = (u @ vt).T @ axes @ true.mT
@@ -135,23 +137,23 @@ def turned(camera: RefinedCamera) -> Tensor:
 
 
 @pytest.mark.parametrize("brightness", [0.0, 0.15])
-def test_cameras_turn_until_their_skies_agree(brightness: float) -> None:
+def test_sky_alignment_recovers_rotations(brightness: float) -> None:
     """Half a degree is a quarter of a pixel. Shifts of cameras and other exposures do not disturb."""
     gains = 0.6 * torch.exp(brightness * torch.randn(NUM_VIEWS, generator=torch.Generator().manual_seed(0)))
     camera = RefinedCamera(exposure=brightness > 0)
     assert panorama(camera, DISTURBED, gains=gains) is not None
     assert not bool(camera.motions.motion[:, 3:].any())
-    assert float(turned(camera).median()) < (0.03 if brightness == 0 else 0.06)
+    assert float(rotation_errors(camera).median()) < (0.03 if brightness == 0 else 0.06)
 
 
-def test_the_shared_lens_is_found_with_them() -> None:
+def test_sky_alignment_recovers_the_shared_focal_length() -> None:
     given = replace(TRUE, fx=1.02 * TRUE.fx, fy=1.02 * TRUE.fy)
     camera = RefinedCamera(lens=True)
     assert panorama(camera, given) is not None
     assert float(camera.estimated(given).fx[0]) == pytest.approx(float(TRUE.fx[0]), rel=2e-3)
 
 
-def test_without_a_sky_nothing_is_known() -> None:
+def test_sky_alignment_has_no_result_without_sky_pixels() -> None:
     camera = RefinedCamera()
     assert panorama(camera, TRUE, box=10 * BOX) is None
     assert not bool(camera.motions.motion.any())
@@ -166,33 +168,36 @@ def silhouettes() -> Silhouettes:
     return Silhouettes.of(TRUE, soft_masks(ellipsoid()))
 
 
-def met(camera: RefinedCamera, given: Cameras, seen: Silhouettes, sure: list[int] | None = None) -> PriorInformation:
-    """Move cameras; some of the six numbers of each are known to be right."""
+def aligned(
+    camera: RefinedCamera, given: Cameras, seen: Silhouettes, fixed: list[int] | None = None
+) -> PriorInformation:
+    """Align cameras to outlines; a prior fixes some of the six motion parameters of each camera."""
     camera.begin(given)
-    surely = torch.zeros_like(camera.motions.motion)
-    surely[:, sure or []] = 1e6
-    information = torch.nn.functional.pad(surely.flatten(), (0, len(camera.numbers()) - surely.numel())).diag()
-    known = [PriorInformation(camera.numbers(), information)]
-    told = align_to_outlines(camera, given, lambda cameras: cameras, seen, ellipsoid(), known)
-    assert told is not None
-    return told
+    precision = torch.zeros_like(camera.motions.motion)
+    precision[:, fixed or []] = 1e6
+    mean = camera.parameter_vector()
+    information = torch.nn.functional.pad(precision.flatten(), (0, len(mean) - precision.numel())).diag()
+    prior = [PriorInformation(mean, information)]
+    posterior = align_to_outlines(camera, given, lambda cameras: cameras, seen, ellipsoid(), prior)
+    assert posterior is not None
+    return posterior
 
 
-def pixels_off(given: Cameras) -> float:
-    """How far from their right places points of the surface are seen, median."""
+def projection_error(given: Cameras) -> float:
+    """Median displacement of projected points of the surface, pixels."""
     points = torch.from_numpy(ellipsoid().vertices[::20]).float()
     return float((given.project(points)[0] - TRUE.project(points)[0]).norm(dim=-1).median())
 
 
 @pytest.mark.parametrize("too_wide", [0.0, 0.4])
-def test_disturbed_cameras_see_the_surface_where_it_is(too_wide: float) -> None:
+def test_outline_alignment_recovers_disturbed_cameras(too_wide: float) -> None:
     """From half a degree and 1 %, also where all masks are too wide by less than half a pixel."""
     camera, seen = RefinedCamera(), silhouettes()
-    met(camera, DISTURBED, replace(seen, distances=seen.distances + too_wide))
-    assert pixels_off(camera.estimated(DISTURBED)) < 0.15 * pixels_off(DISTURBED)
+    aligned(camera, DISTURBED, replace(seen, distances=seen.distances + too_wide))
+    assert projection_error(camera.estimated(DISTURBED)) < 0.15 * projection_error(DISTURBED)
 
 
-def test_cameras_stay_where_the_surface_is_another(capsys: pytest.CaptureFixture[str]) -> None:
+def test_outline_alignment_does_not_move_cameras_to_a_wrong_surface(capsys: pytest.CaptureFixture[str]) -> None:
     camera = RefinedCamera()
     camera.begin(TRUE)
     other = TriangleMesh(ellipsoid().vertices[:, [1, 0, 2]], ellipsoid().faces[:, ::-1])
@@ -201,32 +206,32 @@ def test_cameras_stay_where_the_surface_is_another(capsys: pytest.CaptureFixture
     assert "pixels off its masks" in capsys.readouterr().out
 
 
-def test_masks_of_nothing_are_refused() -> None:
+def test_outline_alignment_refuses_empty_masks() -> None:
     camera = RefinedCamera()
     camera.begin(TRUE)
     nothing = Silhouettes.of(TRUE, torch.zeros(NUM_VIEWS, SIZE, SIZE))
     refused("belong together", align_to_outlines, camera, TRUE, lambda cameras: cameras, nothing, ellipsoid())
 
 
-def test_the_shared_lens_is_found_where_cameras_are_known() -> None:
+def test_outline_alignment_recovers_the_principal_point_of_known_cameras() -> None:
     given = replace(TRUE, cx=TRUE.cx + 0.4, cy=TRUE.cy - 0.3)
     camera = RefinedCamera(lens=True)
-    met(camera, given, silhouettes(), [0, 1, 2, 3, 4, 5])
+    aligned(camera, given, silhouettes(), [0, 1, 2, 3, 4, 5])
     found = camera.estimated(given)
     assert float(found.cx[0]) == pytest.approx(float(TRUE.cx[0]), abs=0.03)
     assert float(found.cy[0]) == pytest.approx(float(TRUE.cy[0]), abs=0.03)
 
 
-def test_shifts_are_told_apart_from_turns_hardly() -> None:
-    """A pixel to the side is known to hundredths; a turn that undoes it leaves little to see."""
+def test_outlines_do_not_separate_rotation_from_translation() -> None:
+    """A shift is determined to 0.05 pixels, but a compensating rotation hardly changes the outlines."""
     camera = RefinedCamera()
-    told = met(camera, TRUE, silhouettes())
-    assert pixels_off(camera.estimated(TRUE)) < 0.05
-    of_view = torch.stack([told.information[6 * v : 6 * v + 6, 6 * v : 6 * v + 6] for v in range(NUM_VIEWS)])
+    posterior = aligned(camera, TRUE, silhouettes())
+    assert projection_error(camera.estimated(TRUE)) < 0.05
+    of_view = torch.stack([posterior.information[6 * v : 6 * v + 6, 6 * v : 6 * v + 6] for v in range(NUM_VIEWS)])
     assert torch.equal(of_view, of_view.mT) or torch.allclose(of_view, of_view.mT, rtol=1e-3)
-    # About y a turn to the left, along x a shift to the right.
-    aside, undone = torch.tensor([0.0, 0, 0, 1, 0, 0]), torch.tensor([0.0, 1, 0, 1, 0, 0])
-    other = torch.tensor([0.0, -1, 0, 1, 0, 0])
-    known = of_view @ aside @ aside
-    assert float(known.median()) > 1 / 0.05**2
-    assert float((torch.minimum(*(of_view @ motion @ motion for motion in (undone, other))) / known).max()) < 0.1
+    # A shift along x, and the same shift with a rotation about y in either direction.
+    shift, left = torch.tensor([0.0, 0, 0, 1, 0, 0]), torch.tensor([0.0, 1, 0, 1, 0, 0])
+    right = torch.tensor([0.0, -1, 0, 1, 0, 0])
+    of_shift = of_view @ shift @ shift
+    assert float(of_shift.median()) > 1 / 0.05**2
+    assert float((torch.minimum(*(of_view @ motion @ motion for motion in (left, right))) / of_shift).max()) < 0.1

@@ -11,7 +11,7 @@ from nerfro.models.refractive import RefractiveModel
 from nerfro.testing import NUM_RAYS, example_batch, example_components
 
 
-def test_gains_are_one_on_average_whatever_is_learned() -> None:
+def test_gains_have_a_mean_of_one() -> None:
     exposure = Exposure()
     exposure.begin(5)
     assert torch.equal(exposure.gains(), torch.ones(5, 3))
@@ -30,7 +30,7 @@ def test_gains_are_fitted_to_unsaturated_pixels() -> None:
     torch.testing.assert_close(exposure.gains(), gains)
 
 
-def test_a_rendering_is_exposed_before_losses_see_it() -> None:
+def test_losses_use_exposed_renderings() -> None:
     model, batch = RefractiveModel(example_components()), example_batch()
     gain = torch.rand(NUM_RAYS, 3) + 0.5
     (rendering,) = model(batch.rays)
@@ -42,7 +42,7 @@ def test_a_rendering_is_exposed_before_losses_see_it() -> None:
 
 
 @pytest.mark.parametrize("factors", [(1.0, 1.0, 1.0), (0.4, 0.9, 1.7), (3.0, 0.2, 1.0)])
-def test_the_gain_of_a_picture_is_found_again_though_parts_of_it_saturate(factors: tuple[float, ...]) -> None:
+def test_fitted_gain_is_exact_despite_saturated_pixels(factors: tuple[float, ...]) -> None:
     radiance, gain = 1.5 * torch.rand(500, 3), torch.tensor(factors)
     found = fit_gain(
         RefractiveModel(example_components()).scene.colour_space.to_srgb,

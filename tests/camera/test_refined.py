@@ -10,7 +10,7 @@ from torch.nn.functional import normalize
 from nerfro.camera.similarity import Similarity, motion_between, similarity
 from nerfro.cameras import Cameras
 from nerfro.lens import coefficients
-from tests.camera.refined_cameras import pixel_units, refined
+from tests.camera.refined_cameras import phase, pixel_units, refined
 
 NUM_VIEWS, SIZE = 8, 20
 
@@ -48,12 +48,12 @@ LENSES = [None, coefficients([0.05, -0.02], [0.002, -0.001])]
 
 
 @pytest.mark.parametrize("distortion", LENSES)
-def test_slopes_are_those_of_central_differences(distortion: tuple[float, ...] | None) -> None:
+def test_derivatives_match_central_differences(distortion: tuple[float, ...] | None) -> None:
     given = cameras(distortion)
     made, (view, row, column) = part(given), pixels(given)
     made.motions.fix_gauge = False
     made.motions.motion *= 0.01  # turns are composed to first order
-    made.motions.of_world = made.motions.of_world[:0]
+    made.motions.gauge_basis = made.motions.gauge_basis[:0]
     rays = given.rays(view, row, column)
     by_origin, by_direction = torch.randn(2, len(view), 2, 3, dtype=torch.float64)
     found = made.slopes(rays, view, by_origin, by_direction)
@@ -62,22 +62,22 @@ def test_slopes_are_those_of_central_differences(distortion: tuple[float, ...] |
     for number in range(9):
         ends = []
         for sign in (h, -h):
-            before = made.numbers()
+            before = made.parameter_vector()
             step = sign * torch.eye(9, dtype=torch.float64)[number]
             made.move(step[:6].expand(NUM_VIEWS, 6), step[6:])
             moved = made(rays, view)
             by_all = (by_origin * moved.origins[:, None]).sum(-1) + (by_direction * moved.directions[:, None]).sum(-1)
             ends.append(by_all)
-            made.move_back(before, torch.ones(NUM_VIEWS, dtype=torch.bool), lens=True)
+            made.restore(before, torch.ones(NUM_VIEWS, dtype=torch.bool), lens=True)
         expected = (ends[0] - ends[1]) / (2 * h)
         torch.testing.assert_close(found[..., number], expected, rtol=1e-2, atol=1e-3 * float(expected.abs().max()))
 
 
-def test_a_motion_that_all_cameras_share_is_taken_out() -> None:
+def test_common_motion_of_all_cameras_is_removed() -> None:
     given = cameras()
     made, small = part(given), 1e-4
     poses = given.camera_to_world
-    turn = refined.rotations(small * torch.tensor([[0.3, -0.7, 0.5]], dtype=torch.float64))[0]
+    turn = refined.rotation_matrices(small * torch.tensor([[0.3, -0.7, 0.5]], dtype=torch.float64))[0]
     world = Similarity(torch.tensor(1 + small).double(), turn, small * torch.tensor([1.0, 2.0, -1.0]).double())
     shared = world.apply(poses)
     turns, shifts = poses[..., :3].mT @ shared[..., :3], poses[..., :3].mT @ (shared[..., 3:] - poses[..., 3:])
@@ -95,7 +95,7 @@ def test_a_motion_that_all_cameras_share_is_taken_out() -> None:
     assert float(shifted.max()) < 1e-3 * float(moved[1].max())
 
 
-def test_a_unit_of_each_parameter_moves_points_by_a_pixel() -> None:
+def test_each_parameter_unit_moves_points_by_one_pixel() -> None:
     given = cameras()
     distances, h = pixel_units.object_distances(given), 1e-5
     axis = (torch.arange(90) + 0.5).double() * SIZE / 90
@@ -110,7 +110,7 @@ def test_a_unit_of_each_parameter_moves_points_by_a_pixel() -> None:
             turn, shift = torch.zeros(2, 1, 3, dtype=torch.float64)
             (turn if k < 3 else shift)[0, k % 3] = h
             pose = torch.cat(
-                [axes @ refined.rotations(turn), one.camera_to_world[..., 3:] + axes @ shift[..., None]], -1
+                [axes @ refined.rotation_matrices(turn), one.camera_to_world[..., 3:] + axes @ shift[..., None]], -1
             )
             seen, _ = replace(one, camera_to_world=pose).project(points)
             moved = (seen[0] - torch.stack([u, v], -1)).square().sum(-1).mean().sqrt() / h
@@ -120,9 +120,9 @@ def test_a_unit_of_each_parameter_moves_points_by_a_pixel() -> None:
         assert float(motions[view, 6]) == pytest.approx(float(moved), rel=0.02)
 
 
-def test_a_similarity_is_found_again() -> None:
+def test_similarity_is_recovered() -> None:
     poses = cameras().camera_to_world
-    turn = refined.rotations(torch.tensor([[0.5, -1.0, 2.0]], dtype=torch.float64))[0]
+    turn = refined.rotation_matrices(torch.tensor([[0.5, -1.0, 2.0]], dtype=torch.float64))[0]
     made = Similarity(torch.tensor(1.7).double(), turn, torch.tensor([3.0, -1.0, 0.5]).double())
     for some in (poses, poses[:2], poses[:1]):
         found = similarity(some, made.apply(some), *torch.rand(2, len(some), dtype=torch.float64) + 0.5)
@@ -130,3 +130,20 @@ def test_a_similarity_is_found_again() -> None:
         torch.testing.assert_close(found.apply(some), made.apply(some))
         if len(some) > 1:
             torch.testing.assert_close(found.scale, made.scale)
+
+
+def test_checkpoints_with_the_old_name_of_the_gauge_basis_are_read() -> None:
+    made, restored = part(cameras()), refined.RefinedCamera(lens=True).double()
+    stored = made.state_dict()
+    old = {name.replace("gauge_basis", "of_world"): tensor for name, tensor in stored.items()}
+    assert old.keys() != stored.keys()
+    restored.load_state_dict(old)
+    assert all(torch.equal(tensor, restored.state_dict()[name]) for name, tensor in stored.items())
+
+
+def test_priors_of_old_checkpoints_are_read() -> None:
+    vector, matrix = torch.arange(3.0), torch.eye(3)
+    for name in ("mean", "numbers"):
+        prior = phase._prior({name: vector, "information": matrix})
+        assert torch.equal(prior.mean, vector)
+        assert torch.equal(prior.information, matrix)

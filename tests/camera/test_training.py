@@ -37,7 +37,7 @@ def poses_in(file: Path) -> torch.Tensor:
 
 
 @pytest.mark.slow
-def test_disturbed_poses_come_back(train_here: Runner, tmp_path: Path) -> None:
+def test_training_recovers_disturbed_poses(train_here: Runner, tmp_path: Path) -> None:
     views = photographs([1.45])
     true = views.cameras
     moved = disturbed(true, math.radians(0.5), 0.01, 0)
@@ -52,7 +52,7 @@ def test_disturbed_poses_come_back(train_here: Runner, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_gains_of_disturbed_exposures_come_back(train_here: Runner, tmp_path: Path) -> None:
+def test_training_recovers_exposure_gains(train_here: Runner, tmp_path: Path) -> None:
     views = photographs([1.45])
     logarithm = 0.3 * torch.randn(len(views), 3).clamp(-2, 0)  # darker, so that nothing saturates
     images = to_srgb(to_linear(views.images) * logarithm.exp()[:, None, None])
@@ -69,7 +69,7 @@ def test_the_gains_of_disturbed_exposures_come_back(train_here: Runner, tmp_path
     assert metrics.treatments["exposed"].mean("psnr") > metrics.result.mean("psnr") + 3
 
 
-def test_each_treatment_of_test_views_is_told_by_its_name(train: Runner, tmp_path: Path) -> None:
+def test_test_view_treatments_are_reported_by_name(train: Runner, tmp_path: Path) -> None:
     options = ["camera=refined", "camera.lens=true", "camera.exposure=true", "phase.cameras={start: 0, every: 1}"]
     train(*options, *LEARNED_SKY, "trainer.max_steps=3")
     document = json.loads((tmp_path / "run" / "metrics.json").read_text("utf-8"))
@@ -97,7 +97,7 @@ def test_each_treatment_of_test_views_is_told_by_its_name(train: Runner, tmp_pat
             torch.testing.assert_close(poses[Path(frame["file_path"]).name], expected)
 
 
-def test_a_run_whose_cameras_learn_goes_on_as_if_it_had_not_stopped(train: Runner, tmp_path: Path) -> None:
+def test_resumed_run_with_refined_cameras_equals_an_uninterrupted_run(train: Runner, tmp_path: Path) -> None:
     options = ["camera=refined", "camera.lens=true", "camera.exposure=true", "phase.cameras={start: 2, every: 2}"]
     options += ["evaluation=none", "optimizer.final_learning_rate=1e-2"]
     states = []
@@ -113,7 +113,7 @@ def test_a_run_whose_cameras_learn_goes_on_as_if_it_had_not_stopped(train: Runne
     assert float(states[0]["renderer.scene.camera.exposure.log_gain"].abs().max()) > 0
 
 
-def test_cameras_move_by_sky_and_masks_before_training_and_their_priors_are_kept(
+def test_cameras_are_aligned_by_sky_and_masks_before_training_and_priors_are_saved(
     train: Runner, tiny_scene: Path, tmp_path: Path
 ) -> None:
     options = ["camera=refined", "evaluation=none", "trainer.max_steps=1"]
@@ -137,11 +137,11 @@ def test_cameras_move_by_sky_and_masks_before_training_and_their_priors_are_kept
     kept = [state["cameras"]["state"] for state in kept]
     assert list(kept[0]) == ["panorama"]
     assert list(kept[1]) == ["panorama", "outlines"]
-    for told, camera in ((kept[0]["panorama"], without), (kept[1]["outlines"], with_masks)):
-        torch.testing.assert_close(told["numbers"], camera.numbers())
-        assert told["information"].shape == (camera.numbers().numel(),) * 2
+    for prior, camera in ((kept[0]["panorama"], without), (kept[1]["outlines"], with_masks)):
+        torch.testing.assert_close(prior["mean"], camera.parameter_vector())
+        assert prior["information"].shape == (camera.parameter_vector().numel(),) * 2
 
 
-def test_a_gain_for_each_view_needs_linear_radiance(train: Runner) -> None:
+def test_exposure_gains_need_linear_radiance(train: Runner) -> None:
     refused = train("camera.exposure=true", "model.colour=srgb", "trainer.max_steps=1", code=1).error
     assert "model.colour=linear" in refused

@@ -19,7 +19,7 @@ def search(views: Views, num_bodies: int = 1, inner: float = INNER) -> Estimate:
 
 
 @pytest.mark.parametrize(("ior", "is_material"), [(1.2, False), (1.5, True)])
-def test_index_of_a_ball(ior: float, is_material: bool) -> None:
+def test_index_search_recovers_the_index_of_a_ball(ior: float, is_material: bool) -> None:
     """No liquid or solid has an index of 1.2, which would be that of an opaque or hollow object."""
     found = search(photographs([ior]))
     assert found.values[0] == pytest.approx(ior, rel=0.005)
@@ -28,7 +28,7 @@ def test_index_of_a_ball(ior: float, is_material: bool) -> None:
 
 
 @pytest.mark.parametrize(("num_views", "num_seen"), [(1, 1), (8, 4)])
-def test_a_few_views_have_no_standard_error(num_views: int, num_seen: int) -> None:
+def test_too_few_views_have_an_infinite_standard_error(num_views: int, num_seen: int) -> None:
     """Views without pixels of the object contribute nothing."""
     views = photographs([1.5]).select(list(range(num_views)))
     beside, through = divide_pixels(views, mesh())
@@ -41,14 +41,14 @@ def test_a_few_views_have_no_standard_error(num_views: int, num_seen: int) -> No
 
 
 @pytest.mark.slow
-def test_indices_of_water_in_a_wall_of_glass() -> None:
+def test_index_search_recovers_water_in_a_glass_wall() -> None:
     found = search(photographs([1.5, 1.33]), 2)
     assert found.values.tolist() == pytest.approx([1.5, 1.33], rel=0.01)
     assert not found.doubts
 
 
 @pytest.mark.slow
-def test_indices_that_trade_are_not_taken_for_certain() -> None:
+def test_correlated_indices_are_reported_as_uncertain() -> None:
     """Every ray crosses both bodies: 1.69 and 1.375 look nearly the same, and do in such small photographs."""
     found = search(photographs([1.5, 1.33], inner=0.5), 2, 0.5)
     assert (abs(found.values - [1.5, 1.33]) < 3 * found.standard_errors).all()
@@ -56,12 +56,12 @@ def test_indices_that_trade_are_not_taken_for_certain() -> None:
     assert any("the views do not agree" in doubt for doubt in found.doubts)
 
 
-def test_an_opaque_ball_has_no_index() -> None:
+def test_opaque_ball_has_no_index() -> None:
     found = search(photographs([1.5], opaque=True))
     assert found.doubts
 
 
-def test_masks_decide_which_pixels_are_the_objects() -> None:
+def test_masks_define_the_pixels_of_the_object() -> None:
     views = photographs([1.5])
     masks = torch.zeros(NUM_VIEWS, SIZE, SIZE)
     masks[:, 10:20, 10:20] = 1

@@ -63,7 +63,7 @@ def observed(cylinder: Path, glass: Solid) -> Observations:
     [{"wall": 0.025, "foot": 0.1, "fillet": 0.12}, {"wall": 0.025, "foot": 0.1, "fillet": 0.12, "level": 0.64}],
     ids=["empty", "partly filled"],
 )
-def test_lengths_of_a_glass_are_found_from_ordinary_values(cylinder: Path, lengths: dict[str, float]) -> None:
+def test_vessel_fit_recovers_lengths_from_default_values(cylinder: Path, lengths: dict[str, float]) -> None:
     def build(**options: Any) -> SdfVessel:
         return SdfVessel(str(cylinder), ior=1.52, **BOX, **options)
 
@@ -77,7 +77,7 @@ def test_lengths_of_a_glass_are_found_from_ordinary_values(cylinder: Path, lengt
 
 
 @pytest.mark.parametrize(("ior", "supported"), [(1.0, []), (1.333, ["solid body, water"]), (None, ["vessel"])])
-def test_pixels_support_the_body_that_refracted_their_rays(
+def test_pixels_support_the_body_that_refracts_their_rays(
     cylinder: Path, ior: float | None, supported: list[str]
 ) -> None:
     solid, vessel = SdfGrid(str(cylinder), ior=ior or 1.5, **BOX), SdfVessel(str(cylinder), wall=0.05, level=0.6, **BOX)

@@ -99,7 +99,7 @@ def read(root: Path, view: int) -> np.ndarray:
     return levels > 127
 
 
-def test_one_box_leads_to_all_masks(tmp_path: Path, photographs: list, command: Callable[..., str]) -> None:
+def test_one_box_produces_all_masks(tmp_path: Path, photographs: list, command: Callable[..., str]) -> None:
     picture, _, pose = photographs[0]
     away = picture, None, pose * [-1, 1, -1, 1]
     capture = write_capture(tmp_path / "capture", [*photographs, away])
@@ -118,7 +118,9 @@ def test_one_box_leads_to_all_masks(tmp_path: Path, photographs: list, command: 
         assert sheet.size[0] > 6 * 220
 
 
-def test_masks_that_exist_are_kept_and_show_the_way(capture: Path, photographs: list, mask: Callable[..., str]) -> None:
+def test_existing_masks_are_kept_and_guide_the_others(
+    capture: Path, photographs: list, mask: Callable[..., str]
+) -> None:
     drawn = {view: photographs[view][1].copy() for view in (0, 3, 5, 8, 11)}
     drawn[3][:2, :2] = True  # known again
     for view, silhouette in drawn.items():
@@ -134,7 +136,7 @@ def test_masks_that_exist_are_kept_and_show_the_way(capture: Path, photographs: 
     assert "5 existing masks" in mask()  # projections are made again
 
 
-def test_two_outlines_of_a_body_of_revolution_give_all_masks_whatever_the_colours() -> None:
+def test_two_outlines_of_a_body_of_revolution_give_all_masks_for_any_colours() -> None:
     width, height, num_views, focal = 288, 216, 8, 345.0
     azimuth = torch.arange(num_views) * 2 * torch.pi / num_views
     towards = [np.array([np.cos(turn) * 0.8, np.sin(turn) * 0.8, 0.6]) for turn in azimuth.tolist()]
@@ -204,7 +206,7 @@ def test_masks_are_kept_if_the_sides_of_downscaled_images_are_rounded(
     assert "3 existing masks" in mask("hull_only=true", "data.downscale=1.9")  # images of 51 x 38 pixels
 
 
-def test_projections_are_made_again_and_edited_masks_are_kept(
+def test_projections_are_recomputed_and_edited_masks_are_kept(
     capture: Path, photographs: list, mask: Callable[..., str]
 ) -> None:
     for view in (1, 5, 9):
@@ -225,7 +227,7 @@ def test_projections_are_made_again_and_edited_masks_are_kept(
     assert file.read_bytes() == content
 
 
-def test_a_polygon_covers_the_pixels_whose_centres_it_contains() -> None:
+def test_polygon_covers_the_pixels_whose_centres_it_contains() -> None:
     square = [[2, 1], [7, 1], [7, 4], [2, 4]]
     expected = np.zeros((6, 9), bool)
     expected[1:4, 2:7] = True
@@ -244,7 +246,7 @@ def test_mistakes_are_reported_in_one_line(capture: Path, mask: Callable[..., st
     assert not list((capture / "photos").glob("mask_*"))
 
 
-def test_a_neighbour_that_looks_from_the_same_place_does_not_lead(
+def test_neighbour_at_the_same_position_does_not_guide_a_mask(
     photographs: list, tmp_path: Path, command: Callable[..., str]
 ) -> None:
     """Lines through the centres of two such masks meet anywhere, behind the cameras too."""
@@ -260,7 +262,7 @@ def test_a_neighbour_that_looks_from_the_same_place_does_not_lead(
 
 
 @pytest.mark.parametrize("hull_only", [False, True])
-def test_the_hull_is_taken_where_colours_say_something_else(
+def test_hull_overrides_contradicting_colours(
     hull_only: bool, photographs: list, tmp_path: Path, command: Callable[..., str]
 ) -> None:
     noise = np.random.default_rng(0).integers(0, 256, (NUM_VIEWS, HEIGHT, WIDTH, 3), np.uint8)
@@ -292,7 +294,7 @@ def choose(browser: Browser, view: int) -> str:
 
 
 @needs_chromium
-def test_drawn_outlines_lead_to_the_masks_of_the_command(
+def test_drawn_outlines_give_the_masks_of_the_command(
     capture: Path, photographs: list, tmp_path: Path, command: Callable[..., str]
 ) -> None:
     options = [f"data.root={capture}", "view=true", "open=false", "port=0"]

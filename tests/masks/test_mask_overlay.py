@@ -36,7 +36,7 @@ def rasterise(mesh: trimesh.Trimesh, pose: np.ndarray, centre: tuple[float, floa
 
 
 @pytest.mark.parametrize("data_format", ["blender", "opencv"])
-def test_mesh_seen_through_the_loader_covers_masks_drawn_by_projection(tmp_path, data_format):
+def test_projected_mesh_covers_its_masks_after_loading(tmp_path, data_format):
     generator, shape = np.random.default_rng(0), odd_shape()
     centre = (SIZE / 2, SIZE / 2) if data_format == "blender" else (35.3, 28.9)
     document = {"camera_angle_x": 2 * math.atan(SIZE / 2 / FOCAL), "frames": []}

@@ -6,7 +6,7 @@ import pytest
 from tests.poses.camera_calibration import draw_tag, tag_grid, twelve_faces
 
 
-def test_positions_are_those_of_the_authors() -> None:
+def test_board_positions_match_the_authors() -> None:
     corners = twelve_faces().tag_corners()
     assert sorted(corners) == list(range(108))
     # Face, tag within it, and the place of its cell by calib_camera_with_apriltag.py; 2 to 7 modules from its sides.
@@ -26,7 +26,7 @@ def test_positions_are_those_of_the_authors() -> None:
         np.testing.assert_allclose(corners[9 * face + j + 3 * i], np.stack(expected, 1), atol=1e-12)
 
 
-def test_tags_are_those_of_opencv() -> None:
+def test_tags_match_opencv() -> None:
     cv2 = pytest.importorskip("cv2")
     pytest.importorskip("pyapriltags")
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
@@ -38,14 +38,14 @@ def test_tags_are_those_of_opencv() -> None:
         np.testing.assert_array_equal(tag[1:-1, 1:-1], np.rot90(theirs, 2))
 
 
-def test_detected_corners_are_those_of_the_drawing() -> None:
+def test_detected_corners_match_the_drawing() -> None:
     cv2 = pytest.importorskip("cv2")
     pytest.importorskip("pyapriltags")
     for board in (twelve_faces(), tag_grid(3, 4, 0.05)):
         face = board.faces[-1]
         drawn = np.pad(board.draw(face, 12), 36, constant_values=255)
-        sighting = board.find(cv2.GaussianBlur(drawn, (0, 0), 1.0))
-        assert sorted(set(sighting.features)) == sorted(face.ids.ravel())
-        offset = sighting.points - np.array(face.origin)
+        found = board.detect(cv2.GaussianBlur(drawn, (0, 0), 1.0))
+        assert sorted(set(found.tag_ids)) == sorted(face.ids.ravel())
+        offset = found.board_points - np.array(face.origin)
         expected = 36 + 12 * np.stack([offset @ face.right, offset @ face.down], 1) / board.module
-        np.testing.assert_allclose(sighting.pixels, expected, atol=0.5)
+        np.testing.assert_allclose(found.image_points, expected, atol=0.5)

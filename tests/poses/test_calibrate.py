@@ -14,9 +14,10 @@ pytest.importorskip("pyapriltags")
 
 from nerfro.data.blender import OpenCVData
 from tests.poses.camera_calibration import (
-    Sighting,
     TagBoard,
+    TagDetections,
     calibrate,
+    calibration,
     luminance,
     photographs,
     tag_grid,
@@ -84,46 +85,48 @@ def test_lens_and_poses_are_recovered(kind: str, tmp_path: Path, command: Callab
         assert np.ptp(np.asarray(plot.convert("L"))) > 100
 
 
-def test_tags_look_no_larger_than_they_are(tmp_path: Path) -> None:
+def test_detected_tag_corners_are_not_displaced_outwards(tmp_path: Path) -> None:
     generator = np.random.default_rng(0)
     board = twelve_faces()
     outward = []
     for pose in around(board.sheets(), 3, 1.7, generator):
         Image.fromarray(photograph(board.sheets(), MATRIX, pose, SIZE, generator)).save(tmp_path / "p.png")
-        sighting = board.find(luminance(tmp_path / "p.png"))
-        seen = (sighting.points - pose[:, 3]) @ pose[:, :3] @ MATRIX.T
+        found = board.detect(luminance(tmp_path / "p.png"))
+        seen = (found.board_points - pose[:, 3]) @ pose[:, :3] @ MATRIX.T
         true = (seen[:, :2] / seen[:, 2:]).reshape(-1, 4, 2)
         away = true - true.mean(1, keepdims=True)
         away /= np.linalg.norm(away, axis=-1, keepdims=True)
-        outward.append(((sighting.pixels.reshape(-1, 4, 2) - true) * away).sum(-1).ravel())
+        outward.append(((found.image_points.reshape(-1, 4, 2) - true) * away).sum(-1).ravel())
     # A median, for some tags are seen in part; 0.2 where edges are looked for in sRGB values.
     assert abs(np.median(np.concatenate(outward))) < 0.05
 
 
-def sightings_of(board: TagBoard, distortion: tuple[float, ...] = ()) -> tuple[dict[str, Sighting], list[np.ndarray]]:
+def detections_of(
+    board: TagBoard, distortion: tuple[float, ...] = ()
+) -> tuple[dict[str, TagDetections], list[np.ndarray]]:
     """Noisy projections of all tags that face the camera, without pictures."""
     import cv2
 
     generator = np.random.default_rng(0)
     poses = around(board.sheets(), 8, 1.7, generator)
     corners = board.tag_corners()
-    points, features = np.concatenate(list(corners.values())), np.repeat(list(corners), 4)
-    sightings = {}
+    points, tag_ids = np.concatenate(list(corners.values())), np.repeat(list(corners), 4)
+    detections = {}
     for view, pose in enumerate(poses):
         rotation = pose[:, :3].T
         lens = np.array(distortion) if distortion else None
         pixels, _ = cv2.projectPoints(points, cv2.Rodrigues(rotation)[0], -rotation @ pose[:, 3], MATRIX, lens)
         pixels = pixels.reshape(-1, 2) + generator.normal(0, 0.1, (len(points), 2))
-        sightings[f"v{view}"] = Sighting(features, points, pixels)
-    return sightings, poses
+        detections[f"v{view}"] = TagDetections(tag_ids, points, pixels)
+    return detections, poses
 
 
-def test_wrong_tags_are_taken_out() -> None:
+def test_outlier_tags_are_removed() -> None:
     board = twelve_faces()
-    sightings, poses = sightings_of(board)
-    sightings["v2"].pixels[40:48] += [25, -40]  # two tags, seen through the glass
-    sightings["v5"].pixels[4:8] += [3, 2]
-    found = calibrate(sightings, SIZE, "pinhole")
+    detections, poses = detections_of(board)
+    detections["v2"].image_points[40:48] += [25, -40]  # two tags, seen through the glass
+    detections["v5"].image_points[4:8] += [3, 2]
+    found = calibrate(detections, SIZE, "pinhole")
     assert found.num_outliers == 12
     for view, pose in enumerate(poses):
         assert angle(found.poses[f"v{view}"].camera_to_world, pose) < 0.05
@@ -133,10 +136,19 @@ def test_wrong_tags_are_taken_out() -> None:
     assert found.intrinsics.focal_deviation < 1
 
 
+def test_outliers_of_the_last_estimate_are_not_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    detections, _ = detections_of(twelve_faces())
+    detections["v2"].image_points[40:48] += [25, -40]
+    monkeypatch.setattr(calibration, "_MAX_ESTIMATES", 1)
+    found = calibrate(detections, SIZE, "pinhole")
+    assert found.num_outliers == 0
+    assert found.poses["v2"].num_observations == detections["v2"].num_tags
+
+
 def test_distortion_is_estimated() -> None:
     truth = (-0.15, 0.05, 0.001, -0.002)
-    sightings, poses = sightings_of(tag_grid(6, 6, 0.05), truth)
-    found, pinhole = (calibrate(sightings, SIZE, model) for model in ("opencv", "pinhole"))
+    detections, poses = detections_of(tag_grid(6, 6, 0.05), truth)
+    found, pinhole = (calibrate(detections, SIZE, model) for model in ("opencv", "pinhole"))
     np.testing.assert_allclose(found.intrinsics.distortion, truth, atol=0.02)
     for view, pose in enumerate(poses):
         one = found.poses[f"v{view}"]
@@ -153,11 +165,11 @@ def test_tags_inside_the_objects_mask_do_not_count(tmp_path: Path, command: Call
     command("calibrate", f"images={tmp_path / 'photos'}", f"out={tmp_path}", *options)
     images = json.loads((tmp_path / "calibration.json").read_text())["images"]
     assert set(images) == set(truth)
-    counts = {name: image["features"] for name, image in images.items()}
+    counts = {name: image["num_observations"] for name, image in images.items()}
     assert counts.pop("p_0.png") <= 15 < min(counts.values())
 
 
-def test_masks_of_photographs_behind_a_link_are_found(tmp_path: Path, command: Callable[..., str]) -> None:
+def test_masks_of_linked_photographs_are_found(tmp_path: Path, command: Callable[..., str]) -> None:
     options, make, distance = BOARDS["grid"]
     names = take(tmp_path / "elsewhere", make(), distance)
     data = tmp_path / "data"
@@ -179,9 +191,9 @@ def test_boards_are_printed_in_their_size(tmp_path: Path, command: Callable[...,
     with Image.open(pages[8]) as page:
         per_metre = page.info["dpi"][0] / 0.0254
         levels = np.uint8(np.asarray(page.convert("L")))
-    sighting = board.find(levels)
-    assert sorted(set(sighting.features)) == list(range(72, 81))
-    sides = np.linalg.norm(sighting.pixels[0::4] - sighting.pixels[1::4], axis=1) / per_metre
+    found = board.detect(levels)
+    assert sorted(set(found.tag_ids)) == list(range(72, 81))
+    sides = np.linalg.norm(found.image_points[0::4] - found.image_points[1::4], axis=1) / per_metre
     np.testing.assert_allclose(sides, 0.03, rtol=0.005)
     assert "board.pdf exists; give another out=" in command("calibrate", "write_board=true", f"out={tmp_path}")
 
@@ -208,7 +220,7 @@ def test_mistakes_are_reported_in_one_line(tmp_path: Path, command: Callable[...
     assert (tmp_path / "cameras.png").read_bytes() == b"mine"
 
 
-def test_photographs_that_are_left_out_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_omitted_photographs_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("a.jpg", "b.jpg"):
         Image.new("RGB", (8, 6)).save(tmp_path / name)
     (tmp_path / "b.HEIC").touch()  # has a converted copy

@@ -29,7 +29,7 @@ def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_the_sharpest_frame_of_each_part_is_written(video: Path, tmp_path: Path) -> None:
+def test_sharpest_frame_of_each_interval_is_written(video: Path, tmp_path: Path) -> None:
     files = extract_frames(video, tmp_path, 4)
     assert [file.name for file in files] == [f"frame_{number:05d}.jpg" for number in SHARP]
     assert cv2.imread(str(files[0])).shape == (64, 96, 3)
@@ -54,7 +54,7 @@ def test_frames_of_another_extraction_are_deleted(video: Path, tmp_path: Path) -
     assert all(cv2.imread(str(file)).shape == (64, 96, 3) for file in files)
 
 
-def test_what_is_no_video_is_refused(video: Path, tmp_path: Path) -> None:
+def test_files_without_a_video_are_refused(video: Path, tmp_path: Path) -> None:
     text = tmp_path / "text.mp4"
     text.write_text("no video")
     for path, count, message in (

@@ -1,4 +1,4 @@
-"""Bodies with sharp edges come out of their silhouettes with sharp edges."""
+"""Reconstructions of bodies with sharp edges have sharp edges."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ def tilt(mesh: TriangleMesh, normals: np.ndarray) -> float:
 
 
 @pytest.mark.slow
-def test_a_fitted_box_has_flat_sides_and_sharp_edges() -> None:
+def test_fitted_box_has_flat_sides_and_sharp_edges() -> None:
     """From 24 views of 80x80 pixels; with edges as marching cubes leave them its sides are off by 9 degrees."""
     silhouettes = photographed_softly(box(), cameras_around(24, 80))
     fitted = fit_surface(hull(silhouettes, 32), silhouettes)
@@ -35,7 +35,7 @@ def test_a_fitted_box_has_flat_sides_and_sharp_edges() -> None:
 
 
 @pytest.mark.slow
-def test_the_round_side_of_a_cylinder_stays_round() -> None:
+def test_round_side_of_a_cylinder_stays_round() -> None:
     body = trimesh.creation.cylinder(0.6, 1.0, sections=120)
     silhouettes = photographed_softly(body, cameras_around(24, 80))
     fitted = fit_surface(hull(silhouettes, 32), silhouettes)
@@ -46,7 +46,7 @@ def test_the_round_side_of_a_cylinder_stays_round() -> None:
     assert np.abs(np.abs(caps[:, 2]) - 0.5).mean() < 0.006
 
 
-def test_the_outlines_of_a_sharp_body_are_seen_at_its_edges() -> None:
+def test_outlines_of_a_sharp_body_lie_at_its_edges() -> None:
     """Where normals that are smooth turn away is within the edge, by a tenth of a pixel here."""
     made = box().subdivide_to_size(0.05)
     mesh = TriangleMesh(np.asarray(made.vertices), np.asarray(made.faces))
@@ -59,4 +59,4 @@ def test_the_outlines_of_a_sharp_body_are_seen_at_its_edges() -> None:
 def test_only_sharp_bodies_have_creases() -> None:
     ball, sharp = trimesh.creation.icosphere(3), box().subdivide_to_size(0.1)
     for made, expected in ((ball, False), (sharp, True)):
-        assert has_creases(MovingMesh(np.asarray(made.faces)).surface(np.asarray(made.vertices))) is expected
+        assert has_creases(MovingMesh(np.asarray(made.faces)).geometry(np.asarray(made.vertices))) is expected

@@ -1,4 +1,4 @@
-"""What the sides of pixels tell of an outline that masks in black and white leave open."""
+"""Outlines of binary masks, determined by the sides of pixels."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def ball(radius: float = RADIUS) -> trimesh.Trimesh:
 def seen(radius: float, silhouettes: Silhouettes) -> tuple[Rims, Rims]:
     """Rims of a ball of another radius, as read off the outlines, and by the sides of pixels."""
     made = ball(radius)
-    surface = MovingMesh(np.asarray(made.faces)).surface(np.asarray(made.vertices))
+    surface = MovingMesh(np.asarray(made.faces)).geometry(np.asarray(made.vertices))
     rims = find_rims(surface, silhouettes, outlines_of(silhouettes))
     return rims, by_pixel_sides(rims, silhouettes, 0.16)
 
@@ -44,7 +44,7 @@ def silhouettes() -> Silhouettes:
     return photographed(ball(), cameras_around(20, 96))
 
 
-def test_a_surface_that_is_right_stays(silhouettes: Silhouettes) -> None:
+def test_correct_surface_is_unchanged(silhouettes: Silhouettes) -> None:
     """The outlines that are read off the masks want single rims to move by a tenth of a pixel."""
     read, sides = seen(RADIUS, silhouettes)
     moves = [np.sqrt(np.average((rims.misfit / rims.width) ** 2, weights=rims.weight)) for rims in (read, sides)]
@@ -53,7 +53,7 @@ def test_a_surface_that_is_right_stays(silhouettes: Silhouettes) -> None:
 
 
 @pytest.mark.parametrize("off", [-0.3, 0.3])
-def test_a_surface_that_is_off_is_moved_there(silhouettes: Silhouettes, off: float) -> None:
+def test_displaced_surface_moves_to_the_outlines(silhouettes: Silhouettes, off: float) -> None:
     """In a few steps."""
     width = pixel(silhouettes.cameras.width)
     radius = RADIUS + off * width
@@ -62,7 +62,7 @@ def test_a_surface_that_is_off_is_moved_there(silhouettes: Silhouettes, off: flo
     assert abs(radius - RADIUS) / width < 0.03
 
 
-def test_a_fit_is_as_large_as_the_body() -> None:
+def test_fitted_surface_has_the_size_of_the_body() -> None:
     """It is 0.09 pixels too small if the sides of pixels are not looked at."""
     size, axes = 48, np.array([0.8, 0.6, 0.45])
     body = trimesh.creation.icosphere(5)
@@ -73,7 +73,7 @@ def test_a_fit_is_as_large_as_the_body() -> None:
     assert abs(beyond.mean()) < 0.05 * pixel(size)
 
 
-def test_masks_in_black_and_white_are_told_from_those_of_shares(silhouettes: Silhouettes) -> None:
+def test_binary_masks_are_distinguished_from_coverage_masks(silhouettes: Silhouettes) -> None:
     soft = photographed_softly(ball(), silhouettes.cameras, 4)
     nearly = Silhouettes.of(silhouettes.cameras, (silhouettes.masks + 0.01).clamp(max=1))  # as JPEG leaves them
     empty = torch.zeros(1, 8, 8)

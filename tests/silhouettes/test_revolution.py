@@ -1,4 +1,4 @@
-"""Bodies of revolution from their masks: a glass behind something, and what is none."""
+"""Bodies of revolution from their masks: a partly hidden glass, and bodies without an axis."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from nerfro.silhouettes.revolution import fit_revolution
 from nerfro.silhouettes.silhouettes import mesh_silhouettes
 from nerfro.silhouettes.surface import make_mesh
 from nerfro.silhouettes.visual_hull import Silhouettes
-from tests.cameras_at import cameras_at
+from tests.cameras_at import upright_cameras
 from tests.exact_silhouettes import volume
 
 SIZE, VIEWS, SHIFT = 160, 16, np.array([0.05, -0.03, -0.6])
@@ -21,13 +21,8 @@ TURN = trimesh.transformations.rotation_matrix(0.6, [0.5, -0.8, 0.2])[:3, :3]  #
 
 def _cameras() -> Cameras:
     """Around the axis, 20 to 50 degrees above the foot."""
-    poses = []
-    for view in range(VIEWS):
-        azimuth, raised = 2 * np.pi * view / VIEWS, np.radians(20 + 30 * (view % 3) / 2)
-        back = np.array([np.cos(raised) * np.cos(azimuth), np.cos(raised) * np.sin(azimuth), np.sin(raised)])
-        right = np.cross([0, 0, 1], back) / np.cos(raised)
-        poses.append(TURN @ np.stack([right, np.cross(back, right), back, 4 * back], 1))
-    return cameras_at(np.stack(poses), SIZE, SIZE, 2 * SIZE, near=0.1, far=9.0)
+    elevation = 20 + 15 * (np.arange(VIEWS) % 3)
+    return upright_cameras(VIEWS, SIZE, 2 * SIZE, elevation, world=TURN, near=0.1, far=9.0)
 
 
 def _body(outline: list[list[float]]) -> TriangleMesh:
@@ -43,7 +38,7 @@ def _masks(mesh: TriangleMesh, cameras: Cameras) -> torch.Tensor:
     return mesh_silhouettes(mesh, cameras, 1).float()
 
 
-def test_a_glass_is_found_whose_foot_is_hidden_in_some_masks() -> None:
+def test_revolution_fit_recovers_a_glass_with_a_partly_hidden_foot() -> None:
     cameras, glass = _cameras(), _glass()
     masks = _masks(glass, cameras)
     seen = masks.clone()
@@ -65,19 +60,19 @@ def test_a_glass_is_found_whose_foot_is_hidden_in_some_masks() -> None:
     assert radius.max() == pytest.approx(0.45, abs=0.02)
 
 
-def test_a_box_is_no_body_of_revolution(capsys: pytest.CaptureFixture[str]) -> None:
+def test_box_is_no_body_of_revolution(capsys: pytest.CaptureFixture[str]) -> None:
     cameras = _cameras()
     box = trimesh.creation.box([0.9, 0.3, 1.2])
     mesh = TriangleMesh(np.asarray(box.vertices) @ TURN.T, np.asarray(box.faces))
     silhouettes = Silhouettes.of(cameras, _masks(mesh, cameras))
-    for symmetry, told in (("axis", "symmetry=axis is ignored"), ("auto", "as a body of revolution")):
+    for symmetry, message in (("axis", "symmetry=axis is ignored"), ("auto", "as a body of revolution")):
         found = make_mesh(silhouettes, None, 32, 0, None, 0.0, symmetry)  # type: ignore[arg-type]
-        assert told in capsys.readouterr().out
+        assert message in capsys.readouterr().out
         sides = np.sort(np.ptp(found.vertices @ TURN, axis=0))
         assert sides == pytest.approx([0.3, 0.9, 1.2], abs=0.15)
 
 
-def test_what_came_off_a_wheel_is_known_by_its_masks(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bodies_of_revolution_are_detected_by_their_masks(monkeypatch: pytest.MonkeyPatch) -> None:
     cameras = _cameras()
     masks = _masks(_glass(), cameras)
     masks[:3, 105:] = 0  # something stands before the foot

@@ -1,4 +1,4 @@
-"""Which way is up: cameras that people hold, and glasses that stand on tables."""
+"""The up direction from handheld cameras and from axes of glasses."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ import trimesh
 from nerfro.cameras import Cameras
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.silhouettes.upright import body_axis, camera_up, find_up
-from tests.cameras_at import cameras_at
+from tests.cameras_at import upright_cameras
 
 TURN = trimesh.transformations.rotation_matrix(1.1, [0.3, -0.9, 0.4])[:3, :3]  # of the world
 UP = TURN[:, 2]
@@ -15,16 +15,9 @@ UP = TURN[:, 2]
 
 def _cameras(roll: float = 0.05, level: bool = True) -> Cameras:
     """Around the origin, 10 to 50 degrees above it, each rolled by a random angle (radians); or tumbled."""
-    random, poses = np.random.default_rng(0), []
-    for view in range(24):
-        azimuth, raised = 2 * np.pi * view / 24, random.uniform(0.2, 0.9)
-        back = np.array([np.cos(raised) * np.cos(azimuth), np.cos(raised) * np.sin(azimuth), np.sin(raised)])
-        right = np.cross([0, 0, 1], back) / np.cos(raised)
-        angle = random.normal() * roll if level else random.uniform(0, 6)
-        above = np.cross(back, right)
-        right, above = np.cos(angle) * right + np.sin(angle) * above, np.cos(angle) * above - np.sin(angle) * right
-        poses.append(TURN @ np.stack([right, above, back, 4 * back], 1))
-    return cameras_at(np.stack(poses), 40, 40, 50.0)
+    random = np.random.default_rng(0)
+    angles = random.normal(0, roll, 24) if level else random.uniform(0, 6, 24)
+    return upright_cameras(24, 40, 50.0, np.degrees(random.uniform(0.2, 0.9, 24)), angles, TURN)
 
 
 def _glass(tilt: float = 0.0) -> TriangleMesh:
@@ -39,26 +32,26 @@ def _degrees(first: np.ndarray, second: np.ndarray) -> float:
     return float(np.degrees(np.arccos(np.clip(first @ second, -1, 1))))
 
 
-def test_cameras_that_were_held_level_tell_up() -> None:
+def test_level_cameras_determine_up() -> None:
     up = camera_up(_cameras())
     assert up is not None
     assert _degrees(up, UP) < 2
 
 
-def test_cameras_that_were_tumbled_or_stood_in_a_line_tell_nothing() -> None:
+def test_tumbled_or_coincident_cameras_do_not_determine_up() -> None:
     assert camera_up(_cameras(level=False)) is None
     assert camera_up(_cameras().select([0] * 8)) is None
 
 
 @pytest.mark.parametrize("tilt", [0.0, 6.0])
-def test_the_axis_of_a_glass_is_found_from_a_direction_beside_it(tilt: float) -> None:
+def test_axis_of_a_glass_is_found_from_an_approximate_direction(tilt: float) -> None:
     expected = TURN @ [0, -np.sin(np.radians(tilt)), np.cos(np.radians(tilt))]
     axis = body_axis(_glass(tilt), UP)
     assert axis is not None
     assert _degrees(axis, expected) < 0.2
 
 
-def test_the_axis_is_up_where_cameras_agree() -> None:
+def test_axis_of_the_body_is_up_if_the_cameras_agree() -> None:
     found = find_up(_cameras(roll=0.08), _glass())
     assert found is not None
     assert _degrees(found[0], UP) < 0.2

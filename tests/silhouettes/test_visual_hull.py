@@ -1,4 +1,4 @@
-"""From silhouettes to a surface: outlines, carving, the fit, and what explains silhouettes that do not agree."""
+"""From silhouettes to a surface: outlines, carving, the fit, and the diagnosis of inconsistent silhouettes."""
 
 from dataclasses import replace
 
@@ -43,7 +43,7 @@ def test_outline_of_a_binary_mask_is_found_between_the_pixels() -> None:
     assert np.std(np.concatenate(errors)) < 0.18
 
 
-def test_outline_of_a_mask_of_shares_does_not_move_in_at_bends() -> None:
+def test_outline_of_a_coverage_mask_does_not_shrink_at_curves() -> None:
     """Without the correction it is drawn in by variance / 2r, 0.108 pixels here."""
     place = (np.arange(32 * 16) + 0.5) / 16
     fine = 5 - np.hypot(place - 16.2, place[:, None] - 15.7)
@@ -55,7 +55,7 @@ def test_outline_of_a_mask_of_shares_does_not_move_in_at_bends() -> None:
     assert error.std() < 0.03
 
 
-def test_hull_of_a_ball_is_the_ball_between_the_voxels() -> None:
+def test_hull_of_a_ball_is_accurate_below_a_voxel() -> None:
     silhouettes = photographed(trimesh.creation.icosphere(4, 0.7), cameras_around(30, 64))
     mesh = hull(silhouettes, 32)
     radii = np.linalg.norm(mesh.vertices, axis=1)
@@ -66,7 +66,7 @@ def test_hull_of_a_ball_is_the_ball_between_the_voxels() -> None:
     assert volume(mesh) == pytest.approx(4 / 3 * np.pi * 0.7**3, rel=0.05)
 
 
-def test_nothing_is_known_behind_a_camera_and_beyond_a_frame_that_cuts() -> None:
+def test_points_behind_a_camera_or_beyond_a_cut_frame_are_unknown() -> None:
     cameras = cameras_around(1, 16)
     back = cameras.camera_to_world[0, :, 2]
     masks = torch.zeros(1, 16, 16)
@@ -80,10 +80,10 @@ def test_nothing_is_known_behind_a_camera_and_beyond_a_frame_that_cuts() -> None
     assert Silhouettes.of(cameras, masks).depth_inside(0, points)[0][2] == torch.inf
 
 
-def test_points_are_outside_unless_more_views_see_them_than_may_be_wrong() -> None:
+def test_points_are_outside_unless_enough_views_contain_them() -> None:
     cameras, generator = cameras_around(4, 16), torch.Generator().manual_seed(0)
     masks = torch.zeros(4, 16, 16)
-    masks[:, 4:12, 4:] = 1  # cut by the frame
+    masks[:, 4:12, 4:] = 1  # cut by the image border
     silhouettes = Silhouettes.of(cameras, masks)
     points = 3 * (2 * torch.rand(2000, 3, generator=generator) - 1)
     num_seen = torch.stack([silhouettes.depth_inside(view, points)[0] < torch.inf for view in range(4)]).sum(0)
@@ -94,7 +94,7 @@ def test_points_are_outside_unless_more_views_see_them_than_may_be_wrong() -> No
         assert (distances < 0).any()
 
 
-def test_wrong_masks_are_tolerated_when_told(odd_shape: trimesh.Trimesh) -> None:
+def test_wrong_masks_are_tolerated_on_request(odd_shape: trimesh.Trimesh) -> None:
     right = photographed(odd_shape, cameras_around(20, 48))
     masks = right.masks.clone()
     masks[3] = masks[3].roll(20, 1)
@@ -104,7 +104,7 @@ def test_wrong_masks_are_tolerated_when_told(odd_shape: trimesh.Trimesh) -> None
     assert volume(hull(wrong, 40, wrong_masks=1)) == pytest.approx(expected, rel=0.25)
 
 
-def test_a_box_that_is_too_small_grows(odd_shape: trimesh.Trimesh, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_small_box_grows(odd_shape: trimesh.Trimesh, monkeypatch: pytest.MonkeyPatch) -> None:
     """Wrong masks shift the place where all seem to meet."""
     silhouettes = photographed(odd_shape, cameras_around(12, 48))
     whole = make_mesh(silhouettes, None, 32, 0, None, 0.0)
@@ -113,7 +113,7 @@ def test_a_box_that_is_too_small_grows(odd_shape: trimesh.Trimesh, monkeypatch: 
     assert make_mesh(silhouettes, None, 32, 0, None, 0.0).bounds == pytest.approx(whole.bounds, abs=0.05)
 
 
-def test_strays_go_and_voids_are_filled() -> None:
+def test_stray_voxels_are_removed_and_voids_are_filled() -> None:
     x, y, z = np.meshgrid(*[np.arange(20.0)] * 3, indexing="ij")
 
     def ball(cx: float, radius: float) -> np.ndarray:
@@ -132,7 +132,7 @@ def _arrays(mesh: TriangleMesh) -> tuple[np.ndarray, np.ndarray]:
     return mesh.vertices, mesh.faces
 
 
-def test_body_that_reaches_the_box_is_closed_there() -> None:
+def test_body_is_closed_at_the_box() -> None:
     distances = np.full((6, 6, 6), 0.5)
     distances[3:, 2:4, 2:4] = -0.5
     assert reaches_border(distances)
@@ -143,7 +143,7 @@ def test_body_that_reaches_the_box_is_closed_there() -> None:
     assert mesh.bounds[0] == pytest.approx([2.25, 2.75, 3.75])
 
 
-def test_fit_is_smooth_though_marching_cubes_triangles_are_not_alike() -> None:
+def test_fit_is_smooth_despite_uneven_triangles_of_marching_cubes() -> None:
     silhouettes = photographed_softly(trimesh.creation.icosphere(5, 0.7), cameras_around(24, 48))
     fitted = fit_surface(hull(silhouettes, 32), silhouettes)
     normals = np.cross(*np.diff(fitted.triangles, axis=1).swapaxes(0, 1))
@@ -153,7 +153,7 @@ def test_fit_is_smooth_though_marching_cubes_triangles_are_not_alike() -> None:
     assert np.linalg.norm(fitted.vertices, axis=1) == pytest.approx(0.7, rel=0.005)
 
 
-def test_fit_is_the_same_in_any_unit_of_length() -> None:
+def test_fit_is_invariant_to_the_unit_of_length() -> None:
     silhouettes = photographed(trimesh.creation.box((1.2, 0.9, 0.7)), cameras_around(12, 32))
     carved = hull(silhouettes, 16)
     poses = silhouettes.cameras.camera_to_world * torch.tensor([1.0, 1, 1, 8])
@@ -162,7 +162,7 @@ def test_fit_is_the_same_in_any_unit_of_length() -> None:
     np.testing.assert_allclose(scaled.vertices / 8, fit_surface(carved, silhouettes).vertices, atol=2e-3)
 
 
-def test_hull_meets_its_masks(odd_shape: trimesh.Trimesh) -> None:
+def test_hull_projects_onto_its_masks(odd_shape: trimesh.Trimesh) -> None:
     silhouettes = photographed(odd_shape, cameras_around(16, 64))
     require_consistent_poses(silhouettes, [f"r_{view}" for view in range(16)], wrong_masks=0)
     assert overlap(hull(silhouettes, 48), silhouettes, 64).mean() > 0.93
@@ -178,7 +178,7 @@ MISREAD = {
 
 
 @pytest.mark.parametrize("convention", MISREAD)
-def test_misread_poses_are_named(odd_shape: trimesh.Trimesh, convention: str) -> None:
+def test_wrong_poses_are_reported(odd_shape: trimesh.Trimesh, convention: str) -> None:
     silhouettes = photographed(odd_shape, cameras_around(16, 32))
     poses = MISREAD[convention](silhouettes.cameras.camera_to_world)
     misread = replace(silhouettes, cameras=replace(silhouettes.cameras, camera_to_world=poses))

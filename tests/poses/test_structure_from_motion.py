@@ -21,7 +21,7 @@ pytest.importorskip("pycolmap")
 import pycolmap
 
 from tests.conftest import refused
-from tests.poses.camera_calibration import Sheet, numeric_order, reconstruction, sequential_pairs
+from tests.poses.camera_calibration import Sheet, numeric_order, sequential_pairs, structure_from_motion
 from tests.sheet_photographs import angle, look_at, photograph
 
 
@@ -83,10 +83,10 @@ def test_models_without_points_have_no_reprojection_errors(tmp_path: Path, comma
     assert "nan" not in printed
     assert "RuntimeWarning" not in printed
     report = json.loads((tmp_path / "calibration.json").read_text(), parse_constant=pytest.fail)
-    assert {(image["error"], image["features"]) for image in report["images"].values()} == {(None, 0)}
+    assert {(image["error"], image["num_observations"]) for image in report["images"].values()} == {(None, 0)}
 
 
-def test_the_printed_command_quotes_the_folder(tmp_path: Path, command: Callable[..., str]) -> None:
+def test_printed_command_quotes_the_folder(tmp_path: Path, command: Callable[..., str]) -> None:
     out = tmp_path / "DIR [1], (x)"
     model = synthesized(out / "sparse" / "0", ("SIMPLE_PINHOLE", [1280.0, 512, 384]), 0.0)
     blank(out / "images", [image.name for image in model.images.values()], (512, 384))
@@ -94,7 +94,7 @@ def test_the_printed_command_quotes_the_folder(tmp_path: Path, command: Callable
     assert shlex.split(printed.splitlines()[-1])[5] == f'data.root="{out}"'
 
 
-def test_models_whose_files_contradict_each_other_are_refused(tmp_path: Path) -> None:
+def test_inconsistent_models_are_refused(tmp_path: Path) -> None:
     model = synthesized(tmp_path / "model", ("SIMPLE_PINHOLE", [1280.0, 512, 384]), 0.0)
     names = [image.name for image in model.images.values()]
     blank(tmp_path / "images", names, (512, 384))
@@ -103,14 +103,25 @@ def test_models_whose_files_contradict_each_other_are_refused(tmp_path: Path) ->
     lines[-1] = ""  # features that points refer to
     file.write_text("\n".join(lines) + "\n")
     images = [tmp_path / "images" / name for name in names]
-    refused("is not a valid COLMAP model", reconstruction.import_model, tmp_path / "model", images, (512, 384))
+    refused("is not a valid COLMAP model", structure_from_motion.import_model, tmp_path / "model", images, (512, 384))
+
+
+@pytest.mark.parametrize("place", ["sparse/0", "colmap/sparse/0", "."])
+def test_existing_model_is_used(place: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    image, model = tmp_path / "images" / "a.png", tmp_path / place
+    model.mkdir(parents=True, exist_ok=True)
+    (model / "cameras.txt").touch()
+    settings = structure_from_motion.SfmSettings()
+    found = structure_from_motion.find_model(None, [image], [None], tmp_path / "out", settings, overwrite=False)
+    assert found.samefile(model)
+    assert f"using the COLMAP model {found}" in capsys.readouterr().out
 
 
 def test_features_on_and_near_the_object_are_ignored(tmp_path: Path) -> None:
     mask = np.zeros((60, 200), np.uint8)
     mask[20:40, 50:100] = 255
     Image.fromarray(mask).save(tmp_path / "mask_a.png")
-    reconstruction._write_ignored(tmp_path / "mask_a.png", tmp_path / "a.jpg.png")
+    structure_from_motion._write_ignored(tmp_path / "mask_a.png", tmp_path / "a.jpg.png")
     ignored = np.asarray(Image.open(tmp_path / "a.jpg.png")) == 0
     assert ignored[mask > 0].all()
     assert ignored[30, 48:102].all()  # 1 % of the width farther
@@ -118,7 +129,7 @@ def test_features_on_and_near_the_object_are_ignored(tmp_path: Path) -> None:
     assert not ignored[30, 102]
 
 
-def test_a_model_is_made_where_there_is_none(tmp_path: Path, command: Callable[..., str]) -> None:
+def test_missing_model_is_computed(tmp_path: Path, command: Callable[..., str]) -> None:
     generator = np.random.default_rng(1)
     sheets = []
     for corner, right, down in (
@@ -163,11 +174,11 @@ def test_a_model_is_made_where_there_is_none(tmp_path: Path, command: Callable[.
         assert angle(turns[0], turns[1]) < 0.5
 
 
-def test_a_model_that_colmap_could_not_write_is_not_kept(tmp_path: Path) -> None:
+def test_incomplete_model_of_colmap_is_removed(tmp_path: Path) -> None:
     synthesized(tmp_path / "model", ("SIMPLE_PINHOLE", [1280.0, 512, 384]), 0.0, "binary")
     images = tmp_path / "model" / "images.bin"
     images.write_bytes(images.read_bytes()[:-1])
-    refused("COLMAP cannot write to", reconstruction._copy_model, tmp_path / "model", tmp_path / "sparse" / "0")
+    refused("COLMAP cannot write to", structure_from_motion._copy_model, tmp_path / "model", tmp_path / "sparse" / "0")
     assert not (tmp_path / "sparse").exists()
 
 
@@ -179,7 +190,7 @@ def test_a_model_that_colmap_could_not_write_is_not_kept(tmp_path: Path) -> None
         (("SIMPLE_PINHOLE", [1280.0, 512, 384]), "model", False),  # a given model keeps its lens
     ],
 )
-def test_a_lens_with_distortion_is_advised_where_the_option_acts(
+def test_distortion_is_advised_only_if_the_option_has_an_effect(
     camera: tuple[str, list[float]], folder: str, advised: bool, tmp_path: Path, command: Callable[..., str]
 ) -> None:
     model = tmp_path / folder / "0"
@@ -193,7 +204,7 @@ def test_a_lens_with_distortion_is_advised_where_the_option_acts(
     assert ("lens=radial" in printed) == advised
 
 
-def test_names_that_count() -> None:
+def test_numbered_names_give_the_order_of_a_sequence() -> None:
     assert numeric_order([f"IMG_{number}.JPG" for number in range(7039, 7136, 3)]) == list(range(33))
     unsorted = [f"p_{number}.png" for number in (1, 10, 11, *range(2, 10))]
     assert numeric_order(unsorted) == [0, *range(3, 11), 1, 2]
@@ -202,14 +213,14 @@ def test_names_that_count() -> None:
     assert numeric_order(["20240101.png", "20260730.png", "20260731.png", "20260801.png"]) is None
 
 
-def test_a_sequence_is_matched_with_its_neighbours_and_ever_fewer_beyond() -> None:
+def test_sequence_is_matched_densely_with_near_and_sparsely_with_far_frames() -> None:
     pairs = sequential_pairs(range(40))
     assert len(pairs) == len(set(pairs)) == sum(40 - stride for stride in (*range(1, 11), 16, 32))
     assert {abs(i - j) for i, j in pairs} == {*range(1, 11), 16, 32}
     assert sequential_pairs([2, 0, 1]) == [(2, 0), (0, 1), (2, 1)]
 
 
-def test_pycolmap_leaves_sigterm_alone() -> None:
+def test_pycolmap_does_not_change_the_handler_of_sigterm() -> None:
     program = "import signal; signal.signal(15, lambda *_: exit(130)); "
     program += "import tests.poses.camera_calibration as made; made.require_pycolmap(); signal.raise_signal(15)"
     assert subprocess.run([sys.executable, "-c", program], stderr=subprocess.DEVNULL).returncode == 130

@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
-from nerfro_plugins.data_formats.colmap_model import lens_of, read_colmap
+from nerfro_plugins.data_formats.colmap_model import MODEL_FOLDERS, find_model_folder, lens_of, read_colmap
 from PIL import Image
 from scipy.ndimage import binary_dilation
 from scipy.sparse import csr_array
@@ -33,7 +33,6 @@ from .calibration import Calibration, Intrinsics, LensModel, Pose
 Pairs = Literal["sequential", "all"]
 
 _MODELS = "models"  # temporary folder of new models
-_MODEL_FOLDERS = ("sparse/0", "sparse")
 # COLMAP's camera model for each of nerfro's lens models.
 _CAMERAS = {"pinhole": "PINHOLE", "radial": "RADIAL", "opencv": "OPENCV"}
 # Features within this distance of the object's outline also describe the object. Fraction of the image width.
@@ -76,17 +75,19 @@ def find_model(
     if model is not None:
         return user_path(model)
     folder = images[0].parent
-    for candidate in (root / name for root in (folder.parent, folder) for name in _MODEL_FOLDERS):
-        if any((candidate / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
-            print(f"using the COLMAP model {candidate} with its lens; delete the folder to compute another model")
-            return candidate
+    found = find_model_folder(root / name for root in (folder.parent, folder) for name in MODEL_FOLDERS)
+    if found is not None:
+        print(f"using the COLMAP model {found} with its lens; move its files away to compute another model")
+        return found
     refuse_existing([out], overwrite)
     num_masks = sum(mask is not None for mask in masks)
     print(f"structure from motion of {len(images)} images, {num_masks} of them with a mask of the object")
-    return reconstruct(images, masks, out, settings)
+    return run_structure_from_motion(images, masks, out, settings)
 
 
-def reconstruct(images: Sequence[Path], masks: Sequence[Path | None], folder: Path, settings: SfmSettings) -> Path:
+def run_structure_from_motion(
+    images: Sequence[Path], masks: Sequence[Path | None], folder: Path, settings: SfmSettings
+) -> Path:
     """Run structure from motion on the images of one folder, taken with one lens.
 
     Features on the refractive object are discarded, because refracted rays do not intersect in a scene point and would
