@@ -208,6 +208,8 @@ def _refusal(value: Any, hint: Any) -> str | None:
         return None if value in hints else f"choose {', '.join(map(repr, hints))}"
     if origin is Annotated and isinstance(hints[1], Refused):
         return str(hints[1])
+    if origin is Annotated and isinstance(hints[1], Range) and isinstance(value, str):
+        return "take a number without quotes"
     if origin is Annotated and isinstance(hints[1], Range):
         return f"take {hints[1]}" if value not in hints[1] else None
     if origin is Annotated:

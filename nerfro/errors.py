@@ -46,6 +46,13 @@ def warn_of_old_name(old: str, new: str) -> None:
     warnings.warn(f"{old} is called {new}; the next release removes the old name", stacklevel=3)
 
 
+def follow_old_method(cls: type, old: str, new: str) -> None:
+    """Let a class that defines a method under its old name define it under the new one, with a warning."""
+    if (method := cls.__dict__.get(old)) is not None:
+        warn_of_old_name(f"{cls.__name__}.{old}", new)
+        setattr(cls, new, method)
+
+
 def warn(message: str) -> None:
     """Print a warning about an allowed but suspicious input or result."""
     print(f"nerfro: warning: {one_line(message)}")

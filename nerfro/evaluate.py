@@ -21,7 +21,7 @@ from nerfro.evaluation.metrics import prepared_metrics
 from nerfro.evaluation.request import EvaluateConfig, find_device, own_folder, record, require_one_task
 from nerfro.evaluation.results import RunMetrics
 from nerfro.evaluation.scoring import score_folders
-from nerfro.evaluation.tables import report
+from nerfro.evaluation.tables import write_scores
 from nerfro.evaluation.treatments import score_split
 from nerfro.files.foreign_config import read_foreign_config
 from nerfro.files.images import load_png
@@ -64,7 +64,7 @@ def _evaluate_checkpoint(config: DictConfig) -> None:
         title = f"{trained.name} on {trained.data.root}, {config.split} views"
         spending = checkpoint["global_step"], spent.seconds, spent.rays_per_second
         phases = steps_by_phase(checkpoint["callbacks"], checkpoint["global_step"])
-        report(RunMetrics(result, *spending, treated, phases), title, folder)
+        write_scores(RunMetrics(result, *spending, treated, phases), title, folder)
     print(f"images and tables: {folder}")
 
 
@@ -83,7 +83,7 @@ def _evaluate_folder(config: DictConfig) -> None:
         metrics = prepared_metrics()
         record(folder, config)
         result = score_folders(pairs, config.alpha, metrics, folder, device)
-        report(RunMetrics(result), f"{predictions} against {references}", folder)
+        write_scores(RunMetrics(result), f"{predictions} against {references}", folder)
     print(f"images and tables: {folder}")
 
 

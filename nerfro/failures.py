@@ -133,6 +133,8 @@ def _not_parsed(override: str) -> str:
 def _messages(error: BaseException) -> list[str]:
     """Return the lines of an error and of its cause, because Hydra names the wrong key only in the cause."""
     lines = [line.strip() for line in str(error).partition("Config search path")[0].splitlines() if line.strip()]
+    if (present := re.search(r"Could not append to config\. An item is already at '([^']+)'", str(error))) is not None:
+        return [f"{present[1]} has a value already; write {present[1]}=..., without a plus sign"]
     cause = error.__cause__ or error.__context__ or error
     if not isinstance(cause, OmegaConfBaseException):
         return lines

@@ -47,8 +47,10 @@ MOVED_CLASSES = (
     }
     | {
         "nerfro.camera.refined.RefinedCamera": f"{PLUGINS_PACKAGE}.refined_cameras.refined.RefinedCamera",
+        "nerfro.training.phases.background.Background": "nerfro.training.phases.background.BackgroundSteps",
         "nerfro.training.phases.cameras.CameraSteps": f"{PLUGINS_PACKAGE}.refined_cameras.phase.CameraSteps",
         "nerfro.data.opencv.OpenCVData": "nerfro.data.blender.OpenCVData",
+        "nerfro.losses.boundary.BoundaryRegulariser": "nerfro.losses.boundary.BoundaryRegularizer",
         "nerfro.losses.distortion.Distortion": f"{PLUGINS_PACKAGE}.distortion.Distortion",
         "nerfro.media.vessel.SdfVessel": f"{PLUGINS_PACKAGE}.vessels.vessel.SdfVessel",
         "nerfro.losses.smoothness.Smoothness": f"{PLUGINS_PACKAGE}.paper.smoothness.Smoothness",
@@ -104,6 +106,8 @@ RENAMED: dict[str, str | None] = {
     "supersample": "subdivision.side",  # of evaluate and render
     "divergence": "subdivision.divergence",
     "contrast": "subdivision.contrast",
+    "model.scene_share": "model.scene_fraction",
+    "model.index_share": "model.index_fraction",
     "sampler.points.every": "sampler.points.update_every",
     "sampler.points.looks": "sampler.points.update_fraction",
     "sampler.points.trust": "sampler.points.max_bin_alpha",

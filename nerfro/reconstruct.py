@@ -19,8 +19,8 @@ from nerfro.files.folder_lock import lock_folder
 from nerfro.overrides import is_given, of_groups
 from nerfro.paths import resolve_path, user_path
 from nerfro.pipeline.options import ReconstructConfig, have_poses
-from nerfro.pipeline.stages import terminated_in_one_line
-from nerfro.pipeline.steps import calibrate, preprocess, report, segment, train
+from nerfro.pipeline.stage import terminated_in_one_line
+from nerfro.pipeline.stages import calibrate, preprocess, report, segment, train
 from nerfro.rendering.scene_file import with_scene
 
 

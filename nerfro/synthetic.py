@@ -11,7 +11,7 @@ from nerfro.allowed import Count, Names, Natural, NotNegative, Positive, Range
 from nerfro.registry import plugin_module
 
 SCENES: dict[str, str] = {}
-"""Module of each scene, by name; plugins add scenes. `build(spacing)` of the module returns the `Scene`."""
+"""Module of each scene, by name; plugins add scenes. `build(spacing)` of the module returns the `SyntheticScene`."""
 
 SceneName = Annotated[str, Names(lambda: SCENES)]
 

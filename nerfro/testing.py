@@ -42,7 +42,7 @@ from nerfro.samplers.base import PathSampler, PointSampler
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.paths.straight import Straight
 from nerfro.samplers.points.stratified import Stratified, point_samples
-from nerfro.training.phases.base import Phase, Run
+from nerfro.training.phases.base import Phase, TrainingRun
 from nerfro.training.ray_batches import RayBatches
 from nerfro.types import Batch, Exits, Path, Radiance, Rays, Rendering, Samples
 from nerfro.viewing.exports import ExportConfig, export_of
@@ -149,14 +149,14 @@ def example_batch(num_rays: int = NUM_RAYS, rays_per_pixel: int = 1) -> Batch:
     )
 
 
-def example_run() -> Run:
+def example_run() -> TrainingRun:
     """Return a small model with a learned background, its batches and its optimizer; equal in every call."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         model = RefractiveModel(replace(example_components(), boundary=EnvironmentMap([8])))
     batches = RayBatches(example_views(), NUM_RAYS, "all_images")
     optimizer = torch.optim.Adam(model.parameters_by_name().values())
-    return Run(model, batches, example_views(), optimizer, spent=0.0)
+    return TrainingRun(model, batches, example_views(), optimizer, spent=0.0)
 
 
 class _ExampleData(DataSource):

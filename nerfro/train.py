@@ -18,7 +18,7 @@ from nerfro.cli import entry_point
 from nerfro.distributed import leave
 from nerfro.evaluation.metrics import prepared_metrics
 from nerfro.evaluation.results import RunMetrics, optimized
-from nerfro.evaluation.tables import report
+from nerfro.evaluation.tables import write_scores
 from nerfro.evaluation.treatments import score_split
 from nerfro.failures import EXIT_INTERRUPTED
 from nerfro.fields.networks import compile_networks
@@ -102,7 +102,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetr
     finally:
         finish_logs(trainer, scores)
     if scored is not None:
-        report(scored, f"{config.name} on {config.data.root}, {split} views", folder, brief=True)
+        write_scores(scored, f"{config.name} on {config.data.root}, {split} views", folder, brief=True)
     print(next_steps(folder, split))
     return scored
 

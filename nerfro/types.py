@@ -61,8 +61,8 @@ class Path:
         throughput: linear factor of the light of the polyline; the factors of a ray sum to at most 1.
         body: body of the segment after each vertex (`Solid.deciding_body`), numbered from 1; 0 in air, or if the index
             varies continuously.
-        surface: body on whose surface each vertex lies, numbered from 0; -1 for vertices on no sharp surface, such as
-            both ends.
+        surface_body: body on whose surface each vertex lies, numbered as `body`; 0 for vertices on no sharp surface,
+            such as both ends.
         across: body on the other side of the surface, numbered as `body`. Transmitted light enters the body, reflected
             light does not. 0 for vertices on no surface.
         triangle: triangle on which each vertex lies; -1 if the surface has no triangles.
@@ -82,7 +82,7 @@ class Path:
     ray: Int[Tensor, "P"]
     throughput: Float[Tensor, "P 3"]
     body: Int[Tensor, "P S"]
-    surface: Int[Tensor, "P S"]
+    surface_body: Int[Tensor, "P S"]
     across: Int[Tensor, "P S"]
     triangle: Int[Tensor, "P S"]
     absorption: Float[Tensor, "media 3"]
@@ -102,13 +102,13 @@ class Path:
 
         The class documents the arguments. The other fields are expanded constants, which take no memory.
         """
-        none = torch.full((), -1, dtype=torch.int8, device=s.device)
-        of_vertices, air = none.expand(s.shape), (none + 1).expand(s.shape)
+        zero = torch.zeros((), dtype=torch.int8, device=s.device)
+        air, no_triangle = zero.expand(s.shape), (zero - 1).expand(s.shape)
         return cls(
             positions, directions, s, refracted, radii,
             splits=False, ray=torch.arange(len(s), device=s.device), throughput=s.new_ones(()).expand(len(s), 3),
-            body=air, surface=of_vertices, across=air, triangle=of_vertices,
-            absorption=s.new_empty(0, 3), band=(none + 1).expand(len(s)),
+            body=air, surface_body=air, across=air, triangle=no_triangle,
+            absorption=s.new_empty(0, 3), band=zero.expand(len(s)),
         )  # fmt: skip
 
     @classmethod
@@ -193,6 +193,12 @@ class Path:
         return self.s[:, -1]
 
     @property
+    def surface(self) -> Int[Tensor, "P S"]:
+        """Old form of `surface_body`, numbered from 0; -1 for none."""
+        warn_of_old_name("Path.surface", "Path.surface_body, which counts from 1")
+        return self.surface_body - 1
+
+    @property
     def exit_positions(self) -> Float[Tensor, "P 3"]:
         """End of each polyline, behind the last event."""
         return self.positions[:, -1]
@@ -254,7 +260,7 @@ class Path:
 
 
 # Fields of `Path` with a column for each vertex, and fields without rows.
-_OF_VERTICES = frozenset({"positions", "directions", "s", "body", "surface", "across", "triangle"})
+_OF_VERTICES = frozenset({"positions", "directions", "s", "body", "surface_body", "across", "triangle"})
 _OF_PATHS = frozenset({"splits", "absorption", "samples"})
 
 

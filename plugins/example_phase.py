@@ -8,7 +8,7 @@ import torch
 
 from nerfro.allowed import Count
 from nerfro.registry import register
-from nerfro.training.phases.base import Phase, Run
+from nerfro.training.phases.base import Phase, TrainingRun
 
 _OTHER_PIXELS = 10**6  # numbers of batches that training steps do not use
 
@@ -28,7 +28,7 @@ class ExtraSteps(Phase):
     def steps_before(self, training_step: int) -> int:
         return training_step // self.every
 
-    def step(self, run: Run, number: int, state: dict[str, Any]) -> bool:
+    def step(self, run: TrainingRun, number: int, state: dict[str, Any]) -> bool:
         renderer = run.renderer
         with torch.no_grad():
             batch = run.batches.for_rank(0, 1).batch(_OTHER_PIXELS + number)  # the same pixels in all processes

@@ -23,11 +23,11 @@ from nerfro.subdivision import Subdivision
 
 
 @dataclass(frozen=True)
-class Images:
-    """Images of an evaluation.
+class ScoringProtocol:
+    """Treatment of rendered images before they are scored.
 
     Attributes:
-        subfolder: name of their folder.
+        subfolder: name of the folder of the images.
         right_halves: score only the right half of each view, with the gain that is fitted on the left half of the
             photograph.
     """
@@ -43,7 +43,7 @@ def score_views(
     folder: Path,
     subdivision: Subdivision,
     prefix: str,
-    images: Sequence[Images],
+    protocols: Sequence[ScoringProtocol],
 ) -> list[EvaluationResult]:
     """Render all views, write 8-bit sRGB images to `folder/<subfolder>/<prefix>_NNN.png`, and compute their scores.
 
@@ -52,30 +52,30 @@ def score_views(
     Args:
         renderer: trained model.
         views: views to score.
-        metrics: metrics of each of the images.
+        metrics: metrics of an image.
         folder: folder of the evaluation.
         subdivision: which pixels get several rays.
         prefix: beginning of the names of the views, which end with a number of three digits.
-        images: images that are made of each rendering.
+        protocols: treatments of each rendered image.
 
     Returns:
-        Scores of each of the images.
+        Scores by each protocol.
     """
     scene, height, width = renderer.scene, views.cameras.height, views.cameras.width
     cameras, left = views.cameras.to(scene.device), slice(width // 2)
-    scores: list[list[ViewScores]] = [[] for _ in images]
+    scores: list[list[ViewScores]] = [[] for _ in protocols]
     for view in track("evaluate", range(len(views))):
         radiance = render_view(renderer, cameras, view, subdivision).radiance.view(height, width, 3).cpu()
         target, mask = views.images[view], None if views.masks is None else views.masks[view]
         name = f"{prefix}_{view:03d}"
-        for kind, scored in zip(images, scores, strict=True):
+        for protocol, scored in zip(protocols, scores, strict=True):
             gain = torch.ones(3)
-            if kind.right_halves:
+            if protocol.right_halves:
                 to_srgb, shown = scene.colour_space.to_srgb, radiance[:, left].flatten(0, 1)
                 gain = fit_gain(to_srgb, shown, target[:, left].flatten(0, 1))
             rgb = scene.colour_space.to_display(radiance, gain)
-            save_png(folder / kind.subfolder / f"{name}.png", rgb)
-            part = slice(width // 2, None) if kind.right_halves else slice(None)
+            save_png(folder / protocol.subfolder / f"{name}.png", rgb)
+            part = slice(width // 2, None) if protocol.right_halves else slice(None)
             coverage = None if mask is None else mask[:, part].contiguous()
             scored.append(metrics.score(name, rgb[:, part].contiguous(), target[:, part].contiguous(), coverage))
     return [metrics.result(scored) for scored in scores]

@@ -181,7 +181,7 @@ def short(reason: str) -> str:
     return reason.partition(";")[0]
 
 
-def report(metrics: RunMetrics, title: str, folder: Path, brief: bool = False) -> None:
+def write_scores(metrics: RunMetrics, title: str, folder: Path, brief: bool = False) -> None:
     """Write metrics.json and the tables of all regions into a folder, and print the scores.
 
     Args:

@@ -12,7 +12,7 @@ from pathlib import Path
 from nerfro.data.base import Views
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.results import AS_GIVEN, EXPOSED, EvaluationResult
-from nerfro.evaluation.scoring import Images, score_views
+from nerfro.evaluation.scoring import ScoringProtocol, score_views
 from nerfro.rendering import Renderer
 from nerfro.subdivision import Subdivision
 
@@ -41,13 +41,13 @@ def score_split(
     """
     scene, results = renderer.scene, dict[str, EvaluationResult]()
     settings = metrics, folder, subdivision, prefix
-    images = {AS_GIVEN: Images("images")}
+    protocols = {AS_GIVEN: ScoringProtocol("images")}
     if scene.camera.moves:
-        [results[AS_GIVEN]] = score_views(renderer, views, *settings, [*images.values()])
+        [results[AS_GIVEN]] = score_views(renderer, views, *settings, [*protocols.values()])
         views = replace(views, cameras=scene.camera.aligned(views.cameras))
-        images = {"aligned": Images("images_aligned")}
+        protocols = {"aligned": ScoringProtocol("images_aligned")}
     if scene.camera.exposure is not None:
-        images[EXPOSED] = Images("images_exposed", right_halves=True)
-    scores = score_views(renderer, views, *settings, [*images.values()])
-    results |= dict(zip(images, scores, strict=True))
+        protocols[EXPOSED] = ScoringProtocol("images_exposed", right_halves=True)
+    scores = score_views(renderer, views, *settings, [*protocols.values()])
+    results |= dict(zip(protocols, scores, strict=True))
     return results.pop(AS_GIVEN), results

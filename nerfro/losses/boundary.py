@@ -16,7 +16,7 @@ _MIN_TRANSMITTANCE = 0.5
 
 
 @register("loss", "boundary")
-class BoundaryRegulariser(Loss):
+class BoundaryRegularizer(Loss):
     """Penalize |T C'(d) - C| where the final transmittance T is above 1/2 (paper, Eqn. 8).
 
     The background should explain such pixels without the field, so the loss removes fog in front of the surface. Only

@@ -29,7 +29,7 @@ class ReconstructConfig:
         outlines: boxes or polygons around the object in some photographs, as for `python -m nerfro.mask`.
         out: output folder.
         trial_steps: number of steps of the training that tries each hypothesis about the object on validation
-            photographs (straight rays, solid body, vessel); 0 trains the solid body without a comparison.
+            photographs; 0 skips the comparison and trains the first hypothesis with bent rays (`hypotheses`).
         pixels: maximum length of the longer side of the photographs in training; `data.downscale` has precedence.
         calibrate: further options of `python -m nerfro.calibrate`, separated by spaces.
         mask: further options of `python -m nerfro.mask`: `view=true` opens a page for drawing outlines, and

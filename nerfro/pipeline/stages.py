@@ -1,110 +1,169 @@
-"""Stages of `python -m nerfro.reconstruct`: commands with results that are kept until an input file changes."""
+"""The stages of `nerfro.reconstruct`. A stage runs a command, unless the result exists and is newer than the inputs."""
 
 from __future__ import annotations
 
-import contextlib
-import gc
-import itertools
-import os
-import signal
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+import shlex
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from types import FrameType
 
-import torch
+from omegaconf import DictConfig
 
-from nerfro.cli import call
-from nerfro.errors import Interrupted, NerfroError
-from nerfro.failures import EXIT_INTERRUPTED, in_one_line
-from nerfro.overrides import command_line, without_hints
+from nerfro.capture.preprocess_options import MESH
+from nerfro.errors import NerfroError, warn
+from nerfro.evaluation.results import EXPOSED, FULL, read_metrics_json
+from nerfro.files.reading import read_json
+from nerfro.overrides import as_overrides, is_given, not_given
+from nerfro.pipeline.hypotheses import Hypothesis, hypotheses
+from nerfro.pipeline.options import common_options
+from nerfro.pipeline.stage import Stage, is_older, move_aside
+from nerfro.registry import plugin_module
+from nerfro.rendering.scene_file import OLD_SCENE, SCENE, read_scene_file
+from nerfro.silhouettes.overlaps import SHEET
+from nerfro.training.run_folder import CONFIG_FILE
 
-_SEED = 67280421310721  # of torch in a new process
+# Smallest gain of bent rays over straight rays in short trainings, in dB. On a simulated empty glass, a gain of 0.33 dB
+# in the trial became a gain of 0.75 dB after four minutes (docs/lab/simulated_glassware.md).
+_MIN_GAIN = 0.25
+_NEVERTHELESS = (
+    "to use bent rays nevertheless, add trial_steps=0 for a solid body, or train='+experiment=glass_room "
+    "medium=vessel' for a fitted vessel"
+)
+_MIN_PHOTOGRAPHS = 3
+_MASKS = ("masks/*", "masks/*/*", "mask_*", "*/mask_*")  # where loaders search for masks
 
 
-@dataclass(frozen=True)
-class Stage:
-    """A command of nerfro in this process, with input and output files.
+def calibrate(config: DictConfig, data: list[str], out: Path) -> list[str]:
+    """Estimate the poses of the photographs, and return the options of the resulting data set."""
+    linked = plugin_module("camera_calibration.collection").collect_photographs(config, out)
+    if len(linked) < _MIN_PHOTOGRAPHS:
+        raise NerfroError(
+            f"{len(linked)} photographs do not determine poses and shape; take at least {_MIN_PHOTOGRAPHS}, "
+            "better 60, from all sides"
+        )
+    draws = "view=true" in shlex.split(config.mask)
+    if not config.outlines and not draws and not any(file for place in _MASKS for file in out.glob(place)):
+        raise NerfroError(
+            "the photographs have no masks; add mask='view=true' to draw the outline of the object in two to five "
+            f"images in the browser, outlines={{{linked[0].stem}:[[COLUMN,ROW],...],...}}, or masks=FOLDER"
+        )
+    written = plugin_module("camera_calibration.calibrated_data")
+    report, plot = out / written.REPORT, out / written.PLOT
+    options = [*as_overrides({"images": out / "images", "out": out}), "target=colmap", "overwrite=true"]
+    options += [text.removeprefix("data.") for text in data if text.startswith("data.mask_labels=")]
+    Stage("calibrate", [*options, *shlex.split(config.calibrate)], report, plot).run()
+    content = read_json(report, "delete the file to repeat the stage")
+    bounds = content.get("options", []) if isinstance(content, dict) else []  # bounds of the rays in earlier releases
+    return [*as_overrides({"data.root": out}), *bounds, *data]
 
-    Attributes:
-        command: name of the command, as in `python -m nerfro.COMMAND`.
-        options: command-line options.
-        result: the last file that the command writes.
-        preview: file or folder that the user should check.
-        inputs: files that the command reads; the command is repeated if one of them is newer than the result.
+
+def segment(config: DictConfig, options: list[str], root: Path) -> None:
+    """Make the missing masks, if outlines are given."""
+    if config.outlines or config.mask:
+        sheet = root / "masks.png"
+        Stage("mask", [*options, *shlex.split(config.mask)], sheet, sheet).run()
+
+
+def preprocess(config: DictConfig, options: list[str], root: Path, folder: Path) -> Path:
+    """Reconstruct surface and index in a folder, and return the scene file."""
+    inputs = [*root.glob("transforms*.json"), *(file for place in _MASKS for file in root.glob(place))]
+    automatic = [*as_overrides({"out": folder}), "refine=true", "wrong_masks=null", "symmetry=auto", "overwrite=true"]
+    if "wall" not in config.medium and "shell_voxels" in config.medium and config.medium.get("bodies") is None:
+        automatic.append("vessel=true")
+    given = shlex.split(config.preprocess)
+    options = [*options, *not_given(automatic, given), *given]
+    old = (folder / OLD_SCENE).is_file() and not (folder / SCENE).is_file()  # written by an earlier release
+    scene = folder / (OLD_SCENE if old else SCENE)
+    Stage("preprocess", options, scene, folder / SHEET, inputs).run()
+    return folder / SCENE if (folder / SCENE).is_file() else scene
+
+
+def train(config: DictConfig, overrides: list[str], scene: Path, out: Path) -> None:
+    """Train with the hypothesis that predicts the validation photographs best."""
+    inputs = [scene, scene.with_name(MESH)]
+    content = read_scene_file(scene)
+    common, candidates = common_options(config, overrides, scene, content.photograph), hypotheses(content)
+    if is_given("experiment", common):
+        options = []
+    elif content.surroundings is None:
+        raise NerfroError(
+            f"{scene} does not tell whether the surroundings are near, because no stage needed them; write "
+            '"surroundings": "near" (an object in a room) or "far" into the file, and repeat this command'
+        )
+    elif config.trial_steps == 0:
+        options = candidates[1].options
+    else:
+        unsupported = content.provenance.unsupported
+        candidates = [hypothesis for hypothesis in candidates if hypothesis.name not in unsupported]
+        trials = [out / "trials" / hypothesis.folder for hypothesis in candidates] if len(candidates) > 1 else []
+        for hypothesis, trial in zip(candidates, trials, strict=False):
+            print(f"\nhypothesis: {hypothesis.name}")
+            short = hypothesis.trial_options(config.trial_steps)
+            _run_training([*hypothesis.options, *not_given(common, short), *short], inputs, trial)
+        options = _best_hypothesis(candidates, trials).options
+        inputs += [trial / "metrics.json" for trial in trials]
+    _run_training([*options, *common], inputs, out / "run")
+
+
+def _best_hypothesis(tried: Sequence[Hypothesis], runs: Sequence[Path]) -> Hypothesis:
+    """Print the scores of the trials, and return the hypothesis with the best mean of image and object.
+
+    Bent rays have to be better than straight rays by `_MIN_GAIN`, because scores of five views vary.
+
+    Args:
+        tried: the hypotheses, straight rays first.
+        runs: run folder of the trial of each hypothesis; empty if there are only straight rays.
     """
-
-    command: str
-    options: Sequence[str]
-    result: Path
-    preview: Path
-    inputs: Sequence[Path] = ()
-
-    @property
-    def is_done(self) -> bool:
-        """Whether the result exists and no input is newer."""
-        return self.result.is_file() and not is_older(self.result, self.inputs)
-
-    def run(self) -> None:
-        """Run the command in this process unless the stage is done.
-
-        Raises:
-            NerfroError: the command failed.
-            Interrupted: the command was interrupted.
-        """
-        if self.is_done:
-            print(f"{self.command}: done; {self.result} is kept (delete the file to repeat the stage)", flush=True)
-            return
-        print(f"\n{self.command}: {command_line(self.command, self.options)}", flush=True)
-        # Training has saved a checkpoint.
-        again = "continue" if self.command == "train" else "start this stage again"
-        incomplete = f"{self.command} is incomplete; repeat the same command to {again}"
-        try:
-            # A command depends on no random numbers of earlier stages.
-            with without_hints(), torch.random.fork_rng(devices=[]):
-                torch.manual_seed(_SEED)
-                call(self.command, list(self.options))
-            if not self.result.is_file():
-                raise NerfroError(f"{self.result} was not written")
-        except KeyboardInterrupt:
-            raise Interrupted(incomplete) from None
-        except SystemExit as end:
-            if end.code != EXIT_INTERRUPTED:
-                raise
-            raise Interrupted(incomplete) from None
-        except Exception as error:
-            if os.environ.get("NERFRO_DEBUG"):
-                raise
-            raise NerfroError(
-                f"{self.command} failed: {in_one_line(error)}; correct the input, set {self.command}='OPTIONS', or run "
-                "the printed command with other options; then repeat this command, which keeps all completed stages"
-            ) from error
-        gc.collect()  # models refer to themselves
-        print(f"{self.command}: done; look at {self.preview}", flush=True)
+    if not runs:
+        print(f"\ntraining continues with: {tried[0].name}")
+        print(f"no body explains the pixels of the object better; {_NEVERTHELESS}")
+        return tried[0]
+    scores = []
+    print("\nPSNR of short trainings on validation photographs, in dB:")
+    print(f"  {'hypothesis':<20}{'image':>9}{'object':>9}{'mean':>9}")
+    for hypothesis, run in zip(tried, runs, strict=True):
+        metrics = read_metrics_json(run / "metrics.json")
+        # The exposures of validation photographs are unknown. Their right halves may lack the object.
+        result = metrics.treatments.get(EXPOSED, metrics.result)
+        result = metrics.result if result.mean("psnr", "mask") is None else result
+        image, inside = result.mean("psnr", FULL) or 0.0, result.mean("psnr", "mask")
+        scores.append(image if inside is None else 0.5 * (image + inside))
+        shown = "n/a" if inside is None else f"{inside:.2f}"
+        print(f"  {hypothesis.name:<20}{image:>9.2f}{shown:>9}{scores[-1]:>9.2f}")
+    bent = max(range(1, len(tried)), key=scores.__getitem__)
+    best = tried[bent if scores[bent] >= scores[0] + _MIN_GAIN else 0]
+    print(f"training continues with: {best.name}")
+    if best is tried[0]:
+        doubts = [hypothesis.doubt for hypothesis in tried if hypothesis.doubt]
+        reason = doubts[0] if doubts else "the surface or the index is not accurate enough, or the object is opaque"
+        print(f"the mean of bent rays is not higher by {_MIN_GAIN} dB: {reason}; {_NEVERTHELESS}")
+    return best
 
 
-@contextlib.contextmanager
-def terminated_in_one_line() -> Iterator[None]:
-    """End this program on SIGTERM in the same way as on Ctrl-C. A second SIGTERM ends the program immediately."""
+def _run_training(options: list[str], inputs: list[Path], run: Path) -> None:
+    """Train, or resume an interrupted training if the inputs have not changed."""
+    started = run / CONFIG_FILE
+    options = [*options, *as_overrides({"hydra.run.dir": run})]
+    stage = Stage("train", options, run / "metrics.json", run / "images", inputs)
+    if started.is_file() and not stage.is_done:
+        if is_older(started, inputs):
+            print(f"\ntrain: the surface is newer than {run}, which is kept as {move_aside(run)}")
+        else:
+            stage = replace(stage, options=[*options, "ckpt_path=last"])
+    stage.run()
 
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        raise KeyboardInterrupt
 
-    previous = signal.signal(signal.SIGTERM, interrupt)
+def report(out: Path) -> None:
+    """Write the report and the interactive page, and print where they are; a page that cannot be made is a warning."""
+    report, page, run = out / "report" / "report.html", out / "page.html", out / "run"
+    options = [*as_overrides({"runs": [run], "out": report.parent}), "report=true", "overwrite=true"]
+    Stage("summary", options, report, report, [run / "metrics.json"]).run()
+    options = as_overrides({"checkpoint": run, "what": "page", "out": page, "overwrite": True})
     try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, previous)
-
-
-def is_older(file: Path, others: Iterable[Path]) -> bool:
-    """Test whether one of the existing other files was modified after a file."""
-    written = file.stat().st_mtime_ns
-    return any(other.stat().st_mtime_ns > written for other in others if other.exists())
-
-
-def move_aside(folder: Path) -> Path:
-    """Rename a folder to the first free name with a number, and return the new path."""
-    free = next(path for n in itertools.count(1) if not (path := folder.with_name(f"{folder.name}_{n}")).exists())
-    return folder.rename(free)
+        Stage("export", options, page, page, [run / "metrics.json"]).run()
+    except NerfroError as error:
+        warn(f"no page was written: {error}")
+        page.unlink(missing_ok=True)  # of an earlier run
+    print(f"\nreport: {report}")
+    if page.is_file():
+        print(f"page: {page}")

@@ -158,11 +158,11 @@ class Renderer(nn.Module, ABC):
         medium = self.scene.medium
         path = self.path_sampler(rays, medium) if path is None else path
         learns = self.paths_learn and torch.is_grad_enabled()
-        return medium.with_absorption(self._refined(path, rays) if learns else path)
+        return medium.with_absorption(self._replayed(path, rays) if learns else path)
 
     def exit_directions(self, rays: Rays) -> Float[Tensor, "R 3"]:
         """Return the unit exit direction of the main polyline of each ray; other branches are not traced."""
-        return self.path_sampler.main(rays, self.scene.medium).exit_directions
+        return self.path_sampler.trace_main(rays, self.scene.medium).exit_directions
 
     @property
     def paths_learn(self) -> bool:
@@ -183,19 +183,19 @@ class Renderer(nn.Module, ABC):
         """Render the radiance of any number of rays in chunks, without the other results of `render`."""
         return self._in_chunks(lambda chunk: self._render_traced(chunk, self.trace(chunk)), rays)[0]
 
-    def _refined(self, path: Path, rays: Rays) -> Path:
+    def _replayed(self, path: Path, rays: Rays) -> Path:
         """Replay paths with gradients, except for paths whose derivatives are too large."""
         medium = self.scene.medium
         steady = self.path_sampler.steady(path, medium)
         if steady.all():
-            return self.path_sampler.refine(path, rays, medium)
+            return self.path_sampler.replay(path, rays, medium)
         rows = steady.nonzero()[:, 0]
         if not len(rows):
             return path
         # Other paths have many events, and their replay would take most of the time.
-        refined = self.path_sampler.refine(path[rows], rays[path.ray[rows]], medium)
+        replayed = self.path_sampler.replay(path[rows], rays[path.ray[rows]], medium)
         names = ["positions", "directions", "s", *(["throughput"] if path.splits else [])]
-        columns = {name: getattr(path, name).index_copy(0, rows, getattr(refined, name)) for name in names}
+        columns = {name: getattr(path, name).index_copy(0, rows, getattr(replayed, name)) for name in names}
         return dataclasses.replace(path, **columns)
 
     def _in_chunks(self, render: Callable[[Rays], tuple[Tensor, ...]], rays: Rays) -> list[Tensor]:

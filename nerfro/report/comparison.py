@@ -11,7 +11,7 @@ from nerfro.errors import NerfroError
 from nerfro.evaluation.image_metrics import ImageMetric, image_metrics
 from nerfro.evaluation.results import FULL, OBJECT, Region
 from nerfro.evaluation.tables import MISSING, Column, Row, Table, short
-from nerfro.report.runs import Budget, EvaluationSet, Run, shown
+from nerfro.report.runs import Budget, EvaluatedRun, EvaluationSet, shown
 from nerfro.training.settings import TABLE_ROW, settings
 
 
@@ -30,15 +30,15 @@ class Comparison:
     budget: Budget
     methods: tuple[str, ...]
     scenes: Mapping[EvaluationSet, str]
-    cells: Mapping[tuple[str, EvaluationSet], tuple[Run, ...]]
+    cells: Mapping[tuple[str, EvaluationSet], tuple[EvaluatedRun, ...]]
     notes: tuple[str, ...]
 
     @property
-    def runs(self) -> list[Run]:
+    def runs(self) -> list[EvaluatedRun]:
         return [run for method in self.methods for scene in self.scenes for run in self.cells.get((method, scene), ())]
 
 
-def compare(runs: Sequence[Run], methods: Mapping[str, str], scenes: Mapping[str, str]) -> list[Comparison]:
+def compare(runs: Sequence[EvaluatedRun], methods: Mapping[str, str], scenes: Mapping[str, str]) -> list[Comparison]:
     """Group runs by budget, method and test set.
 
     Runs of one experiment whose configurations differ in more than the seed are different methods; the title of each
@@ -107,11 +107,11 @@ def find_metrics(names: Sequence[str] | None = None) -> dict[str, type[ImageMetr
 
 
 def _comparison(
-    budget: Budget, runs: Sequence[Run], methods: Mapping[str, str], scenes: Mapping[str, str]
+    budget: Budget, runs: Sequence[EvaluatedRun], methods: Mapping[str, str], scenes: Mapping[str, str]
 ) -> Comparison:
     titles = _method_titles(runs, methods)
     names = {titles[run.folder]: run.name for run in runs}
-    cells: dict[tuple[str, EvaluationSet], tuple[Run, ...]] = {}
+    cells: dict[tuple[str, EvaluationSet], tuple[EvaluatedRun, ...]] = {}
     notes = []
     for run in sorted(runs, key=lambda r: (r.seed, -r.evaluated_at)):
         place = titles[run.folder], run.test_set
@@ -137,7 +137,7 @@ def _rank(name: str, order: Mapping[str, str]) -> tuple[int, str]:
     return (list(order).index(name), name) if name in order else (len(order), name)
 
 
-def _method_titles(runs: Sequence[Run], titles: Mapping[str, str]) -> dict[Any, str]:
+def _method_titles(runs: Sequence[EvaluatedRun], titles: Mapping[str, str]) -> dict[Any, str]:
     """Return the title of each run's method, by folder, with the fields that differ among runs on the same test set."""
     named: dict[Any, str] = {}
     for name in {run.name for run in runs}:
@@ -152,7 +152,7 @@ def _method_titles(runs: Sequence[Run], titles: Mapping[str, str]) -> dict[Any, 
     return named
 
 
-def _method(run: Run) -> dict[str, Any]:
+def _method(run: EvaluatedRun) -> dict[str, Any]:
     """Return the fields of a configuration that define the method, with paths relative to the data set."""
     root = str(run.config["data"]["root"])
     fields = settings(run.config, TABLE_ROW)
@@ -213,7 +213,7 @@ def _describe_seeds(comparison: Comparison) -> str:
     return f"mean ± standard deviation over {most if least == most else f'{least} to {most}'} seeds"
 
 
-def _score(runs: Sequence[Run], metric: str, region: Region) -> tuple[float | None, float | None]:
+def _score(runs: Sequence[EvaluatedRun], metric: str, region: Region) -> tuple[float | None, float | None]:
     """Return mean and sample standard deviation over runs; None for missing values or a single run."""
     values = [run.metrics.result.mean(metric, region) for run in runs]
     present = [value for value in values if value is not None]
@@ -222,7 +222,7 @@ def _score(runs: Sequence[Run], metric: str, region: Region) -> tuple[float | No
     return statistics.fmean(present), statistics.stdev(present) if len(present) > 1 else None
 
 
-def _reason(run: Run, metric: str, region: Region) -> str | None:
+def _reason(run: EvaluatedRun, metric: str, region: Region) -> str | None:
     """Return the reason why a run lacks a metric, or None if it has the metric."""
     if run.metrics.result.mean(metric, region) is not None:
         return None

@@ -17,7 +17,7 @@ from nerfro.files.drawing import magma
 from nerfro.files.templates import fill_template
 from nerfro.paths import PACKAGE_DIR
 from nerfro.report.comparison import Comparison
-from nerfro.report.runs import Run, device, duration, shown
+from nerfro.report.runs import EvaluatedRun, device, duration, shown
 from nerfro.report.views import JPEG_QUALITY, PNG_SIDE, SceneImages, Selection, embed_image, scene_images
 
 _TEMPLATES = PACKAGE_DIR / "report"
@@ -41,7 +41,7 @@ class SceneSection:
 
 
 @dataclass(frozen=True)
-class Provenance:
+class RunOrigin:
     """Origin of one run, as text."""
 
     method: str
@@ -61,7 +61,7 @@ class Section:
     table: Table
     methods: Sequence[str]
     scenes: Sequence[SceneSection]
-    runs: Sequence[Provenance]
+    runs: Sequence[RunOrigin]
 
 
 def report_page(compared: Sequence[tuple[Comparison, Table]], unfinished: Sequence[str], selection: Selection) -> str:
@@ -73,7 +73,7 @@ def report_page(compared: Sequence[tuple[Comparison, Table]], unfinished: Sequen
             table=table,
             methods=comparison.methods,
             scenes=_scenes(f"b{number}", comparison, selection),
-            runs=[_provenance(comparison, run) for run in comparison.runs],
+            runs=[_run_origin(comparison, run) for run in comparison.runs],
         )
         for number, (comparison, table) in enumerate(compared)
     ]
@@ -101,7 +101,7 @@ def _scenes(prefix: str, comparison: Comparison, selection: Selection) -> list[S
     return sections
 
 
-def _provenance(comparison: Comparison, run: Run) -> Provenance:
+def _run_origin(comparison: Comparison, run: EvaluatedRun) -> RunOrigin:
     place = next(place for place, runs in comparison.cells.items() if run in runs)
     facts, metrics = run.facts, run.metrics
     commit = facts.get("commit") or "not a git checkout"
@@ -115,7 +115,7 @@ def _provenance(comparison: Comparison, run: Run) -> Provenance:
     }
     config = OmegaConf.to_yaml(OmegaConf.create(json.loads(json.dumps(run.config))))
     method, test_set = place
-    return Provenance(method, comparison.scenes[test_set], run.seed, shown(run.folder), texts, config)
+    return RunOrigin(method, comparison.scenes[test_set], run.seed, shown(run.folder), texts, config)
 
 
 def _spent(steps: int | None, seconds: float | None, rays_per_second: float | None) -> str:

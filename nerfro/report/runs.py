@@ -98,7 +98,7 @@ class IncompleteRunError(NerfroError):
 
 
 @dataclass(frozen=True)
-class Run:
+class EvaluatedRun:
     """An evaluated run.
 
     Attributes:
@@ -126,7 +126,7 @@ class Run:
     evaluated_at: float
 
 
-def find_runs(places: Sequence[str]) -> tuple[list[Run], list[str]]:
+def find_runs(places: Sequence[str]) -> tuple[list[EvaluatedRun], list[str]]:
     """Read all evaluated runs below some folders.
 
     Args:
@@ -181,7 +181,7 @@ def _why_unfinished(folder: Path) -> str:
     return f"it has not been evaluated{command if (folder / LAST_CHECKPOINT).is_file() else ''}"
 
 
-def read_run(folder: Path) -> Run:
+def read_run(folder: Path) -> EvaluatedRun:
     """Read an evaluated run folder.
 
     Raises:
@@ -208,7 +208,7 @@ def read_run(folder: Path) -> Run:
         with open_image(file) as (image, _):
             width, height = image.size
         options = sorted((key, str(value)) for key, value in data.items() if key not in ("root", "near", "far"))
-        return Run(
+        return EvaluatedRun(
             folder=folder,
             scores=scores,
             name=str(config["name"]),

@@ -19,7 +19,7 @@ from nerfro.evaluation.results import FULL, Region, Score
 from nerfro.evaluation.tables import MISSING
 from nerfro.files.images import data_uri, load_png, to_8bit
 from nerfro.report.comparison import Comparison
-from nerfro.report.runs import EvaluationSet, Run
+from nerfro.report.runs import EvaluatedRun, EvaluationSet
 from nerfro.training.config import build_data
 
 PNG_SIDE = 256  # pixels; larger images are embedded as JPEG to limit the size of the page
@@ -119,7 +119,7 @@ def scene_images(comparison: Comparison, test_set: EvaluationSet, selection: Sel
     )
 
 
-def _median_view(runs: Sequence[Run], selection: Selection) -> int:
+def _median_view(runs: Sequence[EvaluatedRun], selection: Selection) -> int:
     """Return the view whose mean score over methods is the median, so that the figure is representative."""
     scores = []
     for index in range(len(runs[0].metrics.result.views)):
@@ -128,12 +128,12 @@ def _median_view(runs: Sequence[Run], selection: Selection) -> int:
     return scores.index(statistics.median_low(scores))
 
 
-def _score(run: Run, view: int, selection: Selection) -> Score:
+def _score(run: EvaluatedRun, view: int, selection: Selection) -> Score:
     return run.metrics.result.views[view].score(selection.metric, selection.region)
 
 
 def _view(
-    index: int, references: Views, runs: Mapping[int, Run], titles: Mapping[int, str], selection: Selection
+    index: int, references: Views, runs: Mapping[int, EvaluatedRun], titles: Mapping[int, str], selection: Selection
 ) -> View:
     metric, name, reference = image_metrics()[selection.metric], references.names[index], references.images[index]
     predictions, errors = {}, {}
@@ -147,7 +147,7 @@ def _view(
     return View(index, name, PageImage(f"reference, view {index}", "", embed_image(reference)), predictions, errors)
 
 
-def _prediction(run: Run, index: int) -> Float[Tensor, "H W 3"]:
+def _prediction(run: EvaluatedRun, index: int) -> Float[Tensor, "H W 3"]:
     return load_png(run.scores / "images" / f"{run.metrics.result.views[index].name}.png")
 
 

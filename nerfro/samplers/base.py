@@ -10,7 +10,7 @@ from jaxtyping import Bool
 from torch import Tensor, nn
 
 from nerfro.draws import Draws
-from nerfro.errors import warn_of_old_name
+from nerfro.errors import follow_old_method
 from nerfro.fields.base import Field
 from nerfro.media.base import Medium
 from nerfro.samplers.paths.branching import ONE_PATH
@@ -18,7 +18,7 @@ from nerfro.types import Path, Rays, Rendering, Samples
 
 
 class PathSampler(nn.Module, ABC):
-    """Turn rays into paths. Paths are traced without gradients, and refined if parameters learn from them.
+    """Turn rays into paths. Paths are traced without gradients, and replayed with them if parameters learn from them.
 
     Attributes:
         needs_medium: whether the sampler queries the medium; otherwise no medium is built.
@@ -27,6 +27,11 @@ class PathSampler(nn.Module, ABC):
 
     needs_medium = True
     branching = ONE_PATH
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        follow_old_method(cls, "refine", "replay")
+        follow_old_method(cls, "main", "trace_main")
 
     @abstractmethod
     def forward(self, rays: Rays, medium: Medium) -> Path:
@@ -40,11 +45,11 @@ class PathSampler(nn.Module, ABC):
             P polylines, at least one for each ray. Bent paths end outside of the medium, beyond far if necessary.
         """
 
-    def main(self, rays: Rays, medium: Medium) -> Path:
+    def trace_main(self, rays: Rays, medium: Medium) -> Path:
         """Trace only the first polyline of each ray, which is enough to find the exit directions."""
         return self(rays, medium)
 
-    def refine(self, path: Path, rays: Rays, medium: Medium) -> Path:
+    def replay(self, path: Path, rays: Rays, medium: Medium) -> Path:
         """Return a traced path with the same values, and gradients with respect to rays and medium.
 
         Moving silhouettes, and events that appear or disappear, have no gradients.
@@ -71,9 +76,7 @@ class PointSampler(nn.Module, ABC):
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
-        if (old := cls.__dict__.get("after_step")) is not None:
-            warn_of_old_name(f"{cls.__name__}.after_step", "update")
-            cls.update = old  # type: ignore[method-assign]
+        follow_old_method(cls, "after_step", "update")
 
     @abstractmethod
     def forward(self, path: Path, previous: Rendering | None, draws: Draws | None = None) -> Samples:

@@ -43,7 +43,7 @@ from nerfro.training.backdrop import derive_backdrop
 from nerfro.training.content import ContentConfig, derive_content, require_contraction
 from nerfro.training.optimizer import OptimizerConfig
 
-Score = Annotated[str, Names(lambda: [plugin.name for plugin in plugins("metric")])]  # of a region: mask.NAME
+MetricName = Annotated[str, Names(lambda: [plugin.name for plugin in plugins("metric")])]  # of a region: mask.NAME
 
 
 @dataclass
@@ -194,7 +194,7 @@ class TrainConfig:
     # Settings of each callback, by the registered name of the callback.
     callbacks: dict[str, Any] = dataclasses.field(default_factory=dict)
     # Score that training returns to sweepers of Hydra: a metric, or `<region>.<metric>`, such as mask.psnr.
-    optimized_metric: Score = "psnr"
+    optimized_metric: MetricName = "psnr"
     debug: bool = False  # a run of ten steps that scores one view
     # Checkpoint to resume from, or `last` for the newest checkpoint of this experiment.
     ckpt_path: Optional[str] = None  # noqa: UP045

@@ -12,7 +12,7 @@ from nerfro.errors import NerfroError
 from nerfro.progress import track
 from nerfro.training.callbacks import StopOnSignal
 from nerfro.training.module import TrainingModule, training_progress
-from nerfro.training.phases.base import Phase, Run
+from nerfro.training.phases.base import Phase, TrainingRun
 
 
 class Schedule(Callback):
@@ -73,6 +73,6 @@ class Schedule(Callback):
         else:
             begun["ended"] = True
 
-    def _run(self, trainer: Trainer) -> Run:
+    def _run(self, trainer: Trainer) -> TrainingRun:
         module, batches = cast(TrainingModule, trainer.lightning_module), trainer.datamodule.batches  # type: ignore[attr-defined]
-        return Run(module.renderer, batches, self._views, trainer.optimizers[0], training_progress(trainer))
+        return TrainingRun(module.renderer, batches, self._views, trainer.optimizers[0], training_progress(trainer))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from enum import Enum
+from enum import Enum, auto
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
@@ -12,13 +12,13 @@ from omegaconf import DictConfig, OmegaConf
 class Role(Enum):
     """Role of a setting; METHOD for every setting outside `_NAMED`."""
 
-    METHOD = "what is learned, and how"
-    SEED = "which random draws"
-    SCENE = "on which data"
-    BUDGET = "for how long"
-    SCORING = "how it is rendered and scored in the end"
-    MACHINE = "where: changes time, memory and rounding"
-    WATCHING = "how it is called, followed and stored"
+    METHOD = auto()  # changes the trained model
+    SEED = auto()  # random numbers
+    SCENE = auto()  # data set
+    BUDGET = auto()  # training time
+    SCORING = auto()  # evaluation after the training
+    MACHINE = auto()  # changes only time, memory and rounding
+    OUTPUT = auto()  # names, logs, checkpoints and live view
 
 
 _NAMED = {
@@ -35,20 +35,20 @@ _NAMED = {
     "trainer.devices": Role.MACHINE,
     "trainer.num_nodes": Role.MACHINE,
     "trainer.strategy": Role.MACHINE,
-    "name": Role.WATCHING,
-    "authors": Role.WATCHING,  # used only by other settings
-    "evaluation.every": Role.WATCHING,
-    "logger": Role.WATCHING,
-    "optimized_metric": Role.WATCHING,
-    "checkpoint": Role.WATCHING,
-    "ckpt_path": Role.WATCHING,
-    "viewer": Role.WATCHING,
-    "viewer_port": Role.WATCHING,
-    "trainer.log_every_n_steps": Role.WATCHING,
-    "trainer.enable_checkpointing": Role.WATCHING,
-    "trainer.enable_model_summary": Role.WATCHING,
-    "trainer.enable_progress_bar": Role.WATCHING,
-    "trainer.profiler": Role.WATCHING,
+    "name": Role.OUTPUT,
+    "authors": Role.OUTPUT,  # used only by other settings
+    "evaluation.every": Role.OUTPUT,
+    "logger": Role.OUTPUT,
+    "optimized_metric": Role.OUTPUT,
+    "checkpoint": Role.OUTPUT,
+    "ckpt_path": Role.OUTPUT,
+    "viewer": Role.OUTPUT,
+    "viewer_port": Role.OUTPUT,
+    "trainer.log_every_n_steps": Role.OUTPUT,
+    "trainer.enable_checkpointing": Role.OUTPUT,
+    "trainer.enable_model_summary": Role.OUTPUT,
+    "trainer.enable_progress_bar": Role.OUTPUT,
+    "trainer.profiler": Role.OUTPUT,
 }
 
 # Settings with these roles must be equal to resume a checkpoint; budget, machine and scoring may differ.

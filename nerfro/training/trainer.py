@@ -181,6 +181,7 @@ def _quieten_lightning() -> None:
         ".*does not have many workers.*",
         ".*You are using .* devices.*",
         ".*Starting from v1.9.*",
+        ".*Total length of .* across ranks is zero.*",  # of data sets without validation views
         ".*sync_dist=True.*",  # only one process evaluates validation views
         ".*broadcast_buffers.* is deprecated.*",  # the replacement is missing in older supported versions of torch
         ".*LeafSpec.* is deprecated.*",

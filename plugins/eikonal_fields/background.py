@@ -21,7 +21,7 @@ _POINTS_AT_ONCE = 65536
 
 
 @dataclass(frozen=True)
-class Background:
+class BackgroundGrids:
     """Radiance outside a box, and the background, on grids that are differentiable in position and direction.
 
     Attributes:
@@ -43,7 +43,7 @@ class Background:
         box: Float[Tensor, "2 3"],
         hidden: Float[Tensor, "2 3"],
         resolution: int,
-    ) -> Background:
+    ) -> BackgroundGrids:
         """Evaluate a field and a background model at the vertices of grids.
 
         The colour of the field is the mean over the six axis directions.
@@ -65,10 +65,10 @@ class Background:
         sides = (resolution,) * 3
         return cls(radiance.view(*sides, 4), box, sky.view(*sides, 3))
 
-    def blurred(self, sigma: float) -> Background:
+    def blurred(self, sigma: float) -> BackgroundGrids:
         """Convolve both grids with a Gaussian of standard deviation `sigma`, voxels."""
         size = 2 * math.ceil(3 * sigma) + 1
-        return Background(smooth(self.radiance, size, sigma), self.box, smooth(self.sky, size, sigma))
+        return BackgroundGrids(smooth(self.radiance, size, sigma), self.box, smooth(self.sky, size, sigma))
 
     def radiance_at(self, samples: Samples) -> Radiance:
         """Look up density and colour at samples."""

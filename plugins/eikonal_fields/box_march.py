@@ -8,7 +8,7 @@ from nerfro_plugins.paper.eikonal import march_uniform
 from nerfro_plugins.paper.integrators import Index, RayState
 from torch import Tensor
 
-from nerfro.errors import NerfroError
+from nerfro.allowed import Count
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.media.base import Medium
 from nerfro.registry import register
@@ -23,20 +23,13 @@ class BoxMarch(PathSampler):
 
     Gradients flow through all steps. The total length of the steps is the diagonal of the box; afterwards, a ray inside
     the box continues straight.
+
+    Args:
+        num_steps: number of steps inside the box.
     """
 
-    def __init__(self, num_steps: int = 32) -> None:
-        """Set the number of steps.
-
-        Args:
-            num_steps: number of steps inside the box.
-
-        Raises:
-            NerfroError: the number is less than 1.
-        """
+    def __init__(self, num_steps: Count = 32) -> None:
         super().__init__()
-        if num_steps < 1:
-            raise NerfroError(f"sampler.path.num_steps={num_steps} makes no path; give at least 1 (32 is usual)")
         self.num_steps = num_steps
 
     def forward(self, rays: Rays, medium: Medium) -> Path:
@@ -57,7 +50,7 @@ class BoxMarch(PathSampler):
             rays.radii,
         )
 
-    def refine(self, path: Path, rays: Rays, medium: Medium) -> Path:
+    def replay(self, path: Path, rays: Rays, medium: Medium) -> Path:
         """Trace the path again; `forward` has gradients."""
         return self(rays, medium)
 

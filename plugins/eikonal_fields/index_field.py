@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from nerfro.allowed import Depth, Natural, Positive, Width
 from nerfro.errors import NerfroError
 from nerfro.fields.selection import inside_box
 from nerfro.geometry.mesh import load_mesh, local_origin
@@ -29,6 +30,18 @@ class IndexField(Medium):
     constant. The constant is chosen such that n = 1 on average over 26 points on the faces of the box.
 
     Value and gradient are both propagated forward through the layers, so that one backward pass trains both.
+
+    Args:
+        mesh: surface whose bounds are the bounds of the content; None for `box_min` and `box_max`.
+        box_min, box_max: corners of the bounds of the content, world units.
+        margin: width of the window around the bounds, as a fraction of the longest side.
+        width, depth: width and number of hidden layers of the MLP.
+        skip: layer, counted from 1, after which the encoding is concatenated again.
+        octaves: number of octaves of the positional encoding; half the longest side has the length 1.
+        ior: ignored, because the index is learned. Scene files set the index for other media.
+
+    Raises:
+        NerfroError: the box is empty.
     """
 
     box: Float[Tensor, "2 3"]
@@ -41,27 +54,13 @@ class IndexField(Medium):
         mesh: str | None = None,
         box_min: Sequence[float] = (-1.0, -1.0, -1.0),
         box_max: Sequence[float] = (1.0, 1.0, 1.0),
-        margin: float = 0.1,
-        width: int = 64,
-        depth: int = 6,
-        skip: int = 4,
-        octaves: int = 5,
+        margin: Positive = 0.1,
+        width: Width = 64,
+        depth: Depth = 6,
+        skip: Natural = 4,
+        octaves: Natural = 5,
         ior: float | None = None,
     ) -> None:
-        """Make an untrained field.
-
-        Args:
-            mesh: surface whose bounds are the bounds of the content; None for `box_min` and `box_max`.
-            box_min, box_max: corners of the bounds of the content, world units.
-            margin: width of the window around the bounds, as a fraction of the longest side.
-            width, depth: width and number of hidden layers of the MLP.
-            skip: layer, counted from 1, after which the encoding is concatenated again.
-            octaves: number of octaves of the positional encoding; half the longest side has the length 1.
-            ior: ignored, because the index is learned. Scene files set the index for other media.
-
-        Raises:
-            NerfroError: the box is empty, or a number is out of range.
-        """
         super().__init__()
         if mesh is not None:
             surface = load_mesh(resolve_path(mesh), accept_open_mesh=True)
@@ -75,11 +74,6 @@ class IndexField(Medium):
             raise NerfroError(
                 f"medium=index_field: no box from {list(box_min)} to {list(box_max)}; give three numbers each, "
                 "box_min below box_max"
-            )
-        if margin <= 0 or width < 1 or depth < 1 or octaves < 0:
-            raise NerfroError(
-                f"medium=index_field: margin={margin} width={width} depth={depth} octaves={octaves}; "
-                "take a positive margin, at least 1 for width and depth, and 0 or more octaves"
             )
         side = float((bounds[1] - bounds[0]).max())
         self.fade, self.scale, self.skip = margin * side, 0.5 * side, skip

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from enum import IntEnum
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from nerfro.allowed import Count, Positive, Range, Share
 from nerfro.draws import Draws
 from nerfro.errors import NerfroError
 from nerfro.fields.base import Field
@@ -18,12 +20,12 @@ from nerfro.rendering import Components, Renderer, composite
 from nerfro.samplers.paths.straight import straight_path
 from nerfro.types import Path, Radiance, Rays, Rendering, Samples
 
-from .background import Background
+from .background import BackgroundGrids
 
 Ask = Callable[[Samples], Radiance]
 
 
-class Stage(IntEnum):
+class TrainingStage(IntEnum):
     """Stage of the training."""
 
     SCENE = 0
@@ -42,9 +44,20 @@ class EikonalFields(Renderer):
 
     Each stage takes a fraction of the budget of the run, in steps or time, and the learning rates decay in each stage.
 
+    Args:
+        components: components of the model; the medium has parameters.
+        scene_fraction, index_fraction: fractions of the budget for the first two stages; the third has the rest.
+        box_min, box_max: corners of the box in which radiance is sampled, world units.
+        resolution: vertices along each side of the grids of the second stage.
+        blur: standard deviation of the blur at the first level, voxels; each level halves the value.
+        num_levels: number of levels of blur, for equal fractions of the second stage.
+
     Attributes:
-        stage: current `Stage`; part of checkpoints.
+        stage: current `TrainingStage`; part of checkpoints.
         interior: radiance field of the third stage.
+
+    Raises:
+        NerfroError: the fractions leave a negative rest.
     """
 
     trains_in_parallel = False  # a stage leaves out parameters, whose gradients other processes would wait for
@@ -55,61 +68,43 @@ class EikonalFields(Renderer):
     def __init__(
         self,
         components: Components,
-        scene_share: float = 0.4,
-        index_share: float = 0.4,
+        scene_fraction: Share = 0.4,
+        index_fraction: Share = 0.4,
         box_min: Sequence[float] = (-1.0, -1.0, -1.0),
         box_max: Sequence[float] = (1.0, 1.0, 1.0),
-        resolution: int = 128,
-        blur: float = 2.0,
-        num_levels: int = 5,
+        resolution: Annotated[int, Range(at_least=2)] = 128,
+        blur: Positive = 2.0,
+        num_levels: Count = 5,
     ) -> None:
-        """Compose the model.
-
-        Args:
-            components: components of the model; the medium has parameters.
-            scene_share, index_share: fractions of the budget for the first two stages; the third has the rest.
-            box_min, box_max: corners of the box in which radiance is sampled, world units.
-            resolution: vertices along each side of the grids of the second stage.
-            blur: standard deviation of the blur at the first level, voxels; each level halves the value.
-            num_levels: number of levels of blur, for equal fractions of the second stage.
-
-        Raises:
-            NerfroError: a number is out of range.
-        """
         super().__init__(components, num_fields=1)
-        if not (scene_share > 0 and index_share > 0 and scene_share + index_share <= 1):
+        if scene_fraction + index_fraction > 1:
             raise NerfroError(
-                f"model=eikonal_fields: scene_share={scene_share} index_share={index_share}; "
-                "take two positive shares that leave the rest of 1 to the interior"
-            )
-        if resolution < 2 or blur <= 0 or num_levels < 1:
-            raise NerfroError(
-                f"model=eikonal_fields: resolution={resolution} blur={blur} num_levels={num_levels}; "
-                "take at least 2 vertices, a positive blur and 1 level or more"
+                f"model=eikonal_fields: scene_fraction={scene_fraction} index_fraction={index_fraction}; "
+                "take fractions that sum to at most 1; the interior has the rest"
             )
         self.interior = components.make_field()
-        self.scene_share, self.index_share = scene_share, index_share
+        self.scene_fraction, self.index_fraction = scene_fraction, index_fraction
         self.resolution, self.blur, self.num_levels = resolution, blur, num_levels
         self.register_buffer("box", torch.tensor([list(box_min), list(box_max)]), persistent=False)
-        self.register_buffer("stage", torch.tensor(int(Stage.SCENE)))
-        self._sharp: Background | None = None
-        self._blurred: Background | None = None
+        self.register_buffer("stage", torch.tensor(int(TrainingStage.SCENE)))
+        self._sharp: BackgroundGrids | None = None
+        self._blurred: BackgroundGrids | None = None
         self._level = -1
 
-    def stage_at(self, progress: float) -> tuple[Stage, float]:
+    def stage_at(self, progress: float) -> tuple[TrainingStage, float]:
         """Return the stage at a fraction of the budget, and the completed fraction of the stage."""
-        if progress < self.scene_share:
-            return Stage.SCENE, progress / self.scene_share
-        progress -= self.scene_share
-        if progress < self.index_share:
-            return Stage.INDEX, progress / self.index_share
-        rest = 1 - self.scene_share - self.index_share
-        return Stage.INTERIOR, min((progress - self.index_share) / rest, 1.0) if rest > 0 else 1.0
+        if progress < self.scene_fraction:
+            return TrainingStage.SCENE, progress / self.scene_fraction
+        progress -= self.scene_fraction
+        if progress < self.index_fraction:
+            return TrainingStage.INDEX, progress / self.index_fraction
+        rest = 1 - self.scene_fraction - self.index_fraction
+        return TrainingStage.INTERIOR, min((progress - self.index_fraction) / rest, 1.0) if rest > 0 else 1.0
 
     def begin_step(self, progress: float) -> float:
         stage, done = self.stage_at(progress)
         self.stage.fill_(int(stage))
-        if stage == Stage.INDEX:
+        if stage == TrainingStage.INDEX:
             self.sharpen(min(int(done * self.num_levels), self.num_levels - 1))
         else:
             self._sharp = self._blurred = None
@@ -120,7 +115,7 @@ class EikonalFields(Renderer):
         if self._sharp is None:
             scene = self.scene
             (field,) = scene.fields
-            self._sharp = Background.fit(
+            self._sharp = BackgroundGrids.fit(
                 field,  # type: ignore[arg-type]
                 scene.boundary,
                 self.box,
@@ -132,29 +127,29 @@ class EikonalFields(Renderer):
 
     def trace(self, rays: Rays, path: Path | None = None) -> Path:
         """Trace rays according to the current stage, because the medium changes during training."""
-        stage = Stage(int(self.stage))
-        if stage == Stage.SCENE:
+        stage = TrainingStage(int(self.stage))
+        if stage == TrainingStage.SCENE:
             return straight_path(rays)
-        with torch.set_grad_enabled(stage == Stage.INDEX and torch.is_grad_enabled()):
+        with torch.set_grad_enabled(stage == TrainingStage.INDEX and torch.is_grad_enabled()):
             return self.path_sampler(rays, self.scene.medium)
 
     def render_path(
         self, path: Path, draws: Draws | None = None, teaches_background: Bool[Tensor, "R"] | None = None
     ) -> list[Rendering]:
-        stage = Stage(int(self.stage))
+        stage = TrainingStage(int(self.stage))
         samples = self.point_sampler(path, None, draws)
         (field,) = self.scene.fields
-        if stage == Stage.SCENE:
+        if stage == TrainingStage.SCENE:
             return [composite(samples, field(samples), self.background(path, teaches_background), path)]
         outside = ~inside_box(samples.positions.detach(), *self.scene.medium.box)
-        if stage == Stage.INDEX and self.training:
+        if stage == TrainingStage.INDEX and self.training:
             assert self._blurred is not None  # made at the start of the step
             radiance = radiance_where(self._blurred.radiance_at, samples, outside)
             return [composite(samples, radiance, self._blurred.sky_towards(path.exit_directions), path)]
         with torch.no_grad():
             radiance = radiance_where(field, samples, outside)
             sky = self.background(path)
-        if stage == Stage.INTERIOR:
+        if stage == TrainingStage.INTERIOR:
             inner = radiance_where(self.interior, samples, ~outside)
             radiance = Radiance(radiance.density + inner.density, radiance.rgb + inner.rgb)
         return [composite(samples, radiance, sky, path)]

@@ -69,7 +69,7 @@ class Eikonal(PathSampler):
             return eikonal_on_grid(rays, medium, step, tolerance, self.max_steps)[0]
         return march_adaptive(rays, medium, tolerance, self.max_steps)[0]
 
-    def refine(self, path: Path, rays: Rays, medium: Medium) -> Path:
+    def replay(self, path: Path, rays: Rays, medium: Medium) -> Path:
         """Repeat the steps of a path with gradients with respect to rays and medium, and keep the states of all steps.
 
         At a thin shell, gradients grow without bound towards grazing and critical angles, as at a sharp surface.

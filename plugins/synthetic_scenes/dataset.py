@@ -27,7 +27,7 @@ from nerfro.light import to_srgb
 from nerfro.overrides import as_overrides, command_line
 
 from .path_tracer import Pinhole
-from .scene import Scene, lat_long_texture
+from .scene import SyntheticScene, lat_long_texture
 from .viewpoints import directions_on_sphere, look_at_origin
 
 CAMERA_ANGLE_X = 0.6911112070083618  # field of view of the NeRF synthetic scenes and of the paper's scenes
@@ -58,7 +58,7 @@ class DataSet(ABC):
     """Images of a scene in a folder; `config` is a resolved `SynthesizeConfig`."""
 
     config: DictConfig
-    scene: Scene
+    scene: SyntheticScene
     folder: Path
 
     META: ClassVar[str]  # file with the settings
@@ -89,7 +89,7 @@ class DataSet(ABC):
     def next_command(self) -> str:
         """Return what to do with the data set, with the command."""
 
-    def lit(self) -> Scene:
+    def lit(self) -> SyntheticScene:
         """Return the scene as the renderer receives the scene."""
         return self.scene
 
@@ -134,7 +134,7 @@ class DataSet(ABC):
         ]
 
 
-class Views(DataSet):
+class ViewSplits(DataSet):
     """Views from all sides in Blender format, in splits."""
 
     META = "meta.json"
@@ -194,7 +194,7 @@ class Views(DataSet):
         return f"train on it: {command_line('train', options)}"
 
 
-def fingerprint(scene: Scene) -> str:
+def fingerprint(scene: SyntheticScene) -> str:
     """Compute a short hash of a scene, so that images of different scenes are not mixed in one folder."""
     digest = hashlib.sha256(repr((scene.ior, scene.tint, scene.absorption)).encode())
     for surface in (scene.glass, scene.interior):

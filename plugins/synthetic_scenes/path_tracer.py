@@ -15,8 +15,8 @@ from nerfro.light import to_linear
 
 from . import llvm
 from .glass import EMBEDDED, PLUGIN, register_materials
-from .scene import Panel, Scene, Sky
-from .surface import Surface
+from .scene import Panel, Sky, SyntheticScene
+from .surface import SurfaceMesh
 
 VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb", "scalar_rgb")
 # Hammersley points: at most one point lies in each row and column, which edges may be parallel to.
@@ -104,7 +104,7 @@ class PathTracer:
         variant: Mitsuba variant, see `load_mitsuba`.
     """
 
-    def __init__(self, scene: Scene, fresnel: bool, camera: Pinhole, variant: str = "auto") -> None:
+    def __init__(self, scene: SyntheticScene, fresnel: bool, camera: Pinhole, variant: str = "auto") -> None:
         self.mitsuba = mi = load_mitsuba(variant)
         self.camera = camera
         absorption = {"absorption": mi.ScalarColor3f(*scene.absorption)}
@@ -239,7 +239,7 @@ def panel_shape(mi: ModuleType, panel: Panel) -> dict:
     return shape | {"bsdf": {"type": "diffuse", "reflectance": linear}}
 
 
-def triangle_shape(mi: ModuleType, name: str, surface: Surface, material: dict):
+def triangle_shape(mi: ModuleType, name: str, surface: SurfaceMesh, material: dict):
     """Return a Mitsuba mesh; vertex colours become the attribute `vertex_color`, decoded to linear albedo."""
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict(material)

@@ -9,7 +9,7 @@ import numpy as np
 
 from nerfro.files import lat_long
 
-from .surface import Surface
+from .surface import SurfaceMesh
 
 Sky = Callable[[np.ndarray], np.ndarray]
 """Maps unit directions [..., 3], z up, to linear radiance [..., 3] of at most 1, so that 8-bit images never clip."""
@@ -61,7 +61,7 @@ class Panel:
 
 
 @dataclass(frozen=True)
-class Scene:
+class SyntheticScene:
     """A refractive object in world units, z up.
 
     Attributes:
@@ -77,8 +77,8 @@ class Scene:
     """
 
     ior: float
-    glass: Surface
-    interior: Surface
+    glass: SurfaceMesh
+    interior: SurfaceMesh
     sky: Sky | None
     panels: tuple[Panel, ...] = ()
     tint: Vector = (1.0, 1.0, 1.0)

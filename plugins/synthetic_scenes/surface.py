@@ -13,7 +13,7 @@ from nerfro.files.atomic import write_atomically
 
 
 @dataclass(frozen=True)
-class Surface:
+class SurfaceMesh:
     """A triangle surface in world units; normals point out of the enclosed volume.
 
     Attributes:
@@ -40,7 +40,7 @@ class Surface:
         write_atomically(path, trimesh.exchange.ply.export_ply(self.as_trimesh(), vertex_normal=True))
 
 
-def rounded_box(half_sides: Sequence[float] | np.ndarray, radius: float, edge_steps: int) -> Surface:
+def rounded_box(half_sides: Sequence[float] | np.ndarray, radius: float, edge_steps: int) -> SurfaceMesh:
     """Mesh a box around the origin whose edges and corners are rounded with `radius`, watertight.
 
     The surface is the set of points at distance `radius` from the inner box of half sides `half_sides - radius`. Flat
@@ -72,17 +72,19 @@ def rounded_box(half_sides: Sequence[float] | np.ndarray, radius: float, edge_st
     quad = inverse.reshape(-1)[np.concatenate(quads)]
     faces = np.concatenate([quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]])
     vertices = (core + radius * normals)[first]
-    return Surface(vertices.astype(np.float32), faces.astype(np.int32), normals[first].astype(np.float32))
+    return SurfaceMesh(vertices.astype(np.float32), faces.astype(np.int32), normals[first].astype(np.float32))
 
 
-def sphere(radius: float, subdivisions: int) -> Surface:
+def sphere(radius: float, subdivisions: int) -> SurfaceMesh:
     """Mesh a sphere around the origin as a subdivided icosahedron (20 * 4^subdivisions faces) with exact normals."""
     mesh = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
     normals = mesh.vertices / np.linalg.norm(mesh.vertices, axis=1, keepdims=True)
-    return Surface((normals * radius).astype(np.float32), np.asarray(mesh.faces, np.int32), normals.astype(np.float32))
+    return SurfaceMesh(
+        (normals * radius).astype(np.float32), np.asarray(mesh.faces, np.int32), normals.astype(np.float32)
+    )
 
 
-def torus_angles(major_radius: float, minor_radius: float, spacing: float) -> tuple[Surface, np.ndarray]:
+def torus_angles(major_radius: float, minor_radius: float, spacing: float) -> tuple[SurfaceMesh, np.ndarray]:
     """Mesh a torus around the z axis with vertices every `spacing`, and return the angles of the vertices.
 
     Angles [V, 2] in [0, 2 pi) run around the axis, and around the tube; the centre line of the tube has `major_radius`.
@@ -100,5 +102,5 @@ def torus_angles(major_radius: float, minor_radius: float, spacing: float) -> tu
 
     a, b, c, d = index(i, j), index(i + 1, j), index(i + 1, j + 1), index(i, j + 1)
     faces = np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)])
-    surface = Surface(vertices.astype(np.float32), faces.astype(np.int32), normals.astype(np.float32))
+    surface = SurfaceMesh(vertices.astype(np.float32), faces.astype(np.int32), normals.astype(np.float32))
     return surface, np.stack([phi, theta], -1)

@@ -16,9 +16,9 @@ from nerfro.progress import progress_bar
 from nerfro.registry import discover
 from nerfro.synthetic import SCENES
 
-from .dataset import DataSet, Views
+from .dataset import DataSet, ViewSplits
 from .path_tracer import PathTracer, load_mitsuba
-from .scene import Scene
+from .scene import SyntheticScene
 
 
 def find_scene(name: str) -> ModuleType:
@@ -35,10 +35,10 @@ def find_scene(name: str) -> ModuleType:
 
 def data_set_type(scene: ModuleType) -> type[DataSet]:
     """Return the class of the data set of a scene; the module of the scene may define it as `DATA_SET`."""
-    return getattr(scene, "DATA_SET", Views)
+    return getattr(scene, "DATA_SET", ViewSplits)
 
 
-def build_scene(name: str, resolution: int) -> Scene:
+def build_scene(name: str, resolution: int) -> SyntheticScene:
     """Model a scene. Colours have a resolution of half a pixel in images of `resolution` pixels."""
     module = find_scene(name)
     return module.build(spacing=max(0.5 * data_set_type(module).WIDTH / resolution, 0.0025))

@@ -48,7 +48,7 @@ def snell_on_grid(rays: Rays, medium: SdfGrid, max_events: int, branching: Branc
     positions, directions, s, body, surface, across, weight, num_vertices, num_events, exceeded = columns
     radii = rays.radii[owner] if branching.max_split_events else rays.radii
     path = Path.unbranched(positions, directions, s, num_vertices > 2, radii)
-    path = replace(path, body=body, surface=surface, across=across)
+    path = replace(path, body=body, surface_body=surface, across=across)
     if branching.max_split_events:
         path = replace(path, splits=True, ray=owner, throughput=weight[:, None].expand(-1, 3))
     return SnellTrace(path, num_events, exceeded)

@@ -47,7 +47,7 @@ class Crossed(NamedTuple):
     """Bodies and surface of vertices, see `Path`. The default is a vertex in air."""
 
     body: Int[Tensor, "A"] | int = 0
-    surface: Int[Tensor, "A"] | int = -1
+    surface: Int[Tensor, "A"] | int = 0
     across: Int[Tensor, "A"] | int = 0
     triangle: Int[Tensor, "A"] | int = -1
 
@@ -122,7 +122,7 @@ class PolylineBuilder:
         path = Path.unbranched(
             vertices[..., :3], vertices[..., 3:6], vertices[..., 6], refracted.to(like.device), radii
         )
-        path = replace(path, body=body, surface=surface, across=across, triangle=triangle)
+        path = replace(path, body=body, surface_body=surface, across=across, triangle=triangle)
         if ray is None or weight is None:
             return path
         return replace(path, splits=True, ray=ray, throughput=weight.to(like)[:, None].expand(-1, 3))

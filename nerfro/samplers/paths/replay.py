@@ -63,7 +63,7 @@ def smallest_cosine(path: Path, medium: Medium) -> Float[Tensor, "P"]:
         before, after = path.directions[:, :-1], path.directions[:, 1:]
         normals = turning_normals(before, after, n[:, :-1], n[:, 1:])
         cosines = torch.minimum((normals * before).sum(-1).abs(), (normals * after).sum(-1).abs())
-        return torch.where((path.surface[:, 1:] >= 0) & normals.any(-1), cosines, 1.0).amin(-1)
+        return torch.where((path.surface_body[:, 1:] > 0) & normals.any(-1), cosines, 1.0).amin(-1)
 
 
 def indices_of(medium: Medium, like: Tensor) -> Float[Tensor, " media"]:
@@ -91,7 +91,7 @@ def replay(path: Path, rays: Rays, medium: Medium, intersect: Intersect, branchi
     indices = indices_of(medium, path.s)
     weight, num_events = torch.ones_like(s), torch.zeros_like(path.ray)
     for i in range(1, num_vertices - 1):
-        rows = (path.surface[:, i] >= 0).nonzero().squeeze(1)
+        rows = (path.surface_body[:, i] > 0).nonzero().squeeze(1)
         if not len(rows):
             break
         old_x, old_d, old_s = (with_gradient(values[rows, i - 1], replayed[rows]) for values, replayed in (
@@ -155,11 +155,11 @@ def intersect_solid(medium: Solid, surface: Int[Tensor, "P S"]) -> Intersect:
 
     Args:
         medium: traced bodies.
-        surface: recorded surface of each vertex.
+        surface: body on whose surface each vertex lies, `Path.surface_body`.
     """
 
     def intersect(rows: Tensor, column: int, x: Tensor, d: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
-        body = surface[rows, column].long()
+        body = surface[rows, column].long() - 1
         phi, gradients = medium.signed_distances(x + length[:, None] * d)
         slope = (_of_body(gradients, body) * d).sum(-1).detach()
         slope = torch.copysign(slope.abs().clamp(min=_MIN_COSINE), slope)

@@ -26,7 +26,7 @@ from nerfro.samplers.paths.branching import ONE_PATH, Branching
 from nerfro.samplers.paths.compiled import snell_on_grid
 from nerfro.samplers.paths.polylines import SnellTrace
 from nerfro.samplers.paths.replay import intersect_solid, intersect_triangles, replay, smallest_cosine
-from nerfro.samplers.paths.straight import refined_straight, straight_path
+from nerfro.samplers.paths.straight import replay_straight, straight_path
 from nerfro.samplers.paths.wavefront import Wavefront
 from nerfro.types import Path, Rays
 
@@ -76,27 +76,27 @@ class Snell(PathSampler):
         return self.trace(rays, medium).path
 
     @torch.no_grad()
-    def main(self, rays: Rays, medium: Medium) -> Path:
+    def trace_main(self, rays: Rays, medium: Medium) -> Path:
         if isinstance(medium, Solid) and medium.disperses:
             medium = self._at_wavelengths(medium)[0]
         return self.trace(rays, medium, replace(self.branching, main_only=True)).path
 
-    def refine(self, path: Path, rays: Rays, medium: Medium) -> Path:
+    def replay(self, path: Path, rays: Rays, medium: Medium) -> Path:
         """Return the path with gradients with respect to rays, indices and distance grids; see `samplers.paths.replay`.
 
         Gradients are unbounded at grazing and critical angles; omit paths whose `smallest_cosine` is below 0.15.
         """
         if isinstance(medium, Solid) and medium.disperses:
-            return _refined_in_bands(path, rays, self._at_wavelengths(medium), self._refine)
-        return self._refine(path, rays, medium)
+            return _replay_in_bands(path, rays, self._at_wavelengths(medium), self._replay)
+        return self._replay(path, rays, medium)
 
-    def _refine(self, path: Path, rays: Rays, medium: Medium) -> Path:
+    def _replay(self, path: Path, rays: Rays, medium: Medium) -> Path:
         if self.interface == "mesh" and isinstance(medium, SdfGrid):
             intersect = intersect_triangles(medium.triangles, path.triangle)
         elif isinstance(medium, Solid):
-            intersect = intersect_solid(medium, path.surface)
+            intersect = intersect_solid(medium, path.surface_body)
         else:
-            return refined_straight(path, rays)
+            return replay_straight(path, rays)
         return replay(path, rays, medium, intersect, self.branching)
 
     def _at_wavelengths(self, medium: Solid) -> list[Solid]:
@@ -168,14 +168,14 @@ def _traced_in_bands(rays: Rays, media: Sequence[Solid], trace: Callable[[Rays, 
     return SnellTrace(path, num_events, exceeded)
 
 
-def _refined_in_bands(
-    path: Path, rays: Rays, media: Sequence[Solid], refine: Callable[[Path, Rays, Solid], Path]
+def _replay_in_bands(
+    path: Path, rays: Rays, media: Sequence[Solid], replay: Callable[[Path, Rays, Solid], Path]
 ) -> Path:
-    """Refine the polylines of each band in the medium at its wavelength; see `_traced_in_bands` for the arguments."""
+    """Replay the polylines of each band in the medium at its wavelength; see `_traced_in_bands` for the arguments."""
     rows = [(path.band == band).nonzero()[:, 0] for band in range(len(media))]
-    refined = [refine(path[some], rays[path.ray[some]], medium) for some, medium in zip(rows, media, strict=True)]
+    replayed = [replay(path[some], rays[path.ray[some]], medium) for some, medium in zip(rows, media, strict=True)]
     order, names = torch.cat(rows).argsort(), ("positions", "directions", "s", "throughput")
-    columns: dict[str, Any] = {name: torch.cat([getattr(part, name) for part in refined])[order] for name in names}
+    columns: dict[str, Any] = {name: torch.cat([getattr(part, name) for part in replayed])[order] for name in names}
     return replace(path, **columns)
 
 

@@ -195,7 +195,7 @@ def _put_end(solids, rows, row, branch, far, exceeded):
     end = Branch(advance(line, ahead), branch.s + ahead, branch.weight, branch.num_vertices, branch.num_events)
     rows.weight[row], rows.num_events[row], rows.exceeded[row] = branch.weight, branch.num_events, exceeded
     rows.num_vertices[row] = branch.num_vertices + 1
-    return _put_vertex(rows, row, end, 0, -1, 0).num_vertices
+    return _put_vertex(rows, row, end, 0, 0, 0).num_vertices
 
 
 @compiled
@@ -295,7 +295,7 @@ def _follow(solids, settings, scratch, rows, row, branch, num_pending):
         if n_before == n_across:
             branch = Branch(far, branch.s + behind, branch.weight, branch.num_vertices, branch.num_events)
             if body != across and (_absorbs(body, solids) or _absorbs(across, solids)):
-                branch = _put_vertex(rows, row, branch, across, hit, across)
+                branch = _put_vertex(rows, row, branch, across, hit + 1, across)
             continue
         if branch.num_events >= settings.max_events:
             return branch, True, num_pending
@@ -305,7 +305,14 @@ def _follow(solids, settings, scratch, rows, row, branch, num_pending):
             if not settings.main_only:
                 _flip(scratch)
                 num_pending = _push(
-                    scratch, num_pending, branch, event.mirrored, branch.s + before, weight * event.share, hit, across
+                    scratch,
+                    num_pending,
+                    branch,
+                    event.mirrored,
+                    branch.s + before,
+                    weight * event.share,
+                    hit + 1,
+                    across,
                 )
                 _flip(scratch)
             weight *= 1.0 - event.share
@@ -313,7 +320,7 @@ def _follow(solids, settings, scratch, rows, row, branch, num_pending):
             _flip(scratch)
         length = before if event.reflected else behind
         branch = Branch(event.line, branch.s + length, weight, branch.num_vertices, branch.num_events + 1)
-        branch = _put_vertex(rows, row, branch, body if event.reflected else across, hit, across)
+        branch = _put_vertex(rows, row, branch, body if event.reflected else across, hit + 1, across)
 
 
 @compiled
@@ -330,7 +337,7 @@ def _trace_ray(solids, line, near, far, settings, scratch, rows):
     entry = advance(branch.line, max(enter, 0.0))
     for body in range(len(inside)):
         inside[body] = not misses and body_distance(solids, body, entry.x, entry.y, entry.z) < 0.0
-    branch = _put_vertex(rows, 0, branch, _deciding_body(inside, solids), -1, 0)
+    branch = _put_vertex(rows, 0, branch, _deciding_body(inside, solids), 0, 0)
     if misses:
         return 1, _put_end(solids, rows, 0, branch, far, False)
     branch = Branch(entry, near + max(enter, 0.0), 1.0, branch.num_vertices, 0)

@@ -26,8 +26,8 @@ class Straight(PathSampler):
     def releases_gil(self, medium: Medium) -> bool:
         return True
 
-    def refine(self, path: Path, rays: Rays, medium: Medium) -> Path:
-        return refined_straight(path, rays)
+    def replay(self, path: Path, rays: Rays, medium: Medium) -> Path:
+        return replay_straight(path, rays)
 
 
 def straight_path(rays: Rays) -> Path:
@@ -39,7 +39,7 @@ def straight_path(rays: Rays) -> Path:
     return Path.unbranched(positions, directions, s, refracted, rays.radii)
 
 
-def refined_straight(path: Path, rays: Rays) -> Path:
+def replay_straight(path: Path, rays: Rays) -> Path:
     """Return straight paths with gradients with respect to the rays."""
     lines = straight_path(rays[path.ray])
     return replace(path, positions=lines.positions, directions=lines.directions, s=lines.s)

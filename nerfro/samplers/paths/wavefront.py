@@ -110,7 +110,7 @@ class Wavefront:
     def add_vertices(
         self,
         rows: Int[Tensor, "A"],
-        surface: Int[Tensor, "A"] | int = -1,
+        surface: Int[Tensor, "A"] | int = 0,
         across: Int[Tensor, "A"] | int = 0,
         triangle: Int[Tensor, "A"] | int = -1,
     ) -> None:
@@ -166,7 +166,7 @@ class Wavefront:
         self.triangles[rows], self.start[rows] = met.triangles, self.offset
         self.num_events[rows] += met.visible
         vertex = met.select(met.recorded)
-        self.add_vertices(rows[met.recorded], vertex.body[:, 0], vertex.across, vertex.triangles[:, 0])
+        self.add_vertices(rows[met.recorded], vertex.body[:, 0] + 1, vertex.across, vertex.triangles[:, 0])
 
     def _split(
         self, rows: Int[Tensor, "A"], share: Float[Tensor, "A"], reflected: Bool[Tensor, "A"]

@@ -18,7 +18,7 @@ from nerfro.rays import Rays
 from nerfro.registry import register
 from nerfro.rendering import Renderer
 from nerfro.subdivision import DIVERGENT, divergence, main_exits, neighbour_rays, pixel_rays
-from nerfro.training.phases.base import Phase, Run
+from nerfro.training.phases.base import Phase, TrainingRun
 from nerfro.types import Exits
 
 # Largest number of pixels of a pass beside the object, relative to the texels of the finest level.
@@ -35,7 +35,7 @@ _TURNS = 10
 
 
 @register("phase", "background")
-class Background(Phase):
+class BackgroundSteps(Phase):
     """Fit the environment map to pixels that show only the background, without gradient descent.
 
     A pass before training uses pixels whose rays miss the boxes of content and object. Such rays need no tracing. With
@@ -59,7 +59,7 @@ class Background(Phase):
     def __init__(self, steps: Natural = 10, time_share: Share = 0.2, start: Count | None = 250) -> None:
         self.steps, self.time_share, self.start = steps, time_share, start
 
-    def begin(self, run: Run) -> dict[str, Any]:
+    def begin(self, run: TrainingRun) -> dict[str, Any]:
         """Return the weights of the observations of each texel in the current pass."""
         background = run.renderer.scene.boundary
         if not isinstance(background, EnvironmentMap) or not background.texels.requires_grad:
@@ -76,7 +76,7 @@ class Background(Phase):
         return self.steps * (1 + later_passes)
 
     @torch.no_grad()
-    def step(self, run: Run, number: int, state: dict[str, Any]) -> bool:
+    def step(self, run: TrainingRun, number: int, state: dict[str, Any]) -> bool:
         background, box = run.renderer.scene.boundary, occupied_box(run.renderer)
         if not state or not isinstance(background, EnvironmentMap) or box is None:
             return False
@@ -107,7 +107,7 @@ class Background(Phase):
 
 
 def _divided(
-    run: Run, pixels: Int[Tensor, "Q"], box: Float[Tensor, "2 3"]
+    run: TrainingRun, pixels: Int[Tensor, "Q"], box: Float[Tensor, "2 3"]
 ) -> tuple[Int[Tensor, " beside"], Rays, Int[Tensor, " crossing"]]:
     """Return the pixels whose rays miss a box, with their rays, and the other pixels."""
     beside, rays, crossing = [], [], []
@@ -120,7 +120,7 @@ def _divided(
     return torch.cat(beside), Rays.joined(rays), torch.cat(crossing)
 
 
-def _observe_through_object(run: Run, pixels: Int[Tensor, "Q"]) -> Observed:
+def _observe_through_object(run: TrainingRun, pixels: Int[Tensor, "Q"]) -> Observed:
     """Observe the background along those rays of pixels that cross hardly any content."""
     batches, renderer, scene = run.batches, run.renderer, run.renderer.scene
     view = batches.cameras.view_of(pixels)
@@ -139,7 +139,7 @@ def _observe_through_object(run: Run, pixels: Int[Tensor, "Q"]) -> Observed:
     return observed[fraction.amin(-1) >= _BACKGROUND]
 
 
-def _observe_beside_object(run: Run, pixels: Int[Tensor, "Q"], rays: Rays, fits_gains: bool = True) -> Observed:
+def _observe_beside_object(run: TrainingRun, pixels: Int[Tensor, "Q"], rays: Rays, fits_gains: bool = True) -> Observed:
     """Observe the background along the rays of pixels beside the object, after the exposures are fitted to it."""
     batches, scene = run.batches, run.renderer.scene
     view, rgb, exposure = batches.cameras.view_of(pixels), batches.photographed(pixels), scene.camera.exposure
@@ -149,13 +149,13 @@ def _observe_beside_object(run: Run, pixels: Int[Tensor, "Q"], rays: Rays, fits_
     return Observed(rays.directions, _photographed(run, rgb, view), rgb >= 1, torch.ones_like(widths), widths)
 
 
-def _rays(run: Run, pixels: Int[Tensor, "Q"]) -> Rays:
+def _rays(run: TrainingRun, pixels: Int[Tensor, "Q"]) -> Rays:
     """Make the rays of the estimated cameras through the centres of pixels."""
     batches = run.batches
     return run.renderer.scene.camera(pixel_rays(batches.cameras, pixels), batches.cameras.view_of(pixels))
 
 
-def _photographed(run: Run, rgb: Float[Tensor, "R 3"], view: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
+def _photographed(run: TrainingRun, rgb: Float[Tensor, "R 3"], view: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
     """Decode the colours of photographs, and divide by the gains of the photographs."""
     scene = run.renderer.scene
     radiance, gains = scene.colour_space.to_radiance(rgb), scene.camera.gains(view)

@@ -13,14 +13,14 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerfro.data.base import Views
-from nerfro.errors import NerfroError
+from nerfro.errors import NerfroError, warn_of_old_name
 from nerfro.rendering import Renderer
 from nerfro.training.optimizer import require_matches
 from nerfro.training.ray_batches import RayBatches
 
 
 @dataclass(frozen=True)
-class Run:
+class TrainingRun:
     """Model, data and optimizer of a training.
 
     Attributes:
@@ -75,7 +75,7 @@ class Phase(ABC):
     `phase.NAME.SETTING`. The schedule counts the steps, and a resumed run continues with the next one.
     """
 
-    def begin(self, run: Run) -> dict[str, Any]:
+    def begin(self, run: TrainingRun) -> dict[str, Any]:
         """Prepare before the first training step.
 
         Returns:
@@ -93,7 +93,7 @@ class Phase(ABC):
         """
 
     @abstractmethod
-    def step(self, run: Run, number: int, state: dict[str, Any]) -> bool:
+    def step(self, run: TrainingRun, number: int, state: dict[str, Any]) -> bool:
         """Take a step.
 
         Args:
@@ -104,3 +104,10 @@ class Phase(ABC):
         Returns:
             True to continue with the next step later, False to end the phase.
         """
+
+
+def __getattr__(name: str) -> Any:
+    if name == "Run":
+        warn_of_old_name("nerfro.training.phases.base.Run", "nerfro.training.phases.base.TrainingRun")
+        return TrainingRun
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -10,13 +10,13 @@ from skimage.transform import resize
 from nerfro.light import to_linear, to_srgb
 
 from ..path_tracer import PathTracer, Pinhole
-from ..scene import Panel, Scene
+from ..scene import Panel, SyntheticScene
 
 TEXELS = 16  # resolution of the light on a panel
 _ABOVE = 2e-3  # world units; more than the offsets of the renderer, less than the gap under the globe
 
 
-def bake(scene: Scene, spp: int, variant: str = "auto") -> Scene:
+def bake(scene: SyntheticScene, spp: int, variant: str = "auto") -> SyntheticScene:
     """Replace the reflected light of panels by emitted light, so that shading and shadows have no noise.
 
     The radiance of a panel is independent of the direction, because panels are diffuse. During the computation, each

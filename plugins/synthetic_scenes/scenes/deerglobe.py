@@ -6,7 +6,7 @@ import numpy as np
 
 from nerfro.light import to_linear
 
-from ..scene import Scene
+from ..scene import SyntheticScene
 from ..surface import sphere
 from .distance import ball, capsule, ellipsoid, join, mirrored, painted, smooth_union
 from .patterns import chosen, fractal_noise, hashed, mix, smoothstep
@@ -167,7 +167,7 @@ def _snow(directions: np.ndarray) -> np.ndarray:
     return mix(np.array([0.80, 0.84, 0.92]), colour, smoothstep(0.02, 0.16, -directions[..., 2]))
 
 
-def build(spacing: float) -> Scene:
+def build(spacing: float) -> SyntheticScene:
     """Return the scene; `spacing` is the distance between neighbouring coloured vertices, world units."""
     fine = min(max(spacing, 0.0035), 0.006)  # thin parts need a fine mesh whatever the resolution of the images
     x, y = PINE
@@ -178,4 +178,4 @@ def build(spacing: float) -> Scene:
         painted(pine, pine_colours, (x - 0.2, y - 0.2, -0.31), (x + 0.2, y + 0.2, 0.33), fine),
     ]
     glass = sphere(GLASS_RADIUS, GLASS_SUBDIVISIONS)
-    return Scene(ior=1.5, glass=glass, interior=join(parts), sky=sky)
+    return SyntheticScene(ior=1.5, glass=glass, interior=join(parts), sky=sky)

@@ -13,7 +13,7 @@ import numpy as np
 from skimage.measure import marching_cubes
 
 from ..scene import Vector
-from ..surface import Surface
+from ..surface import SurfaceMesh
 
 Distance = Callable[[np.ndarray], np.ndarray]
 Colour = Callable[[np.ndarray], np.ndarray]
@@ -82,7 +82,7 @@ def smooth_union(distances: Sequence[np.ndarray], width: float) -> np.ndarray:
     return total
 
 
-def triangulate(distance: Distance, low: Vector, high: Vector, spacing: float) -> Surface:
+def triangulate(distance: Distance, low: Vector, high: Vector, spacing: float) -> SurfaceMesh:
     """Mesh the zero set of a distance with marching cubes, then pull the vertices and normals onto the exact surface.
 
     Args:
@@ -111,25 +111,25 @@ def triangulate(distance: Distance, low: Vector, high: Vector, spacing: float) -
         vertices = vertices - step[:, None] * gradient
     gradient = _gradient(distance, vertices, 0.25 * spacing)
     normals = gradient / np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-12)
-    return Surface(vertices.astype(np.float32), faces.astype(np.int32), normals.astype(np.float32))
+    return SurfaceMesh(vertices.astype(np.float32), faces.astype(np.int32), normals.astype(np.float32))
 
 
-def painted(distance: Distance, colour: Colour, low: Vector, high: Vector, spacing: float) -> Surface:
+def painted(distance: Distance, colour: Colour, low: Vector, high: Vector, spacing: float) -> SurfaceMesh:
     """Mesh a solid as `triangulate` does and colour its vertices with `colour`(points [V, 3]) -> sRGB [V, 3]."""
     surface = triangulate(distance, low, high, spacing)
     colours = np.clip(colour(surface.vertices.astype(np.float64)), 0.0, 1.0)
     return replace(surface, colours=colours.astype(np.float32))
 
 
-def moved(surface: Surface, offset: Vector) -> Surface:
+def moved(surface: SurfaceMesh, offset: Vector) -> SurfaceMesh:
     """Translate a surface by `offset` (world units)."""
     return replace(surface, vertices=(surface.vertices + np.asarray(offset)).astype(np.float32))
 
 
-def join(surfaces: Sequence[Surface]) -> Surface:
+def join(surfaces: Sequence[SurfaceMesh]) -> SurfaceMesh:
     """Join coloured surfaces to one surface."""
     offsets = np.cumsum([0] + [len(surface.vertices) for surface in surfaces[:-1]])
-    return Surface(
+    return SurfaceMesh(
         vertices=np.concatenate([surface.vertices for surface in surfaces]),
         faces=np.concatenate([surface.faces + offset for surface, offset in zip(surfaces, offsets, strict=True)]),
         normals=np.concatenate([surface.normals for surface in surfaces]),

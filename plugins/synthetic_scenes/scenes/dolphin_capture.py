@@ -11,7 +11,7 @@ import itertools
 import numpy as np
 from nerfro_plugins.camera_calibration.boards import TagBoard, twelve_faces
 
-from ..scene import Panel, Scene, Vector
+from ..scene import Panel, SyntheticScene, Vector
 from . import distance, starlamp
 from .distance import Colour, ball, capsule, ellipsoid, join, mirrored, moved, painted, smooth_union
 from .patterns import chosen, fractal_noise, hashed, mix, smoothstep
@@ -183,7 +183,7 @@ def room_panels(spacing: float) -> list[Panel]:
     ]
 
 
-def build(spacing: float) -> Scene:
+def build(spacing: float) -> SyntheticScene:
     """Return the scene; `spacing` is the distance between neighbouring coloured vertices, world units."""
     fine, coarse = min(max(spacing, 0.004), 0.012), max(3 * spacing, 0.015)
     parts = [
@@ -193,7 +193,7 @@ def build(spacing: float) -> Scene:
     glass = distance.triangulate(globe, (-GLOBE_RADIUS,) * 3, (GLOBE_RADIUS,) * 3, GLOBE_SPACING)
     table = wooden(TABLE_HALF_SIDE, 0.0, (0.62, 0.42, 0.28), 41)
     top = wooden(0.5 * BOARD_SCALE * 0.27, BLOCK_TOP, (0.80, 0.72, 0.60), 43)
-    return Scene(
+    return SyntheticScene(
         ior=WATER,
         glass=moved(glass, CENTRE),
         interior=moved(join(parts), CENTRE),

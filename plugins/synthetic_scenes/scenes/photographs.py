@@ -9,7 +9,7 @@ from nerfro.overrides import as_overrides, command_line
 
 from ..dataset import DataSet, PlannedImage, write_image, write_json
 from ..path_tracer import Pinhole
-from ..scene import Scene, Vector
+from ..scene import SyntheticScene, Vector
 from ..viewpoints import look_at_origin
 from .baking import bake
 
@@ -37,7 +37,7 @@ class Photographs(DataSet):
         cx, cy = 0.5 * width + OFF_CENTRE[0] * width, 0.5 * height + OFF_CENTRE[1] * width
         return Pinhole(width, height, FOCAL * width, cx, cy)
 
-    def lit(self) -> Scene:
+    def lit(self) -> SyntheticScene:
         return bake(self.scene, BAKING_SPP, self.config.variant)
 
     def planned(self) -> list[PlannedImage]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from nerfro.light import to_linear
 
-from ..scene import Scene
+from ..scene import SyntheticScene
 from ..surface import rounded_box
 from .distance import ball, block, capsule, join, painted
 from .patterns import chosen, fractal_noise, hashed, mix, smoothstep
@@ -148,7 +148,7 @@ def _sea(directions: np.ndarray) -> np.ndarray:
     return mix(np.array([0.80, 0.72, 0.64]), water, smoothstep(0.0, 0.12, depth))
 
 
-def build(spacing: float) -> Scene:
+def build(spacing: float) -> SyntheticScene:
     """Return the scene; `spacing` is the distance between neighbouring coloured vertices, world units."""
     spacing = max(spacing, 0.0035)
     fine = min(spacing, 0.006)  # thin parts need a fine mesh whatever the resolution of the images
@@ -162,4 +162,4 @@ def build(spacing: float) -> Scene:
         corners = (x, -half_width, low), (x + 0.1, half_width, high)
         parts.append(painted(sheet, sail_colours, *corners, min(fine, 0.005)))
     glass = rounded_box(HALF_SIDES, EDGE_RADIUS, edge_steps=12)
-    return Scene(ior=1.5, glass=glass, interior=join(parts), sky=sky, tint=TINT)
+    return SyntheticScene(ior=1.5, glass=glass, interior=join(parts), sky=sky, tint=TINT)

@@ -8,7 +8,7 @@ import numpy as np
 
 from nerfro.light import to_linear
 
-from ..scene import Scene
+from ..scene import SyntheticScene
 from . import distance
 from .patterns import chosen, fractal_noise, hashed, mix, smoothstep
 
@@ -135,7 +135,7 @@ def _floor_and_ceiling(x: np.ndarray, y: np.ndarray, up: np.ndarray) -> np.ndarr
     return np.where(up[..., None], ceiling, floor)
 
 
-def build(spacing: float) -> Scene:
+def build(spacing: float) -> SyntheticScene:
     """Return the scene; `spacing` is the distance between neighbouring coloured vertices, world units."""
     spacing = max(spacing, 0.003)
     extent = np.full(3, 1.1 * PLANET_RADIUS)
@@ -144,4 +144,4 @@ def build(spacing: float) -> Scene:
     extent = np.full(3, 1.1 * RING_RADII[1])
     rings = distance.painted(ring, ring_colours, -extent, extent, min(spacing, 0.006))
     glass = distance.triangulate(star_prism, (-OUTER, -HALF_DEPTH, -OUTER), (OUTER, HALF_DEPTH, OUTER), GLASS_SPACING)
-    return Scene(ior=1.5, glass=glass, interior=distance.join([planet, rings]), sky=sky)
+    return SyntheticScene(ior=1.5, glass=glass, interior=distance.join([planet, rings]), sky=sky)

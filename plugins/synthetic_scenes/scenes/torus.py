@@ -8,7 +8,7 @@ import numpy as np
 
 from nerfro.light import to_linear
 
-from ..scene import Scene
+from ..scene import SyntheticScene
 from ..surface import rounded_box, torus_angles
 from .patterns import chosen, hashed, mix, smoothstep
 from .skies import clouds, elevation, skyline
@@ -61,7 +61,7 @@ def _paving(directions: np.ndarray) -> np.ndarray:
     return mix(np.array([0.62, 0.58, 0.54]), colour, smoothstep(0.04, 0.24, depth))
 
 
-def build(spacing: float) -> Scene:
+def build(spacing: float) -> SyntheticScene:
     """Return the scene; `spacing` is the distance between neighbouring coloured vertices, world units."""
     ring, angles = torus_angles(MAJOR_RADIUS, MINOR_RADIUS, spacing)
     (cx, cy), (sx, sy) = np.cos(np.radians(TILT_DEGREES)), np.sin(np.radians(TILT_DEGREES))
@@ -69,4 +69,4 @@ def build(spacing: float) -> Scene:
     vertices, normals = ((array @ turn.T).astype(np.float32) for array in (ring.vertices, ring.normals))
     ring = replace(ring, vertices=vertices, normals=normals, colours=torus_colours(angles).astype(np.float32))
     glass = rounded_box((HALF_SIDE,) * 3, EDGE_RADIUS, edge_steps=12)
-    return Scene(ior=1.5, glass=glass, interior=ring, sky=sky)
+    return SyntheticScene(ior=1.5, glass=glass, interior=ring, sky=sky)

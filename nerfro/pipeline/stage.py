@@ -1,0 +1,110 @@
+"""A stage of `python -m nerfro.reconstruct`: a command with results that are kept until an input file changes."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import itertools
+import os
+import signal
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+
+import torch
+
+from nerfro.cli import call
+from nerfro.errors import Interrupted, NerfroError
+from nerfro.failures import EXIT_INTERRUPTED, in_one_line
+from nerfro.overrides import command_line, without_hints
+
+_SEED = 67280421310721  # of torch in a new process
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A command of nerfro in this process, with input and output files.
+
+    Attributes:
+        command: name of the command, as in `python -m nerfro.COMMAND`.
+        options: command-line options.
+        result: the last file that the command writes.
+        preview: file or folder that the user should check.
+        inputs: files that the command reads; the command is repeated if one of them is newer than the result.
+    """
+
+    command: str
+    options: Sequence[str]
+    result: Path
+    preview: Path
+    inputs: Sequence[Path] = ()
+
+    @property
+    def is_done(self) -> bool:
+        """Whether the result exists and no input is newer."""
+        return self.result.is_file() and not is_older(self.result, self.inputs)
+
+    def run(self) -> None:
+        """Run the command in this process unless the stage is done.
+
+        Raises:
+            NerfroError: the command failed.
+            Interrupted: the command was interrupted.
+        """
+        if self.is_done:
+            print(f"{self.command}: done; {self.result} is kept (delete the file to repeat the stage)", flush=True)
+            return
+        print(f"\n{self.command}: {command_line(self.command, self.options)}", flush=True)
+        # Training has saved a checkpoint.
+        again = "continue" if self.command == "train" else "start this stage again"
+        incomplete = f"{self.command} is incomplete; repeat the same command to {again}"
+        try:
+            # A command depends on no random numbers of earlier stages.
+            with without_hints(), torch.random.fork_rng(devices=[]):
+                torch.manual_seed(_SEED)
+                call(self.command, list(self.options))
+            if not self.result.is_file():
+                raise NerfroError(f"{self.result} was not written")
+        except KeyboardInterrupt:
+            raise Interrupted(incomplete) from None
+        except SystemExit as end:
+            if end.code != EXIT_INTERRUPTED:
+                raise
+            raise Interrupted(incomplete) from None
+        except Exception as error:
+            if os.environ.get("NERFRO_DEBUG"):
+                raise
+            raise NerfroError(
+                f"{self.command} failed: {in_one_line(error)}; correct the input, set {self.command}='OPTIONS', or run "
+                "the printed command with other options; then repeat this command, which keeps all completed stages"
+            ) from error
+        gc.collect()  # models refer to themselves
+        print(f"{self.command}: done; look at {self.preview}", flush=True)
+
+
+@contextlib.contextmanager
+def terminated_in_one_line() -> Iterator[None]:
+    """End this program on SIGTERM in the same way as on Ctrl-C. A second SIGTERM ends the program immediately."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        raise KeyboardInterrupt
+
+    previous = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, previous)
+
+
+def is_older(file: Path, others: Iterable[Path]) -> bool:
+    """Test whether one of the existing other files was modified after a file."""
+    written = file.stat().st_mtime_ns
+    return any(other.stat().st_mtime_ns > written for other in others if other.exists())
+
+
+def move_aside(folder: Path) -> Path:
+    """Rename a folder to the first free name with a number, and return the new path."""
+    free = next(path for n in itertools.count(1) if not (path := folder.with_name(f"{folder.name}_{n}")).exists())
+    return folder.rename(free)
