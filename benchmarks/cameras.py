@@ -31,7 +31,7 @@ from nerfro.registry import discover
 
 discover()
 pixel_units = import_module("nerfro_plugins.refined_cameras.pixel_units")
-rotations = import_module("nerfro_plugins.refined_cameras.refined").rotations
+rotation_matrices = import_module("nerfro_plugins.refined_cameras.refined").rotation_matrices
 
 
 def main() -> None:
@@ -84,9 +84,9 @@ def disturbed(cameras: Cameras, angle: float, share: float, seed: int) -> Float[
     axes = torch.randn(len(cameras), 2, 3, generator=generator, dtype=torch.float64)
     weights = pixel_units.even_weights(pixel_units.pixel_motions(cameras, distances))
     motion = torch.nn.functional.normalize(axes, dim=-1).flatten(1) * units
-    motion = pixel_units.without_world(motion, pixel_units.world_motions(poses, weights), weights)
+    motion = pixel_units.project_out_gauge(motion, pixel_units.gauge_basis(poses, weights), weights)
     axes = poses[..., :3]
-    return torch.cat([axes @ rotations(motion[:, :3]), poses[..., 3:] + axes @ motion[:, 3:, None]], -1)
+    return torch.cat([axes @ rotation_matrices(motion[:, :3]), poses[..., 3:] + axes @ motion[:, 3:, None]], -1)
 
 
 def write_disturbed(root: Path, cameras: Cameras, folder: Path) -> Path:
@@ -124,11 +124,16 @@ def line(row: str, run: Path, true: Cameras, initial: Cameras) -> str:
     turn, shift = errors(poses, true)
     aligned = result.treatments.get("aligned")
     return (
-        f"{row:<12} {result.result.mean('psnr'):6.2f} {result.result.mean('psnr', 'mask') or math.nan:15.2f} "
-        f"{aligned.mean('psnr') if aligned else math.nan:9.2f} {turn.median():10.3f} {turn.max():9.3f} "
+        f"{row:<12} {result.result.mean('psnr'):6.2f} {decibels(result.result.mean('psnr', 'mask')):>15} "
+        f"{decibels(aligned.mean('psnr') if aligned else None):>9} {turn.median():10.3f} {turn.max():9.3f} "
         f"{shift.median():10.3f} {shift.max():9.3f} {100 * (lens[0] / true_lens[0] - 1):17.3f} "
         f"{math.dist(lens[1:], true_lens[1:]):25.3f}"
     )
+
+
+def decibels(psnr: float | None) -> str:
+    """Format a PSNR, or a dash if there is none."""
+    return "-" if psnr is None else f"{psnr:.2f}"
 
 
 def errors(poses: Float[Tensor, "V 3 4"], true: Cameras) -> tuple[Float[Tensor, "V"], Float[Tensor, "V"]]:

@@ -1,4 +1,4 @@
-"""How well a simulated capture was calibrated and carved: `python benchmarks/capture.py DIR`."""
+"""Measure errors of calibration and visual hull of a simulated capture: `python benchmarks/capture.py DIR`."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float
+from torch import Tensor
 
-from nerfro.camera.similarity import motion_between, similarity
+from nerfro.camera.similarity import Similarity, motion_between, similarity
 from nerfro.data.transforms import find_splits, read_manifest
 from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
@@ -23,7 +24,7 @@ def main() -> None:
     """Print the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path, help="written by nerfro.synthesize, nerfro.calibrate, nerfro.preprocess")
-    parser.add_argument("--data", type=Path, help="what nerfro.calibrate wrote, if that is another folder")
+    parser.add_argument("--data", type=Path, help="folder written by nerfro.calibrate, if it is another folder")
     given = parser.parse_args()
     for name, value in measure(given.folder, given.data or given.folder).items():
         print(f"{name:<52} {value:.4g}")
@@ -40,15 +41,9 @@ def measure(folder: Path, data: Path) -> dict[str, float]:
         NerfroError: there are no cameras, or fewer than three.
     """
     lens, true_poses = read_cameras(folder / "truth")
-    found_lens, found_poses = read_cameras(data)
-    # Frames of a video are copies of the photographs with equal names.
-    true_poses, found_poses = ({file.name: pose for file, pose in poses.items()} for poses in (true_poses, found_poses))
-    names = sorted(found_poses)
-    if len(names) < 3:
-        raise NerfroError(f"{data} has {len(names)} cameras; three or more can be aligned")
-    true, found = (torch.from_numpy(np.stack([poses[name] for name in names])) for poses in (true_poses, found_poses))
-    weights = torch.ones(len(names), dtype=true.dtype)
-    to_truth = similarity(found, true, 0 * weights, weights)  # by the camera centres alone
+    found_lens, _ = read_cameras(data)
+    found, true = matched_poses(folder, data)
+    to_truth = align_to_truth(folder, data)
     angles, shifts = (values.numpy() for values in motion_between(to_truth.apply(found), true))
     true, moved = true.numpy(), to_truth.apply(found).numpy()
     surface = load_mesh(folder / "truth" / "mesh.ply")
@@ -58,7 +53,7 @@ def measure(folder: Path, data: Path) -> dict[str, float]:
         _project(surface.vertices[::50], found_lens, moved) - _project(surface.vertices[::50], lens, true), axis=-1
     )
     figures = {
-        "photographs with a pose": len(names),
+        "photographs with a pose": len(found),
         "photographs": len(true_poses),
         "focal length, error in %": 100 * abs(found_lens[0, 0] / lens[0, 0] - 1),
         "principal point, error in pixels": float(np.linalg.norm(found_lens[:2, 2] - lens[:2, 2])),
@@ -74,26 +69,59 @@ def measure(folder: Path, data: Path) -> dict[str, float]:
             np.mean([image["error"] for image in report["images"].values()])
         )
     if (data / "mesh.ply").is_file():
-        hull = load_mesh(data / "mesh.ply")
-        scale, turn, shift = (values.numpy() for values in to_truth)
-        hull = TriangleMesh((scale * hull.vertices @ turn.T + shift).astype(hull.vertices.dtype), hull.faces)
+        hull = transformed(load_mesh(data / "mesh.ply"), to_truth)
         figures["hull, intersection over union with the object"] = volume_overlap(hull, surface)
     return figures
 
 
-def read_cameras(root: Path) -> tuple[Float[np.ndarray, "3 3"], dict[Path, Float[np.ndarray, "3 4"]]]:
-    """The camera matrix of a data set in the format `opencv`, and the poses of all its splits by image."""
-    poses: dict[Path, Float[np.ndarray, "3 4"]] = {}
+def align_to_truth(folder: Path, data: Path) -> Similarity:
+    """Fit the similarity transformation from the estimated world to the true one by the centres of the cameras.
+
+    Args:
+        folder: holds `truth/`.
+        data: holds the estimated cameras in the format `opencv`.
+
+    Raises:
+        NerfroError: there are fewer than three estimated cameras, or one of them has no true pose.
+    """
+    found, true = matched_poses(folder, data)
+    weights = torch.ones(len(true), dtype=true.dtype)
+    return similarity(found, true, 0 * weights, weights)
+
+
+def matched_poses(folder: Path, data: Path) -> tuple[Float[Tensor, "V 3 4"], Float[Tensor, "V 3 4"]]:
+    """Return the estimated poses and the true poses of the same photographs, see `align_to_truth`."""
+    true, found = (read_cameras(root)[1] for root in (folder / "truth", data))
+    if len(found) < 3:
+        raise NerfroError(f"{data} has {len(found)} cameras; the alignment needs three or more")
+    if unknown := sorted(found.keys() - true.keys()):
+        raise NerfroError(f"{folder / 'truth'} has no pose of {unknown[0]}")
+    estimated, exact = (torch.from_numpy(np.stack([poses[name] for name in sorted(found)])) for poses in (found, true))
+    return estimated, exact
+
+
+def transformed(mesh: TriangleMesh, similarity: Similarity) -> TriangleMesh:
+    """Transform the vertices of a mesh by a similarity transformation."""
+    scale, rotation, shift = (values.numpy() for values in similarity)
+    return TriangleMesh((scale * mesh.vertices @ rotation.T + shift).astype(mesh.vertices.dtype), mesh.faces)
+
+
+def read_cameras(root: Path) -> tuple[Float[np.ndarray, "3 3"], dict[str, Float[np.ndarray, "3 4"]]]:
+    """Read the camera matrix of a data set in the format `opencv`, and the poses of all its splits by file name.
+
+    The folders differ, because frames of a video are copies of the photographs.
+    """
+    poses: dict[str, Float[np.ndarray, "3 4"]] = {}
     matrix = np.eye(3)
     for split in find_splits(root):
         manifest = read_manifest(root, split)
         matrix = np.array(manifest.document["cam_mat"], np.float64)
-        poses |= {frame.image.resolve(): np.asarray(frame.camera_to_world) for frame in manifest.frames}
+        poses |= {frame.image.name: np.asarray(frame.camera_to_world) for frame in manifest.frames}
     return matrix, poses
 
 
 def volume_overlap(first: TriangleMesh, second: TriangleMesh) -> float:
-    """Intersection over union of two closed bodies."""
+    """Return the intersection over union of two closed bodies."""
     both = np.concatenate([first.bounds, second.bounds])
     margin = 0.02 * np.ptp(both, axis=0).max()
     box = np.stack([both.min(0) - margin, both.max(0) + margin])
@@ -104,7 +132,7 @@ def volume_overlap(first: TriangleMesh, second: TriangleMesh) -> float:
 def _project(
     points: Float[np.ndarray, "P 3"], lens: Float[np.ndarray, "3 3"], poses: Float[np.ndarray, "N 3 4"]
 ) -> Float[np.ndarray, "N P 2"]:
-    """Pixels at which cameras with OpenCV's axes see points."""
+    """Project points to the pixels of cameras with OpenCV axes."""
     seen = np.einsum("npi,nij->npj", points - poses[:, None, :, 3], poses[:, :, :3]) @ lens.T
     return seen[..., :2] / seen[..., 2:]
 

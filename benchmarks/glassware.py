@@ -42,8 +42,8 @@ path_tracer = import_module("nerfro_plugins.synthetic_scenes.path_tracer")
 PathTracer, Pinhole = path_tracer.PathTracer, path_tracer.Pinhole
 panel_shape, triangle_shape = path_tracer.panel_shape, path_tracer.triangle_shape
 modelled = import_module("nerfro_plugins.synthetic_scenes.scene")
-Panel, Scene = modelled.Panel, modelled.Scene
-Surface = import_module("nerfro_plugins.synthetic_scenes.surface").Surface
+Panel, Scene = modelled.Panel, modelled.SyntheticScene
+Surface = import_module("nerfro_plugins.synthetic_scenes.surface").SurfaceMesh
 find_scene = import_module("nerfro_plugins.synthetic_scenes.synthesis").find_scene
 
 dolphin = find_scene("dolphin_capture")
@@ -246,10 +246,10 @@ def furniture(spacing: float) -> tuple[list[Panel], Surface]:
         right[1 - axis] = 1.7 * (1 if (axis == 0) == (side == 0) else -1)
         panels.append(sheet(centre, right, np.array([0.0, 0.0, -1.3]), 0.3, glows=True))
 
-    def thing(solid: Callable[[np.ndarray], np.ndarray], centre: np.ndarray, size: float, seed: int) -> Surface:
+    def painted_solid(solid: Callable[[np.ndarray], np.ndarray], centre: np.ndarray, size: float, seed: int) -> Surface:
         return distance.painted(solid, lambda p: mosaic(p, 0.12, seed), centre - size, centre + size, 0.02)
 
-    things = []
+    solids = []
     for number, (x, y, size) in enumerate([(1.2, 0.7, 0.28), (-0.9, 1.2, 0.2), (-1.2, -0.9, 0.3), (0.7, -1.4, 0.2)]):
         centre, half = np.array([x, y, size + 0.04]), np.array([size, 0.6 * size, size])
         solid = (
@@ -257,8 +257,8 @@ def furniture(spacing: float) -> tuple[list[Panel], Surface]:
             if number % 2
             else (lambda p, c=centre, s=size: distance.ball(p, c, s))
         )
-        things.append(thing(solid, centre, size + 0.03, 100 * number))
-    return panels, distance.join(things)
+        solids.append(painted_solid(solid, centre, size + 0.03, 100 * number))
+    return panels, distance.join(solids)
 
 
 def render(kind: str, folder: Path, count: int, width: int, spp: int) -> None:

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from capture import read_cameras, similarity, volume_overlap
+from capture import align_to_truth, transformed, volume_overlap
 from jaxtyping import Float
 
+from nerfro.camera.similarity import Similarity
 from nerfro.data.base import Views
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.media.sdf_grid import SdfGrid
@@ -45,11 +46,9 @@ def true_surface(root: Path) -> TriangleMesh:
     """Return the true surface in the frame of the data set's cameras; for captures, cameras are estimated."""
     if not (root / "truth").is_dir():
         return load_mesh(root / "mesh.ply")
-    true_poses, poses = (read_cameras(folder)[1] for folder in (root / "truth", root))
-    names = sorted(poses)
-    scale, turn, shift = similarity(*(np.stack([p[name][:, 3] for name in names]) for p in (true_poses, poses)))
-    mesh = load_mesh(root / "truth" / "mesh.ply")
-    return TriangleMesh(scale * mesh.vertices @ turn.T + shift, mesh.faces)
+    scale, rotation, shift = align_to_truth(root, root)
+    from_truth = Similarity(1 / scale, rotation.T, -rotation.T @ shift / scale)
+    return transformed(load_mesh(root / "truth" / "mesh.ply"), from_truth)
 
 
 def measure(mesh: TriangleMesh, true: TriangleMesh, views: Views, ior: float) -> dict[str, float]:
@@ -85,7 +84,7 @@ def measure(mesh: TriangleMesh, true: TriangleMesh, views: Views, ior: float) ->
 
 
 def normal_errors(mesh: TriangleMesh, exact: SdfGrid) -> tuple[Float[np.ndarray, "F"], Float[np.ndarray, "F"]]:
-    """Angle of each triangle to the true surface beside it, degrees, and its area."""
+    """Return the angle of each triangle to the nearest true surface in degrees, and its area."""
     a, b, c = mesh.triangles.swapaxes(0, 1)
     gradient = exact.signed_distances(torch.from_numpy(mesh.triangles.mean(1)).float())[1][:, 0].double().numpy()
     normals = np.cross(b - a, c - a)
@@ -99,7 +98,7 @@ def _medium(mesh: TriangleMesh, box: Float[np.ndarray, "2 3"], ior: float) -> Sd
 
 
 def _degrees(first: Float[np.ndarray, "N 3"], second: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N"]:
-    """Angles between vectors, accurate for small ones."""
+    """Return angles between vectors; small angles are accurate."""
     across = np.linalg.norm(np.cross(first, second), axis=1)
     return np.degrees(np.arctan2(across, (first * second).sum(1)))
 

@@ -46,7 +46,7 @@ def main() -> None:
     """Print all tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--resolution", type=int, default=256, help="of the signed-distance grids")
-    parser.add_argument("--branches", action="store_true", help="only the cost of light that splits")
+    parser.add_argument("--branches", action="store_true", help="print only the cost of light that splits")
     parser.add_argument("--euler-resolution", type=int, default=512, help="of the paper's voxel grid (authors: 512)")
     parser.add_argument("--side", type=int, default=400, help="pixels of the view whose rays are timed")
     parser.add_argument("--rays", type=int, default=4000, help="rays through the ball; 3/8 of them through the cube")
@@ -77,11 +77,11 @@ def main() -> None:
         coarse = VoxelGrid(str(ball), N_BALL, arguments.resolution, cache=False)
         speed([voxels, coarse], {"sphere": mesh_ball, "cube": mesh_cube}, arguments.side)
         branches({"sphere": mesh_ball, "cube": mesh_cube}, arguments.side)
-    print("\nGPU: not measured, there was none.")
+    print("\nThe compiled kernels trace on the CPU for rays on any device, so there are no separate times for a GPU.")
 
 
 def sphere_errors(voxels: VoxelGrid, mesh_ball: SdfGrid, resolution: int, num: int) -> None:
-    """Error of the exit direction against 2 (asin(b / R) - asin(b / (n R))), for rays of random directions."""
+    """Print errors of the exit direction against 2 (asin(b / R) - asin(b / (n R))), for rays of random directions."""
     generator = np.random.default_rng(0)
     d = generator.normal(size=(num, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
@@ -118,9 +118,9 @@ def sphere_errors(voxels: VoxelGrid, mesh_ball: SdfGrid, resolution: int, num: i
 
 
 def cube_errors(mesh_cube: SdfGrid, resolution: int, num: int) -> None:
-    """Error of the exit direction behind the rounded cube against the independent tracer.
+    """Print errors of the exit direction behind the rounded cube against the independent tracer.
 
-    A ray is well-conditioned when neighbours 1e-4 units beside it see as many reflections and leave within 0.5 degrees.
+    A ray is well-conditioned if its neighbours at 1e-4 units have as many reflections and leave within 0.5 degrees.
     """
     generator = np.random.default_rng(1)
     d = generator.normal(size=(num, 3))
@@ -161,9 +161,9 @@ def cube_errors(mesh_cube: SdfGrid, resolution: int, num: int) -> None:
 
 
 def speed(baselines: list[VoxelGrid], solids: dict[str, SdfGrid], side: int) -> None:
-    """Rays per second over all rays of a view, against Euler steps in the same kind of compiled kernel.
+    """Print rays per second over all rays of a view, against Euler steps in the same kind of compiled kernel.
 
-    Euler's cost does not depend on the object; a smaller grid is faster, because more of it stays in the CPU's caches.
+    The cost of Euler steps does not depend on the object. A smaller grid is faster, because more of it stays in caches.
     """
     print(f"\n### All {side}x{side} rays of a view, {CHUNK} at once\n")
     print("| object | sampler | ms | million rays/s | against the faster euler | bound | met |")
@@ -190,31 +190,33 @@ def speed(baselines: list[VoxelGrid], solids: dict[str, SdfGrid], side: int) -> 
 
 
 def branches(solids: dict[str, SdfGrid], side: int) -> None:
-    """What it costs to follow light that splits, over the same rays; in processor time, as cores may be shared."""
+    """Print the cost of light that splits for the same rays, in processor time because cores may be shared."""
     print(f"\n### Light that splits, all {side}x{side} rays of a view\n")
     print("| object | branches, least weight | paths a ray that meets it | ms | million rays/s | against one path |")
     print("|---|---|---|---|---|---|")
     rays = view(side).image_rays(0)
-    ways = {"none": Snell(), "first, 0.02": Snell(branches="first")}
-    ways |= {f"all, {least}": Snell(branches="all", least_weight=least) for least in (0.05, 0.02, 0.005)}
+    samplers = {"none": Snell(), "first, 0.02": Snell(branches="first")}
+    samplers |= {f"all, {least}": Snell(branches="all", least_weight=least) for least in (0.05, 0.02, 0.005)}
     for scene, solid in solids.items():
-        traces = [partial(sampler, medium=solid) for sampler in ways.values()]
+        traces = [partial(sampler, medium=solid) for sampler in samplers.values()]
         best = fastest([partial(trace_all, trace, rays) for trace in traces], 4, time.process_time)
-        for name, trace, seconds in zip(ways, traces, best, strict=True):
-            met = torch.cat([path.ray[path.refracted] + CHUNK * i for i, path in enumerate(in_chunks(trace, rays))])
-            paths = len(met) / len(met.unique())
+        for name, trace, seconds in zip(samplers, traces, best, strict=True):
+            refracted = torch.cat(
+                [path.ray[path.refracted] + CHUNK * i for i, path in enumerate(in_chunks(trace, rays))]
+            )
+            paths = len(refracted) / len(refracted.unique())
             cost = f"{1e3 * seconds:.0f} | {1e-6 * len(rays) / seconds:.2f}"
             print(f"| {scene} | {name} | {paths:.2f} | {cost} | {seconds / best[0]:.2f}x |", flush=True)
 
 
 def in_chunks(trace: Callable[[Rays], Any], rays: Rays) -> Iterator[Any]:
-    """Trace rays as in evaluation, not all at once."""
+    """Trace rays in chunks, as in evaluation."""
     for first in range(0, len(rays), CHUNK):
         yield trace(rays[first : first + CHUNK])
 
 
 def trace_all(trace: Callable[[Rays], object], rays: Rays) -> None:
-    """Trace rays and keep nothing."""
+    """Trace rays and discard the paths."""
     for _ in in_chunks(trace, rays):
         pass
 
@@ -231,12 +233,12 @@ def fastest(tasks: Sequence[Callable[[], object]], turns: int, clock: Callable[[
 
 
 def exits(sampler: Eikonal | Snell, medium: torch.nn.Module) -> Trace:
-    """Exit directions by a sampler."""
+    """Return a function that traces exit directions by a sampler."""
     return lambda rays: sampler(rays, medium).exit_directions
 
 
 def grid_distances(shape: Ball | RoundedBox, resolution: int) -> Tensor:
-    """A shape's signed distance at the vertices of a grid."""
+    """Return the signed distances of a shape at the vertices of a grid."""
     axis = torch.linspace(-1.5, 1.5, resolution, dtype=torch.float64)
     planes = torch.stack(torch.meshgrid(axis, axis, indexing="ij"), -1)
     slices = [torch.cat([torch.full_like(planes[..., :1], float(x)), planes], -1) for x in axis]
@@ -244,7 +246,7 @@ def grid_distances(shape: Ball | RoundedBox, resolution: int) -> Tensor:
 
 
 def rounded_cube_mesh(per_edge: int = 24, per_face: int = 8) -> trimesh.Trimesh:
-    """A rounded cube with fine facets on edges and corners and coarse ones on the faces."""
+    """Return a rounded cube with fine facets on edges and corners and coarse facets on the faces."""
     inner = HALF_SIDE - EDGE
     # Tangents spaced evenly in angle over the rounding, and evenly over the flat part.
     bend = inner + EDGE * np.tan(np.linspace(0, np.pi / 4, per_edge + 1)[1:])
@@ -274,7 +276,7 @@ def rounded_cube_mesh(per_edge: int = 24, per_face: int = 8) -> trimesh.Trimesh:
 
 
 def view(side: int) -> Cameras:
-    """A camera as in the synthetic scenes: 39.6 degrees wide, 4.03 units from the origin."""
+    """Return a camera as in the synthetic scenes: 39.6 degrees wide, 4.03 units from the origin."""
     z = np.array([0.5, 0.6, 0.62]) / np.linalg.norm([0.5, 0.6, 0.62])
     x = np.cross([0.0, 0.0, 1.0], z)
     x /= np.linalg.norm(x)
@@ -284,7 +286,7 @@ def view(side: int) -> Cameras:
 
 
 def verdict(met: bool) -> str:
-    """A table cell."""
+    """Return the cell of a table."""
     return "yes" if met else "**no**"
 
 

@@ -1,14 +1,14 @@
-"""How fast training and rendering are, and what a time budget buys. Each part prints Markdown.
+"""Measure the speed of training and rendering, and the scores after a limited time. Each part prints Markdown.
 
     python benchmarks/training.py step                        # a step of the paper's recipe, plain and fast
     python benchmarks/training.py curve                       # their losses over 200 steps
     python benchmarks/training.py profile refractive          # parts of a step beside the bounds of the machine
-    python benchmarks/training.py paths                       # what live tracing costs of a step; see docs for one core
-    python benchmarks/training.py branches                    # what light that splits costs of a step
-    python benchmarks/training.py budget 00:00:05:00          # default preset and paper's recipe, given the same time
+    python benchmarks/training.py paths                       # share of live tracing in a step; see docs for one core
+    python benchmarks/training.py branches                    # cost of a step with light that splits
+    python benchmarks/training.py budget 00:00:05:00          # default preset and paper's recipe after the same time
     python benchmarks/training.py view RUN/checkpoints/last.ckpt   # rendering a 400x400 view
 
-The embedded scene, all cores unless OMP_NUM_THREADS and NUMBA_NUM_THREADS say otherwise.
+The parts use the embedded scene, and all cores unless OMP_NUM_THREADS and NUMBA_NUM_THREADS are set.
 """
 
 from __future__ import annotations
@@ -31,9 +31,7 @@ from typing import Any
 import lightning.pytorch as pl
 import numpy as np
 import torch
-from hydra import compose, initialize_config_dir
-from hydra.core.config_store import ConfigStore
-from omegaconf import DictConfig
+from omegaconf import OmegaConf
 from PIL import Image
 from torch.profiler import ProfilerActivity, profile, record_function
 from torch.utils.flop_counter import FlopCounterMode
@@ -44,14 +42,10 @@ from nerfro.evaluation.results import read_metrics_json
 from nerfro.fields.hash_grid import HashGridField
 from nerfro.kernels.allocator import keep_freed_memory
 from nerfro.kernels.available import fast_bfloat16
-from nerfro.paths import ASSETS_DIR, CONF_DIR
+from nerfro.paths import ASSETS_DIR
 from nerfro.rays import Rays
-from nerfro.registry import build, discover
-from nerfro.rendering import Renderer
 from nerfro.subdivision import Subdivision
-from nerfro.training.config import TrainConfig, build_model
-from nerfro.training.data_module import RayDataModule, traced
-from nerfro.training.module import TrainingModule
+from nerfro.training.data_module import RayDataModule
 from nerfro.training.ray_batches import RayBatches
 from nerfro.training.trainer import lightning_precision
 from nerfro.types import Batch
@@ -101,7 +95,10 @@ def main() -> None:
 
 
 class Steps(pl.Callback):
-    """Seconds by the clock and of the processor and total loss of every training step, from one's end to the next's."""
+    """Record wall-clock time, processor time and loss of each training step.
+
+    A step begins at the end of the previous step, so that its time includes its batch and the phases that precede it.
+    """
 
     def __init__(self) -> None:
         self.seconds: list[float] = []
@@ -122,27 +119,24 @@ class Steps(pl.Callback):
 
 
 class Training:
-    """An experiment on the embedded scene that can be trained for a few steps at a time, as nerfro.train does it.
+    """An experiment that can be trained for a few steps at a time, with all its phases.
+
+    The steps of phases before the training are taken once, in the first run.
 
     Args:
         overrides: Hydra overrides of conf/train.yaml.
     """
 
     def __init__(self, *overrides: str) -> None:
-        ConfigStore.instance().store(name="train_schema", node=TrainConfig, provider="nerfro")
-        discover()
-        with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
-            self.config: DictConfig = compose("train", [*overrides])
-        pl.seed_everything(self.config.seed, verbose=False)
-        wanted, views = self.config.batches, build(self.config.data).load("train")
-        self.renderer: Renderer = build_model(self.config, views)
-        self.module = TrainingModule.of(self.renderer, self.config)
-        batches = RayBatches(views, wanted.size, wanted.batching, self.config.seed)
-        self.batches = traced(batches, self.renderer, self.config)
-        self.num_rays = wanted.size
+        self.module, self.data = nerfro.build(overrides=[*overrides, "evaluation.every=0"])
+        checkpoint: dict[str, str] = {}
+        self.module.on_save_checkpoint(checkpoint)
+        self.config = OmegaConf.create(checkpoint["nerfro_config"])
+        self.renderer, self.batches = self.module.renderer, self.data.batches
+        self.num_rays = self.batches.batch_size
 
     def run(self, num_steps: int, data: RayDataModule | None = None, callbacks: Sequence[pl.Callback] = ()) -> Steps:
-        """Train for some steps with a new optimizer; what callbacks do at the end of a step counts as the next step."""
+        """Train for some steps with a new optimizer; the time of callbacks after a step counts for the next step."""
         steps = Steps()
         trainer = pl.Trainer(
             max_steps=num_steps,
@@ -157,17 +151,17 @@ class Training:
             num_sanity_val_steps=0,
             use_distributed_sampler=False,
         )
-        trainer.fit(self.module, datamodule=data or RayDataModule(self.batches, None, 0))
+        trainer.fit(self.module, datamodule=data or self.data)
         return steps
 
 
 def paper_recipe(experiment: str, *overrides: str) -> Training:
-    """The paper's recipe on the embedded scene; its index grid has 256 instead of 512 vertices a side."""
+    """Return the paper's recipe on the embedded scene, with an index grid of 256 instead of 512 vertices per side."""
     return Training(*EMBEDDED, f"+experiment={experiment}", MESH, "medium.resolution=256", *overrides)
 
 
 def report_step(turns: int, options: list[str]) -> None:
-    """A step of 1024 rays in single precision with every sample evaluated, and what makes it faster."""
+    """Measure a step of 1024 rays in single precision with every sample evaluated, and faster settings."""
     variants = {
         "plain: float32, every sample evaluated (`paper_refractive`)": paper_recipe(PLAIN, *options),
         "bfloat16 products (`trainer.precision=bf16-mixed`)": paper_recipe(
@@ -186,8 +180,9 @@ def report_step(turns: int, options: list[str]) -> None:
 
 
 def report_curve(steps: int, rays: int, options: list[str]) -> None:
-    """Total losses of plain and fast training from the same weights and pixels, against other pixels."""
-    rate = (*options, "optimizer.warmup_steps=0", f"batches.size={rays}")  # no warm-up, or nothing would be learned yet
+    """Compare total losses of plain and fast training from the same weights and pixels, and from other pixels."""
+    # With warm-up, the first 200 steps would learn nothing.
+    rate = (*options, "optimizer.warmup_steps=0", f"batches.size={rays}")
     bf16 = "trainer.precision=bf16-mixed"
     runs = {
         "plain": paper_recipe(PLAIN, *rate),
@@ -339,7 +334,7 @@ def write_images(folder: Path, pixels: int, views: int) -> None:
 
 
 class TracedInStep(RayDataModule):
-    """Paths are traced when a step asks for them, as where the medium learns."""
+    """Trace the paths of a batch within its step, as for a medium with learned parameters."""
 
     def train_dataloader(self) -> Iterator[int]:
         steps = super().train_dataloader()
@@ -348,7 +343,7 @@ class TracedInStep(RayDataModule):
 
 
 class ReadyBatches(TracedInStep):
-    """The batches of the first steps again and again, traced before training starts."""
+    """Repeat the batches of the first steps, traced before training starts."""
 
     def __init__(self, batches: RayBatches, num_steps: int) -> None:
         super().__init__(batches, None, 0)
@@ -360,21 +355,21 @@ class ReadyBatches(TracedInStep):
 
 
 def report_paths(turns: int, steps: int, options: list[str]) -> None:
-    """What live tracing costs of a step of the default preset, against the same batches made before.
+    """Measure the share of live tracing in a step of the default preset, against the same batches made before.
 
-    Ways take turns, and the median of each way's turns counts. Processor time is of all threads.
+    The methods alternate, and the median of the turns of each method counts. Processor time is of all threads.
     """
     training = Training("+experiment=refractive", *options)
     batches = training.batches
     ready = ReadyBatches(batches, steps)
-    ways: dict[str, Callable[[], RayDataModule]] = {
+    methods: dict[str, Callable[[], RayDataModule]] = {
         "ready before training": lambda: ready,
         "one step ahead (as trained)": lambda: RayDataModule(batches, None, 0),
         "in the step": lambda: TracedInStep(batches, None, 0),
     }
-    seconds: dict[str, list[tuple[float, float]]] = {name: [] for name in ways}
+    seconds: dict[str, list[tuple[float, float]]] = {name: [] for name in methods}
     for turn in range(turns + 1):
-        for name, make in ways.items():
+        for name, make in methods.items():
             begun = time.process_time()
             walls = training.run(steps, make()).seconds[1:]
             if turn > 0:  # the first one compiles and allocates
@@ -388,27 +383,27 @@ def report_paths(turns: int, steps: int, options: list[str]) -> None:
 
 
 def report_branches(turns: int, steps: int, options: list[str]) -> None:
-    """A step of the default preset with and without light that splits, and with a tint that learns, in turns.
+    """Measure a step of the default preset with and without light that splits, and with a learned tint, in turns.
 
-    Processor time is of all threads, and hardly depends on what else the machine does.
+    Processor time is of all threads, and hardly depends on other programs.
     """
     of_path = "sampler.path.branches"
-    ways = {
+    variants = {
         "none (`refractive`)": Training("+experiment=refractive", *options),
         "first": Training("+experiment=refractive", f"{of_path}=first", *options),
         "all": Training("+experiment=refractive", f"{of_path}=all", *options),
         "all, and the tint learns (`glass`)": Training("+experiment=glass", *options),
     }
-    seconds: dict[str, list[tuple[float, float]]] = {name: [] for name in ways}
+    seconds: dict[str, list[tuple[float, float]]] = {name: [] for name in variants}
     for turn in range(turns + 1):
-        for name, training in ways.items():
+        for name, training in variants.items():
             measured = training.run(steps)
             if turn > 0:  # the first one compiles and allocates
                 seconds[name].append((float(np.median(measured.seconds[1:])), float(np.median(measured.processor[1:]))))
     base = np.median(seconds["none (`refractive`)"], 0)
     print("| default preset, branches | paths a training ray | ms a step | processor, ms | against one path |")
     print("|---|---|---|---|---|")
-    for name, training in ways.items():
+    for name, training in variants.items():
         path = training.batches.batch(0).path
         assert path is not None
         wall, processor = np.median(seconds[name], 0)
@@ -417,7 +412,7 @@ def report_branches(turns: int, steps: int, options: list[str]) -> None:
 
 
 def label(stack: ExitStack, owner: object, method: str, name: str) -> None:
-    """Have a method's calls counted under a name in a profile, until the stack unwinds."""
+    """Count the calls of a method under a name in a profile, until the stack unwinds."""
     wrap(stack, owner, method, lambda: record_function(name))
 
 
@@ -434,7 +429,7 @@ def clock(stack: ExitStack, owner: object, method: str, name: str, seconds: dict
 
 
 def wrap(stack: ExitStack, owner: object, method: str, context: Callable[[], AbstractContextManager]) -> None:
-    """Have a method's calls run in a context, until the stack unwinds."""
+    """Run the calls of a method in a context, until the stack unwinds."""
     original = getattr(owner, method)
 
     def wrapped(*args: object, **kwargs: object) -> object:
@@ -458,16 +453,16 @@ def fastest(task: Callable[[], object], turns: int = 10) -> float:
 
 
 def timed(task: Callable[[], object]) -> float:
-    """Seconds of one call."""
+    """Return the seconds of one call."""
     start = time.perf_counter()
     task()
     return time.perf_counter() - start
 
 
 def report_budget(budget: str, out: Path, options: list[str]) -> None:
-    """Test scores of the default preset and of the paper's recipe after the same time on the embedded scene.
+    """Compare test scores of the default preset and the paper's recipe after the same time on the embedded scene.
 
-    The recipe in its fast form, which gets several times as many steps as the plain one.
+    The recipe has its fast settings, which allow several times as many steps as the plain settings.
     """
     commands = {"refractive": [], FAST: [*EMBEDDED, MESH, "medium.resolution=256"]}
     print(
@@ -491,9 +486,9 @@ def report_budget(budget: str, out: Path, options: list[str]) -> None:
 
 
 def report_view(checkpoint: Path, side: int, turns: int) -> None:
-    """Seconds to render a test camera's view with one ray a pixel and supersampled as trained; where the first go.
+    """Measure rendering of a test view with one ray per pixel, also by component, and with supersampling as in the run.
 
-    Processor time hardly depends on what else the machine does; the fastest of the turns counts.
+    Processor time hardly depends on other programs; the fastest of the turns counts.
     """
     scene = nerfro.load(checkpoint)
     cameras, model = scene.cameras("test").resized(side, side), scene.renderer
@@ -524,7 +519,7 @@ def report_view(checkpoint: Path, side: int, turns: int) -> None:
 
 
 def spent(task: Callable[[], object]) -> tuple[float, float]:
-    """Seconds of one call, by the clock and of the processor."""
+    """Return the wall-clock time and the processor time of one call, in seconds."""
     busy = time.process_time()
     return timed(task), time.process_time() - busy
 

@@ -20,7 +20,7 @@ from nerfro.media.sdf_grid import SdfGrid
 from nerfro.samplers.paths.snell import Snell
 from nerfro.silhouettes.silhouettes import mesh_silhouettes
 from nerfro.types import Exits
-from tests.cameras_at import cameras_at
+from tests.cameras_at import cameras_at, poses_towards_origin
 from tests.closed_forms import grid_points
 
 SIZE, NUM_VIEWS, RADIUS, INNER = 40, 30, 0.7, 0.35
@@ -47,13 +47,11 @@ RECONSTRUCTION_TRAINING = [
 
 def cameras() -> Cameras:
     """Around the origin, looking at it."""
-    index = torch.arange(NUM_VIEWS) + 0.5
+    index = np.arange(NUM_VIEWS) + 0.5
     z = 1 - 2 * index / NUM_VIEWS
-    flat, turn = (1 - z * z).sqrt(), 2.4 * index
-    back = torch.stack([flat * turn.cos(), flat * turn.sin(), z], -1)
-    right = normalize(torch.linalg.cross(torch.tensor([0.3, 0.9, 0.1]).expand_as(back), back), dim=-1)
-    poses = torch.stack([right, torch.linalg.cross(back, right), back, 3 * back], -1)
-    return cameras_at(poses, SIZE, SIZE, 0.8 * SIZE, near=0.5)
+    flat, turn = np.sqrt(1 - z * z), 2.4 * index
+    back = np.stack([flat * np.cos(turn), flat * np.sin(turn), z], -1)
+    return cameras_at(poses_towards_origin(back, 3.0, (0.3, 0.9, 0.1)), SIZE, SIZE, 0.8 * SIZE, near=0.5)
 
 
 def soft_masks(mesh: TriangleMesh) -> Tensor:

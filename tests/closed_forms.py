@@ -1,4 +1,4 @@
-"""Media whose rays are known in closed form, and what tests of optics share. Lengths are in world units."""
+"""Media with rays in closed form, and helpers of the tests of optics. Lengths are in world units."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -90,7 +90,7 @@ def grid_points(half_side: float, size: int, dtype: torch.dtype = torch.float32)
 
 
 def make_rays(origins: list | Tensor, directions: list | Tensor, near: float, far: float) -> Rays:
-    """Rays in double precision; directions are normalised."""
+    """Rays in double precision; directions are normalized."""
     o = torch.as_tensor(origins, dtype=torch.float64)
     d = torch.nn.functional.normalize(torch.as_tensor(directions, dtype=torch.float64), dim=-1)
     ones = torch.ones(len(o), dtype=torch.float64)

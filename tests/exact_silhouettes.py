@@ -1,4 +1,4 @@
-"""Masks that cameras around a body take of it, and hulls of them."""
+"""Masks of a body from cameras around it, and visual hulls of the masks."""
 
 import numpy as np
 import torch
@@ -11,7 +11,7 @@ from nerfro.data.base import Views
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.silhouettes.silhouettes import mesh_silhouettes
 from nerfro.silhouettes.visual_hull import Silhouettes, carve_mesh, find_box
-from tests.cameras_at import cameras_at
+from tests.cameras_at import cameras_at, poses_towards_origin
 
 
 def cameras_around(count: int, size: int, distance: float = 4.0, focal: float = 1.4, spread: float = 1.0) -> Cameras:
@@ -19,10 +19,9 @@ def cameras_around(count: int, size: int, distance: float = 4.0, focal: float = 
     z = 1 - spread * (2 * np.arange(count) + 1) / count
     turn = 2.4 * np.arange(count)
     back = np.stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z], -1)
-    right = np.cross([0.3, 0.9, 0.1], back)
-    right /= np.linalg.norm(right, axis=-1, keepdims=True)
-    poses = np.stack([right, np.cross(back, right), back, distance * back], -1)
-    return cameras_at(poses, size, size, focal * size, near=1.0, far=9.0)
+    return cameras_at(
+        poses_towards_origin(back, distance, (0.3, 0.9, 0.1)), size, size, focal * size, near=1.0, far=9.0
+    )
 
 
 def photographed(mesh: trimesh.Trimesh, cameras: Cameras) -> Silhouettes:

@@ -1,4 +1,4 @@
-"""Commands in processes of their own, to be signalled, killed and begun again.
+"""Commands in separate processes, which tests interrupt, kill and restart.
 
 A server that has imported what commands import forks the processes, so that starting one takes no seconds.
 """
@@ -75,10 +75,10 @@ class Command:
             time.sleep(0.005)
         return found
 
-    def send(self, how: signal.Signals) -> None:
+    def send(self, number: signal.Signals) -> None:
         assert self._process.pid is not None
         with contextlib.suppress(ProcessLookupError):  # it has ended meanwhile
-            os.kill(self._process.pid, how)
+            os.kill(self._process.pid, number)
 
     def wait(self, seconds: float = PATIENCE) -> int | None:
         """Its exit code when it has ended, negative if a signal did; None if it has not after so many seconds."""

@@ -1,4 +1,4 @@
-"""Python in processes of its own."""
+"""Python in separate processes."""
 
 import os
 import subprocess

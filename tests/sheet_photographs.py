@@ -1,4 +1,4 @@
-"""What the tests of capture share: photographs of printed sheets, from cameras that are known."""
+"""Helpers of the tests of calibration: photographs of printed sheets from known cameras."""
 
 from collections.abc import Sequence
 

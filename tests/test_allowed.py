@@ -1,4 +1,4 @@
-"""Which values annotations allow: in constructors, in configurations, and how the others are refused."""
+"""Values that annotations allow in constructors and configurations, and errors for other values."""
 
 import math
 from typing import Annotated, Literal
@@ -10,8 +10,8 @@ from nerfro.registry import create, discover, find
 from tests.conftest import refused
 
 
-@checked("thing")
-class Thing:
+@checked("component")
+class Component:
     def __init__(
         self,
         count: Count,
@@ -25,14 +25,14 @@ class Thing:
         self.count = count
 
 
-def test_what_is_allowed_passes() -> None:
-    assert Thing(1, rate=2, radius=None, sizes=[1, 2], mode="exact", anything=math.nan).count == 1
+def test_allowed_values_pass() -> None:
+    assert Component(1, rate=2, radius=None, sizes=[1, 2], mode="exact", anything=math.nan).count == 1
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"count": 0}, "thing: count=0 is not allowed; take at least 1"),
+        ({"count": 0}, "component: count=0 is not allowed; take at least 1"),
         ({"rate": 0}, "rate=0 is not allowed; take more than 0 and at most 2"),
         ({"rate": math.nan}, "rate=nan is not allowed"),
         ({"radius": math.inf}, "radius=inf is not allowed; take more than 0"),
@@ -42,8 +42,8 @@ def test_what_is_allowed_passes() -> None:
         ({"mode": "slow"}, "mode='slow' is not allowed; choose 'fast', 'exact'"),
     ],
 )
-def test_what_is_not_allowed_is_refused(arguments: dict[str, object], message: str) -> None:
-    refused(message, Thing, **{"count": 1, **arguments})
+def test_values_that_are_not_allowed_are_refused(arguments: dict[str, object], message: str) -> None:
+    refused(message, Component, **{"count": 1, **arguments})
 
 
 MESH = "embedded:torus/mesh.ply"
@@ -96,5 +96,5 @@ def test_options_of_plugins_that_are_out_of_range_are_refused(
 
 
 @pytest.mark.parametrize("box_max", [[1.0, 0.0, 1.0], [1.0, 1.0], [1.0, 1.0, math.nan], [1.0, 1.0, math.inf]])
-def test_what_is_no_box_is_refused(box_max: list[float]) -> None:
+def test_invalid_boxes_are_refused(box_max: list[float]) -> None:
     refused("is not a box; give three numbers each, min below max", corners_of_box, [0.0] * 3, box_max)

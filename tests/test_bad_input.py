@@ -125,6 +125,7 @@ def test_damaged_data_is_refused(
         (["nme=x"], ["nme is not a setting; did you mean name?"]),
         (["field=nrf"], ["Could not find 'field/nrf'", "Available options", "mip_nerf", "nerf"]),
         (["loss.opaque.start=1"], ["write +loss.opaque.weight=..., with a plus sign"]),
+        (["+loss.photometric.weight=1"], ["loss.photometric.weight has a value already", "without a plus sign"]),
         (["callbacks.early_stopping.patience=2"], ["not selected; add +callbacks=early_stopping"]),
         (["field.widht=3"], ["field.widht is not a setting; did you mean width?"]),
         (["+field.widht=3"], ["field.widht is not a setting; did you mean width?"]),
@@ -153,13 +154,13 @@ def test_damaged_data_is_refused(
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) and "=" in value[0] else "",
 )
-def test_mistake_on_the_command_line_is_told_in_one_line(
+def test_mistake_on_the_command_line_gives_a_one_line_error(
     overrides: list[str], words: list[str], require_refusal: Callable[..., None]
 ) -> None:
     require_refusal(words, *overrides)
 
 
-def test_a_field_that_rays_miss_is_told_before_training(
+def test_field_missed_by_all_rays_is_refused_before_training(
     train_here: Runner, tiny_run: list[str], tmp_path: Path
 ) -> None:
     sky = "boundary=skybox", "boundary.width=8"
@@ -177,7 +178,7 @@ def test_a_field_that_rays_miss_is_told_before_training(
     assert "pass the field's box" not in train_here(*run, *whole, f"hydra.run.dir={tmp_path / 'whole'}").out
 
 
-def test_straight_rays_without_an_object_ask_for_the_box(train: Runner, tiny_scene: Path, tmp_path: Path) -> None:
+def test_straight_rays_without_an_object_need_a_box(train: Runner, tiny_scene: Path, tmp_path: Path) -> None:
     root = tmp_path / "data"
     shutil.copytree(tiny_scene, root)
     (root / "mesh.ply").unlink()

@@ -22,7 +22,7 @@ def distance_to_ray(point: list[float], origin: torch.Tensor, direction: torch.T
     return float(torch.linalg.norm(offset - (offset @ direction) * direction))
 
 
-def test_ray_meets_the_point_that_is_projected_onto_its_pixel_by_hand():
+def test_ray_meets_the_point_that_projects_onto_its_pixel():
     # From (0, 0, 4) along -z: (0.4, 0.2, 0) lies 4 in front, so it is seen at 32 + 100 * 0.4 / 4 = 42 from the left
     # and 24 - 100 * 0.2 / 4 = 19 from the top: the corner of pixel (19, 42).
     pose = np.eye(4)[None, :3]
@@ -121,7 +121,7 @@ def test_tile_is_a_window_of_some_view(cameras):
     assert len(left) > 8
 
 
-def test_making_rays_never_waits_for_the_device(cameras):
+def test_ray_generation_does_not_synchronize_the_device(cameras):
     # Tensors on the meta device have no values: reading one on the host raises.
     there = cameras.to("meta")
     index = torch.zeros(4, dtype=torch.long, device="meta")
@@ -136,6 +136,6 @@ def test_directions_keep_their_precision_in_mixed_precision(cameras):
     assert torch.equal(mixed, cameras.image_rays(0).directions)
 
 
-def test_directions_stay_unit_where_the_rotation_is_rounded(cameras):
+def test_directions_have_unit_length_despite_rounded_rotations(cameras):
     rounded = replace(cameras, camera_to_world=(cameras.camera_to_world * 1000).round() / 1000)
     assert torch.allclose(rounded.image_rays(0).directions.norm(dim=-1), torch.ones(280), atol=1e-6)

@@ -1,4 +1,4 @@
-"""The simulated capture: photographs fit the truth that is kept apart, and the commands lead back to it."""
+"""The simulated capture: photographs match the separate ground truth, and the commands recover it."""
 
 import json
 import math
@@ -51,20 +51,20 @@ def few(mitsuba: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return photograph(tmp_path_factory.mktemp("few"), resolution=400, photographs=2, spp=4)
 
 
-def test_poses_are_only_in_the_truth(few: Path) -> None:
+def test_poses_are_written_only_to_the_truth(few: Path) -> None:
     beside = [path.relative_to(few).parts[0] for path in few.rglob("*") if path.is_file()]
     assert set(beside) == {"images", "masks", "truth", ".lock"}
     assert len(list((few / "images").iterdir())) == len(list((few / "masks").iterdir())) == 2
 
 
-def test_masks_are_the_true_surface_in_the_true_cameras(few: Path) -> None:
+def test_masks_match_the_true_surface_in_the_true_cameras(few: Path) -> None:
     views = OpenCVData(str(few / "truth")).load("train")
     assert min(overlaps_of_convex_body(views, load_mesh(few / "truth" / "mesh.ply").vertices)) > 0.99
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("mitsuba")
-def test_from_photographs_to_a_table(
+def test_commands_lead_from_photographs_to_scores(
     request: pytest.FixtureRequest,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,

@@ -1,4 +1,4 @@
-"""What every command shares: how it ends, and mistakes told in one line."""
+"""Behaviour that all commands share: exit codes, streams, and one-line messages for mistakes."""
 
 import io
 import os
@@ -26,7 +26,7 @@ from tests.conftest import composed, refused
 
 
 @pytest.mark.parametrize("num_lines", [1, 10_000])  # less and more than a pipe's buffer
-def test_a_reader_that_has_seen_enough_is_no_error(num_lines: int) -> None:
+def test_closed_output_pipe_is_no_error(num_lines: int) -> None:
     program = f"import nerfro.failures\nwith nerfro.failures.errors_in_one_line():\n    print('line\\n' * {num_lines})"
     reader, writer = os.pipe()
     os.close(reader)
@@ -38,7 +38,7 @@ def test_a_reader_that_has_seen_enough_is_no_error(num_lines: int) -> None:
     assert done.returncode == 141
 
 
-def test_streams_that_lack_characters_or_are_closed_are_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_limited_encoding_and_closed_streams_are_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
     written = io.BytesIO()
     for stream in (io.TextIOWrapper(written, "ascii"), None):
         monkeypatch.setattr(sys, "stdout", stream)
@@ -56,7 +56,7 @@ def test_streams_that_lack_characters_or_are_closed_are_no_error(monkeypatch: py
         ("--seed", "write key=value"),
     ],
 )
-def test_overrides_that_cannot_be_read_are_told_how_to_quote(override: str, hint: str) -> None:
+def test_unparsable_overrides_explain_quoting(override: str, hint: str) -> None:
     parser = OverridesParser.create()
     with pytest.raises(OverrideParseException) as caught:
         parser.parse_overrides([override])
@@ -78,20 +78,20 @@ def test_flags_may_stand_anywhere() -> None:
         refused(message, _flags_first, flags)
 
 
-def test_messages_are_one_line_whatever_files_are_called(capsys: pytest.CaptureFixture[str]) -> None:
+def test_messages_are_one_line_for_any_file_name(capsys: pytest.CaptureFixture[str]) -> None:
     assert in_one_line(NerfroError("a\nb\x1b.png does not exist")) == "a\\nb\\x1b.png does not exist"
 
     warn("a\nb.png is skipped")
     assert capsys.readouterr().out == "nerfro: warning: a\\nb.png is skipped\n"
 
 
-def test_killed_worker_of_a_launcher_is_no_bug() -> None:
+def test_killed_worker_of_a_launcher_is_not_reported_as_a_bug() -> None:
     loky = pytest.importorskip("joblib.externals.loky.process_executor")
     line = in_one_line(loky.TerminatedWorkerError("A worker was terminated.\n\nMore"))
     assert line == "A worker was terminated (TerminatedWorkerError); repeat the command to continue the sweep"
 
 
-def test_a_configuration_folder_that_does_not_exist_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_configuration_folder_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hydra._internal.hydra.ConfigLoaderImpl", GuardedConfigLoader)
     with (
         initialize_config_dir(str(CONF_DIR), version_base="1.3"),
@@ -100,7 +100,7 @@ def test_a_configuration_folder_that_does_not_exist_is_refused(monkeypatch: pyte
         compose("train", ["hydra.searchpath=[file:///no/where]"])
 
 
-def test_a_file_that_is_no_yaml_is_named_with_the_line(tmp_path: Path) -> None:
+def test_invalid_yaml_file_is_named_with_the_line(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     for content in ("seed: 1\nfield: {width: [\n", "seed: 1\nfield: !!python/object:os.system {}\n"):
         path.write_text(content)
@@ -116,13 +116,13 @@ def test_a_file_that_is_no_yaml_is_named_with_the_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("location", ["~nobody_of_that_name/run", "a\0b"])
-def test_paths_that_cannot_be_are_refused(location: str) -> None:
+def test_impossible_paths_are_refused(location: str) -> None:
     for take in (user_path, resolve_path):
         refused(r"give the full path|give another", take, location)
 
 
 @pytest.mark.parametrize("location", ["embedded:", "embedded:nothing", "embedded:_lpips", "embedded:.."])
-def test_what_is_not_embedded_is_refused(location: str) -> None:
+def test_unknown_embedded_scene_is_refused(location: str) -> None:
     refused("embedded scenes: torus", resolve_path, location)
 
 
@@ -160,7 +160,7 @@ def test_old_names_in_overrides_are_replaced_with_a_warning(
     refused(r"medium\.old_depth was removed .* leave it out", renamed_override, "medium.old_depth=3")
 
 
-def test_old_names_in_files_of_users_and_in_old_runs_are_replaced_with_a_warning(
+def test_old_names_in_files_and_old_runs_are_replaced_with_a_warning(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("nerfro.old_names.RENAMED", OLD_NAMES)

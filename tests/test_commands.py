@@ -65,11 +65,11 @@ def test_help_version_and_mistakes_do_not_wait_for_torch(arguments: list[str], p
         ("+metric=psnr", r"\+metric=psnr: all registered metrics are scored"),
     ],
 )
-def test_names_that_nothing_knows_are_refused(mistake: str, message: str) -> None:
+def test_unknown_names_are_refused(mistake: str, message: str) -> None:
     refused(message, DESCRIBED.require_known, ["seed=1", mistake])
 
 
-def test_the_cache_ends_when_a_plugin_changes(cache: Path) -> None:
+def test_changed_plugin_invalidates_the_cache(cache: Path) -> None:
     assert recall("train") is None
     remember("train", DESCRIBED)
     assert recall("train") == DESCRIBED
@@ -80,7 +80,7 @@ def test_the_cache_ends_when_a_plugin_changes(cache: Path) -> None:
     assert recall("train") is None
 
 
-def test_a_missing_option_is_told_with_an_example(run_here: Runner, unchecked: None) -> None:
+def test_missing_option_is_reported_with_an_example(run_here: Runner, unchecked: None) -> None:
     done = run_here("view", code=1)
     assert done.err == "nerfro: error: checkpoint=... is missing; for example: nerfro view checkpoint=outputs/first\n"
 
@@ -113,7 +113,7 @@ def test_completion_of_commands_options_and_choices(
     assert completions(["train", "trace", "view"], ["nerfro", word, ""]) == found
 
 
-def test_demo_opens_the_page_and_ends_with_the_score_in_one_line(
+def test_demo_opens_the_page_and_prints_the_score_in_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run_here: Runner
 ) -> None:
     program = "import json, sys; print('much'); print('nerfro: the page: http://localhost:1', flush=True)\n"
@@ -179,14 +179,14 @@ def test_every_command_is_listed_in_one_line() -> None:
     assert listed.returncode == 0
 
 
-def test_an_unknown_command_is_refused_in_one_line(script: Path) -> None:
+def test_unknown_command_is_refused_in_one_line(script: Path) -> None:
     refused = python(str(script), "trian")
     assert refused.returncode == 1
     assert refused.stderr.startswith("nerfro: error: there is no command 'trian'; did you mean train?")
     assert refused.stderr.count("\n") == 1
 
 
-def test_arguments_reach_the_command_and_its_status_comes_back(script: Path, cache: Path) -> None:
+def test_arguments_and_exit_status_are_passed_through(script: Path, cache: Path) -> None:
     remember("train", DESCRIBED)
     helped = python(str(script), "train", "seed=1", "--help")
     assert (helped.returncode, helped.stdout, helped.stderr) == (0, "All options.\n", "")
@@ -195,7 +195,7 @@ def test_arguments_reach_the_command_and_its_status_comes_back(script: Path, cac
     assert refused.stderr == "nerfro: error: sed is not a setting; did you mean seed?\n"
 
 
-def test_the_recorded_command_of_a_script_repeats_the_run(script: Path, tiny_run: list[str], tmp_path: Path) -> None:
+def test_recorded_command_of_a_script_repeats_the_run(script: Path, tiny_run: list[str], tmp_path: Path) -> None:
     options = [*tiny_run, "trainer.max_steps=1", f"hydra.run.dir={tmp_path / 'run'}"]
     done = python(str(script), "train", *options, folder=tmp_path)
     assert done.returncode == 0, done.stderr

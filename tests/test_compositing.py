@@ -32,7 +32,7 @@ def test_extreme_densities_stay_finite_and_have_finite_gradients(density: float)
     assert raw.grad.isfinite().all()
 
 
-def test_a_dense_ball_of_glass_absorbs_along_its_chords() -> None:
+def test_dense_ball_of_glass_absorbs_along_its_chords() -> None:
     # Beer-Lambert along a refracted ray: exp(-a l) with the chord l = 2 R cos t, sin t = b / (n R).
     radius, n, absorption = 0.8, 1.5, 1.7
     heights = torch.linspace(-0.75, 0.75, 11, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""Every registered plugin, local ones included, keeps the contract of its kind."""
+"""Every registered plugin, including local plugins, keeps the contract of its type."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Every kind of experiment on a GPU, pretended: nothing is left on the CPU, and it is known where the host waits."""
+"""Every type of experiment on a simulated GPU: all tensors are there, and the host waits only at known places."""
 
 import warnings
 

@@ -1,4 +1,4 @@
-"""Several processes that train one model: what one process would learn, stopped and resumed together."""
+"""Several processes that train one model learn the weights of one process, and stop and resume together."""
 
 import json
 import os
@@ -127,7 +127,7 @@ def require_alike(together: Path, alone: Path) -> None:
 
 
 @pytest.mark.slow
-def test_signal_to_one_process_stops_both_and_both_resume_to_learn_what_one_learns(
+def test_signal_stops_both_processes_and_resumed_weights_equal_those_of_one(
     small: list[str], train_here: Runner, start: Callable[..., subprocess.Popen[str]], tmp_path: Path
 ) -> None:
     stopped = start("two", *small)
@@ -186,7 +186,7 @@ def test_time_ends_both_processes_at_one_step(
         (["hydra.mode=MULTIRUN"], "a sweep (-m) cannot use several devices; start its runs one by one"),
     ],
 )
-def test_what_two_processes_cannot_do_is_refused_in_one_line(
+def test_unsupported_settings_of_two_processes_are_refused_in_one_line(
     overrides: list[str], message: str, tiny_run: list[str], train_here: Runner, tmp_path: Path
 ) -> None:
     folders = [f"hydra.run.dir={tmp_path / 'run'}", f"hydra.sweep.dir={tmp_path / 'sweep'}"]
@@ -212,7 +212,7 @@ def test_processes_do_not_exchange_buffers(strategy: str, tmp_path: Path) -> Non
     assert trainer.strategy._ddp_kwargs["broadcast_buffers"] is False
 
 
-def test_a_signal_is_not_lost_while_the_processes_agree() -> None:
+def test_signal_during_synchronization_is_not_lost() -> None:
     """It arrives after this process has said that there was none."""
     callback = StopOnSignal()
 
@@ -228,7 +228,7 @@ def test_a_signal_is_not_lost_while_the_processes_agree() -> None:
     assert trainer.should_stop
 
 
-def test_several_processes_exchange_a_few_times_a_second_and_not_at_each_step(tmp_path: Path) -> None:
+def test_processes_synchronize_a_few_times_per_second(tmp_path: Path) -> None:
     others = Mock(reduce_boolean_decision=Mock(side_effect=lambda decision, all: decision))
     others.broadcast = Mock(side_effect=lambda value: value)
     interruption, timer = StopOnSignal(), SharedTimer(timedelta(seconds=1000))

@@ -94,7 +94,7 @@ def test_reference_explains_every_option() -> None:
     assert unexplained == []
 
 
-def test_links_lead_to_files() -> None:
+def test_links_point_to_existing_files() -> None:
     generated = {CHECKOUT / "docs" / "reference" / name for name in ("commands.md", "configuration.md", "plugins.md")}
     for source in [*CHECKOUT.glob("*.md"), *CHECKOUT.glob("docs/**/*.md")]:
         text = re.sub(r"^```.*?^```", "", source.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
@@ -117,7 +117,7 @@ def test_code_of_the_library_page_executes(tmp_path: Path, monkeypatch: pytest.M
     assert max(len(repr(value)) for value in (build["model"].scene, build["components"].medium)) < 250
 
 
-def test_the_example_of_several_bodies_agrees_with_the_closed_form(
+def test_example_of_several_bodies_matches_closed_form(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -140,7 +140,7 @@ def test_job_files_are_scripts() -> None:
         assert checked.stderr == "", file
 
 
-def test_help_lists_what_plugins_add() -> None:
+def test_help_lists_plugins() -> None:
     names: dict[str, list[str]] = {"export": list(PLUGIN_EXPORTS), "synthesize": list(SCENES)}
     names["train"] = [plugin.name for plugin in plugins()]
     names["trace"] = [plugin.name for kind in ("medium", "surface", "sampler/path") for plugin in plugins(kind)]

@@ -45,7 +45,7 @@ def test_kernels_draw_the_same_numbers(num: int) -> None:
     assert torch.equal(torch.from_numpy(found), given.uniform(given.ray, num, "samples"))
 
 
-def test_a_number_depends_on_its_seed_step_stream_index_and_dimension_alone() -> None:
+def test_number_depends_only_on_seed_step_stream_index_and_dimension() -> None:
     given = draws()
     numbers = given.uniform(given.ray, 9, "samples")
     some = torch.tensor([400, 3, 3, 77])

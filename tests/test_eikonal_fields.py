@@ -123,14 +123,14 @@ def make_model(make_field: Callable[[], Field] = Slanted, **fields: Any) -> Rend
     return EikonalFields(parts, **{"resolution": 16, "box_min": [-5.0] * 3, "box_max": [5.0] * 3, **fields})
 
 
-def test_stages_have_their_shares_of_the_budget() -> None:
-    model = make_model(scene_share=0.5, index_share=0.3)
+def test_stages_split_the_budget() -> None:
+    model = make_model(scene_fraction=0.5, index_fraction=0.3)
     stages = [model.stage_at(progress) for progress in (0.0, 0.25, 0.5, 0.65, 0.9, 1.0)]
     assert [int(stage) for stage, _ in stages] == [SCENE, SCENE, INDEX, INDEX, INTERIOR, INTERIOR]
     assert [done for _, done in stages] == pytest.approx([0, 0.5, 0, 0.5, 0.5, 1])
 
 
-def test_each_stage_trains_its_own_part() -> None:
+def test_each_stage_trains_its_own_parameters() -> None:
     model = make_model(lambda: NerfField(width=8, depth=2, skip=1, view_width=8))
     torch.nn.init.normal_(model.scene.medium.last.weight, std=0.2)
     model.train()
@@ -145,7 +145,7 @@ def test_each_stage_trains_its_own_part() -> None:
     assert trained == {SCENE: {"scene"}, INDEX: {"index"}, INTERIOR: {"interior"}}
 
 
-def test_what_the_first_stage_saw_inside_the_box_is_dropped() -> None:
+def test_content_of_the_first_stage_inside_the_box_is_discarded() -> None:
     rays = example_rays()
     model = make_model().eval()
     first = model(rays)[-1]
@@ -176,7 +176,7 @@ RADIUS, SHELL, IOR = 0.6, 0.2, 1.33
 
 
 @pytest.mark.slow
-def test_the_index_of_a_homogeneous_ball_is_recovered(train_here: Runner, tmp_path: Path) -> None:
+def test_index_of_a_homogeneous_ball_is_recovered(train_here: Runner, tmp_path: Path) -> None:
     """From twelve images of 20x20 pixels before a known sky, from n = 1 on, within 2 %.
 
     The ball's surface is a shell in which the index rises smoothly, because a smooth field cannot be sharp.
@@ -203,7 +203,7 @@ def test_the_index_of_a_homogeneous_ball_is_recovered(train_here: Runner, tmp_pa
         "boundary.resolutions=[64]",
         f"boundary.image={tmp_path / 'sky.png'}",
         "optimizer={learning_rate: 1e-2, final_learning_rate: 1e-3, groups: {background.*: {learning_rate: 1e-9}}}",
-        "model={resolution: 64, blur: 1.5, num_levels: 3, scene_share: 0.003, index_share: 0.997}",
+        "model={resolution: 64, blur: 1.5, num_levels: 3, scene_fraction: 0.003, index_fraction: 0.997}",
         "batches.size=200",
         "trainer.max_steps=150",
         f"hydra.run.dir={tmp_path / 'run'}",

@@ -31,7 +31,7 @@ def pictures(tmp_path: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     return written
 
 
-def test_folder_of_pictures_is_scored_in_every_region(
+def test_folder_of_images_is_scored_in_every_region(
     tmp_path: Path, pictures: dict[str, tuple[np.ndarray, np.ndarray]], evaluate_here: Runner
 ) -> None:
     arguments = [f"{name}={tmp_path / name}" for name in ("predictions", "references", "masks")]
@@ -58,7 +58,7 @@ def test_folder_of_pictures_is_scored_in_every_region(
             assert sheet.width > 5 * 256  # prediction, reference, squared error, SSIM, FLIP
 
 
-def test_scores_stay_beside_the_predictions_and_are_not_replaced_unasked(
+def test_scores_are_written_beside_the_predictions_and_not_overwritten(
     tmp_path: Path, pictures: dict, evaluate_here: Runner
 ) -> None:
     folders = [f"predictions={tmp_path / 'predictions'}", f"references={tmp_path / 'references'}"]
@@ -69,7 +69,7 @@ def test_scores_stay_beside_the_predictions_and_are_not_replaced_unasked(
     evaluate_here(*folders, "overwrite=true")
 
 
-def test_damaged_picture_is_told_before_anything_is_scored(
+def test_damaged_image_is_refused_before_scoring(
     tmp_path: Path, pictures: dict, evaluate_here: Runner, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     last = tmp_path / "predictions" / "pen.png"
@@ -96,7 +96,7 @@ def test_contradictions_are_refused_in_one_line(arguments: list[str], message: s
     assert message in evaluate_here(*arguments, code=1).error
 
 
-def test_pictures_of_a_run_match_the_photographs_of_its_data(
+def test_images_of_a_run_match_the_photographs_of_its_data(
     trained_run: Path, tiny_scene: Path, tmp_path: Path, evaluate_here: Runner
 ) -> None:
     folders = [f"predictions={trained_run / 'images'}", f"references={tiny_scene / 'test'}"]
@@ -105,7 +105,7 @@ def test_pictures_of_a_run_match_the_photographs_of_its_data(
     assert [(view["name"], view["psnr"]) for view in again] == [(f["name"], pytest.approx(f["psnr"])) for f in run]
 
 
-def test_pictures_of_a_run_whose_data_set_has_moved(
+def test_images_of_a_run_with_a_moved_data_set_need_its_root(
     trained_run: Path, tiny_scene: Path, tmp_path: Path, evaluate_here: Runner
 ) -> None:
     run, config = tmp_path / "run", OmegaConf.load(trained_run / "config.yaml")

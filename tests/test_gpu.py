@@ -45,7 +45,7 @@ def step_on(device: str, overrides: list[str]) -> tuple[float, Tensor, Tensor]:
 
 
 @pytest.mark.parametrize("experiment", [name for name in EXPERIMENTS if "ablation_" not in name])
-def test_a_training_step_and_a_view_agree_with_the_cpu(
+def test_training_step_and_view_match_the_cpu(
     experiment: str, unchecked: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(TrainingModule, "global_step", STEP)
@@ -63,7 +63,7 @@ def test_a_training_step_and_a_view_agree_with_the_cpu(
     assert (view - expected_view).abs().amax(-1).quantile(0.98) < 2e-3
 
 
-def test_a_run_on_the_gpu_is_resumed_evaluated_rendered_and_exported(
+def test_run_on_the_gpu_is_resumed_evaluated_rendered_and_exported(
     train_here: Callable[..., Any], run_here: Callable[..., Any], tmp_path: Path
 ) -> None:
     run = tmp_path / "run"

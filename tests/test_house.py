@@ -58,7 +58,7 @@ def room(module: str) -> str:
 
 
 @pytest.mark.parametrize("module", sorted(FILES))
-def test_imports_point_down(module: str) -> None:
+def test_packages_import_only_lower_packages(module: str) -> None:
     below = ORDER[ORDER.index(room(module)) :]
     assert {other for other in IMPORTS[module] if room(other) not in below} == set()
 
@@ -71,7 +71,7 @@ def reachable(arrows: set[tuple[str, str]], start: str) -> set[str]:
     return found
 
 
-def test_the_graph_of_the_documentation_shows_the_imports() -> None:
+def test_graph_of_the_documentation_shows_the_imports() -> None:
     page = PACKAGE_DIR.parent / "docs" / "reference" / "architecture.md"
     if not page.is_file():
         pytest.skip("there is no checkout with the documentation")
@@ -84,7 +84,7 @@ def test_the_graph_of_the_documentation_shows_the_imports() -> None:
     assert {each: reachable(shown, each) for each in ORDER} == {each: reachable(imports, each) for each in ORDER}
 
 
-def test_no_modules_import_each_other_in_a_circle() -> None:
+def test_modules_have_no_circular_imports() -> None:
     left = dict(IMPORTS)
     while free := [module for module, others in left.items() if not others & left.keys()]:
         left = {module: others for module, others in left.items() if module not in free}
@@ -108,7 +108,7 @@ PROVIDED_BY = {
 }  # fmt: skip
 
 
-def test_the_package_imports_only_what_it_requires() -> None:
+def test_package_imports_only_required_dependencies() -> None:
     """A component that needs an extra is a plugin."""
     project = PACKAGE_DIR.parent / "pyproject.toml"
     if not project.is_file():
@@ -144,7 +144,7 @@ def test_commands_compose_call_and_print(module: str) -> None:
     assert {other for other in IMPORTS[module] if room(other) == "commands"} == set(), "commands share what lies below"
 
 
-def test_no_package_is_large() -> None:
+def test_packages_have_a_bounded_size() -> None:
     sizes = count_by_component(PACKAGE_DIR)
     assert {name: lines for name, lines in sizes.items() if lines > 3000 and name != "(top level)"} == {}
 

@@ -1,4 +1,4 @@
-"""A medium that learns must learn, whatever the model and the path sampler are made of."""
+"""Media are learned with any model and path sampler."""
 
 from pathlib import Path
 
@@ -13,20 +13,20 @@ from tests.paper import Eikonal
 FIELDS = {"width": 8, "depth": 2, "skip": 0}
 
 
-def test_a_medium_of_constant_index_learns_from_adaptive_paths() -> None:
+def test_medium_of_constant_index_learns_from_adaptive_paths() -> None:
     # At the start n is 1 everywhere and nothing bends, yet images must be able to say that something should.
     discover()
     medium = find("medium", "index_field").cls(**FIELDS)
     rays = make_rays([[-2.0, 0.3, 0.1], [-2.0, -0.2, 0.4]], [[1.0, 0, 0], [1.0, 0, 0]], 0.5, 4.0)
     sampler = Eikonal()
-    path = sampler.refine(sampler(rays, medium), rays, medium)
+    path = sampler.replay(sampler(rays, medium), rays, medium)
     assert not path.refracted.any()
     path.exit_directions[:, 1].sum().backward()
     assert medium.last.weight.grad.abs().max() > 0
 
 
 @pytest.mark.slow
-def test_an_index_that_is_off_is_mended_in_training(train_here: Runner, tmp_path: Path) -> None:
+def test_training_corrects_a_wrong_index(train_here: Runner, tmp_path: Path) -> None:
     save(photographs([1.45]), tmp_path / "ball")
     options = [*TRAINING, f"data.root={tmp_path / 'ball'}", f"medium.ior={1.02 * 1.45}", "medium.learn_ior=true"]
     options += ["optimizer.groups={bodies.*.ior: {learning_rate: 0.006, start: 60}}", "trainer.max_steps=220"]

@@ -28,7 +28,7 @@ def points() -> torch.Tensor:
     return torch.cartesian_prod(axis, axis)
 
 
-def test_numbers_worked_by_hand():
+def test_distortion_matches_a_manual_computation():
     point = torch.tensor([[0.5, -0.2]], dtype=torch.float64)  # r^2 = 0.29, r^4 = 0.0841
     one = lambda *a, **b: distort(point, torch.tensor([coefficients(*a, **b)], dtype=torch.float64))[0][0].tolist()  # noqa: E731
     assert one([0.1, 0.01]) == pytest.approx([0.5 * 1.029841, -0.2 * 1.029841])

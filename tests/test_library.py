@@ -18,12 +18,12 @@ from tests.conftest import UTM, Runner, moved_mesh, refused
 from tests.processes import printed_by
 
 
-def test_importing_nerfro_imports_nothing_heavy() -> None:
+def test_importing_nerfro_does_not_import_large_packages() -> None:
     source = "import sys, nerfro; print(*(m for m in ('torch', 'numpy', 'numba', 'hydra') if m in sys.modules))"
     assert printed_by("-c", source).strip() == ""
 
 
-def test_what_is_not_there_is_an_attribute_error() -> None:
+def test_missing_name_is_an_attribute_error() -> None:
     with pytest.raises(AttributeError, match="No nerfro attribute lod"):
         _ = nerfro.lod
     assert {"TrainedScene", "bend", "load"} <= set(nerfro.__all__) <= {*dir(nerfro), "__version__"}
@@ -31,7 +31,7 @@ def test_what_is_not_there_is_an_attribute_error() -> None:
         assert getattr(nerfro, name) is not None
 
 
-def test_a_run_is_loaded_rendered_and_exported(trained_run: Path, tmp_path: Path, run_here: Runner) -> None:
+def test_run_is_loaded_rendered_and_exported(trained_run: Path, tmp_path: Path, run_here: Runner) -> None:
     scene = nerfro.load(trained_run, device="cpu")
     cameras = scene.cameras("test")
     views = scene.render(cameras)
@@ -63,7 +63,7 @@ def test_a_run_is_loaded_rendered_and_exported(trained_run: Path, tmp_path: Path
 
 
 @pytest.mark.parametrize("interface", ["mesh", "sdf"])
-def test_bending_at_a_ball_is_as_in_closed_form(interface: str, tmp_path: Path, monkeypatch) -> None:
+def test_paths_through_a_ball_match_closed_form(interface: str, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setenv("NERFRO_CACHE", str(tmp_path / "cache"))
     ball, heights = trimesh.creation.icosphere(5, 0.8), np.linspace(-0.7, 0.7, 15)
     origins = np.stack([0 * heights - 4, heights, 0 * heights], -1)
@@ -106,7 +106,7 @@ def test_rays_that_begin_on_a_face_of_a_slab_do_not_cross_the_face(tmp_path: Pat
         (([0, 0, 0], [1, 0, 0]), "must both be"),
     ],
 )
-def test_rays_that_are_none_are_refused(rays: tuple, message: str, tmp_path: Path) -> None:
+def test_invalid_rays_are_refused(rays: tuple, message: str, tmp_path: Path) -> None:
     refused(message, nerfro.bend, tmp_path / "ball.ply", 1.5, *rays)
     with pytest.raises(NerfroError, match="resolution=9 is not allowed; give at least 10"):
         nerfro.bend(tmp_path / "ball.ply", 1.5, [[0, 0, 0]], [[1, 0, 0]], resolution=9)

@@ -1,4 +1,4 @@
-"""Light adds: transfer function, polylines of a ray, radiance from parts to pixels, and what a model learns."""
+"""Addition of light: transfer function, polylines of a ray, radiance of pixels, and learned parameters."""
 
 from dataclasses import replace
 from pathlib import Path as FilePath
@@ -13,7 +13,7 @@ from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.files import lat_long
 from nerfro.light import to_linear, to_srgb
 from nerfro.losses.base import Loss
-from nerfro.losses.boundary import BoundaryRegulariser
+from nerfro.losses.boundary import BoundaryRegularizer
 from nerfro.losses.photometric import Photometric
 from nerfro.models.refractive import RefractiveModel
 from nerfro.registry import find
@@ -47,14 +47,14 @@ def rendered(path: Path) -> Tensor:
         return model.render_path(path)[-1].rgb
 
 
-def test_a_ray_is_the_sum_of_its_polylines_weighted_by_throughput() -> None:
+def test_ray_is_the_sum_of_its_polylines_weighted_by_throughput() -> None:
     both = rendered(split_path(0.3))
     expected = 0.7 * rendered(example_path()) + 0.3 * rendered(straight_path(example_rays()))
     assert both.shape == (NUM_RAYS, 3)
     torch.testing.assert_close(both, expected)
 
 
-def test_opacity_and_depth_are_those_of_rays() -> None:
+def test_opacity_and_depth_belong_to_rays() -> None:
     path = split_path(0.25)
     samples = Stratified(8)(path, None)
     density = torch.zeros_like(samples.s)
@@ -76,8 +76,8 @@ def test_random_numbers_are_drawn_for_each_ray(sampler: Stratified | Hierarchica
     assert torch.equal(samples.s[::2], sampler(same, None, example_draws()).s), "and splitting changes nobody's"
 
 
-@pytest.mark.parametrize("loss", [Photometric(), BoundaryRegulariser(), find("loss", "distortion").cls()])
-def test_losses_take_rays_that_split(loss: Loss) -> None:
+@pytest.mark.parametrize("loss", [Photometric(), BoundaryRegularizer(), find("loss", "distortion").cls()])
+def test_losses_accept_rays_that_split(loss: Loss) -> None:
     model, batch = RefractiveModel(example_components()).eval(), example_batch()
     with torch.no_grad():
         bent = model.render_path(example_path())
@@ -97,7 +97,7 @@ def test_samples_follow_the_gradients_of_their_path() -> None:
         torch.testing.assert_close(samples.positions.detach(), sampler(path, None).positions, atol=1e-5, rtol=0)
 
 
-def test_exits_begin_where_the_last_straight_run_does() -> None:
+def test_exits_begin_at_the_last_straight_segment() -> None:
     path = example_path()
     exits = path.exits()
     straight = ~path.refracted
@@ -110,7 +110,7 @@ def test_exits_begin_where_the_last_straight_run_does() -> None:
 # --- linear radiance ---
 
 
-def test_a_pixel_is_the_encoded_mean_of_radiance_not_the_mean_of_its_code() -> None:
+def test_pixel_is_the_encoded_mean_of_radiance() -> None:
     one = torch.zeros(1, dtype=torch.long)
     batch = replace(
         example_batch(), ray_pixel=one.expand(NUM_RAYS), pixel_number=one, view=one, rgb=torch.zeros(1, 3),
@@ -122,7 +122,7 @@ def test_a_pixel_is_the_encoded_mean_of_radiance_not_the_mean_of_its_code() -> N
 
 
 @pytest.mark.parametrize("suffix", [".hdr", ".exr"])
-def test_lamps_of_a_sky_survive_a_file_and_a_texture(tmp_path: FilePath, suffix: str) -> None:
+def test_bright_lights_of_a_sky_survive_a_file_and_a_texture(tmp_path: FilePath, suffix: str) -> None:
     sky = torch.full((32, 64, 3), 0.02)
     sky[8:16, 16:32] = torch.tensor([40.0, 25.0, 10.0])
     lat_long.save_lat_long(tmp_path / f"sky{suffix}", sky)
@@ -135,14 +135,14 @@ def test_lamps_of_a_sky_survive_a_file_and_a_texture(tmp_path: FilePath, suffix:
     assert lat_long.load_lat_long(tmp_path / f"again{suffix}").max() > 35
 
 
-def test_a_png_sky_is_decoded_and_encoded_again(tmp_path: FilePath) -> None:
+def test_png_sky_is_decoded_and_encoded(tmp_path: FilePath) -> None:
     levels = torch.linspace(0, 1, 64).expand(32, 64)[..., None].expand(-1, -1, 3)
     lat_long.save_lat_long(tmp_path / "sky.png", to_linear(levels))
     torch.testing.assert_close(to_srgb(lat_long.load_lat_long(tmp_path / "sky.png")), levels, rtol=0, atol=1 / 400)
 
 
 @pytest.mark.parametrize("num_channels", [1, 3])
-def test_a_sky_of_16_bits_keeps_its_levels(tmp_path: FilePath, num_channels: int) -> None:
+def test_sky_of_16_bits_keeps_its_levels(tmp_path: FilePath, num_channels: int) -> None:
     levels = np.random.default_rng(0).integers(0, 65536, (4, 8, num_channels), dtype=np.uint16)
     cv2.imwrite(str(tmp_path / "sky.png"), levels[..., ::-1])
     expected = to_linear(torch.from_numpy(levels / 65535).float()).expand(-1, -1, 3)
@@ -152,7 +152,7 @@ def test_a_sky_of_16_bits_keeps_its_levels(tmp_path: FilePath, num_channels: int
 # --- what learns ---
 
 
-def test_all_that_learns_has_a_group_and_a_rate() -> None:
+def test_every_learned_parameter_has_a_group_and_a_learning_rate() -> None:
     model = RefractiveModel(example_components())
     assert all(name.startswith("fields.0.") for name in model.parameters_by_name())
     model.scene.medium.index = torch.nn.Parameter(torch.tensor(1.5))
@@ -166,7 +166,7 @@ def test_all_that_learns_has_a_group_and_a_rate() -> None:
     assert model.paths_learn
 
 
-def test_middle_grey_and_the_ends_are_the_standards() -> None:
+def test_srgb_curve_matches_the_standard() -> None:
     torch.testing.assert_close(to_linear(torch.tensor([0.0, 0.5, 1.0])), torch.tensor([0.0, 0.214041, 1.0]))
 
 
@@ -179,7 +179,7 @@ def test_encoding_undoes_decoding_with_finite_gradients() -> None:
     assert srgb.grad.isfinite().all()
 
 
-def test_arrays_are_coded_as_tensors_are() -> None:
+def test_arrays_are_encoded_like_tensors() -> None:
     values = np.linspace(0, 1.5, 24, dtype=np.float32).reshape(4, 6)[::-1]  # negative strides, as in flipped pictures
     for code in (to_linear, to_srgb):
         np.testing.assert_array_equal(code(values), code(torch.tensor(values.copy())).numpy())

@@ -22,12 +22,15 @@ from nerfro.data.base import DataSource, Views
 from nerfro.data.blender import BlenderData
 from nerfro.losses.base import Loss
 from nerfro.media.base import Medium
+from nerfro.media.shapes import Ball
 from nerfro.media.surface import Surface
 from nerfro.paths import PLUGINS_DIR
 from nerfro.registry import KINDS, discover, find, plugins, register
 from nerfro.samplers.base import PathSampler, PointSampler
-from nerfro.testing import ContractError, check, check_export, example_batch, example_draws, example_views
-from nerfro.training.phases.base import Phase, Run
+from nerfro.samplers.paths.snell import Snell
+from nerfro.testing import ContractError, check, check_export, example_batch, example_draws, example_rays, example_views
+from nerfro.training.phases import base as phase_base
+from nerfro.training.phases.base import Phase, TrainingRun
 from nerfro.training.ray_batches import RayBatches
 from nerfro.viewing import PLUGIN_EXPORTS
 from nerfro.viewing.exports import Export, find_export
@@ -79,7 +82,7 @@ def write_plugin(tmp_path: Path) -> Callable[[str, str], Path]:
         ("1 / 0", "ZeroDivisionError: division by zero"),
     ],
 )
-def test_plugin_that_fails_is_named_with_the_cause(
+def test_failing_plugin_is_named_with_the_cause(
     source: str, cause: str, write_plugin: Callable[[str, str], Path]
 ) -> None:
     folder = write_plugin("broken", source)
@@ -114,7 +117,7 @@ def test_metric_that_cannot_be_scored_is_refused_with_its_file(
     assert advice in refused(f"^plugin {folder / 'worst_metric.py'}: metric=worst: class Worst ", discover, folder)
 
 
-def test_metric_without_a_title_is_called_by_its_name(write_plugin: Callable[[str, str], Path]) -> None:
+def test_metric_without_a_title_has_its_name(write_plugin: Callable[[str, str], Path]) -> None:
     discover(write_plugin("worst_metric", METRIC))
     check(find("metric", "worst"))
     assert find("metric", "worst").cls.title == "worst"
@@ -145,7 +148,7 @@ def loss(forward: Callable[..., object]) -> dict[str, object]:
 def phase(step: Callable[[nn.Parameter], object] = lambda _: True, **members: object) -> dict[str, object]:
     """Return the members of a phase with one step, which may change a parameter."""
 
-    def first(run: Run) -> nn.Parameter:
+    def first(run: TrainingRun) -> nn.Parameter:
         return next(iter(run.renderer.parameters_by_name().values()))
 
     return {"steps_before": lambda _, step: 1, "step": lambda _, run, number, state: step(first(run)), **members}
@@ -183,7 +186,7 @@ def ramp(slope: float, start: float) -> dict[str, object]:
 
 
 @pytest.mark.parametrize("members", [lens(-2.0), ramp(0.1, 1.4), ramp(1e-6, 1.4)], ids=["lens", "step", "constant"])
-def test_a_medium_of_varying_index_keeps_its_contract(members: dict[str, object]) -> None:
+def test_medium_of_varying_index_keeps_its_contract(members: dict[str, object]) -> None:
     register("medium", "broken")(type("Lens", (Medium,), {"__doc__": "Lens.", "__module__": __name__, **members}))
     check(find("medium", "broken"))
 
@@ -232,7 +235,7 @@ def test_a_medium_of_varying_index_keeps_its_contract(members: dict[str, object]
         ("data", DataSource, {"load": None, "splits": ["train"]}, "has the attribute `root`"),
     ],
 )
-def test_check_names_the_broken_contract(kind: str, base: type, members: dict[str, object], contract: str) -> None:
+def test_check_names_the_violated_contract(kind: str, base: type, members: dict[str, object], contract: str) -> None:
     register(kind, "broken")(type("Broken", (base,), {"__doc__": "Broken.", "__module__": __name__, **members}))
     with pytest.raises(ContractError, match=contract):
         check(find(kind, "broken"))
@@ -246,9 +249,17 @@ def test_old_names_work_with_a_warning() -> None:
         assert batch.index is batch.pixel_number
     with pytest.warns(UserWarning, match="CameraModel"):
         assert camera.base.Camera is camera.base.CameraModel
+    path = Snell()(example_rays(), Ball())
+    with pytest.warns(UserWarning, match="Path.surface is called Path.surface_body, which counts from 1"):
+        assert torch.equal(path.surface + 1, path.surface_body)
+    with pytest.warns(UserWarning, match="TrainingRun"):
+        assert phase_base.Run is TrainingRun
     with pytest.warns(UserWarning, match="after_step is called update"):
         old = type("Old", (PointSampler,), {"after_step": lambda sampler, fields, draws: 7, "forward": None})
     assert old().update([], example_draws()) == 7
+    with pytest.warns(UserWarning, match="Bent.refine is called replay"):
+        bent = type("Bent", (PathSampler,), {"refine": lambda sampler, path, rays, medium: 7, "forward": None})
+    assert bent().replay(None, None, None) == 7
     batches = RayBatches(example_views(), 4)
     with pytest.warns(UserWarning, match="for_rank"):
         assert torch.equal(batches.share(1, 2).batch(0).rgb, batches.for_rank(1, 2).batch(0).rgb)
@@ -382,7 +393,7 @@ def writer(*names: str, text: str | None = "a file") -> Callable[..., str | None
         (Export((".csv",), writer("scene.csv", "scene.mtl"), (".mtl",)), None),
     ],
 )
-def test_check_names_the_broken_contract_of_an_export(
+def test_check_names_the_violated_contract_of_an_export(
     export: Export, contract: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "broken_export", SimpleNamespace(EXPORT=export))  # type: ignore[arg-type]
@@ -446,7 +457,7 @@ def test_list_shows_every_plugin_with_its_fields_defaults_and_summary(run_here: 
         ("field=x", "no field is called 'x'; known: "),
     ],
 )
-def test_list_of_nothing_known_is_refused(argument: str, message: str, run_here: Runner) -> None:
+def test_list_of_unknown_plugins_is_refused(argument: str, message: str, run_here: Runner) -> None:
     assert message in run_here("plugins", argument, code=1).error
 
 

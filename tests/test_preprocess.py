@@ -1,4 +1,4 @@
-"""`python -m nerfro.preprocess`: what it writes, the command that it prints, and what it refuses."""
+"""`python -m nerfro.preprocess`: its files, the command that it prints, and refused options."""
 
 import json
 import re
@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 
 from nerfro.capture import refinement
-from nerfro.capture.refinement import RefinementSettings, Stage
+from nerfro.capture.refinement import DescentStage, RefinementSettings
 from nerfro.data.base import Frame, Views
 from nerfro.geometry.mesh import load_mesh
 from nerfro.media.bodies import BodySettings
@@ -60,7 +60,7 @@ def _change_masks(capture: Path, change: Callable[[np.ndarray], np.ndarray], cou
         Image.fromarray(change(np.array(Image.open(path)))).save(path)
 
 
-def test_ball_from_its_silhouettes(preprocess: Callable[..., str], capture: Path) -> None:
+def test_preprocess_carves_a_ball_from_its_silhouettes(preprocess: Callable[..., str], capture: Path) -> None:
     printed = preprocess("medium.ior=1.33")
     surface = load_mesh(capture / "mesh.ply")
     assert surface.is_closed
@@ -88,12 +88,11 @@ def test_printed_command_trains(
 ) -> None:
     command = shlex.split(preprocess("smoothing=0").split("train on it: ")[1])[3:]
     small = [text for text in tiny_default_run if not text.startswith(("data.root=", "medium."))]
-    train_here(*small, *command, "trainer.max_steps=1", "evaluation.split=train", "evaluation.every=0")
+    trained = train_here(*small, *command, "trainer.max_steps=1", "evaluation.split=train", "evaluation.every=0")
+    assert "1 steps in" in trained.out
 
 
-def test_a_vessel_stands_upright_in_a_world_whose_z_points_elsewhere(
-    preprocess: Callable[..., str], capture: Path
-) -> None:
+def test_vessel_is_upright_in_a_world_with_another_z_axis(preprocess: Callable[..., str], capture: Path) -> None:
     lengths = ["medium=vessel", "medium.wall=0.1", "medium.level=1.0", "smoothing=0"]
     printed = preprocess(*lengths)
     # The cameras' right-hand axes are perpendicular to it, see `capture`.
@@ -105,12 +104,12 @@ def test_a_vessel_stands_upright_in_a_world_whose_z_points_elsewhere(
     assert "set medium.up=" not in preprocess(*lengths, "medium.up=[0,0,1]", "overwrite=true")
 
 
-def test_a_body_of_revolution_is_fitted_where_it_is_asked_for(preprocess: Callable[..., str], capture: Path) -> None:
+def test_body_of_revolution_is_fitted_on_request(preprocess: Callable[..., str], capture: Path) -> None:
     assert "as a body of revolution" in preprocess("medium.ior=1.33", "symmetry=axis", "smoothing=0")
     assert abs(radii(capture).mean() - RADIUS) < 0.06
 
 
-def test_a_vessel_is_fitted_where_it_is_asked_for(preprocess: Callable[..., str], capture: Path) -> None:
+def test_vessel_is_fitted_on_request(preprocess: Callable[..., str], capture: Path) -> None:
     printed = preprocess("medium.ior=1.33", "smoothing=0", "vessel=true", "room=false", "data.downscale=2")
     command = shlex.split(printed.split("train on the vessel: ")[1])
     assert command[3:] == [f"scene={capture / 'scene.json'}", "medium=vessel"]
@@ -119,7 +118,7 @@ def test_a_vessel_is_fitted_where_it_is_asked_for(preprocess: Callable[..., str]
     assert all(0 < scene.vessel[name] < RADIUS for name in ("wall", "foot", "fillet"))
 
 
-def test_nothing_is_overwritten_unasked(preprocess: Callable[..., str], capture: Path) -> None:
+def test_existing_files_are_not_overwritten(preprocess: Callable[..., str], capture: Path) -> None:
     (capture / "mesh.ply").write_text("mine")
     assert "mesh.ply exists; give another out=... or overwrite=true" in preprocess()
     assert (capture / "mesh.ply").read_text() == "mine"
@@ -136,7 +135,7 @@ def test_supplied_mesh_is_compared_and_kept(preprocess: Callable[..., str], capt
     assert json.loads((capture / "overlaps.json").read_text())["mean"] > 0.97
 
 
-def test_the_index_of_a_named_body_without_material_is_searched(preprocess: Callable[..., str], capture: Path) -> None:
+def test_index_of_a_named_body_without_material_is_estimated(preprocess: Callable[..., str], capture: Path) -> None:
     save(photographs([1.45]), capture, UTM)
     ball = f"bodies={{ball: {{mesh: {capture / 'mesh.ply'}, absorption: [0.1]}}}}"
     printed = preprocess(f"mesh={capture / 'mesh.ply'}", ball, "room=false", "data.near=0.5")
@@ -146,10 +145,10 @@ def test_the_index_of_a_named_body_without_material_is_searched(preprocess: Call
     assert found.absorption == [0.1]
 
 
-def test_a_hull_far_from_the_origin_is_searched_and_refined(
+def test_index_search_and_refinement_work_far_from_the_origin(
     preprocess: Callable[..., str], capture: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    quick = RefinementSettings((Stage(25, 5e-4, (3.0, 1.0)),), 1000, (8,))
+    quick = RefinementSettings((DescentStage(25, 5e-4, (3.0, 1.0)),), 1000, (8,))
     monkeypatch.setattr(refinement, "RefinementSettings", lambda: quick)
     place = 200.0, 0.0, 0.0
     save(photographs([1.45]), capture, place)
@@ -176,13 +175,13 @@ def test_data_without_masks_is_refused(preprocess: Callable[..., str], tiny_scen
         (
             lambda mask: np.maximum(mask, 255 * (np.arange(SIZE) < 15)).astype(np.uint8),
             NUM_VIEWS,
-            f"frame cuts the object in all {NUM_VIEWS}",
+            f"border cuts the object in all {NUM_VIEWS}",
         ),
         (lambda mask: np.roll(mask, 20, 1), 1, "check the masks and poses of train/r_0, and .* wrong_masks=1"),
     ],
     ids=["empty", "inverted", "size", "cut", "wrong"],
 )
-def test_wrong_masks_give_one_line(
+def test_wrong_masks_give_a_one_line_error(
     preprocess: Callable[..., str], capture: Path, change: Callable, count: int, message: str
 ) -> None:
     _change_masks(capture, change, count)
@@ -205,7 +204,7 @@ def test_views_from_one_side_are_bounded_by_the_box(preprocess: Callable[..., st
     assert load_mesh(capture / "mesh.ply").bounds[1, 2] < 0.6
 
 
-def test_options_out_of_range(preprocess: Callable[..., str]) -> None:
+def test_options_out_of_range_are_refused(preprocess: Callable[..., str]) -> None:
     assert "resolution=8 is not allowed" in preprocess("resolution=8")
     assert "give both box_min and box_max" in preprocess("box_min=[0,0,0]")
     assert "add out=FOLDER" in preprocess("data.root=embedded:torus")
@@ -217,7 +216,7 @@ def test_options_out_of_range(preprocess: Callable[..., str]) -> None:
             assert "first body, which must" in preprocess(f"bodies={bodies}", option)
 
 
-def test_a_hull_needs_masks_of_some_views_only(preprocess: Callable[..., str], capture: Path) -> None:
+def test_hull_needs_masks_of_only_some_views(preprocess: Callable[..., str], capture: Path) -> None:
     for view in range(0, NUM_VIEWS, 2):
         (capture / "masks" / "train" / f"r_{view}.png").unlink()
     frame = Frame("", capture / "train" / "r_1.png", capture / "masks" / "train" / "r_1.png", np.eye(4)[:3])
@@ -238,10 +237,10 @@ def test_disagreeing_masks_name_the_number_that_may_be_wrong(preprocess: Callabl
     # The hull alone: the fit finds most of the side again.
     printed = preprocess("smoothing=0")
     assert "overlap below 0.9" in printed
-    told = re.search(r"wrong_masks=(\d)", printed)
-    assert told is not None
+    suggested = re.search(r"wrong_masks=(\d)", printed)
+    assert suggested is not None
     before = json.loads((capture / "overlaps.json").read_text())["views"]
-    again = preprocess(f"wrong_masks={told[1]}", "smoothing=0", "overwrite=true")
+    again = preprocess(f"wrong_masks={suggested[1]}", "smoothing=0", "overwrite=true")
     assert "wrong_masks=" not in again
     after = json.loads((capture / "overlaps.json").read_text())["views"]
     whole = [f"train/r_{view}" for view in range(1, NUM_VIEWS)]

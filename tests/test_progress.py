@@ -1,4 +1,4 @@
-"""Work that may take long before training starts says how far it is."""
+"""Progress of long work before training."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from nerfro import progress
 from tests.conftest import Runner
 
 
-def test_pictures_and_grids_have_bars_once_they_take_long(
+def test_long_renderings_and_grids_have_progress_bars(
     train_paper: Runner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for delay, has_bars in ((1e9, False), (0, True)):
@@ -19,7 +19,7 @@ def test_pictures_and_grids_have_bars_once_they_take_long(
             assert (f"{work}: 100%" in finished.err) == has_bars
 
 
-def test_a_log_file_receives_whole_lines_once_per_minute(
+def test_log_file_receives_whole_lines_once_per_minute(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for seconds, num_lines in ((60.0, 2), (0.0, 4)):  # the first and the last state, or all of them

@@ -1,4 +1,4 @@
-"""`python -m nerfro.reconstruct`: stages in their order, what is kept, what is made again, and how it fails."""
+"""`python -m nerfro.reconstruct`: the order of stages, kept and repeated results, and failures."""
 
 import functools
 import json
@@ -22,9 +22,9 @@ from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.files.images import save_png
 from nerfro.files.reading import open_image
 from nerfro.overrides import print_next, without_hints
-from nerfro.pipeline import stages
+from nerfro.pipeline import stage
 from nerfro.pipeline.hypotheses import Hypothesis
-from nerfro.pipeline.stages import terminated_in_one_line
+from nerfro.pipeline.stage import terminated_in_one_line
 from tests.ball_photographs import RECONSTRUCTION, RECONSTRUCTION_TRAINING, save_with_masks
 from tests.conftest import Runner, refused, weights_of
 from tests.poses.camera_calibration import collection
@@ -54,7 +54,7 @@ def test_photographs_that_differ_in_their_extension_are_refused(photos: Path, tm
     refused("several images named IMG_1", collection.link_photographs, photos, None, tmp_path / "out")
 
 
-def test_a_photograph_beside_its_heic_original_is_used(photos: Path, tmp_path: Path) -> None:
+def test_photograph_beside_its_heic_original_is_used(photos: Path, tmp_path: Path) -> None:
     (photos / "IMG_1.heic").touch()
     collection.link_photographs(photos, None, tmp_path / "out")
     assert {file.name for file in (tmp_path / "out" / "images").iterdir()} == {f"IMG_{i}.png" for i in range(3)}
@@ -109,7 +109,7 @@ def test_other_photographs_are_named_and_no_file_is_deleted(
 
 
 @pytest.mark.parametrize("suffix", [".JPG", ".heic"])
-def test_photographs_of_a_telephone_become_upright_and_keep_their_masks(suffix: str, tmp_path: Path) -> None:
+def test_photographs_of_a_phone_become_upright_and_keep_their_masks(suffix: str, tmp_path: Path) -> None:
     if suffix == ".heic":
         pytest.importorskip("pillow_heif").register_heif_opener()
     lying, exif = Image.new("RGB", (96, 64), (200, 30, 30)), Image.Exif()
@@ -195,7 +195,7 @@ class Pretended:
 @pytest.fixture
 def pretended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pretended:
     made = Pretended(tmp_path / "out")
-    monkeypatch.setattr(stages, "call", made)
+    monkeypatch.setattr(stage, "call", made)
     return made
 
 
@@ -210,7 +210,7 @@ TRIALS = ["train"] * 3  # straight rays, solid body, vessel
 ALL = ["calibrate", "preprocess", *TRIALS, "train", "summary", "export"]
 
 
-def test_photographs_pass_all_stages_once(reconstruct: Runner, pretended: Pretended) -> None:
+def test_photographs_pass_every_stage_once(reconstruct: Runner, pretended: Pretended) -> None:
     options = "medium.resolution=64", "train=trainer.max_steps=3 logger=none", "preprocess=keep=1"
     done = reconstruct("data.far=9", *options)
     assert pretended.names == ALL
@@ -239,7 +239,7 @@ def test_photographs_pass_all_stages_once(reconstruct: Runner, pretended: Preten
     assert again.out.endswith(f"report: {pretended.out}/report/report.html\npage: {pretended.out}/page.html\n")
 
 
-def test_what_changed_is_followed_by_what_is_made_of_it(reconstruct: Runner, pretended: Pretended) -> None:
+def test_changed_inputs_repeat_the_dependent_stages(reconstruct: Runner, pretended: Pretended) -> None:
     reconstruct()
     pretended.write("../silhouettes/IMG_1.png")
     done = reconstruct()
@@ -300,7 +300,7 @@ def test_stages_print_no_next_command(capsys: pytest.CaptureFixture[str]) -> Non
 
 
 @pytest.mark.parametrize("end", [SystemExit(130), KeyboardInterrupt()])  # from training, and from any other stage
-def test_an_interrupted_training_goes_on(end: BaseException, reconstruct: Runner, pretended: Pretended) -> None:
+def test_interrupted_training_is_resumed(end: BaseException, reconstruct: Runner, pretended: Pretended) -> None:
     pretended.ends["train"] = end
     stopped = reconstruct("trial_steps=0", code=130)
     assert stopped.err == "nerfro: interrupted; train is incomplete; repeat the same command to continue\n"
@@ -311,7 +311,7 @@ def test_an_interrupted_training_goes_on(end: BaseException, reconstruct: Runner
     assert pretended.ran[3][1] == [*pretended.ran[2][1], "ckpt_path=last"]
 
 
-def test_a_stage_that_fails_is_named_and_the_others_wait(reconstruct: Runner, pretended: Pretended) -> None:
+def test_failed_stage_is_named_and_later_stages_do_not_run(reconstruct: Runner, pretended: Pretended) -> None:
     pretended.ends["preprocess"] = NerfroError("the masks are empty")
     failed = reconstruct(code=1).error
     assert failed.startswith("nerfro: error: preprocess failed: the masks are empty; correct the input, ")
@@ -322,14 +322,14 @@ def test_a_stage_that_fails_is_named_and_the_others_wait(reconstruct: Runner, pr
     assert pretended.names == ["calibrate", "preprocess", "preprocess"]
 
 
-def test_a_page_that_cannot_be_made_does_not_fail_the_reconstruction(reconstruct: Runner, pretended: Pretended) -> None:
+def test_failed_page_does_not_fail_the_reconstruction(reconstruct: Runner, pretended: Pretended) -> None:
     pretended.ends["export"] = NerfroError("the index varies in space")
     done = reconstruct("trial_steps=0")
     assert "nerfro: warning: no page was written: export failed: the index varies in space; " in done.out
     assert done.out.endswith(f"report: {pretended.out}/report/report.html\n")
 
 
-def test_what_was_found_chooses_the_experiment(run_here: Runner, pretended: Pretended, tiny_scene: Path) -> None:
+def test_scene_file_selects_the_experiment(run_here: Runner, pretended: Pretended, tiny_scene: Path) -> None:
     asked = "data=blender", f"data.root={tiny_scene}", "outlines={r_0:[1,2,9,9]}", "medium=vessel", "medium.wall=0.1"
     pretended.surroundings, pretended.doubts, pretended.medium = "near", ["shallow"], {"type": "vessel", "wall": 0.1}
     failed = run_here("reconstruct", *asked, f"out={pretended.out}", code=1).error
@@ -342,7 +342,7 @@ def test_what_was_found_chooses_the_experiment(run_here: Runner, pretended: Pret
 
 
 @pytest.mark.parametrize(
-    ("overrides", "told"),
+    ("overrides", "message"),
     [
         ((), "set out=FOLDER, and images=PHOTOS"),
         (("images=PHOTOS", "data.root=PHOTOS"), "images= and video= are for photographs without poses"),
@@ -356,8 +356,8 @@ def test_what_was_found_chooses_the_experiment(run_here: Runner, pretended: Pret
         (("images=PHOTOS/two",), "2 photographs do not determine poses and shape"),
     ],
 )
-def test_what_contradicts_itself_is_refused(
-    run_here: Runner, pretended: Pretended, photos: Path, overrides: tuple[str, ...], told: str
+def test_contradictory_options_are_refused(
+    run_here: Runner, pretended: Pretended, photos: Path, overrides: tuple[str, ...], message: str
 ) -> None:
     (photos / "film").mkdir()
     (photos / "film" / "CLIP.mp4").touch()
@@ -365,7 +365,7 @@ def test_what_contradicts_itself_is_refused(
     for i in range(2):
         shutil.copy(photos / f"IMG_{i}.png", photos / "two")
     options = [f"out={pretended.out}", *(text.replace("PHOTOS", str(photos)) for text in overrides)]
-    assert told in run_here("reconstruct", *options, code=1).error
+    assert message in run_here("reconstruct", *options, code=1).error
     assert pretended.names == []
 
 
@@ -376,7 +376,7 @@ def test_sigterm_ends_a_stage_like_ctrl_c() -> None:
     assert signal.getsignal(signal.SIGTERM) == before
 
 
-def test_unknown_surroundings_end_before_training(reconstruct: Runner, pretended: Pretended) -> None:
+def test_unknown_surroundings_are_refused_before_training(reconstruct: Runner, pretended: Pretended) -> None:
     pretended.surroundings = None
     refused = reconstruct("trial_steps=0", code=1).error
     assert "scene.json does not tell whether the surroundings are near" in refused
@@ -391,7 +391,7 @@ def test_posed_photographs_of_a_ball_become_a_scene(
     data, out = tmp_path / "ball", tmp_path / "out"
     save_with_masks(data)
     monkeypatch.setattr(nerfro.train, "prepared_metrics", ImageMetrics)
-    short = refinement.RefinementSettings((refinement.Stage(20, 1e-4, (3.0, 1.0)),), 1000)
+    short = refinement.RefinementSettings((refinement.DescentStage(20, 1e-4, (3.0, 1.0)),), 1000)
     monkeypatch.setattr(refinement, "RefinementSettings", lambda: short)
     train = [*RECONSTRUCTION_TRAINING, "trainer.max_steps=2", "phase.background.steps=100"]
     asked = [*RECONSTRUCTION, f"data.root={data}", f"out={out}", "medium.cache=false", "trial_steps=2"]

@@ -1,4 +1,4 @@
-"""The registry and the typed configuration: what they accept, and how they refuse what they do not."""
+"""The registry and the typed configuration: accepted values, and errors for other values."""
 
 from pathlib import Path
 from typing import Any, Literal, Optional
@@ -65,7 +65,7 @@ def test_constructor_becomes_the_configuration() -> None:
     assert built.medium is medium
 
 
-def test_integer_passes_for_a_float_and_a_text_of_digits_for_an_integer() -> None:
+def test_integer_is_accepted_as_float_and_digits_as_integer() -> None:
     plugin = find("loss", "boundary")
     assert configure(plugin, {"weight": 1, "start": "7"})["weight"] == 1.0
     assert configure(plugin, {"weight": 1, "start": "7"})["start"] == 7
@@ -74,7 +74,7 @@ def test_integer_passes_for_a_float_and_a_text_of_digits_for_an_integer() -> Non
 # Refusals by the registry.
 
 
-def test_constructor_that_takes_anything_is_refused() -> None:
+def test_constructor_with_arbitrary_arguments_is_refused() -> None:
     with pytest.raises(NerfroError, match=r"takes \*options; name every parameter instead"):
 
         @register("boundary", "greedy")
@@ -141,7 +141,7 @@ def test_wrong_losses_are_refused(losses: dict[str, object], message: str) -> No
         ("trainer: {strategy: {_target_: os.system, command: 'false'}}", ["'os.system' inside lightning"]),
     ],
 )
-def test_mistake_in_an_experiment_file_is_told_in_one_line(
+def test_mistake_in_an_experiment_file_gives_a_one_line_error(
     experiment: str, words: list[str], train: Runner, tmp_path: Path
 ) -> None:
     (tmp_path / "experiment").mkdir()
@@ -153,5 +153,5 @@ def test_mistake_in_an_experiment_file_is_told_in_one_line(
     assert not list((tmp_path / "run").rglob("*")), "nothing is written"
 
 
-def test_a_missing_plugin_is_named_in_one_line() -> None:
+def test_missing_plugin_is_named_in_one_line() -> None:
     refused("lacks the plugin no_such_plugin; install nerfro again", plugin_module, "no_such_plugin.command")

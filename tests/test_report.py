@@ -63,7 +63,7 @@ def test_figure_shows_the_view_of_the_median_score(runs: Path) -> None:
     assert pictures.methods == dict(enumerate(comparison.methods))
 
 
-def test_small_pictures_are_embedded_bit_for_bit_and_large_ones_as_jpeg(runs: Path) -> None:
+def test_small_images_are_embedded_bit_for_bit_and_large_ones_as_jpeg(runs: Path) -> None:
     file = runs / "bad" / "images" / "test_000.png"
     kind, encoded = embed_image(load_png(file)).split(",")
     assert kind == "data:image/png;base64"
@@ -71,7 +71,7 @@ def test_small_pictures_are_embedded_bit_for_bit_and_large_ones_as_jpeg(runs: Pa
     assert embed_image(torch.zeros(8, 300, 3)).startswith("data:image/jpeg;base64,")
 
 
-def test_page_needs_nothing_from_outside_and_its_parts_find_each_other(runs: Path) -> None:
+def test_page_is_self_contained_with_valid_internal_links(runs: Path) -> None:
     html = page(runs, unfinished=("x has not been evaluated",))
     loaded = re.findall(r"\b(?:src|href|data)=\"([^\"]*)\"", html)
     assert loaded
@@ -89,7 +89,7 @@ def test_page_needs_nothing_from_outside_and_its_parts_find_each_other(runs: Pat
     assert "max_time: 00:00:00:20" in html
 
 
-def test_page_without_its_data_keeps_the_rest(runs: Path, tmp_path: Path) -> None:
+def test_page_without_the_data_set_shows_the_other_parts(runs: Path, tmp_path: Path) -> None:
     moved = tmp_path / "runs"
     shutil.copytree(runs, moved)
     for config in moved.glob("*/config.yaml"):
@@ -101,7 +101,7 @@ def test_page_without_its_data_keeps_the_rest(runs: Path, tmp_path: Path) -> Non
     assert "max_time" in html
 
 
-def test_pictures_of_another_data_set_are_refused(runs: Path, tmp_path: Path, tiny_scene: Path) -> None:
+def test_images_of_another_data_set_are_refused(runs: Path, tmp_path: Path, tiny_scene: Path) -> None:
     (comparison,) = compare(find_runs([str(runs)])[0], {}, {})
     (scored,) = comparison.scenes
     changed = tmp_path / "scene"
@@ -114,7 +114,7 @@ def test_pictures_of_another_data_set_are_refused(runs: Path, tmp_path: Path, ti
     refused("has changed since these views", scene_images, comparison, scored, Selection())
 
 
-def test_runs_that_score_only_the_first_views_show_these(runs: Path, tmp_path: Path) -> None:
+def test_runs_that_score_only_the_first_views_show_them(runs: Path, tmp_path: Path) -> None:
     scene = Path(find_runs([str(runs)])[0][0].config["data"]["root"])
     write_scored_run(tmp_path / "few", "few", scene, 0.1, num_views=1)
     (comparison,) = compare(find_runs([str(tmp_path)])[0], {}, {})
@@ -123,7 +123,7 @@ def test_runs_that_score_only_the_first_views_show_these(runs: Path, tmp_path: P
     assert len(scene_images(comparison, scored, Selection()).views) == 1
 
 
-def test_each_budget_has_a_table_that_tells_medals_without_colours(tmp_path: Path) -> None:
+def test_each_budget_has_a_table_with_medals_in_text(tmp_path: Path) -> None:
     for time in ("00:00:00:20", "00:00:01:00"):
         for name, psnr in (("a <b>", 20.0), ("b", 25.0)):
             write_run(tmp_path / f"{name[0]}{time[6:8]}", name, psnr, max_time=time)

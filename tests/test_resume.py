@@ -1,4 +1,4 @@
-"""Runs that are killed, interrupted, resumed, or asked to go on from the wrong thing."""
+"""Runs that are killed, interrupted and resumed, also from a wrong checkpoint."""
 
 import contextlib
 import csv
@@ -47,7 +47,7 @@ def log_rows(file: Path) -> list[dict[str, str]]:
 
 
 @pytest.mark.slow
-def test_interrupted_run_saves_and_says_how_to_go_on(start: Callable[..., Command], tmp_path: Path) -> None:
+def test_interrupted_run_is_saved_and_prints_how_to_resume(start: Callable[..., Command], tmp_path: Path) -> None:
     process = start("run", "trainer.max_steps=500", "checkpoint.every_steps=400")
     process.until("^at step 4$")
     process.send(signal.SIGINT)
@@ -82,7 +82,9 @@ def interrupted_at_second_picture() -> Iterator[None]:
         yield
 
 
-def test_interrupted_evaluation_says_how_to_go_on(train_paper: Runner, evaluate_here: Runner, tmp_path: Path) -> None:
+def test_interrupted_evaluation_prints_how_to_continue(
+    train_paper: Runner, evaluate_here: Runner, tmp_path: Path
+) -> None:
     run = tmp_path / "run"
     training = ["trainer.max_steps=2", "evaluation.every=0"]
     with interrupted_at_second_picture():

@@ -1,4 +1,4 @@
-"""The scene file: what it says survives moving its folder, a command line has precedence, and mistakes get one line."""
+"""The scene file: moved folders, precedence of the command line, and one-line errors."""
 
 import json
 from pathlib import Path
@@ -27,7 +27,7 @@ def settings(*arguments: str) -> dict[str, Any]:
     return {override.get_key_element(): override.value() for override in parsed}
 
 
-def test_a_scene_survives_moving_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scene_file_is_valid_after_moving_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "old capture" / "surface").mkdir(parents=True)
     monkeypatch.chdir(tmp_path)
     scene = SceneFile(
@@ -50,7 +50,7 @@ def test_a_scene_survives_moving_its_folder(tmp_path: Path, monkeypatch: pytest.
     assert read_scene_file(link / "scene.json").data["root"] == str((tmp_path / "new").resolve())
 
 
-def test_the_command_line_has_precedence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_line_has_precedence_over_the_scene_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bodies, vessel = {"object": {"mesh": "mesh.ply", "ior": 1.4}}, {"wall": 0.1, "ior": 1.52}
     content = {"data": DATA | {"downscale": 2.0}, "bodies": bodies, "vessel": vessel}
     file = write(tmp_path / "surface" / "scene.json", **content, medium={"resolution": 64})
@@ -91,7 +91,7 @@ def test_bodies_with_materials_keep_their_names(tmp_path: Path) -> None:
     }
 
 
-def test_files_of_earlier_releases_are_read(tmp_path: Path) -> None:
+def test_scene_files_of_earlier_releases_are_read(tmp_path: Path) -> None:
     options = ["data=opencv", "data.root=capture", "medium.box_min=[-1.0,-1.0,-1.0]", "medium.mesh=o/mesh.ply"]
     vessel = ["data=opencv", "data.root=capture", "medium=vessel", "medium.wall=0.1", "medium.ior=1.52"]
     old = {"options": options, "doubtful": ["medium.ior=1.4"], "near": True, "pixels": [64, 48], "vessel": vessel}
@@ -120,6 +120,6 @@ def test_files_of_earlier_releases_are_read(tmp_path: Path) -> None:
         ({"options": 3, "near": True, "pixels": []}, "is not a result of nerfro.preprocess"),
     ],
 )
-def test_mistakes_get_one_line(content: Any, message: str, tmp_path: Path) -> None:
+def test_mistakes_give_a_one_line_error(content: Any, message: str, tmp_path: Path) -> None:
     (tmp_path / "scene.json").write_text(json.dumps(content))
     assert message in refused("scene", with_scene, [f"scene={tmp_path}/scene.json"], NODES)

@@ -1,4 +1,4 @@
-"""Rays through parts of pixels, the pixels that need them, and batches and renderings that hold them."""
+"""Rays through parts of pixels: the choice of pixels, and their batches and renderings."""
 
 import math
 from dataclasses import replace
@@ -57,7 +57,7 @@ def diverging(cameras: Cameras, sampler, medium) -> torch.Tensor:
     return divergence(cameras, pixels, exits, beside)
 
 
-def test_parts_are_the_pixels_of_cameras_with_as_many_more(cameras: Cameras) -> None:
+def test_parts_are_the_pixels_of_cameras_with_higher_resolution(cameras: Cameras) -> None:
     pixels = torch.tensor([3, 57, NUM_VIEWS * HEIGHT * WIDTH - 1])
     rays = part_rays(cameras, pixels, 3)
     finer = cameras.resized(3 * WIDTH, 3 * HEIGHT)
@@ -68,7 +68,7 @@ def test_parts_are_the_pixels_of_cameras_with_as_many_more(cameras: Cameras) -> 
         torch.testing.assert_close(rays.directions[number], expected.directions[0])
 
 
-def test_straight_rays_one_pixel_apart_diverge_by_one_pixel_at_most(cameras: Cameras) -> None:
+def test_straight_rays_one_pixel_apart_diverge_by_at_most_one_pixel(cameras: Cameras) -> None:
     pixels = torch.arange(NUM_VIEWS * HEIGHT * WIDTH)
     angles = diverging(cameras, Straight(), Vacuum())
     assert angles.max() <= 1.0 + 1e-5
@@ -78,7 +78,7 @@ def test_straight_rays_one_pixel_apart_diverge_by_one_pixel_at_most(cameras: Cam
     assert angles[central].min() > 0.95 * expected
 
 
-def test_divergence_behind_a_ball_is_that_of_its_deviation(above: Cameras) -> None:
+def test_divergence_behind_a_ball_matches_its_deviation(above: Cameras) -> None:
     """Deviation 2 (asin b - asin(b / n)) of a ray of impact b: the angle between two rays in a plane with the axis."""
     ball = Ball(0.8, 1.5)
     pixels = torch.arange(SIDE * SIDE)
@@ -140,7 +140,7 @@ def test_pixels_of_the_object_are_divided_for_their_contrast(views: Views) -> No
     assert torch.equal(of_pixels(before, True), (~before.teaches_background).nonzero()[:, 0])
 
 
-def test_all_pixels_are_divided_and_steady_ones_teach_the_background(views: Views) -> None:
+def test_zero_divergence_divides_all_pixels_and_steady_pixels_train_the_background(views: Views) -> None:
     batch = batches_of(views, Subdivision(2, 0.0), 1000).batch(1)
     assert len(of_pixels(batch, False)) == 0
     angles = diverging(views.cameras, Snell(), CUBE)[batch.pixel_number]
@@ -181,7 +181,7 @@ def test_batches_and_renderings_do_not_depend_on_the_process_or_the_chunk(views:
         torch.testing.assert_close(model.render_path(share.path, share.draws)[-1].samples.s, sampled[rows])
 
 
-def test_straight_rays_part_nowhere_and_need_one_ray_a_pixel() -> None:
+def test_straight_rays_do_not_diverge_and_need_one_ray_per_pixel() -> None:
     model, cameras = RefractiveModel(example_components()).eval(), example_batch().cameras
     once, divided = (render_view(model, cameras, 0, Subdivision(side, 1.5)) for side in (1, 3))
     assert torch.equal(divided.radiance, once.radiance)
@@ -197,7 +197,7 @@ def test_pixels_are_divided_at_the_rim_of_a_ball() -> None:
     assert 0 < differs.float().mean() < 0.5
 
 
-def test_pixels_of_much_contrast_are_divided_where_no_ray_bends() -> None:
+def test_pixels_with_high_contrast_are_divided_without_refraction() -> None:
     smooth = replace(example_components(), make_field=lambda: NerfField(width=16, depth=2, skip=1, view_width=8))
     model, cameras = RefractiveModel(smooth).eval(), example_batch().cameras
     for parameter in model.scene.fields.parameters():

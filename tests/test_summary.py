@@ -102,7 +102,7 @@ def test_runs_of_different_budgets_never_share_a_table(tmp_path: Path, monkeypat
     assert len({re.split(";", table.title)[0] for table in found}) == 5
 
 
-def test_what_was_scored_differently_stands_in_columns_of_its_own(tmp_path: Path) -> None:
+def test_different_scorings_have_separate_columns(tmp_path: Path) -> None:
     write_run(tmp_path / "0", "a", 20.0)
     write_run(tmp_path / "1", "b", 21.0, size=8)
     write_run(tmp_path / "2", "b", 22.0, root="elsewhere/torus")
@@ -131,7 +131,7 @@ def test_runs_of_one_name_that_differ_in_a_field_are_different_methods(tmp_path:
     assert labels["a (field=NerfField, field.width=64)"][::3] == (25.0, 20.0)
 
 
-def test_of_repeated_runs_the_newest_counts_and_the_others_are_named(tmp_path: Path) -> None:
+def test_newest_of_repeated_runs_counts_and_the_others_are_named(tmp_path: Path) -> None:
     for name, psnr, age in (("old", 20.0, 100), ("new", 25.0, 0), ("older", 22.0, 200)):
         folder = write_run(tmp_path / name, "a", psnr)
         stamp = os.stat(folder).st_mtime - age
@@ -166,7 +166,7 @@ def test_scores_of_a_region_come_from_the_region(tmp_path: Path) -> None:
     assert to_table(comparison, PAPER, "mask").rows[0].values == (None, None, None)
 
 
-def test_places_are_folders_and_globs_and_runs_without_scores_are_named(tmp_path: Path) -> None:
+def test_folders_and_globs_are_accepted_and_runs_without_scores_are_named(tmp_path: Path) -> None:
     for name in ("a", "b", "c"):
         write_run(tmp_path / name, name, 20.0)
     (tmp_path / "c" / "metrics.json").unlink()
@@ -212,25 +212,25 @@ def test_run_without_scores_has_those_of_its_later_evaluation(tmp_path: Path) ->
 
 
 @pytest.fixture
-def summarise(run_here: Runner) -> Runner:
+def summarize(run_here: Runner) -> Runner:
     """Run `python -m nerfro.summary` in this process."""
     return functools.partial(run_here, "summary")
 
 
-def test_command_prints_writes_all_forms_and_refuses_to_overwrite(tmp_path: Path, summarise: Runner) -> None:
+def test_command_prints_writes_all_forms_and_refuses_to_overwrite(tmp_path: Path, summarize: Runner) -> None:
     write_run(tmp_path / "runs" / "a", "refractive", 25.0)
     write_run(tmp_path / "runs" / "b", "mine", 22.0, max_time=None, max_steps=100)
     runs, out = f"runs={tmp_path / 'runs'}", tmp_path / "out"
-    printed = summarise(runs, "methods.refractive=Ours", "+methods.mine=My own").out
+    printed = summarize(runs, "methods.refractive=Ours", "+methods.mine=My own").out
     assert "Ours" in printed
     assert "My own" in printed
     assert not out.exists()
-    summarise(runs, f"out={out}")
+    summarize(runs, f"out={out}")
     assert {path.suffix for path in out.glob("[!.]*")} == {".csv", ".md", ".tex"}
     assert len(list(out.glob("[!.]*"))) == 6
     assert "22.00" in (out / "100_steps_of_512_rays.md").read_text()
-    assert "overwrite=true" in summarise(runs, f"out={out}", code=1).error
-    summarise(runs, f"out={out}", "overwrite=true")
+    assert "overwrite=true" in summarize(runs, f"out={out}", code=1).error
+    summarize(runs, f"out={out}", "overwrite=true")
 
 
 @pytest.mark.parametrize(
@@ -241,6 +241,6 @@ def test_command_prints_writes_all_forms_and_refuses_to_overwrite(tmp_path: Path
         ("region=x", "choose 'full', 'mask', 'crop'"),
     ],
 )
-def test_mistakes_are_told_in_one_line(tmp_path: Path, summarise: Runner, override: str, said: str) -> None:
+def test_mistakes_give_a_one_line_error(tmp_path: Path, summarize: Runner, override: str, said: str) -> None:
     write_run(tmp_path / "a", "refractive", 25.0)
-    assert said in summarise(f"runs=[{tmp_path}]", override, code=1).error
+    assert said in summarize(f"runs=[{tmp_path}]", override, code=1).error

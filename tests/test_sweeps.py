@@ -1,4 +1,4 @@
-"""Sweeps that are stopped, continued, changed, and that fail in part; and the launchers and sweepers that run them."""
+"""Sweeps that are stopped, continued and changed or fail in part, and their launchers and sweepers."""
 
 import functools
 import importlib
@@ -60,7 +60,7 @@ def test_finished_cells_are_skipped_and_new_ones_added(sweep: Runner, tmp_path: 
     assert {name: after[name] for name in before} == before
 
 
-def test_failing_cell_stops_no_other(sweep: Runner, tiny_scene: Path, tmp_path: Path) -> None:
+def test_failing_cell_does_not_stop_other_cells(sweep: Runner, tiny_scene: Path, tmp_path: Path) -> None:
     late = tmp_path / "late.ply"
     swept = f"medium.mesh={late},{tiny_scene / 'mesh.ply'}"
     first = sweep(swept, code=1)
@@ -91,7 +91,7 @@ def test_cell_of_another_configuration_or_other_data_is_never_replaced(
     assert written(tmp_path / "sweep") == before
 
 
-def test_missing_data_are_rendered_by_a_command_that_is_named(sweep: Runner, tmp_path: Path) -> None:
+def test_missing_data_name_the_command_that_renders_them(sweep: Runner, tmp_path: Path) -> None:
     finished = sweep(f"data.root={tmp_path / 'ship'}", code=1)
     assert f"python -m nerfro.synthesize scene=ship out={tmp_path / 'ship'}" in finished.err
 
@@ -156,7 +156,7 @@ def test_optuna_searches_and_repeats_its_search(sweep: Runner, tmp_path: Path) -
     assert written(tmp_path / "sweep") == before
 
 
-def test_identity_is_what_is_computed_and_not_how_it_is_watched() -> None:
+def test_identity_of_a_cell_ignores_settings_of_monitoring() -> None:
     plain = identity_of(composed())
     watched = ("logger=none", "checkpoint.every_seconds=5", "ckpt_path=last", "evaluation.every=7", "trainer.devices=2")
     assert identity_of(composed(*watched)) == plain
@@ -165,7 +165,7 @@ def test_identity_is_what_is_computed_and_not_how_it_is_watched() -> None:
 
 
 @pytest.mark.parametrize("name", ["cameras.bin", "poses_bounds.npy", "arrays.npz", "mesh.ply", "transforms.json"])
-def test_data_that_are_calibrated_anew_are_other_data(name: str, tmp_path: Path) -> None:
+def test_recalibrated_data_are_different_data(name: str, tmp_path: Path) -> None:
     def identity() -> str:
         return identity_of(composed(f"data.root={tmp_path}"))["data"]
 
@@ -180,9 +180,9 @@ def test_data_that_are_calibrated_anew_are_other_data(name: str, tmp_path: Path)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
-def test_stopped_sweep_goes_on_where_it_was(
-    how: signal.Signals, start: Callable[[list[str], str], Command], tiny_scene: Path, tmp_path: Path
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
+def test_stopped_sweep_is_resumed(
+    number: signal.Signals, start: Callable[[list[str], str], Command], tiny_scene: Path, tmp_path: Path
 ) -> None:
     first = start(["seed=0,1,2"], "first")
     cells = [tmp_path / "sweep" / f"refractive-{scene_name(str(tiny_scene))}-seed{seed}" for seed in range(3)]
@@ -191,9 +191,9 @@ def test_stopped_sweep_goes_on_where_it_was(
         assert first.runs, first.errors
         assert time.monotonic() < deadline
         time.sleep(0.05)
-    first.send(how)
-    assert first.wait(60) == (-signal.SIGKILL if how is signal.SIGKILL else 130)
-    if how is signal.SIGINT:
+    first.send(number)
+    assert first.wait(60) == (-signal.SIGKILL if number is signal.SIGKILL else 130)
+    if number is signal.SIGINT:
         assert "to resume, repeat the command" in first.printed + first.errors
     assert not (cells[1] / "metrics.json").exists()
     assert not cells[2].exists()
@@ -224,7 +224,7 @@ def test_launchers_run_cells_in_other_processes(
     assert json.loads(run.read_text())["command"].startswith("python -m nerfro.train data.root=")
 
 
-def test_damaged_record_costs_its_own_cell_alone(sweep: Runner, tmp_path: Path) -> None:
+def test_damaged_record_repeats_only_its_own_cell(sweep: Runner, tmp_path: Path) -> None:
     sweep("seed=0,1")
     record = sorted((tmp_path / "sweep").glob("*/cell.json"))[0]
     record.write_text(record.read_text()[:40])

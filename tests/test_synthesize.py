@@ -1,4 +1,4 @@
-"""`nerfro.synthesize`: what it writes, what it keeps and what it refuses; and the scene that ships with the package."""
+"""`nerfro.synthesize`: written, kept and refused files, and the embedded scene."""
 
 import json
 import shlex
@@ -54,8 +54,8 @@ def test_embedded_scene_is_complete_and_small():
             assert Image.open(EMBEDDED / frame["mask_path"]).mode == "L"
 
 
-@pytest.mark.parametrize("module", ["dataset.Views", "scenes.photographs.Photographs"])
-def test_the_printed_command_quotes_the_folder(module, tmp_path):
+@pytest.mark.parametrize("module", ["dataset.ViewSplits", "scenes.photographs.Photographs"])
+def test_printed_command_quotes_the_folder(module, tmp_path):
     name, _, kind = module.rpartition(".")
     data = getattr(plugin_module(f"synthetic_scenes.{name}"), kind)
     folder = tmp_path / "torus [1]"
@@ -63,13 +63,13 @@ def test_the_printed_command_quotes_the_folder(module, tmp_path):
     assert {f'data.root="{folder}"', f'out="{folder}"'} & set(words)
 
 
-def test_masks_are_the_projected_mesh():
+def test_masks_match_the_projected_mesh():
     vertices = load_mesh(EMBEDDED / "mesh.ply").vertices
     for split in SPLITS:
         assert min(overlaps_of_convex_body(BlenderData(str(EMBEDDED)).load(split), vertices)) > 0.995
 
 
-def test_sky_picture_is_the_sky_of_the_pictures():
+def test_sky_image_matches_the_sky_in_the_images():
     views = BlenderData(str(EMBEDDED)).load("test")
     sky = EnvironmentMap([256], image=str(EMBEDDED / "sky.png"))
     for view in range(3):
@@ -80,7 +80,7 @@ def test_sky_picture_is_the_sky_of_the_pictures():
 
 
 @pytest.mark.usefixtures("mitsuba")
-def test_interrupted_rendering_goes_on_where_it_stopped(tmp_path):
+def test_interrupted_rendering_is_resumed(tmp_path):
     folder = synthesize(small(tmp_path / "scene")).folder
     pictures = sorted(folder.rglob("r_*.png"))
     assert len(pictures) == 2 * 4
@@ -97,7 +97,7 @@ def test_interrupted_rendering_goes_on_where_it_stopped(tmp_path):
 
 
 @pytest.mark.usefixtures("mitsuba")
-def test_another_data_set_is_replaced_only_on_request_and_strangers_survive(tmp_path):
+def test_existing_data_set_is_replaced_only_on_request_and_other_files_are_kept(tmp_path):
     folder = synthesize(small(tmp_path / "scene")).folder
     (folder / "notes.txt").write_text("mine")
     assert (folder / "interior.ply").is_file()
@@ -113,7 +113,7 @@ def test_another_data_set_is_replaced_only_on_request_and_strangers_survive(tmp_
 
 @pytest.mark.parametrize(("name", "content"), [("thesis.tex", "chapter 1"), ("meta.json", "{}"), ("meta.json", "[")])
 @pytest.mark.usefixtures("mitsuba")
-def test_a_folder_of_something_else_is_left_alone(tmp_path, name, content):
+def test_folder_with_other_content_is_not_changed(tmp_path, name, content):
     (tmp_path / name).write_text(content)
     refused("it is no data set of nerfro", synthesize, small(tmp_path, overwrite=True))
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, content)]

@@ -40,7 +40,7 @@ SAMPLERS = [["sampler/path=snell"], ["sampler.path.interface=mesh"], ["sampler/p
 
 @pytest.mark.parametrize("place", [(0, 0, 0), UTM], ids=["origin", "utm"])
 @pytest.mark.parametrize("options", SAMPLERS, ids=["snell", "mesh", "eikonal"])
-def test_rays_leave_a_ball_as_in_closed_form(
+def test_exit_directions_of_a_ball_match_closed_form(
     trace: Callable[..., str], tmp_path: Path, options: list[str], place: tuple[float, ...]
 ) -> None:
     heights, exact = _write_rays(tmp_path / "rays.npz", place)
@@ -90,7 +90,7 @@ def test_far_ends_straight_paths_and_bent_ones_outside_the_box(trace: Callable[.
         assert (np.abs(ends).max(-1) > 1.5).all()
 
 
-def test_the_papers_tracker_is_an_option(trace: Callable[..., str], tmp_path: Path) -> None:
+def test_tracing_of_the_paper_is_an_option(trace: Callable[..., str], tmp_path: Path) -> None:
     _, exact = _write_rays(tmp_path / "rays.npz")
     paper = ["medium=voxel_grid", "medium.smoothing_size=3", "sampler/path=eikonal", "sampler.path.integrator=euler"]
     trace(*paper, "near=2", "far=6")
@@ -126,7 +126,7 @@ def test_plot_is_written_beside_the_result(trace: Callable[..., str], tmp_path: 
         ({"origins": np.zeros((0, 3)), "directions": np.zeros((0, 3))}, "not empty"),
     ],
 )
-def test_bad_rays_are_one_clear_line(trace: Callable[..., str], tmp_path: Path, arrays: dict, message: str) -> None:
+def test_bad_rays_give_a_one_line_error(trace: Callable[..., str], tmp_path: Path, arrays: dict, message: str) -> None:
     np.savez(tmp_path / "rays.npz", **arrays)
     printed = trace()
     assert message in printed
@@ -147,7 +147,7 @@ def test_bad_rays_are_one_clear_line(trace: Callable[..., str], tmp_path: Path, 
         (["medium=voxel_grid", "bodies={a: {ior: 1.5}}"], "bodies is not a setting"),
     ],
 )
-def test_bad_options_are_one_clear_line(
+def test_bad_options_give_a_one_line_error(
     trace: Callable[..., str], tmp_path: Path, options: list[str], message: str
 ) -> None:
     _write_rays(tmp_path / "rays.npz")
@@ -155,7 +155,7 @@ def test_bad_options_are_one_clear_line(
 
 
 @pytest.mark.parametrize("name", ["out.npz", "out.png"])
-def test_existing_results_are_replaced_on_request_alone(trace: Callable[..., str], tmp_path: Path, name: str) -> None:
+def test_existing_results_are_replaced_only_on_request(trace: Callable[..., str], tmp_path: Path, name: str) -> None:
     _write_rays(tmp_path / "rays.npz")
     (tmp_path / name).write_text("precious")
     assert f"{name} exists; give another out=... or overwrite=true" in trace("plot=true")

@@ -1,4 +1,4 @@
-"""A training run from beginning to end, its files, and its evaluation afterwards."""
+"""A complete training run, its files, and its evaluation."""
 
 import json
 import shutil
@@ -32,7 +32,7 @@ def read(path: Path) -> np.ndarray:
         return np.asarray(image)
 
 
-def test_run_writes_metrics_pictures_and_what_repeats_it(run: Path, overrides: list[str], tiny_scene: Path) -> None:
+def test_run_writes_metrics_images_and_its_configuration(run: Path, overrides: list[str], tiny_scene: Path) -> None:
     metrics = json.loads((run / "metrics.json").read_text())
     assert {"test", "views", "steps", "train_seconds", "rays_per_second"} <= metrics.keys()
     assert {"psnr", "ssim", "lpips"} <= metrics["test"].keys()
@@ -86,7 +86,7 @@ def test_georeferenced_data_train_as_at_the_origin(
     assert "too far from the origin for single precision; subtract this point" in refused
 
 
-def test_log_holds_every_loss_and_weight_of_every_second_step_and_images(run: Path) -> None:
+def test_log_contains_every_loss_and_weight_of_every_second_step_and_images(run: Path) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     events = EventAccumulator(str(run / "tensorboard")).Reload()
@@ -128,7 +128,7 @@ def test_training_learns_the_scene(train_paper: Runner, tmp_path: Path) -> None:
     assert psnr[1] > psnr[0] + 3
 
 
-def test_evaluation_of_the_checkpoint_repeats_the_runs_own(run: Path, evaluate_here: Runner) -> None:
+def test_evaluation_of_the_checkpoint_equals_that_of_the_run(run: Path, evaluate_here: Runner) -> None:
     evaluate_here(f"checkpoint={run}")
     again = run / "evaluate_test"
     first, second = (json.loads((folder / "metrics.json").read_text()) for folder in (run, again))

@@ -1,4 +1,4 @@
-"""Commands execute nerfro, Hydra and registered plugins, and nothing that files or the current directory name."""
+"""Commands execute nerfro, Hydra and registered plugins, but no code of files or the current directory."""
 
 import pickle
 import subprocess
@@ -46,7 +46,7 @@ def test_plugins_of_hydra_in_the_current_directory_are_not_imported(folder: Path
         assert done.returncode == 0, done.stderr
 
 
-def test_a_stage_imports_nothing_from_the_current_directory(folder: Path) -> None:
+def test_stages_import_nothing_from_the_current_directory(folder: Path) -> None:
     (folder / "hydra").mkdir()
     (folder / "hydra" / "__init__.py").write_text((folder / "hydra_plugins" / "evil.py").read_text())
     assert run(folder, *command_of_module("nerfro.train")[1:], "--cfg", "job").returncode == 0
@@ -98,7 +98,7 @@ def write_experiment(folder: Path, hydra: str) -> None:
     (conf / "other.yaml").write_text(f"# @package _global_\nhydra: {{{hydra}}}\n{loss}")
 
 
-def test_a_pickled_configuration_is_not_read(folder: Path) -> None:
+def test_pickled_configuration_is_not_read(folder: Path) -> None:
     (folder / "config.pickle").write_bytes(pickle.dumps(Bomb("touch executed")))
     done = run(folder, "-m", "nerfro.train", "--experimental-rerun", "config.pickle")
     assert done.returncode == 1

@@ -1,4 +1,4 @@
-"""Weights & Biases without an account: a run's own file holds what TensorBoard and the CSV show."""
+"""Weights & Biases without an account: the file of a run contains the values of TensorBoard and CSV."""
 
 import csv
 import json
@@ -56,7 +56,7 @@ def read(file: Path) -> tuple[dict[str, Any], dict[str, dict[int, Any]]]:
 
 
 @pytest.mark.slow
-def test_offline_run_needs_no_account_and_holds_what_tensorboard_and_the_csv_hold(
+def test_offline_run_needs_no_account_and_logs_the_values_of_tensorboard_and_csv(
     train_paper: Runner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator

@@ -1,4 +1,4 @@
-"""The wheel carries conf/, plugins/ and the embedded scene, and works from any folder."""
+"""The wheel contains conf/, plugins/ and the embedded scene, and works from any folder."""
 
 import functools
 import zipfile
@@ -25,7 +25,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_wheel_holds_every_configuration_plugin_and_asset(wheel: Path) -> None:
+def test_wheel_contains_every_configuration_plugin_and_asset(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         inside = set(archive.namelist())
     for folder in ("conf", "plugins"):

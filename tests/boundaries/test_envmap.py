@@ -29,11 +29,11 @@ def smooth_sky(directions: torch.Tensor) -> torch.Tensor:
     return 0.5 + 0.2 * torch.stack([x + 0.5 * y, y - 0.7 * z * x, z + 0.4 * x * y], dim=-1)
 
 
-def test_it_starts_grey() -> None:
+def test_environment_map_starts_grey() -> None:
     assert torch.allclose(EnvironmentMap()(Exits(random_directions(10))), torch.full((10, 3), 0.25))
 
 
-def test_texels_take_the_mean_of_all_rays_and_of_one_residual_of_zero() -> None:
+def test_fitted_texels_are_the_mean_of_all_rays_and_one_zero_residual() -> None:
     boundary, generator = EnvironmentMap([4]), torch.Generator().manual_seed(0)
     directions = cube_map.texel_directions(4)
     radiance, weights = torch.rand(3, 96, 3, generator=generator), torch.rand(3, 96, generator=generator)
@@ -46,7 +46,7 @@ def test_texels_take_the_mean_of_all_rays_and_of_one_residual_of_zero() -> None:
     torch.testing.assert_close(boundary.texels.detach(), expected, rtol=1e-4, atol=1e-5)
 
 
-def test_wide_rays_leave_fine_levels_alone() -> None:
+def test_wide_cones_do_not_change_fine_levels() -> None:
     boundary, directions = EnvironmentMap([4, 8]), random_directions(50)
     width = torch.full((50,), 1.1 * math.radians(90 / 4))  # two texels of the fine level are 90 / 4 degrees wide
     sky = smooth_sky(directions)
@@ -74,7 +74,7 @@ def test_fit_learns_a_sky_from_few_rays(levels: tuple[list[int], list[int] | Non
     assert error < 0.02  # the standard deviation of the sky is 0.15
 
 
-def test_fitted_levels_add_to_the_others_without_gradient() -> None:
+def test_fitted_levels_add_to_the_other_levels_without_gradient() -> None:
     together, apart, directions = EnvironmentMap([4, 8, 16]), EnvironmentMap([4], [8, 16]), random_directions(50)
     torch.nn.init.normal_(together.texels)
     assert set(together.state_dict()) == {"texels"}, "checkpoints of earlier versions have no fitted levels"
@@ -96,14 +96,14 @@ def test_sum_of_levels_learns_a_sky_from_few_rays() -> None:
     for resolutions in ([4, 8, 16, 32], [32]):
         torch.manual_seed(0)
         boundary = EnvironmentMap(resolutions)
-        optimiser = torch.optim.Adam(boundary.parameters(), lr=0.02, eps=1e-15)
+        optimizer = torch.optim.Adam(boundary.parameters(), lr=0.02, eps=1e-15)
         for step in range(300):
-            optimiser.param_groups[0]["lr"] = 0.02 * 0.05 ** (step / 300)
+            optimizer.param_groups[0]["lr"] = 0.02 * 0.05 ** (step / 300)
             directions = torch.nn.functional.normalize(torch.randn(64, 3), dim=-1)
             loss = (to_srgb(boundary(Exits(directions))) - smooth_sky(directions)).square().mean()
-            optimiser.zero_grad()
+            optimizer.zero_grad()
             loss.backward()
-            optimiser.step()
+            optimizer.step()
         unseen = random_directions(2000, seed=9)
         errors.append(float((to_srgb(boundary(Exits(unseen))) - smooth_sky(unseen)).detach().square().mean().sqrt()))
     pyramid, single = errors
@@ -111,7 +111,7 @@ def test_sum_of_levels_learns_a_sky_from_few_rays() -> None:
     assert pyramid < 0.2 * single
 
 
-def test_directions_get_the_gradient_that_autograd_finds() -> None:
+def test_gradient_of_directions_matches_autograd() -> None:
     boundary = EnvironmentMap([1, 4, 8])
     torch.nn.init.normal_(boundary.texels)
     directions = random_directions(200)
@@ -131,7 +131,7 @@ def test_directions_get_the_gradient_that_autograd_finds() -> None:
     assert (gradients[1] * directions).sum(-1).abs().max() < 1e-5
 
 
-def test_lat_long_convention_is_blenders() -> None:
+def test_lat_long_convention_matches_blender() -> None:
     directions = lat_long.directions(64)
     assert directions.shape == (64, 128, 3)
     middle = directions[32, 64]
@@ -140,7 +140,7 @@ def test_lat_long_convention_is_blenders() -> None:
     torch.testing.assert_close(directions[32, 32], torch.tensor([0.0, 1, 0]), rtol=0, atol=0.04)  # left of +x
 
 
-def test_a_finer_picture_is_averaged_not_sampled() -> None:
+def test_finer_image_is_averaged_and_not_sampled() -> None:
     # One-pixel stripes are far below the texture's resolution: every texel must become their mean.
     stripes = torch.zeros(256, 512, 3)
     stripes[:, ::2] = 0.8
@@ -174,7 +174,7 @@ def random_texels() -> torch.Tensor:
     return torch.randn(LEVELS.num_texels, 3, generator=torch.Generator().manual_seed(1))
 
 
-def test_texel_centres_look_themselves_up() -> None:
+def test_lookup_at_texel_centres_returns_the_texels() -> None:
     levels = cube_map.CubeLevels((6,))
     texels = torch.randn(levels.num_texels, 3)
     found = cube_map.lookup(

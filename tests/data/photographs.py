@@ -1,4 +1,4 @@
-"""What the tests of the loaders share: cameras whose projection is known without nerfro's."""
+"""Helpers of the tests of data formats: cameras with an independent projection."""
 
 from pathlib import Path
 

@@ -39,7 +39,7 @@ def test_text_models_are_read_and_views_are_sorted_by_name(write):
     assert load(root, "test").names == ["top/v0.png", "top/v3.png"]
 
 
-def test_a_reconstruction_with_a_distorting_lens_trains_in_a_room(write, train_here, tmp_path):
+def test_distorted_reconstruction_of_a_room_trains(write, train_here, tmp_path):
     root, run = write(), tmp_path / "run"
     trimesh.creation.icosphere(2, 0.3).export(root / "mesh.ply")
     train_here(
@@ -72,7 +72,7 @@ def test_every_perspective_model_is_read(write, model, params, lens):
     check_views(load(write(cameras={7: (model, params)}, camera=lambda i: 7)), list(TRAIN), **lens)
 
 
-def test_pycolmap_writes_what_is_read_and_reads_what_is_written(write, tmp_path):
+def test_models_are_exchanged_with_pycolmap_in_both_directions(write, tmp_path):
     pycolmap = pytest.importorskip("pycolmap")
     rational = ("FULL_OPENCV", (FX, FY, CX, CY, 0.3, 0.05, 0.001, -0.002, 0.004, 0.4, 0.1, 0.01))
     root = write(cameras={1: OPENCV, 2: rational}, camera=lambda i: 1 + i % 2)
@@ -90,7 +90,7 @@ def test_pycolmap_writes_what_is_read_and_reads_what_is_written(write, tmp_path)
         np.testing.assert_allclose(again.cameras.project(TORCH_POINTS)[0].numpy(), pixels, atol=1e-4)
 
 
-def test_bounds_come_from_the_points_unless_they_are_given(write):
+def test_bounds_default_to_the_sparse_points(write):
     inside = np.array([[0, 0, 0.5], [0.2, 0, 0], [0, -0.1, -0.3]])
     views = load(write(points=inside), near=None, far=None)
     centres = np.stack([camera_to_world(i, "opencv")[:3, 3] for i in range(6)])
@@ -100,7 +100,7 @@ def test_bounds_come_from_the_points_unless_they_are_given(write):
     assert views.cameras.far == pytest.approx(1.1 * distance.max(), rel=1e-3)
 
 
-def test_bounds_heed_both_focal_lengths(write):
+def test_bounds_use_both_focal_lengths(write):
     lens = (FX, 3 * FX, WIDTH / 2, HEIGHT / 2)
     cameras = load(write(cameras={1: ("PINHOLE", lens)}), near=None, far=None).cameras
     in_view = []
@@ -113,7 +113,7 @@ def test_bounds_heed_both_focal_lengths(write):
     assert cameras.far == pytest.approx(1.1 * max(high for _, high in in_view))
 
 
-def test_points_and_poses_beyond_all_coordinates_do_not_give_bounds(write):
+def test_distant_and_infinite_points_and_poses_do_not_change_bounds(write):
     expected = load(write(), near=None, far=None).cameras
     for far_away in (1e30, 1e7):
         cameras = load(write(points=np.vstack([POINTS, [[far_away] * 3]])), near=None, far=None).cameras
@@ -140,7 +140,7 @@ def test_without_points_bounds_come_from_the_cameras(write):
     assert len(load(root)) == 4
 
 
-def test_images_may_be_smaller_than_those_that_were_calibrated(write):
+def test_images_may_be_smaller_than_the_calibrated_images(write):
     root = write()
     for i in range(6):
         save_picture(root / f"images_2/top/v{i}.png", i, WIDTH // 2, HEIGHT // 2)
@@ -193,7 +193,7 @@ def test_wrong_text_files_are_refused(write, file, old, new, message):
     refused(message, load, root)
 
 
-def test_what_is_missing_is_named(write, tmp_path):
+def test_missing_files_are_named(write, tmp_path):
     refused("there is no COLMAP model", load, tmp_path)
     refused(r"sparse/7; set data\.model to its folder", load, tmp_path, model="sparse/7")
     root = write()

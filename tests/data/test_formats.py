@@ -54,7 +54,7 @@ def test_masks_are_optional(form: Format, tmp_path: Path) -> None:
 
 
 @with_files
-def test_chosen_labels_are_the_object_in_every_format(form: Format, tmp_path: Path) -> None:
+def test_selected_labels_define_the_object_in_every_format(form: Format, tmp_path: Path) -> None:
     views = form.load(form.write(tmp_path, masks=True))
     before = torch.stack(list(views.masks))
     for frame in views.frames:  # label 1 for the object in each mask, and label 2 for everything else
@@ -73,7 +73,7 @@ def test_empty_and_full_masks_are_named(tmp_path: Path, capsys: pytest.CaptureFi
     assert "1 of 4 masks are full (train/r_4)" in out
 
 
-def test_a_mask_that_is_found_for_two_images_is_refused(tmp_path: Path) -> None:
+def test_mask_that_matches_two_images_is_refused(tmp_path: Path) -> None:
     root = write_blender(tmp_path)
     for split, folder in (("train", "front"), ("test", "back")):
         (root / folder).mkdir()
@@ -92,12 +92,12 @@ def test_a_mask_that_is_found_for_two_images_is_refused(tmp_path: Path) -> None:
 
 
 @with_files
-def test_masks_that_fit_no_image_are_refused(form: Format, tmp_path: Path) -> None:
+def test_masks_without_an_image_are_refused(form: Format, tmp_path: Path) -> None:
     save_mask(form.write(tmp_path) / "masks/000000.png", 1)
     refused(r"no image has a mask, although .*masks/000000\.png exist|1 masks for 6", form.load, tmp_path)
 
 
-def test_masks_of_another_split_are_in_use(tmp_path: Path) -> None:
+def test_masks_of_another_split_do_not_count_as_unmatched(tmp_path: Path) -> None:
     source = BlenderData(str(write_blender(tmp_path, masks=True)))
     save_mask(tmp_path / "masks/000000.png", 1)  # fits no image
     for frame in source.load("test").frames:

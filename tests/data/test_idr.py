@@ -32,7 +32,7 @@ def test_near_and_far_enclose_the_unit_sphere(write):
     assert (cameras.near, cameras.far) == (pytest.approx(2), pytest.approx(4))  # all cameras are at distance 3
 
 
-def test_the_files_own_world(write):
+def test_world_of_the_file_is_kept_on_request(write):
     cameras = load(write(), world="file", near=1.0, far=20.0).cameras
     world = torch.from_numpy(POINTS * SCALE + SHIFT).float()
     inside = load(write()).cameras.project(torch.from_numpy(POINTS).float())
@@ -41,7 +41,7 @@ def test_the_files_own_world(write):
     refused(r"data.world=file needs data.near and data.far", IdrData, str(write()), world="file")
 
 
-def test_masks_lie_beside_the_images_if_there_is_no_folder(tmp_path: Path) -> None:
+def test_masks_are_read_beside_the_images_without_a_mask_folder(tmp_path: Path) -> None:
     write_idr(tmp_path)
     for i in range(6):
         save_mask(tmp_path / "image" / f"mask_{i:06d}.png", i)
@@ -52,8 +52,9 @@ def test_masks_lie_beside_the_images_if_there_is_no_folder(tmp_path: Path) -> No
 
 def test_hidden_files_among_the_masks_are_ignored(write: Callable[..., Path]) -> None:
     root = write()
+    expected = load(root).masks
     (root / "mask" / "._000.png").write_bytes(b"of another system")
-    assert load(root).masks is not None
+    assert torch.equal(torch.stack(list(load(root).masks)), torch.stack(list(expected)))
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Images and masks of every kind, against slow means and hand-written values."""
+"""Images and masks of every file type, against slow means and hand-written values."""
 
 from pathlib import Path
 
@@ -128,7 +128,7 @@ def test_chosen_labels_are_indices_or_grey_levels_of_the_file(tmp_path: Path):
     refused("has colours, which have no labels", image_files.read_mask, tmp_path / "mask.png", [1])
 
 
-def test_coverage_along_the_outline_stays_coverage(tmp_path: Path):
+def test_coverage_along_the_outline_is_preserved(tmp_path: Path):
     rows, columns = np.mgrid[:40, :40] / 40 - 0.5
     parts = np.stack([np.hypot(rows + dr, columns + dc) < 0.3 for dr in (0, 0.0125) for dc in (0, 0.0125)])
     coverage = np.rint(255 * parts.mean(0)).astype(np.uint8)  # five levels only
@@ -153,7 +153,7 @@ def test_empty_masks_and_masks_of_one_label_are_read(save):
 
 
 @pytest.mark.parametrize("factor", [1, 1.2, 1.7, 2, 2.5, 3, 4, 5, 6, 11.9, 40])
-def test_any_factor_is_the_mean_over_the_area_of_a_pixel(factor):
+def test_downscaling_by_any_factor_averages_the_pixel_area(factor):
     values = np.random.default_rng(0).random((12, 18, 3), dtype=np.float32)
     small = area_mean(values, downscaled((12, 18), factor))
     height, width = small.shape[:2]
@@ -172,7 +172,7 @@ def test_truncated_16bit_image_is_named(suffix: str, tmp_path: Path):
     refused(rf"image\{suffix} cannot be read", read_rgb, path, "drop")
 
 
-def test_flipped_bit_in_an_8bit_image_is_found(save):
+def test_flipped_bit_in_an_8bit_image_is_detected(save):
     path = save(levels(20, 20, 3))
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 16
@@ -182,7 +182,7 @@ def test_flipped_bit_in_an_8bit_image_is_found(save):
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp", ".tif"])
 @pytest.mark.parametrize("orientation", [1, 3, 6])
-def test_photograph_that_asks_to_be_turned_is_refused(orientation: int, suffix: str, tmp_path: Path) -> None:
+def test_rotated_orientation_tag_is_refused(orientation: int, suffix: str, tmp_path: Path) -> None:
     path, exif = tmp_path / f"a{suffix}", Image.Exif()
     exif[274] = orientation
     Image.new("RGB", (6, 4)).save(path, exif=exif)

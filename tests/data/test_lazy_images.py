@@ -1,4 +1,4 @@
-"""Images stay in their files until they are asked for, and training pixels keep every bit."""
+"""Images are read from their files on demand, and training pixels keep every bit."""
 
 import os
 from functools import partial
@@ -38,7 +38,7 @@ class Reader:
         return read(path)
 
 
-def test_pictures_are_in_the_order_of_their_files_and_means_of_blocks(tmp_path: Path) -> None:
+def test_images_keep_the_order_of_files_and_are_block_means(tmp_path: Path) -> None:
     paths, levels = save(tmp_path, 30)
     whole, half = LazyImages.of(paths, read), LazyImages.of(paths, read, 2)
     assert np.array_equal(np.stack(list(whole.all_levels())), levels)
@@ -46,7 +46,7 @@ def test_pictures_are_in_the_order_of_their_files_and_means_of_blocks(tmp_path: 
     torch.testing.assert_close(torch.stack(list(half)), mean, rtol=0, atol=0.51 / 65535)
 
 
-def test_only_a_few_pictures_are_decoded_ahead(tmp_path: Path) -> None:
+def test_few_images_are_decoded_ahead(tmp_path: Path) -> None:
     paths, _ = save(tmp_path, 60)
     reader = Reader()
     pictures = LazyImages.of(paths, reader)
@@ -57,7 +57,7 @@ def test_only_a_few_pictures_are_decoded_ahead(tmp_path: Path) -> None:
     levels.close()
 
 
-def test_a_program_decodes_a_picture_once_per_size(tmp_path: Path) -> None:
+def test_image_is_decoded_once_per_size(tmp_path: Path) -> None:
     paths, _ = save(tmp_path, 3)
     reader = Reader()
     with decoded_once():
@@ -72,7 +72,7 @@ def test_a_program_decodes_a_picture_once_per_size(tmp_path: Path) -> None:
     assert reader.decoded[7:] == [paths[2]]
 
 
-def test_picture_that_changes_its_size_is_told(tmp_path: Path) -> None:
+def test_image_that_changes_its_size_is_refused(tmp_path: Path) -> None:
     paths, _ = save(tmp_path, 2)
     pictures = LazyImages.of(paths, read)
     Image.new("RGB", (2, 2)).save(paths[1])
@@ -85,7 +85,7 @@ EVERY = torch.arange(NUM_VIEWS * 4 * 6)
 
 
 @pytest.mark.parametrize("bits", [8, 16])
-def test_drawn_colours_are_those_of_the_pictures_to_the_last_bit(bits: int, tmp_path: Path) -> None:
+def test_drawn_colours_equal_the_image_exactly(bits: int, tmp_path: Path) -> None:
     pictures = LazyImages.of(save(tmp_path, NUM_VIEWS, bits)[0], read)
     store = PixelStore(pictures)
     expected = torch.stack(list(pictures)).view(-1, 3)
@@ -95,7 +95,7 @@ def test_drawn_colours_are_those_of_the_pictures_to_the_last_bit(bits: int, tmp_
 
 
 @pytest.mark.parametrize("bits", [8, 16])
-def test_mapped_pixels_are_made_once_for_a_content(bits: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mapped_pixels_are_cached_by_content(bits: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NERFRO_CACHE", str(tmp_path / "cache"))
     paths, _ = save(tmp_path, NUM_VIEWS, bits)
     resident = PixelStore(LazyImages.of(paths, Reader()))[EVERY]

@@ -1,4 +1,4 @@
-"""Keys that state a lens in transforms files, and lenses that no format accepts."""
+"""Keys of the lens in transforms files, and lenses that every format refuses."""
 
 import math
 from collections.abc import Callable
@@ -60,9 +60,7 @@ WIDE = {"camera_angle_x": math.pi / 2}  # focal length 12
         (WIDE | {"is_fisheye": False, "ortho": 0, "sk_x": 0.0, "camera_model": "pinhole"}, {}, (12, 12, *CENTRE)),
     ],
 )
-def test_keys_of_the_frame_come_first_and_focal_lengths_before_angles(
-    file: dict, frame: dict, expected: tuple[float, ...]
-) -> None:
+def test_frame_keys_and_focal_lengths_have_precedence(file: dict, frame: dict, expected: tuple[float, ...]) -> None:
     lens = read_lens(file, frame, SIZE, "it")
     assert (lens.fx, lens.fy, lens.cx, lens.cy) == pytest.approx(expected)
     assert lens.distortion is None
@@ -113,7 +111,7 @@ def test_keys_of_other_projections_are_refused(place: str, keys: dict, message: 
     refused(rf"^it: .*{message}", read_lens, file, frame, SIZE, "it")
 
 
-def test_blender_files_with_intrinsics_have_their_lens(tmp_path: Path) -> None:
+def test_intrinsics_in_blender_files_are_read(tmp_path: Path) -> None:
     root = write_transforms(tmp_path, {"camera_angle_x": ANGLE} | SHARED | DISTORTION)
     check_views(BlenderData(str(root)).load("train"), list(TRAIN), k=K, p=P)
 
@@ -136,7 +134,7 @@ def test_blender_files_with_intrinsics_have_their_lens(tmp_path: Path) -> None:
         (Lens(FX, FY, CX, CY, coefficients([math.nan])), "a: the lens distortion is not invertible everywhere"),
     ],
 )
-def test_lenses_that_no_camera_has_are_refused(lens: Lens, message: str) -> None:
+def test_impossible_lenses_are_refused(lens: Lens, message: str) -> None:
     refused(message, check_lenses, [Lens(FX, FY, CX, CY), lens], ["b", "a"], SIZE)
 
 
@@ -156,7 +154,7 @@ BEYOND: dict[str, Callable[[Path], Path]] = {
 
 
 @pytest.mark.parametrize("form", BEYOND)
-def test_lenses_beyond_reason_are_refused_in_every_format(tmp_path: Path, form: str) -> None:
+def test_extreme_lenses_are_refused_in_every_format(tmp_path: Path, form: str) -> None:
     refused(r"for an image of 24x18 pixels, has (cx=[1-9]\d|fx=1)", FORMATS[form].load, BEYOND[form](tmp_path))
 
 

@@ -34,7 +34,7 @@ def load(root: Path, split: str = "train", **options: Any) -> Views:
 
 
 @pytest.mark.parametrize("frame", ["llff", "eikonal"])
-def test_a_frame_is_a_similarity_that_takes_the_scene_along(write, frame):
+def test_frame_is_a_similarity_transformation_of_the_scene(write, frame):
     root = write()
     _, transform = transformed(root, frame)
     linear = transform[:3, :3]
@@ -76,7 +76,7 @@ def test_eikonal_frame_is_spherified(write):
     np.testing.assert_allclose(np.linalg.norm(axes, axis=-1), 1)
 
 
-def test_bounds_are_the_files_depths_in_the_frames_units(write):
+def test_bounds_are_scaled_to_the_frame(write):
     root = write()
     corner = np.hypot(1, np.hypot(WIDTH, HEIGHT) / 2 / FX)
     own = load(root).cameras

@@ -35,7 +35,7 @@ def test_mask_is_found(tmp_path: Path, image: str, mask: str) -> None:
     assert find_mask(tmp_path, tmp_path / image) == expected
 
 
-def test_stated_mask_wins_and_must_exist(tmp_path: Path) -> None:
+def test_explicit_mask_has_precedence_and_must_exist(tmp_path: Path) -> None:
     image, beside, stated = (_touch(tmp_path / name) for name in ("a.png", "mask_a.png", "other/b.png"))
     assert find_mask(tmp_path, image) == beside
     assert find_mask(tmp_path, image, "other\\b.png") == stated
@@ -47,7 +47,7 @@ def test_views_of_different_splits_never_share_a_mask(tmp_path: Path) -> None:
     assert find_mask(tmp_path, _touch(tmp_path / "train" / "r_0.png")) is None
 
 
-def test_transparency_is_a_silhouette_where_there_are_no_files(tmp_path: Path) -> None:
+def test_transparency_is_the_mask_without_mask_files(tmp_path: Path) -> None:
     levels = np.full((2, 4, 4), 255, np.uint8)
     paths = [tmp_path / "0.png", tmp_path / "1.png"]
     for path in paths:
@@ -62,7 +62,7 @@ def test_transparency_is_a_silhouette_where_there_are_no_files(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("mode", ["RGB", "RGBA"])
-def test_transparency_of_a_later_image_is_a_silhouette(tmp_path: Path, mode: str) -> None:
+def test_transparency_of_any_image_is_the_mask(tmp_path: Path, mode: str) -> None:
     paths = [tmp_path / f"{i}.png" for i in range(3)]
     for path in paths:
         Image.new(mode, (4, 2)).convert("RGB").convert(mode).save(path)
@@ -78,7 +78,7 @@ def test_images_without_alpha_are_not_decoded(tmp_path: Path, monkeypatch: pytes
     assert find_masks([tmp_path / "a.jpg"] * 2, [None] * 2, 1, (4, 2)) is None
 
 
-def test_masks_of_some_images_only_are_told_and_left(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_incomplete_masks_are_reported_and_ignored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     image = _touch(tmp_path / "a.png")
     assert find_masks([image, image], [None, image], 1, (4, 2)) is None
     assert "1 of 2 images have no mask (a.png)" in capsys.readouterr().out

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.usefixtures("few_refref_views")
 pytest.importorskip("pyarrow")
 
 
-def test_splits_are_the_rows_in_turn_across_files_with_equal_bounds(tmp_path):
+def test_splits_number_their_rows_across_files_with_equal_bounds(tmp_path):
     source = RefRefData(str(write_refref(tmp_path, far_away=5)))
     for split, num in (("train", [1, 2]), ("val", [0, 3]), ("test", [4, 5])):
         views = source.load(split)

@@ -127,7 +127,7 @@ FRAME = r"transforms_train\.json: frame 1 \('train/r_2'\)"
         (matrix(lambda m: np.multiply(m[:3, :3], 1.1, m[:3, :3])), FRAME + r".* \(R\^T R differs from 1 by 0.21\)"),
     ],
 )
-def test_wrong_transforms_files_give_one_clear_line(
+def test_wrong_transforms_files_give_a_one_line_error(
     tmp_path: Path, change: Callable[[dict], Any], message: str
 ) -> None:
     root = edit(write_blender(tmp_path), change)
@@ -190,7 +190,7 @@ def test_every_tenth_frame_by_name_is_a_test_view(tmp_path: Path) -> None:
     assert load(root, "val").names == load(root, "test").names
 
 
-def test_a_file_for_each_split_and_a_field_of_view_instead_of_a_focal_length(tmp_path: Path) -> None:
+def test_split_files_and_field_of_view_are_read(tmp_path: Path) -> None:
     root = write_nerfstudio(tmp_path, seeds=(1, 0), top={"camera_angle_x": ANGLE}, name="transforms_train.json")
     assert NerfstudioData(str(root), near=0.5, far=9.0).splits == ["train"]
     check_views(load(root), [1, 0], lens=IDEAL)
@@ -213,7 +213,7 @@ def test_black_pixels_of_mask_path_are_not_usable(tmp_path: Path) -> None:
     assert 0 < whole.sum() < whole.size
 
 
-def test_masks_of_nerfro_beside_the_images_are_silhouettes_unless_they_are_mask_path(tmp_path: Path) -> None:
+def test_masks_beside_the_images_are_silhouettes_unless_named_by_mask_path(tmp_path: Path) -> None:
     root = write_nerfstudio(tmp_path, seeds=range(3))
     for i in range(3):
         save_mask(root / f"images/mask_f_{i}.png", i)
@@ -226,7 +226,7 @@ def test_masks_of_nerfro_beside_the_images_are_silhouettes_unless_they_are_mask_
     assert views.usable is not None
 
 
-def test_grey_of_mask_path_counts_as_the_nearer_level_and_labels_are_0_and_1(tmp_path: Path) -> None:
+def test_mask_path_rounds_grey_levels_and_accepts_labels_0_and_1(tmp_path: Path) -> None:
     root = write_nerfstudio(tmp_path, seeds=range(2), frame=lambda i: {"mask_path": "mask.png"})
     levels = np.full((HEIGHT, WIDTH), 127, np.uint8)
     levels[3, 5] = 128
@@ -276,7 +276,7 @@ def test_wrong_values_are_named(tmp_path: Path, top: dict, frame: dict, message:
         load(write_nerfstudio(tmp_path, seeds=range(3), top=SHARED | top, frame=lambda i: frame), near=None)
 
 
-def test_frames_without_an_image_are_skipped_in_one_line_or_refused(
+def test_frames_without_an_image_are_skipped_with_one_warning_or_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     root = write_nerfstudio(tmp_path)

@@ -1,4 +1,4 @@
-"""Views that are held back: which, and that nobody trains on them."""
+"""Validation views: their selection, and that training does not use them."""
 
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from nerfro.training.ray_batches import RayBatches
 from tests.conftest import Runner
 
 
-def test_places_are_spread_and_the_outermost_are_left() -> None:
+def test_validation_views_are_spread_and_not_outermost() -> None:
     line = np.stack([np.arange(9.0), np.zeros(9), np.zeros(9)], -1)
     assert spread(line, 1) == [4]
     groups = np.concatenate([line + shift for shift in np.diag([0, 100, 100])])
@@ -27,7 +27,7 @@ def test_places_are_spread_and_the_outermost_are_left() -> None:
     assert spread(np.zeros((5, 3)), 3) == [0, 1, 2], "cameras in one place are taken once each"
 
 
-def test_held_back_views_are_val_and_the_others_train(tiny_scene: Path) -> None:
+def test_held_out_views_become_the_val_split(tiny_scene: Path) -> None:
     source = BlenderData(str(tiny_scene), near=2.0, far=6.0)
     held = WithValidationViews(source, 1)
     whole, train, val = source.load("train"), held.load("train"), held.load("val")
@@ -46,7 +46,7 @@ def test_held_back_views_are_val_and_the_others_train(tiny_scene: Path) -> None:
     assert many.load("val").names == train.names
 
 
-def test_a_run_never_draws_what_it_holds_back(train: Runner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_never_draws_validation_views(train: Runner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: list[Views] = []
     make = RayBatches.__init__
 
@@ -62,6 +62,6 @@ def test_a_run_never_draws_what_it_holds_back(train: Runner, tmp_path: Path, mon
     assert not {frame.image for frame in drawn[0].frames} & {frame.image for frame in val.frames}
 
 
-def test_views_that_leave_none_to_train_on_are_refused(train: Runner) -> None:
+def test_too_many_validation_views_are_refused(train: Runner) -> None:
     refused = train("trainer.max_steps=1", "batches.num_validation_views=3", code=1).error
     assert "=3 leaves no view to train on: there are 3 training views; take at most 2" in refused

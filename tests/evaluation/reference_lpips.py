@@ -16,7 +16,7 @@ from torch import nn
 
 
 class AlexNet(nn.Module):
-    """The feature layers of torchvision's AlexNet, in its numbering, with seeded He initialisation."""
+    """The feature layers of torchvision's AlexNet, in its numbering, with seeded He initialization."""
 
     def __init__(self):
         super().__init__()
@@ -36,10 +36,10 @@ class AlexNet(nn.Module):
             nn.ReLU(inplace=True),
             nn.MaxPool2d(kernel_size=3, stride=2),
         )
-        initialise(self.features)
+        initialize(self.features)
 
 
-def initialise(layers):
+def initialize(layers):
     for module in layers:
         if isinstance(module, nn.Conv2d):
             nn.init.kaiming_normal_(module.weight)

@@ -42,7 +42,7 @@ def test_means_of_the_maps_are_the_metrics() -> None:
     assert maps["flip"].values.mean().item() == pytest.approx(flip(prediction, target).item(), abs=1e-6)
 
 
-def test_border_without_a_window_has_no_similarity_and_is_grey() -> None:
+def test_border_without_ssim_window_is_grey() -> None:
     prediction, target = torch.rand(2, 16, 20, 3, generator=torch.Generator().manual_seed(0))
     error = error_maps(prediction, target, build_metrics())[1]
     assert error.values[5:-5, 5:-5].isfinite().all()
@@ -53,13 +53,13 @@ def test_border_without_a_window_has_no_similarity_and_is_grey() -> None:
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_maps_that_a_picture_is_too_small_for_are_left_out() -> None:
+def test_maps_are_omitted_for_small_images() -> None:
     prediction, target = torch.rand(2, 10, 30, 3, generator=torch.Generator().manual_seed(0))
     maps = error_maps(prediction, target, with_lpips())
     assert [error.name for error in maps] == ["squared_error", "flip"]
 
 
-def test_sheet_shows_pictures_and_maps(tmp_path: Path) -> None:
+def test_sheet_contains_images_and_maps(tmp_path: Path) -> None:
     prediction, target = torch.rand(2, 64, 128, 3, generator=torch.Generator().manual_seed(0))
     write_error_sheet(tmp_path, "a", prediction, target, build_metrics())
     sheet = load_png(tmp_path / "errors" / "a.png")
@@ -70,7 +70,7 @@ def test_sheet_shows_pictures_and_maps(tmp_path: Path) -> None:
         assert sheet[22 + 128 :, left : left + 256].min() < 0.2, "a caption in ink"
 
 
-def test_triptych_holds_prediction_reference_and_error() -> None:
+def test_triptych_contains_prediction_reference_and_error() -> None:
     prediction, target = torch.rand(2, 8, 9, 3, generator=torch.Generator().manual_seed(0))
     parts = triptych(prediction, target).split(9, dim=1)
     error = magma(squared_error_map(prediction, target), 0.05)

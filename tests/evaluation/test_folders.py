@@ -24,7 +24,7 @@ def folders(tmp_path: Path) -> tuple[Path, Path]:
     return tmp_path / "predictions", tmp_path / "references"
 
 
-def test_pictures_are_matched_by_name_whatever_their_format(folders: tuple[Path, Path]) -> None:
+def test_images_are_matched_by_name_in_any_format(folders: tuple[Path, Path]) -> None:
     (folders[0] / "notes.txt").write_text("not a picture")
     (folders[0] / "scores").mkdir()
     pairs = match_folders(*folders, None)
@@ -39,9 +39,7 @@ def test_pictures_are_matched_by_name_whatever_their_format(folders: tuple[Path,
     assert coverage is None
 
 
-def test_masks_are_given_or_lie_with_the_references_or_are_their_transparency(
-    folders: tuple[Path, Path], tmp_path: Path
-) -> None:
+def test_masks_come_from_the_option_the_references_or_transparency(folders: tuple[Path, Path], tmp_path: Path) -> None:
     predictions, references = folders
     for name in ("a", "b", "c"):  # those of other views do no harm
         write(tmp_path / "masks" / f"{name}.png", channels=1, level=255)
@@ -66,7 +64,7 @@ def test_masks_are_given_or_lie_with_the_references_or_are_their_transparency(
         assert pair.load(alpha)[1].unique().tolist() == pytest.approx([expected], abs=1 / 2**16)
 
 
-def test_pictures_without_a_partner_are_refused(folders: tuple[Path, Path], tmp_path: Path) -> None:
+def test_images_without_a_partner_are_refused(folders: tuple[Path, Path], tmp_path: Path) -> None:
     predictions, references = folders
     write(predictions / "c.png")
     refused(r"1 of 3 images have no reference in .*c\.png is the first", match_folders, predictions, references, None)
@@ -81,7 +79,7 @@ def test_pictures_without_a_partner_are_refused(folders: tuple[Path, Path], tmp_
     refused(r"2 of 3 images have no mask in masks=", match_folders, predictions, references, tmp_path / "masks")
 
 
-def test_folders_without_pictures_are_refused(folders: tuple[Path, Path], tmp_path: Path) -> None:
+def test_folders_without_images_are_refused(folders: tuple[Path, Path], tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     refused(r"predictions=.*nowhere is not a folder", match_folders, tmp_path / "nowhere", folders[1], None)
     with pytest.raises(NerfroError, match=r"references=.*empty holds no images; allowed are \.png"):
@@ -90,7 +88,7 @@ def test_folders_without_pictures_are_refused(folders: tuple[Path, Path], tmp_pa
     refused(r"a\.jpg and .*a\.png have the same name", match_folders, *folders, None)
 
 
-def test_damaged_and_unfit_files_are_named(folders: tuple[Path, Path]) -> None:
+def test_damaged_and_unsuitable_files_are_named(folders: tuple[Path, Path]) -> None:
     predictions, references = folders
     write(predictions / "a.png", size=(12, 9))
     with pytest.raises(NerfroError, match=r"a\.png has 12x9 pixels but its reference .*a\.bmp has 12x10"):

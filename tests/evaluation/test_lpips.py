@@ -60,7 +60,7 @@ def pictures() -> tuple[Tensor, Tensor]:
     return predictions, targets
 
 
-def test_distance_and_its_map_are_those_of_torchmetrics(reference: Reference) -> None:
+def test_distance_and_map_match_torchmetrics(reference: Reference) -> None:
     compared = reference.predictions, reference.targets, reference.results["distances"], reference.results["maps"]
     for prediction, target, distance, distance_map in zip(*compared, strict=True):
         assert distance > 0.01  # a comparison of zeros would show nothing
@@ -77,12 +77,12 @@ def test_distance_on_a_mask_is_the_mean_of_the_map_there(network: LpipsNetwork) 
     assert network(prediction, target, inside).item() == pytest.approx(expected.item(), abs=1e-7)
 
 
-def test_model_that_holds_the_network_neither_trains_nor_stores_it(network: LpipsNetwork) -> None:
+def test_network_is_neither_trained_nor_saved_with_a_model(network: LpipsNetwork) -> None:
     assert list(network.parameters()) == []
     assert network.state_dict() == {}
 
 
-def test_a_missing_network_is_reported_with_the_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_network_is_reported_with_the_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     monkeypatch.setattr(pretrained, "unreachable", lambda url: "no cable")
     metric = Lpips()

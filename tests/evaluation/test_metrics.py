@@ -45,7 +45,7 @@ def scored(*compared: tuple[Tensor, ...], metrics: ImageMetrics | None = None) -
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_psnr_is_that_of_scikit_image(seed: int) -> None:
+def test_psnr_matches_scikit_image(seed: int) -> None:
     prediction, target = pictures(seed)
     expected = peak_signal_noise_ratio(target.double().numpy(), prediction.double().numpy(), data_range=1.0)
     assert psnr(prediction, target).item() == pytest.approx(expected, abs=1e-6)
@@ -57,7 +57,7 @@ def test_mean_psnr_is_the_mean_over_views_and_not_over_pixels() -> None:
     assert result.mean("psnr") == pytest.approx(-10 * math.log10(0.2 / 255), abs=1e-3)
 
 
-def test_numbers_can_be_computed_again_from_the_written_pictures(tmp_path: Path) -> None:
+def test_scores_are_reproducible_from_the_written_images(tmp_path: Path) -> None:
     prediction, target = pictures()
     prediction = prediction * 1.2 - 0.1  # parts that cannot be displayed are clipped
     save_png(tmp_path / "a.png", prediction)
@@ -98,7 +98,7 @@ def test_every_region_has_the_scores_of_its_pixels() -> None:
     assert len({result.mean("psnr", region) for region in regions}) == 3
 
 
-def test_views_without_the_object_have_the_full_image_only() -> None:
+def test_views_without_the_object_have_only_full_image_scores() -> None:
     images = pictures()
     full = torch.ones(images[0].shape[:2])
     result = scored((*images, full), (*images, 0 * full), images)
@@ -118,12 +118,12 @@ def test_missing_metrics_are_none_with_a_reason() -> None:
     assert result.notes == {"ssim": "images, masks or crops below 11 pixels", "lpips": "no network was given"}
 
 
-def test_an_evaluation_without_views_is_refused() -> None:
+def test_evaluation_without_views_is_refused() -> None:
     refused("no view was scored", scored)
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_pictures_that_cannot_be_compared_are_refused() -> None:
+def test_incomparable_images_are_refused() -> None:
     black = torch.zeros(16, 16, 3)
     refused(r"\[16, 16, 3\] with a reference \[16, 17, 3\]", scored, (black, torch.zeros(16, 17, 3)))
     refused("NaN", scored, (math.nan * black, black))
@@ -142,7 +142,7 @@ def test_collection_scores_batches_like_single_images_and_names_its_results() ->
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_ssim_is_that_of_torchmetrics_over_whole_windows(seed: int) -> None:
+def test_ssim_matches_torchmetrics_over_whole_windows(seed: int) -> None:
     prediction, target = pictures(seed=seed)
     batches = [image.double().permute(2, 0, 1)[None] for image in (prediction, target)]
     _, full = structural_similarity_index_measure(*batches, data_range=1.0, return_full_image=True)
@@ -162,12 +162,12 @@ def test_ssim_on_a_mask_is_the_mean_of_the_map_there() -> None:
     assert ssim(prediction, target, border).isnan()
 
 
-def test_a_picture_without_a_whole_window_is_refused() -> None:
+def test_image_without_a_whole_window_is_refused() -> None:
     refused("at least 11 x 11", ssim, torch.zeros(10, 40, 3), torch.zeros(10, 40, 3))
 
 
 @pytest.mark.parametrize("swap", [False, True])
-def test_map_and_mean_are_those_of_flip_evaluator_whose_first_argument_is_the_reference(swap: bool) -> None:
+def test_flip_map_and_mean_match_flip_evaluator(swap: bool) -> None:
     prediction, target = pictures()[::-1] if swap else pictures()
     errors, mean, viewed = flip_evaluator.evaluate(target.numpy(), prediction.numpy(), "LDR", applyMagma=False)
     assert viewed["ppd"] == pytest.approx(67.02, abs=0.01)

@@ -103,14 +103,14 @@ def test_weights_with_another_hash_are_refused_and_not_kept(site: str, cache: Pa
     assert list(cache.iterdir()) == []
 
 
-def test_stalled_download_is_given_up_and_leaves_nothing(site: str, cache: Path, monkeypatch) -> None:
+def test_stalled_download_times_out_and_leaves_no_file(site: str, cache: Path, monkeypatch) -> None:
     monkeypatch.setattr(pretrained, "STALL_SECONDS", 0.3)
     refused("timed out", load_weights, f"{site}/stalling/{right_name()}")
     assert list(cache.iterdir()) == []
     assert socket.getdefaulttimeout() is None
 
 
-def test_silent_host_is_given_up() -> None:
+def test_silent_host_times_out() -> None:
     with socket.create_server(("127.0.0.1", 0)) as silent:
         url = f"http://127.0.0.1:{silent.getsockname()[1]}/alexnet-00000000.pth"
         assert unreachable(url, seconds=0.3) in ("no answer within 0.3 s", "timed out")
@@ -122,7 +122,7 @@ def test_silent_host_is_given_up() -> None:
 @example(text="cos\nsystem\n(S'true'\ntR.")
 @example(text="\x80\x02]q\x00.")
 @example(text="PK\x03\x04")  # the beginning of a zip file
-def test_any_text_file_is_refused_in_one_line_that_says_what_to_give(text: str) -> None:
+def test_text_file_is_refused_with_advice(text: str) -> None:
     cached = cached_alexnet()
     cached.write_text(text, encoding="latin-1", errors="replace")
     message = refused(rf"AlexNet weights {cached} .*; delete them to fetch them again", load_weights)

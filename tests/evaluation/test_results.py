@@ -39,7 +39,7 @@ def refuse(constant: str) -> None:
     raise AssertionError(f"{constant} is no JSON")
 
 
-def test_file_holds_means_rows_and_budget(tmp_path: Path) -> None:
+def test_file_contains_means_rows_and_budget(tmp_path: Path) -> None:
     write_metrics_json(tmp_path / "metrics.json", RunMetrics(result(), 1500, 312.5, 81000.0))
     content = json.loads((tmp_path / "metrics.json").read_text(), parse_constant=refuse)
     means = scores(psnr=(25.123456789012345 + 27.0) / 2, ssim=pytest.approx(0.85), flip=0.1875)
@@ -59,7 +59,7 @@ def test_read_returns_what_was_written(tmp_path: Path, budget: tuple) -> None:
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_numbers_that_json_lacks_are_refused_and_the_old_file_stays(tmp_path: Path, bad: float) -> None:
+def test_nan_and_infinity_are_refused_and_the_old_file_is_kept(tmp_path: Path, bad: float) -> None:
     path = tmp_path / "metrics.json"
     write_metrics_json(path, RunMetrics(result(), 1, 1.0, 1.0))
     before = path.read_text()
@@ -84,7 +84,7 @@ def test_numbers_that_json_lacks_are_refused_and_the_old_file_stays(tmp_path: Pa
         "\xff",
     ],
 )
-def test_damaged_files_are_an_error_of_one_line(tmp_path: Path, content: str) -> None:
+def test_damaged_files_give_a_one_line_error(tmp_path: Path, content: str) -> None:
     (tmp_path / "metrics.json").write_bytes(content.encode("latin-1"))
     refused(r"metrics\.json", read_metrics_json, tmp_path / "metrics.json")
 

@@ -50,7 +50,7 @@ def test_medals_follow_the_papers_rule() -> None:
     ]
 
 
-def test_csv_reads_back_every_digit() -> None:
+def test_csv_preserves_every_digit() -> None:
     lines = [line for line in to_csv(TABLE).splitlines() if not line.startswith("#")]
     heading, *body = csv.reader(lines)
     titles = ("A & co PSNR", "A & co LPIPS", "B PSNR", "B steps")
@@ -79,7 +79,7 @@ def test_latex_is_a_booktabs_table_with_special_characters_escaped() -> None:
     assert r"\caption{\textbackslash{} \textasciitilde{} \textasciicircum{} \{ \} \$}" in special
 
 
-def test_console_shows_each_group_of_columns_in_a_table_of_its_own() -> None:
+def test_console_prints_a_table_for_each_group_of_columns() -> None:
     console = rich.console.Console(file=io.StringIO(), width=45)
     console.print(to_rich(TABLE))
     first, second = re.split(r"^ *B *$", console.file.getvalue(), flags=re.MULTILINE)

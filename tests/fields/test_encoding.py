@@ -59,7 +59,7 @@ def one_frustum(near: float, far: float, radius: float) -> Samples:
 
 
 @pytest.mark.parametrize(("near", "far", "radius"), [(2.0, 6.0, 0.3), (1.0, 1.2, 0.05), (0.01, 3.0, 1.0)])
-def test_moments_are_those_of_points_in_the_frustum(near: float, far: float, radius: float) -> None:
+def test_moments_match_points_in_the_frustum(near: float, far: float, radius: float) -> None:
     mean, variance = frustum_gaussians(one_frustum(near, far, radius))
     points = draw_from_frustum(near, far, radius)
     deviation = points.std(0)
@@ -69,7 +69,7 @@ def test_moments_are_those_of_points_in_the_frustum(near: float, far: float, rad
     assert (relative < 5 * math.sqrt(2 / NUM_DRAWS)).all()
 
 
-def test_covariance_turns_with_the_direction() -> None:
+def test_covariance_rotates_with_the_direction() -> None:
     samples = one_frustum(2.0, 3.0, 0.2)
     axis = torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
     turned = Samples(samples.s[..., None] * axis, axis.expand(1, 1, 3), samples.s, samples.edges, samples.radii)

@@ -23,7 +23,7 @@ def random_positions(num_points: int) -> torch.Tensor:
     return torch.cat([points, special])
 
 
-def test_levels_grow_geometrically_and_hash_only_what_does_not_fit() -> None:
+def test_levels_grow_geometrically_and_only_large_levels_are_hashed() -> None:
     assert LEVELS.resolutions == (4, 8, 16, 32, 64)
     assert LEVELS.dense == (True, True, False, False, False)
     assert LEVELS.sizes == (125, 729, 1024, 1024, 1024)
@@ -68,7 +68,7 @@ def test_kernels_match_the_reference_forward_and_backward(num_points: int) -> No
     require_equal_gradients(encoded, expected, inputs)
 
 
-def test_positions_learn_after_a_picture_was_rendered() -> None:
+def test_positions_have_gradients_after_an_evaluation() -> None:
     # Tensors made in inference mode, as pictures are, cannot be saved for a gradient, and constants are kept.
     constant.cache_clear()
     positions = random_positions(9).requires_grad_()
@@ -91,7 +91,7 @@ def test_gradient_does_not_depend_on_the_number_of_threads() -> None:
     assert torch.equal(*gradients)
 
 
-def test_positions_that_are_not_numbers_are_answered_with_nan() -> None:
+def test_nan_positions_give_nan() -> None:
     encoded = kernels.hash_encode(torch.full((4, 3), float("nan")), random_table(), LEVELS)
     assert encoded.isnan().all()
 

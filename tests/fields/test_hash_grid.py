@@ -28,7 +28,7 @@ def make_field(precision: str = "float32", **changes: object) -> HashGridField:
     return field
 
 
-def test_selected_samples_get_what_they_would_get_alone() -> None:
+def test_selection_does_not_change_the_values_of_samples() -> None:
     samples = make_samples()
     selected = torch.rand(6, 9, generator=torch.Generator().manual_seed(4)) < 0.4
     asked = []
@@ -44,7 +44,7 @@ def test_selected_samples_get_what_they_would_get_alone() -> None:
     assert torch.equal(radiance.rgb, torch.where(selected[..., None], rgb, 0))
 
 
-def test_nothing_selected_still_has_gradients() -> None:
+def test_empty_selection_has_gradients() -> None:
     field = make_field()
     radiance = field(make_samples(scale=0.0))  # all in the middle
     assert (radiance.density > 0).all()
@@ -77,7 +77,7 @@ def decoded_in_double(
     return field.initial_density * geometry[:, 0].exp(), torch.sigmoid(raw).square()
 
 
-def test_positions_and_directions_get_the_gradients_that_autograd_finds() -> None:
+def test_gradients_of_positions_and_directions_match_autograd() -> None:
     inputs = [values.requires_grad_() for values in (torch.rand(80, 3) * 3 - 1.5, torch.randn(80, 3))]
     upstream = torch.tensor([1.0, -2.0, 3.0])
     field = make_field()
@@ -98,7 +98,7 @@ def test_positions_and_directions_get_the_gradients_that_autograd_finds() -> Non
     assert torch.autograd.gradcheck(lambda p, d: decoded_in_double(field, p, d), few)
 
 
-def test_a_dead_colour_network_still_learns_by_the_shortcut() -> None:
+def test_shortcut_keeps_gradients_of_a_dead_colour_network() -> None:
     for shortcut in (False, True):
         field = make_field(shortcut=shortcut)
         with torch.no_grad():  # all units below zero in the first layer, wherever it is asked
@@ -121,7 +121,7 @@ def test_field_runs_under_autocast_with_encodings_in_single_precision() -> None:
     assert field.table.grad.dtype == torch.float32
 
 
-def test_untrained_field_is_thin_fog_whatever_the_box() -> None:
+def test_untrained_field_is_almost_transparent_in_any_box() -> None:
     for side in (0.1, 20.0):
         torch.manual_seed(0)
         field = HashGridField([0.0] * 3, [side] * 3, initial_depth=0.2)
@@ -130,7 +130,7 @@ def test_untrained_field_is_thin_fog_whatever_the_box() -> None:
         torch.testing.assert_close(density * side, torch.full((100,), 0.2), rtol=0.02, atol=0)
 
 
-def test_field_of_all_space_is_asked_where_contraction_leads() -> None:
+def test_field_of_all_space_is_evaluated_at_contracted_positions() -> None:
     box = {"box_min": [-0.5, 0.0, 0.5], "box_max": [0.5, 1.0, 1.5]}
     everywhere, samples = make_field(**box, radius=0.8), make_samples(scale=5.0)
     centre, positions = torch.tensor([0.0, 0.5, 1.0]), samples.positions.flatten(0, 1)

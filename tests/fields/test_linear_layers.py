@@ -1,4 +1,4 @@
-"""Linear layers and MLPs with gradients written out, against those of PyTorch."""
+"""Linear layers and MLPs with explicit gradients, against those of PyTorch."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def weights(mlp: nn.Sequential) -> list[Tensor]:
 
 @pytest.mark.parametrize("widths", [(5, 3), (24, 64, 16), (32, 64, 64, 3)])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_equals_a_sequential_forward_and_backward(widths: tuple[int, ...], dtype: torch.dtype) -> None:
+def test_layers_equal_sequential_forward_and_backward(widths: tuple[int, ...], dtype: torch.dtype) -> None:
     mlp = layers(*widths)
     inputs = torch.randn(300, widths[0], requires_grad=True)
     with torch.autocast("cpu", torch.bfloat16, enabled=dtype == torch.bfloat16):
@@ -39,7 +39,7 @@ def test_equals_a_sequential_forward_and_backward(widths: tuple[int, ...], dtype
     require_equal_gradients(result, expected, [inputs, *weights(mlp)], tolerance, atol=1e-5)
 
 
-def test_inputs_side_by_side_of_which_one_learns() -> None:
+def test_concatenated_inputs_of_which_one_has_gradients() -> None:
     mlp = layers(9, 8, 3)
     first, second = torch.randn(20, 5, requires_grad=True), torch.randn(20, 4)
     result = relu_mlp([first, second], weights(mlp), torch.float32)
@@ -48,7 +48,7 @@ def test_inputs_side_by_side_of_which_one_learns() -> None:
     require_equal_gradients(result, expected, [first], atol=1e-5)
 
 
-def test_points_of_several_blocks_equal_a_sequential_in_one_thread_and_in_two(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_blocks_equal_sequential_with_one_and_two_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     mlp = layers(6, 8, 3)
     inputs = torch.randn(2 * 16384 + 700, 6, requires_grad=True)
 

@@ -1,4 +1,4 @@
-"""The networks: sizes as published, activations, and where the input is fed in again."""
+"""The networks: published sizes, activations and skip connections."""
 
 import math
 
@@ -66,7 +66,7 @@ def test_colour_reaches_a_thousandth_beyond_black_and_white() -> None:
     torch.testing.assert_close(ends, torch.tensor([-RGB_PADDING, 0.5, 1 + RGB_PADDING]))
 
 
-def test_mip_nerf_field_sees_the_size_of_the_cone() -> None:
+def test_mip_nerf_field_depends_on_the_cone_size() -> None:
     field = MipNerfField(width=16, depth=2, skip=1, view_width=8)
     samples = Stratified(8, cast="cones").eval()(example_path(), None)
     wider = type(samples)(samples.positions, samples.directions, samples.s, samples.edges, 100 * samples.radii)
@@ -98,7 +98,7 @@ def test_field_with_a_box_equals_one_without_inside_and_is_empty_outside(make: t
 
 
 @pytest.mark.usefixtures("unchecked")  # the compiler cannot trace the checks
-def test_compiled_networks_equal_plain_ones_and_keep_their_weights_names() -> None:
+def test_compiled_networks_equal_plain_ones_and_keep_weight_names() -> None:
     plain, compiled = (
         NerfField(width=16, depth=2, skip=1, view_width=8),
         NerfField(width=16, depth=2, skip=1, view_width=8),
@@ -120,7 +120,7 @@ def test_compiled_networks_equal_plain_ones_and_keep_their_weights_names() -> No
     assert compiled.state_dict().keys() == plain.state_dict().keys()
 
 
-def test_radiance_that_was_driven_below_black_comes_back_and_is_not_driven_on() -> None:
+def test_saturated_radiance_has_only_a_brightening_gradient() -> None:
     raw = torch.tensor([-50.0, -50.0, 0.3], requires_grad=True)
     (gradient,) = torch.autograd.grad((radiance(raw) * torch.tensor([-1.0, 1.0, 1.0])).sum(), raw)
     brighter, darker, ordinary = gradient

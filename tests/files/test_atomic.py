@@ -21,7 +21,7 @@ def save_checkpoint(path: Path, content: str) -> None:
 
 @pytest.mark.parametrize("write", [write_atomically, save_checkpoint])
 @pytest.mark.parametrize("step", ["fsync", "replace"])
-def test_full_disk_leaves_the_old_file_whole_and_nothing_beside_it(
+def test_full_disk_keeps_the_old_file_and_no_temporary_file(
     write: Callable[[Path, str], None], step: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "metrics.json"
@@ -45,20 +45,18 @@ def test_text_is_utf8_and_has_the_permissions_of_other_new_files(tmp_path: Path)
     assert len(modes) == 1
 
 
-def test_the_permissions_of_new_files_in_other_threads_are_not_touched(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_writing_does_not_change_the_umask_of_the_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "umask", lambda mask: pytest.fail("the umask belongs to the whole process"))
     write_atomically(tmp_path / "table.md", "PSNR")
 
 
-def test_folder_that_cannot_be_made_is_an_error_of_one_line(tmp_path: Path) -> None:
+def test_uncreatable_folder_gives_a_one_line_error(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     refused("cannot write", write_atomically, tmp_path / "file" / "metrics.json", "{}")
 
 
 @pytest.mark.parametrize("stop", [ValueError, KeyboardInterrupt])
-def test_writing_that_is_broken_off_leaves_the_old_file_and_nothing_beside_it(tmp_path: Path, stop: type) -> None:
+def test_interrupted_write_keeps_the_old_file_and_no_temporary_file(tmp_path: Path, stop: type) -> None:
     path = tmp_path / "paths.npz"
     write_atomically(path, "old")
 

@@ -1,4 +1,4 @@
-"""The disk cache never gives stale or damaged arrays, never fails a run, and does not grow without end."""
+"""The disk cache never returns stale or damaged arrays, never fails a run, and has a bounded size."""
 
 import os
 from collections.abc import Callable, Iterator
@@ -55,7 +55,7 @@ def replaced(**arrays: np.ndarray) -> Callable[[Path], None]:
         lambda file: (save_arrays(file, {"values": np.arange(5.0)}), os.truncate(file, 50)),
     ],
 )
-def test_what_does_not_match_its_checksum_is_made_again(damage: Callable[[Path], None], folder: Path) -> None:
+def test_entry_with_a_wrong_checksum_is_recomputed(damage: Callable[[Path], None], folder: Path) -> None:
     damage(folder / "distance_entry.npz")
     counter = _Counter()
     for _ in range(2):
@@ -65,7 +65,7 @@ def test_what_does_not_match_its_checksum_is_made_again(damage: Callable[[Path],
     assert counter.calls == 1
 
 
-def test_cache_does_not_grow_without_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cache_size_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cache, "LIMIT", 1000)
     (tmp_path / "mine.npz").write_bytes(bytes(2000))
     for number in range(5):
@@ -74,9 +74,7 @@ def test_cache_does_not_grow_without_end(tmp_path: Path, monkeypatch: pytest.Mon
     assert sorted(path.name for path in tmp_path.iterdir()) == ["distance_4.npz", "mine.npz"]
 
 
-def test_entries_that_another_process_removes_meanwhile_are_left_out(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_concurrently_removed_entries_are_ignored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("distance_0.npz", "distance_1.npz", ".distance_2.npz.partial"):
         (tmp_path / name).write_bytes(bytes(10))
     listed = Path.glob
@@ -93,7 +91,7 @@ def test_entries_that_another_process_removes_meanwhile_are_left_out(
     assert [path.name for path in tmp_path.iterdir()] == ["distance_1.npz"]
 
 
-def test_a_folder_that_cannot_be_made_costs_only_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_uncreatable_folder_only_disables_caching(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("NERFRO_CACHE", str(tmp_path / "file" / "below"))
     assert len(cached_arrays("distance_entry", _Counter().compute)["values"]) == 5
@@ -134,19 +132,19 @@ def broken() -> Iterator[np.ndarray]:
     raise NerfroError("a picture cannot be read")
 
 
-def test_what_is_written_to_an_array_stays_in_the_process() -> None:
+def test_changes_of_a_cached_array_stay_in_the_process() -> None:
     array = mapped_array("a", SHAPE, TYPE, rows)
     assert np.array_equal(array, np.arange(4000).reshape(SHAPE))
     array[0] = 7
     assert np.array_equal(mapped_array("a", SHAPE, TYPE, rows), np.arange(4000).reshape(SHAPE))
 
 
-def test_nothing_is_left_of_an_array_that_could_not_be_made(folder: Path) -> None:
+def test_failed_computation_leaves_no_file(folder: Path) -> None:
     refused("a picture cannot be read", mapped_array, "a", SHAPE, TYPE, broken)
     assert list(folder.iterdir()) == []
 
 
-def test_arrays_used_longest_ago_go_first(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_least_recently_used_arrays_are_removed_first(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cache, "LIMIT", 2.5 * 8200)
     for age, key in ((300, "a"), (200, "b")):
         mapped_array(key, SHAPE, TYPE, rows)
@@ -159,7 +157,7 @@ def test_arrays_used_longest_ago_go_first(folder: Path, monkeypatch: pytest.Monk
     assert np.array_equal(used, np.arange(4000).reshape(SHAPE))  # removed, but still mapped here
 
 
-def test_what_a_killed_process_left_goes_after_a_day(folder: Path) -> None:
+def test_files_of_a_killed_process_are_removed_after_a_day(folder: Path) -> None:
     for name, age in ((".mapped_old.npy.x.partial", 1e9), (".mapped_new.npy.x.partial", 2e9), (".mine.partial", 1e9)):
         (folder / name).touch()
         os.utime(folder / name, (age, age))
@@ -172,7 +170,7 @@ def test_what_a_killed_process_left_goes_after_a_day(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("place", [-1, -500, 200])
-def test_array_that_does_not_match_its_checksum_is_made_again(place: int, folder: Path) -> None:
+def test_array_with_a_wrong_checksum_is_recomputed(place: int, folder: Path) -> None:
     mapped_array("a", SHAPE, TYPE, rows)
     content = bytearray((folder / "mapped_a.npy").read_bytes())
     content[place] ^= 1

@@ -1,4 +1,4 @@
-"""Configurations of other people's runs are plain values, and nothing in them reaches this machine."""
+"""Configurations of other users' runs are plain values, which cannot read from this machine."""
 
 from itertools import pairwise
 from pathlib import Path
@@ -30,7 +30,7 @@ OTHERS = ["{[: no yaml", "name: !!python/name:os.system", "- 1", "a: 1\na: 2", B
 
 
 @pytest.mark.parametrize("text", [*HOSTILE, *OTHERS])
-def test_what_a_run_does_not_write_is_refused(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_content_that_no_run_writes_is_refused(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NERFRO_SECRET", "hunter2")
     torch.save({"nerfro_config": text}, tmp_path / "last.ckpt")
     for read in (lambda: foreign_config(text, Path("c.yaml")), lambda: load_checkpoint(tmp_path / "last.ckpt")):

@@ -25,7 +25,7 @@ def test_every_level_survives_a_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
-def test_diverged_picture_is_refused_and_overwrites_nothing(tmp_path: Path, bad: float) -> None:
+def test_diverged_image_is_refused_and_overwrites_nothing(tmp_path: Path, bad: float) -> None:
     save_png(tmp_path / "picture.png", torch.zeros(4, 4, 3))
     diverged = torch.ones(4, 4, 3)
     diverged[1, 2, 0] = bad
@@ -33,7 +33,7 @@ def test_diverged_picture_is_refused_and_overwrites_nothing(tmp_path: Path, bad:
     assert load_png(tmp_path / "picture.png").max() == 0
 
 
-def test_unreadable_pictures_are_named(tmp_path: Path) -> None:
+def test_unreadable_images_are_named(tmp_path: Path) -> None:
     refused(r"missing\.png does not exist", load_png, tmp_path / "missing.png")
     Image.new("RGBA", (4, 4)).save(tmp_path / "transparent.png")
     refused("mode RGBA", load_png, tmp_path / "transparent.png")
@@ -74,7 +74,7 @@ def test_truncated_files_are_refused_in_one_line(kept: float, suffix: str, tmp_p
     assert len(str(raised.value).splitlines()) == 1
 
 
-def test_a_file_without_colours_is_refused(tmp_path: Path) -> None:
+def test_file_without_colours_is_refused(tmp_path: Path) -> None:
     write_radiance(tmp_path / "depth.exr", RADIANCE[..., :1])
     with pytest.raises(OSError, match="it has the channels Y, but R, G and B are needed"):
         read_radiance(tmp_path / "depth.exr")

@@ -1,4 +1,4 @@
-"""Files of strangers: what is damaged, without end or too large is refused in one line, and quickly."""
+"""Untrusted files: damaged, endless or too large files are refused quickly and in one line."""
 
 import json
 import os
@@ -32,7 +32,7 @@ def png(width: int, height: int, bits: int, colour: int, rows: bytes, *chunks: b
     return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
 
 
-def test_png_that_is_cut_off_anywhere_is_no_image(tmp_path: Path) -> None:
+def test_truncated_png_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "image.png"
     Image.fromarray(np.random.default_rng(0).integers(0, 256, (5, 4, 3), dtype=np.uint8)).save(path)
     content = path.read_bytes()
@@ -68,12 +68,12 @@ READERS = [read_levels, read_size, load_png, load_array, load_arrays, lambda pat
 
 
 @pytest.mark.parametrize("read", READERS)
-def test_pipes_are_refused_instead_of_waited_for(tmp_path: Path, read: Callable[[Path], object]) -> None:
+def test_pipes_are_refused_without_blocking(tmp_path: Path, read: Callable[[Path], object]) -> None:
     os.mkfifo(tmp_path / "pipe.png")
     refused(r"pipe\.png is not a regular file; give a file on a disk", read, tmp_path / "pipe.png")
 
 
-def test_arrays_that_unpack_to_more_than_the_limit_are_refused(tmp_path: Path) -> None:
+def test_arrays_that_decompress_beyond_the_limit_are_refused(tmp_path: Path) -> None:
     np.savez_compressed(tmp_path / "rays.npz", origins=np.zeros((1000, 3)))
     assert load_arrays(tmp_path / "rays.npz", most_bytes=25_000)["origins"].shape == (1000, 3)
     with pytest.raises(NerfroError, match=r"rays\.npz holds 0\.0 GiB of arrays, but at most .* split the file"):

@@ -1,4 +1,4 @@
-"""Broken inputs of every kind, drawn at random.
+"""Random broken inputs of every type.
 
 A case draws one input, gives it to a command or to the reader that the command calls, and returns what does not hold
 (see `world.py`); None if everything holds.
@@ -82,14 +82,14 @@ def damaged(draw: random.Random, content: bytes) -> bytes:
     """Some bytes of a file lost, changed, or added."""
     place = draw.randint(0, max(len(content) - 1, 0))
     some = draw.randbytes(draw.randint(0, 8))
-    how = draw.choice(["cut", "change", "insert", "all", "twice"])
+    mutation = draw.choice(["cut", "change", "insert", "all", "twice"])
     return {
         "cut": content[:place],
         "change": content[:place] + some + content[place + len(some) :],
         "insert": content[:place] + some + content[place:],
         "all": some,
         "twice": content + content[place:],
-    }[how]
+    }[mutation]
 
 
 def rays_through_ball() -> dict[str, np.ndarray]:
@@ -288,8 +288,8 @@ def data_formats(world: World, draw: random.Random) -> str | None:
 
 def damage(draw: random.Random, file: Path) -> None:
     """Damage a value or bytes of a file, or replace the file by something else."""
-    how = draw.choice(["value"] * 6 + ["bytes", "bytes", "bytes", "empty", "gone", "folder", "pipe"])
-    if how == "value" and file.suffix == ".json":
+    mutation = draw.choice(["value"] * 6 + ["bytes", "bytes", "bytes", "empty", "gone", "folder", "pipe"])
+    if mutation == "value" and file.suffix == ".json":
         document = json.loads(file.read_text())
         *parents, last = draw.choice([place for place in places(document) if place])
         node = functools.reduce(operator.getitem, parents, document)
@@ -297,15 +297,15 @@ def damage(draw: random.Random, file: Path) -> None:
         if draw.random() < 0.2:
             del node[last]
         file.write_text(json.dumps(document))
-    elif how == "value" and file.suffix in (".txt", ".yaml", ".obj", ".off", ".csv"):
+    elif mutation == "value" and file.suffix in (".txt", ".yaml", ".obj", ".off", ".csv"):
         text = file.read_text()
         found = draw.choice(list(re.finditer(r"-?\d+\.?\d*(e-?\d+)?|true|false|null", text)))
         file.write_text(text[: found.start()] + draw.choice(WEIRD_TEXTS) + text[found.end() :])
-    elif how in ("value", "bytes"):
+    elif mutation in ("value", "bytes"):
         file.write_bytes(damaged(draw, file.read_bytes()))
     else:
         file.unlink()
-        {"empty": file.touch, "gone": lambda: None, "folder": file.mkdir, "pipe": lambda: os.mkfifo(file)}[how]()
+        {"empty": file.touch, "gone": lambda: None, "folder": file.mkdir, "pipe": lambda: os.mkfifo(file)}[mutation]()
 
 
 def _save_metrics(file: Path) -> None:
@@ -371,16 +371,16 @@ def checkpoints(world: World, draw: random.Random) -> str | None:
     """Damage a value anywhere in a checkpoint, or bytes of the file, and restore the scene."""
     checkpoint = torch.load(world.root / "run" / LAST_CHECKPOINT, weights_only=True)
     file = fresh(world, "checkpoint")
-    how = draw.choice(["value", "value", "missing", "number", "setting", "bytes"])
+    mutation = draw.choice(["value", "value", "missing", "number", "setting", "bytes"])
     path = draw.choice([place for place in places(checkpoint) if place])
     node: Any = checkpoint
     for key in path[:-1]:
         node = node[key]
-    if how == "missing":
+    if mutation == "missing":
         del node[path[-1]]
-    elif how == "number" and isinstance(node[path[-1]], torch.Tensor):
+    elif mutation == "number" and isinstance(node[path[-1]], torch.Tensor):
         node[path[-1]].view(-1)[:1] = draw.choice([math.nan, math.inf, 1e30])
-    elif how == "setting":
+    elif mutation == "setting":
         config = OmegaConf.create(checkpoint["nerfro_config"])
         setting, value = draw.choice(settings_of_a_run(world)), draw.choice(WEIRD_JSON)
         OmegaConf.update(config, setting, value, merge=False, force_add=True)
@@ -388,7 +388,7 @@ def checkpoints(world: World, draw: random.Random) -> str | None:
     else:
         node[path[-1]] = draw.choice(WEIRD_OBJECTS)
     torch.save(checkpoint, file)
-    if how == "bytes":
+    if mutation == "bytes":
         file.write_bytes(damaged(draw, file.read_bytes()))
 
     def read() -> None:
@@ -396,7 +396,7 @@ def checkpoints(world: World, draw: random.Random) -> str | None:
         rendered = trained.render(trained.cameras("test").select([0]))
         assert rendered.rgb.isfinite().all(), "a rendering that is not finite"
 
-    return world.trouble_of_reader(read, f"{how} of {'.'.join(map(str, path))}")
+    return world.trouble_of_reader(read, f"{mutation} of {'.'.join(map(str, path))}")
 
 
 KINDS: dict[str, Callable[[World, random.Random], str | None]] = {

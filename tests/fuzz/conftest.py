@@ -1,4 +1,4 @@
-"""What the tests of broken inputs share."""
+"""Fixtures of the tests of broken inputs."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""A short slice of `tests/fuzz/campaign.py`: a few cases of every kind."""
+"""A short run of `tests/fuzz/campaign.py` with a few cases of every type."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Processes that are killed, disks that are full, and two processes in one folder."""
+"""Killed processes, full disks, and two processes in one folder."""
 
 import errno
 import os
@@ -69,7 +69,7 @@ def report(what: str, seconds: float, moments: Counter[str]) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("phase", PHASES if LONG else ["cameras"])  # which has all three
-def test_killed_training_that_goes_on_ends_with_the_same_weights(phase: str, world: World, tmp_path: Path) -> None:
+def test_killed_training_resumes_to_the_same_weights(phase: str, world: World, tmp_path: Path) -> None:
     draw, num_steps = random.Random(0), 40
     options = [*world.train_options(world.root / "data"), "trainer.max_time=null", f"trainer.max_steps={num_steps}"]
     options += PHASES[phase]
@@ -100,7 +100,7 @@ def test_killed_training_that_goes_on_ends_with_the_same_weights(phase: str, wor
 
 
 @pytest.mark.slow
-def test_killed_evaluation_that_is_repeated_has_the_same_scores(world: World, tmp_path: Path) -> None:
+def test_killed_evaluation_repeats_with_the_same_scores(world: World, tmp_path: Path) -> None:
     draw, log = random.Random(1), tmp_path / "log"
     options = [f"checkpoint={world.root / 'run' / LAST_CHECKPOINT}", "device=cpu", "subdivision.side=16"]
     for out in ("compiles", "right"):
@@ -163,9 +163,7 @@ def arguments(command: str, world: World, out: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("command", [name for name in COMMANDS if name not in ("export", "trace")])
-def test_folder_that_another_process_uses_and_a_whole_file_system_are_refused(
-    command: str, world: World, tmp_path: Path
-) -> None:
+def test_locked_folder_and_root_of_a_file_system_are_refused(command: str, world: World, tmp_path: Path) -> None:
     with FileLock(tmp_path / ".lock"):
         for out, words in ((tmp_path, "another process is writing to"), (Path("/"), "is a whole file system")):
             ended = world.command(command, *arguments(command, world, out))
@@ -175,7 +173,7 @@ def test_folder_that_another_process_uses_and_a_whole_file_system_are_refused(
 
 
 @pytest.mark.parametrize("command", ["train", "evaluate", "render", "trace", "summary", "export", "calibrate"])
-def test_disk_that_is_full_at_any_file_is_told_in_one_line(
+def test_full_disk_at_any_file_gives_a_one_line_error(
     command: str, world: World, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     disk, out = Disk(monkeypatch), world.root / "full"
@@ -193,7 +191,7 @@ def test_disk_that_is_full_at_any_file_is_told_in_one_line(
 
 
 @pytest.mark.slow
-def test_file_system_of_one_megabyte(world: World, tmp_path: Path) -> None:
+def test_full_file_system_of_one_megabyte_gives_a_one_line_error(world: World, tmp_path: Path) -> None:
     """A real one: a tmpfs that only this test's processes see."""
     place = tmp_path / "small"
     place.mkdir()

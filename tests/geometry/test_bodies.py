@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 
 from nerfro.geometry.bodies import bodies_of, require_separate
@@ -24,8 +25,8 @@ def mesh_of(*parts: trimesh.Trimesh) -> TriangleMesh:
     return merge_vertices(np.asarray(whole.vertices), np.asarray(whole.faces))
 
 
-def box(size: float, x: float = 0.0) -> trimesh.Trimesh:
-    return trimesh.creation.box((size, size, size)).apply_translation((x, 0, 0))
+def box(size: float, x: float = 0.0, y: float = 0.0) -> trimesh.Trimesh:
+    return trimesh.creation.box((size, size, size)).apply_translation((x, y, 0))
 
 
 @pytest.mark.parametrize(
@@ -43,7 +44,7 @@ def box(size: float, x: float = 0.0) -> trimesh.Trimesh:
         [ball(0.3), *(ball(0.01, x) for x in np.linspace(-0.25, 0.25, 9))],
     ],
 )
-def test_surfaces_apart_inside_each_other_or_touching_pass(parts: list[trimesh.Trimesh]) -> None:
+def test_separate_nested_and_touching_surfaces_are_accepted(parts: list[trimesh.Trimesh]) -> None:
     require_separate(mesh_of(*parts))
 
 
@@ -65,24 +66,26 @@ def test_surfaces_apart_inside_each_other_or_touching_pass(parts: list[trimesh.T
         [ball(0.2, -0.5), ball(0.3, 0.5), ball(0.3, 0.5 + 1e-7)],
     ],
 )
-def test_surfaces_that_go_through_each_other_are_refused(parts: list[trimesh.Trimesh]) -> None:
+def test_intersecting_surfaces_are_refused(parts: list[trimesh.Trimesh]) -> None:
     mesh = mesh_of(*parts)
     assert bodies_of(mesh).max() == len(parts) - 1
     refused("closed surfaces of the mesh cross", require_separate, mesh)
 
 
 @pytest.mark.parametrize("medium", [SdfGrid, VoxelGrid])
-def test_surface_that_is_there_twice_counts_once(medium: type, tmp_path: Path) -> None:
+def test_duplicate_surface_counts_once(medium: type, tmp_path: Path) -> None:
     ball(0.6).export(tmp_path / "once.ply")
     trimesh.util.concatenate([ball(0.6), ball(0.6)]).export(tmp_path / "twice.ply")
     once, twice = (medium(str(tmp_path / f"{name}.ply"), **BOX) for name in ("once", "twice"))
-    for name, values in once.named_buffers():
+    buffers = dict(once.named_buffers())
+    assert sum(values.numel() for values in buffers.values()) >= 24**3
+    for name, values in buffers.items():
         assert values.equal(dict(twice.named_buffers())[name]), name
 
 
 @pytest.mark.parametrize("medium", [SdfGrid, VoxelGrid])
 @pytest.mark.parametrize("shape", ["flat", "both ways", "thin"])
-def test_mesh_without_an_inside_is_refused(medium: type, shape: str, tmp_path: Path) -> None:
+def test_mesh_without_an_interior_is_refused(medium: type, shape: str, tmp_path: Path) -> None:
     mesh = ball(0.6)
     if shape == "flat":
         normal = np.array([1.0, 2.0, 3.0]) / 14**0.5
@@ -97,14 +100,15 @@ def test_mesh_without_an_inside_is_refused(medium: type, shape: str, tmp_path: P
 
 
 @pytest.mark.parametrize("medium", [SdfGrid, VoxelGrid])
-def test_mesh_with_a_hole_is_accepted_when_asked(medium: type, tmp_path: Path) -> None:
+def test_open_mesh_is_accepted_on_request(medium: type, tmp_path: Path) -> None:
     mesh = ball(0.6)
     mesh.update_faces(np.arange(len(mesh.faces)) > 0)
     mesh.export(tmp_path / "mesh.ply")
-    medium(str(tmp_path / "mesh.ply"), accept_open_mesh=True, **BOX)
+    index, _ = medium(str(tmp_path / "mesh.ply"), accept_open_mesh=True, **BOX)(torch.zeros(1, 3))
+    assert float(index) > 1.2
 
 
 @pytest.mark.parametrize("scale", [1e8, 1e30])
-def test_mesh_that_is_far_too_large_is_refused(scale: float, tmp_path: Path) -> None:
+def test_too_large_mesh_is_refused(scale: float, tmp_path: Path) -> None:
     ball(scale).export(tmp_path / "mesh.ply")
     refused("reaches too far; scale it to about one unit", load_mesh, tmp_path / "mesh.ply")

@@ -1,4 +1,4 @@
-"""Contracted space: places and lengths against closed forms and plain sums."""
+"""Contracted space: positions and lengths against closed forms and numerical integrals."""
 
 import math
 
@@ -20,7 +20,7 @@ RADIUS = 1.5
 IMPACT_PARAMETERS = torch.tensor([0.0, 1e-4, 0.7, 1.4999, 1.5, 2.0, 30.0], dtype=torch.float64)
 
 
-def test_contraction_keeps_the_ball_and_brings_infinity_to_twice_its_radius() -> None:
+def test_contraction_keeps_the_ball_and_maps_infinity_to_twice_its_radius() -> None:
     offsets = torch.tensor([[0.3, -0.4, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -4.0], [3e6, 4e6, 0.0]])
     expected = torch.tensor([[0.3, -0.4, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.75], [1.2, 1.6, 0.0]])
     centre = CENTRE.float()
@@ -29,12 +29,12 @@ def test_contraction_keeps_the_ball_and_brings_infinity_to_twice_its_radius() ->
     torch.testing.assert_close(corners, torch.stack([centre - 3, centre + 3]))
 
 
-def test_expansion_is_its_inverse() -> None:
+def test_expansion_inverts_contraction() -> None:
     x = CENTRE + torch.randn(200, 3, dtype=torch.float64) * torch.logspace(-1, 3, 200, dtype=torch.float64)[:, None]
     torch.testing.assert_close(expand(contract(x, CENTRE, RADIUS), CENTRE, RADIUS), x)
 
 
-def test_shrinkage_is_that_of_lengths_on_lines_from_the_centre() -> None:
+def test_contraction_scale_is_the_derivative_along_radial_lines() -> None:
     directions = torch.nn.functional.normalize(torch.randn(50, 3, dtype=torch.float64), dim=-1)
     distance = torch.linspace(0.1, 20, 50, dtype=torch.float64)
     ends = [contract(CENTRE + (distance + h)[:, None] * directions, CENTRE, RADIUS) for h in (-1e-5, 1e-5)]
@@ -45,7 +45,7 @@ def test_shrinkage_is_that_of_lengths_on_lines_from_the_centre() -> None:
 
 
 @pytest.mark.parametrize("impact_parameter", IMPACT_PARAMETERS.tolist())
-def test_contracted_length_is_the_sum_of_the_shrinkage(impact_parameter: float) -> None:
+def test_contracted_length_is_the_integral_of_the_contraction_scale(impact_parameter: float) -> None:
     t = torch.linspace(-40, 60, 400_001, dtype=torch.float64)
     middles = 0.5 * (t[1:] + t[:-1])
     places = torch.stack([middles, torch.full_like(middles, impact_parameter), torch.zeros_like(middles)], -1)
@@ -55,7 +55,7 @@ def test_contracted_length_is_the_sum_of_the_shrinkage(impact_parameter: float) 
     torch.testing.assert_close(last - first, added_up, rtol=1e-6, atol=1e-6)
 
 
-def test_lengths_to_infinity() -> None:
+def test_contracted_length_to_infinity_matches_closed_form() -> None:
     through = contracted_length(
         torch.tensor([math.inf], dtype=torch.float64).clamp(max=1e12), IMPACT_PARAMETERS[:1], RADIUS
     )
@@ -64,13 +64,13 @@ def test_lengths_to_infinity() -> None:
     torch.testing.assert_close(past, math.pi / 2 * RADIUS**2 / IMPACT_PARAMETERS[-1:])
 
 
-def test_world_length_is_its_inverse() -> None:
+def test_world_length_inverts_contracted_length() -> None:
     t = torch.cat([-torch.logspace(-3, math.log10(FAR), 60), torch.logspace(-3, math.log10(FAR), 60)]).double()
     for impact_parameter in IMPACT_PARAMETERS:
         length = contracted_length(t, impact_parameter, RADIUS)
         torch.testing.assert_close(world_length(length, impact_parameter, RADIUS), t, rtol=1e-6, atol=1e-9)
 
 
-def test_places_pass_gradients() -> None:
+def test_contracted_positions_have_gradients() -> None:
     x = (CENTRE + torch.tensor([[0.3, 0.2, -0.4], [3.0, -1.0, 2.0], [0.0, 0.0, -90.0]])).requires_grad_()
     assert torch.autograd.gradcheck(lambda x: (contract(x, CENTRE, RADIUS), contraction_scale(x, CENTRE, RADIUS)), x)

@@ -1,4 +1,4 @@
-"""Interpolation on grids: what it reproduces exactly, its order, and its gradient."""
+"""Interpolation on grids: exactness, order and gradient."""
 
 import pytest
 import torch
@@ -25,7 +25,7 @@ def test_trilinear_reproduces_products_of_linear_functions() -> None:
     torch.testing.assert_close(trilinear(table, BOX, points), torch.stack([1 + x - 2 * y + x * y * z, z], -1))
 
 
-def test_trilinear_takes_border_values_outside() -> None:
+def test_trilinear_clamps_to_border_values_outside() -> None:
     table = _grid((4, 4, 4))
     outside = torch.tensor([[-3.0, 0.2, 0.5], [0.1, 9.0, 7.0]], dtype=torch.float64)
     torch.testing.assert_close(trilinear(table, BOX, outside), torch.minimum(torch.maximum(outside, BOX[0]), BOX[1]))
@@ -60,7 +60,7 @@ def test_spline_of_smooth_values_has_order_three() -> None:
     assert order == pytest.approx(3.0, abs=0.3)
 
 
-def test_box_is_entered_and_left_where_the_planes_are() -> None:
+def test_box_intersections_lie_on_its_planes() -> None:
     origins = torch.tensor([[-3.0, 0.5, 0.5], [0.0, 0.0, 0.5], [-3.0, 5.0, 0.5], [1.0, 0.0, 0.5]], dtype=torch.float64)
     directions = torch.tensor([[1.0, 0, 0], [0, 0.6, 0.8], [1.0, 0, 0], [0, 1.0, 0]], dtype=torch.float64)
     enter, leave = intersect_box(BOX, origins, directions)

@@ -30,7 +30,7 @@ def test_files_without_triangles_or_with_nan_are_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("index", [-1, 8, 2**31 - 1])
-def test_triangles_of_vertices_that_are_not_there_are_refused(index: int, tmp_path: Path) -> None:
+def test_triangles_with_missing_vertices_are_refused(index: int, tmp_path: Path) -> None:
     box = trimesh.creation.box()
     lines = [f"{x} {y} {z}" for x, y, z in box.vertices] + [f"3 {a} {b} {c}" for a, b, c in box.faces]
     lines[-1] = f"3 0 1 {index}"

@@ -45,7 +45,7 @@ def test_columns_through_edges_and_vertices_are_counted_once() -> None:
     assert occupancy.sum() == 8**3
 
 
-def test_a_cavity_with_either_orientation_is_outside() -> None:
+def test_cavity_with_either_orientation_is_outside() -> None:
     outer, inner = trimesh.creation.icosphere(3, 0.9), trimesh.creation.icosphere(3, 0.5)
     for flip in (False, True):
         if flip:
@@ -56,7 +56,7 @@ def test_a_cavity_with_either_orientation_is_outside() -> None:
         assert occupancy[15, 15, 22] == 1
 
 
-def test_a_hole_is_outvoted_by_the_other_axes() -> None:
+def test_hole_is_outvoted_by_the_other_axes() -> None:
     sphere = trimesh.creation.icosphere(4, 0.8)
     # The cap around +z is missing: columns along z that pass through it see a single crossing.
     sphere.update_faces(sphere.triangles_center[:, 2] < 0.75)
@@ -77,7 +77,7 @@ def _points() -> np.ndarray:
     return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1)
 
 
-def test_facets_of_a_sphere_do_not_show() -> None:
+def test_distances_of_a_sphere_are_free_of_facets() -> None:
     radius = 0.6
     mesh = mesh_of(trimesh.creation.icosphere(3, radius))
     sagitta = radius - np.linalg.norm(mesh.triangles.mean(1), axis=1).min()
@@ -87,7 +87,7 @@ def test_facets_of_a_sphere_do_not_show() -> None:
     assert np.abs(distance - exact)[near].max() < 0.2 * sagitta
 
 
-def test_sharp_edges_stay_sharp() -> None:
+def test_distances_preserve_sharp_edges() -> None:
     half = 0.53
     mesh = mesh_of(trimesh.creation.box(extents=[2 * half] * 3))
     distance = signed_distance_grid(mesh, CUBE, SIZE, band=3.0)

@@ -12,7 +12,7 @@ from nerfro.geometry.normals import corner_normals
 from nerfro.geometry.orientation import area_vectors
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.samplers.paths.bend import bend
-from tests.geometry.test_bodies import mesh_of
+from tests.geometry.test_bodies import ball, box, mesh_of
 
 
 def test_normals_of_an_irregular_sphere_are_exact() -> None:
@@ -71,7 +71,7 @@ def _bevelled_box(half: float = 0.5, radius: float = 0.06) -> tuple[trimesh.Trim
 
 @pytest.mark.parametrize("interface", ["mesh", "sdf"])
 @pytest.mark.parametrize("weight", ["uniform", "angle", "area"])
-def test_averages_in_the_file_do_not_bend_rays_through_flat_sides(weight: str, interface: str, tmp_path: Path) -> None:
+def test_averaged_normals_of_a_file_do_not_bend_rays_at_flat_sides(weight: str, interface: str, tmp_path: Path) -> None:
     box, _ = _bevelled_box()
     file = _write(tmp_path / "box.ply", box.vertices, box.faces, _averages(box, weight))
     generator = np.random.default_rng(0)
@@ -96,14 +96,14 @@ def test_normals_of_smooth_shapes_are_kept(tmp_path: Path) -> None:
     assert load_mesh(_write(tmp_path / "box.ply", box.vertices, box.faces, normals)).normals is not None
 
 
-def test_copies_of_the_normals_of_triangles_do_not_make_facets(tmp_path: Path) -> None:
+def test_face_normals_in_a_file_do_not_make_facets(tmp_path: Path) -> None:
     ball = trimesh.creation.icosphere(3)
     vertices, faces = ball.triangles.reshape(-1, 3), np.arange(3 * len(ball.faces)).reshape(-1, 3)
     mesh = load_mesh(_write(tmp_path / "ball.ply", vertices, faces, np.repeat(ball.face_normals, 3, axis=0)))
     np.testing.assert_allclose(corner_normals(mesh), mesh.triangles, atol=1e-6)
 
 
-def test_normals_that_contradict_the_faces_are_not_trusted(tmp_path: Path) -> None:
+def test_normals_that_contradict_the_faces_are_ignored(tmp_path: Path) -> None:
     ball = trimesh.creation.icosphere(3)
     wrong = np.tile([0.0, 0.0, 1.0], (len(ball.vertices), 1))
     trimesh.Trimesh(ball.vertices, ball.faces, vertex_normals=wrong, process=False).export(tmp_path / "ball.ply")
@@ -123,27 +123,19 @@ def test_large_flat_faces_of_the_embedded_cube_are_flat_in_the_distance() -> Non
     assert tilt.max() < 1e-3
 
 
-def _ball(radius: float, x: float = 0.0) -> trimesh.Trimesh:
-    return trimesh.creation.icosphere(2, radius).apply_translation((x, 0, 0))
-
-
-def _box(size: float, x: float = 0.0, y: float = 0.0) -> trimesh.Trimesh:
-    return trimesh.creation.box((size, size, size)).apply_translation((x, y, 0))
-
-
 @pytest.mark.parametrize("winding", ["outwards", "inwards", "random"])
 @pytest.mark.parametrize(
     ("parts", "signs"),
     [
-        ([_ball(1.0)], [1]),
-        ([_ball(1.0), _ball(0.5)], [1, -1]),
-        ([_ball(1.0), _ball(0.5), _ball(0.2, 0.1), _ball(0.1, -0.8)], [1, -1, 1, -1]),
-        ([trimesh.creation.torus(1.0, 0.3), _ball(0.6)], [1, 1]),  # in the hole, which is outside
-        ([_box(0.5), _box(0.5, 0.5, 0.5)], [1, 1]),  # an edge in common
-        ([_box(0.5), _box(0.3, 0.05)], [1, -1]),
+        ([ball(1.0)], [1]),
+        ([ball(1.0), ball(0.5)], [1, -1]),
+        ([ball(1.0), ball(0.5), ball(0.2, 0.1), ball(0.1, -0.8)], [1, -1, 1, -1]),
+        ([trimesh.creation.torus(1.0, 0.3), ball(0.6)], [1, 1]),  # in the hole, which is outside
+        ([box(0.5), box(0.5, 0.5, 0.5)], [1, 1]),  # an edge in common
+        ([box(0.5), box(0.3, 0.05)], [1, -1]),
     ],
 )
-def test_signed_volumes_are_those_of_the_nesting(
+def test_signed_volumes_follow_the_nesting(
     parts: list[trimesh.Trimesh], signs: list[int], winding: str, tmp_path: Path
 ) -> None:
     shape = trimesh.util.concatenate(parts)
@@ -156,10 +148,10 @@ def test_signed_volumes_are_those_of_the_nesting(
     assert volume == pytest.approx(sum(sign * part.volume for sign, part in zip(signs, parts, strict=True)), rel=1e-5)
 
 
-def test_normals_of_the_file_turn_with_the_triangles(tmp_path: Path) -> None:
-    ball = _ball(1.0)
-    normals = -np.asarray(ball.vertices)
-    trimesh.Trimesh(ball.vertices, ball.faces[:, ::-1], vertex_normals=normals, process=False).export(
+def test_normals_of_the_file_are_flipped_with_the_triangles(tmp_path: Path) -> None:
+    shape = ball(1.0)
+    normals = -np.asarray(shape.vertices)
+    trimesh.Trimesh(shape.vertices, shape.faces[:, ::-1], vertex_normals=normals, process=False).export(
         tmp_path / "ball.ply"
     )
     mesh = load_mesh(tmp_path / "ball.ply")

@@ -1,4 +1,4 @@
-"""The allocator's settings, in a process of its own so that other tests keep theirs."""
+"""Settings of the allocator, in a separate process so that other tests keep their settings."""
 
 import sys
 

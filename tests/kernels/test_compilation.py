@@ -1,4 +1,4 @@
-"""Kernels compile wherever nerfro is installed, and again whenever a source of theirs changes."""
+"""Kernels compile in any installation folder, and again after a change of their sources."""
 
 import os
 import sys
@@ -26,7 +26,7 @@ def test_machine_code_is_kept_in_the_cache_folder(tmp_path: Path, monkeypatch: p
     assert before == numba.config.CACHE_DIR
 
 
-def test_kernels_work_where_nothing_can_be_written_and_one_line_says_so(
+def test_kernels_work_without_a_writable_folder_with_one_warning(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "file").write_text("")
@@ -41,7 +41,7 @@ def test_kernels_work_where_nothing_can_be_written_and_one_line_says_so(
     assert set(Path(__file__).parent.rglob("*.nbi")) == in_tree
 
 
-def test_a_kernel_is_compiled_again_where_a_constant_of_another_file_has_changed(tmp_path: Path) -> None:
+def test_kernel_is_recompiled_if_a_constant_of_another_file_changes(tmp_path: Path) -> None:
     package = tmp_path / "plugin"
     package.mkdir()
     (package / "__init__.py").write_text("")

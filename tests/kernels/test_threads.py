@@ -49,23 +49,23 @@ print(len(same), all(same), numba.threading_layer(), numba.config.THREADING_LAYE
 """
 
 
-def test_importing_kernels_changes_nothing_for_other_users_of_numba() -> None:
+def test_importing_kernels_does_not_change_settings_of_numba() -> None:
     assert printed_by("-c", IMPORTS_ONLY, NUMBA_NUM_THREADS="2") == "{}\nno threads\n"
 
 
 @pytest.mark.parametrize(("chosen", "used"), [("default", "workqueue"), ("omp", "omp")])
-def test_two_threads_may_trace_at_once_on_the_threading_layer_that_is_chosen(chosen: str, used: str) -> None:
+def test_two_threads_may_trace_concurrently_on_the_chosen_threading_layer(chosen: str, used: str) -> None:
     printed = printed_by("-c", TWO_THREADS, NUMBA_NUM_THREADS="2", NUMBA_THREADING_LAYER=chosen)
     assert printed == f"400 True {used} {chosen}\n"
 
 
 @pytest.mark.parametrize("busy", [True, False])
-def test_a_thread_helps_if_it_is_idle(busy: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    met, end = threading.Barrier(2), threading.Event()
+def test_idle_thread_takes_tasks(busy: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    both_threads, end = threading.Barrier(2), threading.Event()
 
     def name(number: int) -> str:
         if not busy:
-            met.wait(10)  # passes only if two threads call the function at the same time
+            both_threads.wait(10)  # passes only if two threads call the function at the same time
         return f"{number} {threading.current_thread() is threading.main_thread()}"
 
     with ThreadPoolExecutor(1) as helper:
@@ -78,11 +78,11 @@ def test_a_thread_helps_if_it_is_idle(busy: bool, monkeypatch: pytest.MonkeyPatc
     assert {called.split()[1] for called in names} == {"True"} | ({"False"} if not busy else set())
 
 
-def test_an_error_of_a_helping_thread_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
-    met = threading.Barrier(2)
+def test_error_of_a_helping_thread_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
+    both_threads = threading.Barrier(2)
 
     def fail(number: int) -> None:
-        met.wait(10)
+        both_threads.wait(10)
         if threading.current_thread() is not threading.main_thread():
             raise ValueError("no helper")
 
@@ -92,14 +92,14 @@ def test_an_error_of_a_helping_thread_is_raised(monkeypatch: pytest.MonkeyPatch)
             threads.share(fail, 2)
 
 
-def test_helping_threads_write_to_tensors_of_evaluation(monkeypatch: pytest.MonkeyPatch) -> None:
-    met = threading.Barrier(2)
+def test_helping_threads_write_to_inference_tensors(monkeypatch: pytest.MonkeyPatch) -> None:
+    both_threads = threading.Barrier(2)
     with ThreadPoolExecutor(1) as helper, torch.inference_mode():
         monkeypatch.setattr(threads, "HELPERS", [helper])
         values = torch.zeros(2)
 
         def write(number: int) -> None:
-            met.wait(10)
+            both_threads.wait(10)
             values[number] = 1.0
 
         threads.share(write, 2)

@@ -59,12 +59,12 @@ def loss(weights: torch.Tensor, s: torch.Tensor, measure: torch.Tensor | None = 
     return Distortion()([rendering], example_batch(len(colour)), SCENE)
 
 
-def test_loss_does_not_depend_on_the_scenes_scale_or_place() -> None:
+def test_loss_is_invariant_to_scale_and_translation() -> None:
     weights, edges = random_intervals(5, 6, torch.float32)
     torch.testing.assert_close(loss(weights, edges), loss(weights, 2.0 + 30.0 * edges), rtol=1e-4, atol=0)
 
 
-def test_distances_are_contracted_where_space_is() -> None:
+def test_distances_are_contracted_with_space() -> None:
     weights, edges = random_intervals(5, 6, torch.float32)
     edges[:, 0] = 0.0
     far_away = torch.tan(edges * 1.57)  # however long the last interval is
@@ -73,7 +73,7 @@ def test_distances_are_contracted_where_space_is() -> None:
     torch.testing.assert_close(contracted, loss(weights, edges), rtol=1e-4, atol=0)
 
 
-def test_what_passes_all_samples_of_all_space_counts_at_infinity() -> None:
+def test_transmitted_light_counts_at_infinity_in_all_space() -> None:
     edges = torch.linspace(0, 1, 7).expand(5, -1)
     half = torch.tensor([0.0, 0.5, 0.0, 0.0, 0.0, 0.0]).expand(5, -1)
     # 2 x 1/2 x 1/2 x 3/4 between the two, and 1/3 x 1/4 x 1/6 within the first.

@@ -1,4 +1,4 @@
-"""Losses and the schedule of their weights: values by hand, and what gradients reach."""
+"""Losses and the schedule of their weights: manual values, and the parameters with gradients."""
 
 import math
 from dataclasses import replace
@@ -11,7 +11,7 @@ from torch.nn.functional import conv2d
 
 from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.light import to_srgb
-from nerfro.losses.boundary import BoundaryRegulariser
+from nerfro.losses.boundary import BoundaryRegularizer
 from nerfro.losses.photometric import Photometric
 from nerfro.losses.total_variation import TotalVariation, direction_pairs
 from nerfro.models.refractive import RefractiveModel
@@ -52,7 +52,7 @@ def test_photometric_loss_reaches_both_fields_and_the_boundary(model: Renderer) 
     assert min(norms.values()) > 0
 
 
-def test_boundary_regulariser_by_hand(model: Renderer) -> None:
+def test_boundary_regularizer_matches_a_manual_computation(model: Renderer) -> None:
     batch = example_batch()
     transmittance = torch.linspace(0, 1, NUM_RAYS)
     rendering = replace(example_rendering(), transmittance=transmittance)
@@ -62,28 +62,28 @@ def test_boundary_regulariser_by_hand(model: Renderer) -> None:
             count += 1
             passed = transmittance[ray] * rendering.boundary_rgb[ray]
             total += sum(abs(float(passed[c] - batch.rgb[ray, c])) for c in range(3))
-    value = BoundaryRegulariser()([rendering, rendering], batch, model.scene)
+    value = BoundaryRegularizer()([rendering, rendering], batch, model.scene)
     assert value.item() == pytest.approx(total / (count + 1), rel=1e-5)
 
 
-def test_boundary_regulariser_can_be_restricted_to_refracted_rays(model: Renderer) -> None:
+def test_boundary_regularizer_can_be_restricted_to_refracted_rays(model: Renderer) -> None:
     batch = example_batch()
     rendering = replace(example_rendering(), transmittance=torch.ones(NUM_RAYS))
     refracted = rendering.path.refracted
     assert 0 < refracted.sum() < NUM_RAYS
     error = (rendering.boundary_rgb - batch.rgb).abs().sum(-1)[refracted]
-    value = BoundaryRegulariser(refracted_only=True)([rendering], batch, model.scene)
+    value = BoundaryRegularizer(refracted_only=True)([rendering], batch, model.scene)
     torch.testing.assert_close(value, error.sum() / (len(error) + 1))
 
 
-def test_boundary_regulariser_teaches_the_fine_density_only(model: Renderer) -> None:
+def test_boundary_regularizer_has_gradients_only_for_the_fine_density(model: Renderer) -> None:
     with torch.no_grad():
         for field in model.scene.fields:
             field.mlp.density.bias.fill_(-3.0)  # thin enough for light to pass
     batch = example_batch()
     renderings = model(batch.rays)
     assert (renderings[-1].transmittance > 0.5).any()
-    norms = gradient_norms(model, BoundaryRegulariser()(renderings, batch, model.scene))
+    norms = gradient_norms(model, BoundaryRegularizer()(renderings, batch, model.scene))
     assert norms["coarse"] == norms["boundary"] == 0
     assert norms["fine"] > 0
     colour = model.scene.fields[1].mlp.rgb
@@ -99,7 +99,7 @@ def test_roughness_is_half_the_mean_square_of_two_convolutions() -> None:
     torch.testing.assert_close(tile_roughness(rgb), expected)
 
 
-def test_smoothness_teaches_the_boundary_only(model: Renderer) -> None:
+def test_smoothness_has_gradients_only_for_the_boundary(model: Renderer) -> None:
     batch = example_batch()
     norms = gradient_norms(model, Smoothness(tile_size=8)(model(batch.rays), batch, model.scene))
     assert norms["coarse"] == norms["fine"] == 0
@@ -117,7 +117,7 @@ def test_weight_is_zero_before_the_start_then_grows_linearly_to_its_value() -> N
 BATCH = example_batch()
 
 
-def test_pairs_are_the_angle_apart_and_uniform() -> None:
+def test_pairs_are_uniform_and_separated_by_the_angle() -> None:
     first, second = direction_pairs(torch.rand(20_000, 3), 0.3)
     for directions in (first, second):
         torch.testing.assert_close(directions.norm(dim=-1), torch.ones(20_000))
@@ -172,22 +172,22 @@ def test_values_of_a_pixel_are_the_mean_over_its_rays_in_any_order() -> None:
         assert example_batch(8).per_pixel(values) is values
 
 
-def test_pixels_are_compared_and_not_their_rays() -> None:
+def test_losses_compare_pixels_and_not_their_rays() -> None:
     given, rendered = batch(), rendering(torch.rand(8, 3), torch.rand(8, 3), torch.rand(8))
     expected = (to_srgb(given.per_pixel(rendered.rgb)) - given.rgb).square().mean()
     torch.testing.assert_close(Photometric()([rendered], given, MODEL.scene), expected)
 
 
-def test_the_regulariser_compares_the_background_of_a_pixel_as_well() -> None:
+def test_boundary_regularizer_uses_the_background_of_pixels() -> None:
     given, passed = batch(), torch.tensor([0.9, 0.9, 0.2, 0.2, 0.9, 0.2, 0.9, 0.2])  # of the last pixel little
     rendered = rendering(torch.rand(8, 3), torch.rand(8, 3), passed)
     background = to_srgb(given.per_pixel(passed[:, None] * rendered.boundary_rgb))
     expected = (background - given.rgb).abs().sum(-1)[:2].sum() / (2 + 1)
-    torch.testing.assert_close(BoundaryRegulariser()([rendered], given, MODEL.scene), expected)
+    torch.testing.assert_close(BoundaryRegularizer()([rendered], given, MODEL.scene), expected)
 
 
 @pytest.mark.parametrize("absorbs", [False, True])
-def test_a_background_learns_from_chosen_rays_and_what_bends_them_from_all(absorbs: bool) -> None:
+def test_background_learns_from_selected_rays_and_the_medium_from_all(absorbs: bool) -> None:
     sky = EnvironmentMap([4])
     torch.nn.init.normal_(sky.texels)
     model = RefractiveModel(replace(example_components(), boundary=sky))
@@ -214,7 +214,7 @@ def test_a_background_learns_from_chosen_rays_and_what_bends_them_from_all(absor
     assert gradients(none)[0].abs().max() == 0
 
 
-def test_a_saturated_pixel_is_no_error_where_both_clip_and_keeps_a_gradient_where_one_does() -> None:
+def test_saturated_pixel_has_no_error_if_both_clip_and_a_gradient_if_one_does() -> None:
     photograph = torch.tensor([1.0, 1.0, 0.6])  # saturated, saturated, not
     radiance = torch.tensor([3.0, 0.5, 3.0], requires_grad=True)
     prediction, target = MODEL.scene.colour_space.prediction_and_target(radiance, photograph)
@@ -224,7 +224,7 @@ def test_a_saturated_pixel_is_no_error_where_both_clip_and_keeps_a_gradient_wher
     assert too_dark < 0 < too_bright
 
 
-def test_in_the_authors_arithmetic_nothing_is_encoded_or_clipped() -> None:
+def test_authors_colour_space_neither_encodes_nor_clips() -> None:
     model = RefractiveModel(example_components(), colour="srgb")
     radiance, photograph = 1.2 * torch.rand(50, 3), torch.rand(50, 3).round()
     prediction, target = model.scene.colour_space.prediction_and_target(radiance, photograph)

@@ -1,4 +1,4 @@
-"""Losses that decide what no photograph decides: whether white before white is empty, opaque or near fog."""
+"""Losses for ambiguous content: empty, opaque or near fog in front of a backdrop of the same colour."""
 
 from dataclasses import replace
 from unittest.mock import Mock
@@ -40,21 +40,21 @@ def learned_opacity(seen: torch.Tensor, loss: Loss, start: float = 1.0, num_step
     return float(rendering.opacity.detach().mean())
 
 
-def test_white_before_white_becomes_empty() -> None:
+def test_white_content_before_white_becomes_empty() -> None:
     uncharged = Backdrop(WHITE)
     uncharged.weight = 0.0
     assert learned_opacity(torch.ones(3), uncharged) > 0.95
     assert learned_opacity(torch.ones(3), Backdrop(WHITE)) < 0.05
 
 
-def test_what_is_as_white_as_the_boundary_becomes_opaque() -> None:
+def test_content_as_white_as_the_boundary_becomes_opaque() -> None:
     uncharged, charged = Opaque(), Opaque()
     uncharged.weight, charged.weight = 0.0, 0.1
     assert learned_opacity(torch.ones(3), uncharged, start=-5.0) < 0.05
     assert learned_opacity(torch.ones(3), charged, start=-5.0) > 0.95
 
 
-def test_pixels_of_another_colour_and_photographs_without_a_backdrop_are_not_charged() -> None:
+def test_pixels_of_another_colour_and_photographs_without_a_backdrop_are_not_penalized() -> None:
     assert learned_opacity(torch.tensor([1.0, 1.0, 0.98]), Backdrop(WHITE)) > 0.95
     assert learned_opacity(torch.ones(3), Backdrop()) > 0.95
 
@@ -79,7 +79,7 @@ def straight_paths(near: float = 0.0) -> Path:
     return Straight()(Rays(origins, directions, 1e-3 * eight, near * eight, 8 * eight), Ball())
 
 
-def test_white_fog_before_white_clears_where_it_is_near_alone() -> None:
+def test_near_camera_loss_removes_only_near_fog() -> None:
     path = straight_paths()
     raw = torch.full((8,), -1.0, requires_grad=True)
     optimizer = torch.optim.Adam([raw], lr=0.1)
@@ -95,7 +95,9 @@ def test_white_fog_before_white_clears_where_it_is_near_alone() -> None:
 
 @pytest.mark.parametrize(("interval", "closeness"), [(0, 1 - 0.5 / 4), (2, 1 - 2.5 / 4), (4, 0.0), (7, 0.0)])
 @pytest.mark.parametrize("near", [0.0, 1.5])
-def test_a_wall_counts_by_its_distance_from_the_camera(interval: int, closeness: float, near: float) -> None:
+def test_near_camera_loss_decreases_with_the_distance_from_the_camera(
+    interval: int, closeness: float, near: float
+) -> None:
     path = straight_paths(near)
     density = torch.zeros(8)
     density[interval] = 100.0

@@ -1,4 +1,4 @@
-"""How the parts are composed: fields for each level, where the boundary is asked, and rendering in chunks."""
+"""Composition of models: fields of each level, evaluation of the boundary, and rendering in chunks."""
 
 from dataclasses import replace
 
@@ -33,7 +33,7 @@ def test_refractive_model_has_a_field_for_each_level_and_mip_nerf_one_for_all(pa
     assert len(RefractiveModel(replace(parts, point_sampler=Stratified(8))).scene.fields) == 1
 
 
-def test_boundary_is_asked_where_the_path_leaves_or_at_the_last_coarse_sample(parts: Components) -> None:
+def test_boundary_is_evaluated_at_the_exit_or_at_the_last_coarse_sample(parts: Components) -> None:
     rays, parts = example_rays(), replace(parts, boundary=Compass())
     path = parts.path_sampler(rays, parts.medium)
     leaving = RefractiveModel(parts, "exit").eval()(rays)
@@ -44,7 +44,7 @@ def test_boundary_is_asked_where_the_path_leaves_or_at_the_last_coarse_sample(pa
 
 
 @pytest.mark.parametrize("training", [True, False])
-def test_rendering_is_as_in_evaluation_and_leaves_the_mode_as_it_was(training: bool, parts: Components) -> None:
+def test_rendering_uses_evaluation_mode_and_restores_the_mode(training: bool, parts: Components) -> None:
     model = RefractiveModel(parts).train(training)
     first, second = model.render(example_rays()), model.render(example_rays())
     assert torch.equal(first.radiance, second.radiance), "nothing random"
@@ -53,7 +53,9 @@ def test_rendering_is_as_in_evaluation_and_leaves_the_mode_as_it_was(training: b
     assert not first.radiance.requires_grad
 
 
-def test_chunks_bound_how_many_rays_are_rendered_at_once(parts: Components, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_chunk_size_bounds_the_number_of_rays_rendered_at_once(
+    parts: Components, monkeypatch: pytest.MonkeyPatch
+) -> None:
     model, sizes = RefractiveModel(parts).eval(), []
     whole = model(example_rays())  # 24 rays
     forward = model.path_sampler.forward

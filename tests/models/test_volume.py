@@ -1,4 +1,4 @@
-"""One volume: a glass ball in a painted room with a toy before it, which no sky can explain, learned from pictures."""
+"""A volume of all space learns a glass ball in a painted room with a toy in front of it."""
 
 import torch
 from torch.nn.functional import normalize
@@ -86,7 +86,7 @@ def scores(space: dict, boundary: Boundary, num_steps: int = 150) -> list[float]
     return [float(-10 * torch.log10(e.mean())) for e in (error, error[path.refracted], error[toy])]
 
 
-def test_a_volume_learns_a_room_and_what_stands_before_the_glass_where_a_box_under_a_sky_cannot() -> None:
+def test_volume_of_all_space_learns_a_room_better_than_box_and_environment_map() -> None:
     volume = scores(SPACE, ConstantBoundary([0.0, 0.0, 0.0]))
     sky = scores({"box_min": [-0.85] * 3, "box_max": [0.85] * 3}, EnvironmentMap([4, 8, 16, 32]))
     assert volume[0] > sky[0] + 6

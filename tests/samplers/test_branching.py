@@ -1,4 +1,4 @@
-"""Light that splits at surfaces: energy, closed forms, the three tracers against each other, derivatives of shares."""
+"""Light that splits at surfaces: energy, closed forms, agreement of three tracers, and derivatives of weights."""
 
 import functools
 from collections.abc import Sequence
@@ -40,7 +40,7 @@ def _weights(path: Path) -> Tensor:
     return path.throughput[:, 0].double()
 
 
-def test_reflectance_is_fresnels_both_ways() -> None:
+def test_reflectance_matches_fresnel_in_both_directions() -> None:
     angles = torch.tensor([0.01, 0.3, 0.8, 1.2, 1.5], dtype=torch.float64)
     d = torch.stack([angles.sin(), 0 * angles, angles.cos()], -1)
     normal = torch.tensor([0.0, 0, 1]).double().expand_as(d)
@@ -71,7 +71,7 @@ def test_weights_of_a_ray_sum_to_one(branches: str, tmp_path: FilePath) -> None:
 
 
 @pytest.mark.parametrize(("n", "reflected", "refracted"), [(1.5, 9.2, 83.6), (1.33, 6.6, 88.2)])
-def test_shares_of_a_ball_seen_whole(n: float, reflected: float, refracted: float) -> None:
+def test_branch_weights_of_a_ball_match_fresnel(n: float, reflected: float, refracted: float) -> None:
     share = (torch.arange(4000, dtype=torch.float64) + 0.5) / 4000
     heights = 0.8 * share.sqrt()  # equal areas of the disc
     trace = Snell(branches="all", least_weight=1e-9).trace(beam(heights), Ball(0.8, n).double())
@@ -88,7 +88,7 @@ def test_shares_of_a_ball_seen_whole(n: float, reflected: float, refracted: floa
 
 
 @pytest.mark.parametrize("n", [1.33, 1.52])
-def test_a_slab_transmits_the_sum_over_its_bounces(n: float) -> None:
+def test_transmittance_of_a_slab_sums_its_reflections(n: float) -> None:
     rays = make_rays([[0.1, 0.2, -2.0]], [[0, 0, 1]], 0.5, 4.0)
     path = Snell(branches="all", least_weight=1e-12).trace(rays, Slab(0.5, n).double()).path
     through = path.exit_directions[:, 2] > 0
@@ -96,7 +96,7 @@ def test_a_slab_transmits_the_sum_over_its_bounces(n: float) -> None:
 
 
 @pytest.mark.parametrize("iors", [[1.5, 1.2], [1.8, 1.8], [1.0, 1.8]])
-def test_compiled_branches_are_those_of_torch(iors: list[float], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_compiled_branches_match_the_reference(iors: list[float], monkeypatch: pytest.MonkeyPatch) -> None:
     medium, rays = _nested_grid(iors=iors, absorption=[1.0, 0.0, 2.0, 0.0, 3.0, 0.0]), _rays(400)
     sampler = Snell(branches="all", least_weight=0.005)
     fast = sampler.trace(rays, medium)
@@ -128,21 +128,21 @@ def test_compiled_branches_are_those_of_torch(iors: list[float], monkeypatch: py
 
 
 @pytest.mark.parametrize("medium", [_nested_grid(), NestedBalls()], ids=["compiled", "torch"])
-def test_a_dyed_body_of_index_one_is_no_event(medium: Solid) -> None:
+def test_absorbing_body_of_index_one_adds_no_event(medium: Solid) -> None:
     rays, sampler = _rays(100), Snell(branches="first")
     iors = torch.tensor([1.0, 1.5]).double().requires_grad_()
     results = []
     for outer in (0.0, 1.0):
         dyed = medium.with_indices(iors).with_absorption_coefficients(torch.tensor([[outer] * 3, [0.0] * 3]))
         path, num_events, _ = sampler.trace(rays, dyed)
-        refined, steady = sampler.refine(path, rays, dyed), sampler.steady(path, dyed)
+        refined, steady = sampler.replay(path, rays, dyed), sampler.steady(path, dyed)
         (gradient,) = torch.autograd.grad((refined.throughput * refined.exit_directions)[steady].sum(), iors)
         results.append((path.throughput, path.exit_directions, num_events, steady, gradient[1]))
     for expected, found in zip(*results, strict=True):
         torch.testing.assert_close(found, expected)
 
 
-def test_the_first_polyline_is_the_one_that_is_transmitted() -> None:
+def test_first_polyline_of_a_ray_is_transmitted() -> None:
     rays, medium = _rays(300), _nested_grid()
     single, split = Snell()(rays, medium), Snell(branches="all")(rays, medium)
     first = split.first_of_ray(split.exit_directions)
@@ -153,20 +153,20 @@ def test_the_first_polyline_is_the_one_that_is_transmitted() -> None:
 
 
 @pytest.mark.parametrize("tracer", ["grid", "closed form", "mesh"])
-def test_main_polylines_alone_are_the_first_of_all(tracer: str, tmp_path: FilePath) -> None:
+def test_main_polylines_equal_the_first_of_all_polylines(tracer: str, tmp_path: FilePath) -> None:
     rays, medium = (
         _rays(300),
         {"grid": _nested_grid, "closed form": NestedBalls}.get(tracer, lambda: None)(),
     )
     medium = medium or nested_mesh(tmp_path)
     sampler = Snell("mesh" if tracer == "mesh" else "sdf", branches="all")
-    every, main = sampler(rays, medium), sampler.main(rays, medium)
+    every, main = sampler(rays, medium), sampler.trace_main(rays, medium)
     assert main.num_rays == len(main.s) == len(rays) < len(every.s)
     for name in ("throughput", "exit_directions"):
         assert torch.equal(getattr(main, name), every.first_of_ray(getattr(every, name)))
 
 
-def test_what_is_too_light_is_added_to_the_rest() -> None:
+def test_weights_of_omitted_branches_are_added_to_the_others() -> None:
     heights = torch.tensor([0.0, 0.6, 0.799]).double()
     path = Snell(branches="all", least_weight=0.1)(beam(heights), Ball(0.8, 1.5).double())
     assert torch.bincount(path.ray).tolist() == [1, 1, 2]
@@ -178,7 +178,7 @@ def test_what_is_too_light_is_added_to_the_rest() -> None:
 
 
 @pytest.mark.parametrize("what", ["index", "origin"])
-def test_replayed_shares_have_the_derivatives_of_traced_ones(what: str) -> None:
+def test_derivatives_of_replayed_weights_match_traced_weights(what: str) -> None:
     rays, sampler = _rays(60), Snell(branches="all", least_weight=1e-3)
 
     def traced(step: Tensor) -> tuple[Path, Rays, Solid]:
@@ -190,7 +190,7 @@ def test_replayed_shares_have_the_derivatives_of_traced_ones(what: str) -> None:
         return path, moved, medium
 
     def refined(step: Tensor) -> Tensor:
-        return sampler.refine(*traced(step)).throughput[:, 0]
+        return sampler.replay(*traced(step)).throughput[:, 0]
 
     zero = torch.zeros((), dtype=torch.float64)
     found = torch.autograd.functional.jvp(refined, zero, torch.ones_like(zero))[1]
@@ -225,7 +225,7 @@ class CementedHalves(Solid):
 
 
 @pytest.mark.parametrize("what", ["radius of the first", "radius of the second", "iors"])
-def test_gradients_belong_to_the_body_that_light_met_where_two_bodies_touch(what: str) -> None:
+def test_gradients_at_touching_bodies_belong_to_the_intersected_body(what: str) -> None:
     rays, sampler = _rays(100), Snell(branches="all", least_weight=1e-3)
 
     def moved(step: Tensor) -> CementedHalves:
@@ -251,17 +251,17 @@ def test_gradients_belong_to_the_body_that_light_met_where_two_bodies_touch(what
     def refined(step: Tensor) -> Tensor:
         medium = moved(step)
         medium.radii, medium.box = medium.radii.float(), medium.box.float()
-        return values(sampler.refine(single, rays.to(torch.float32), medium))
+        return values(sampler.replay(single, rays.to(torch.float32), medium))
 
     zero = torch.zeros((), dtype=torch.float64)
     found = torch.autograd.functional.jvp(refined, zero, torch.ones_like(zero))[1]
     h = 1e-8
     after, before = traced(h), traced(-h)
-    assert torch.equal(after.surface, before.surface)
+    assert torch.equal(after.surface_body, before.surface_body)
     expected = (values(after) - values(before)) / (2 * h)
     error = (found - expected).norm(dim=-1) / (1 + expected.norm(dim=-1))
     steady = smallest_cosine(path, moved(zero)) > 0.15
-    reflected = (path.surface == 1) & (path.body == path.body.roll(1, 1))
+    reflected = (path.surface_body == 2) & (path.body == path.body.roll(1, 1))
     assert (steady & reflected.any(-1)).sum() > 50
     assert error[steady].max() < 1e-2
 
@@ -269,7 +269,7 @@ def test_gradients_belong_to_the_body_that_light_met_where_two_bodies_touch(what
 # --- rays with all their polylines ---
 
 
-def test_rays_are_chosen_and_joined_with_all_their_polylines() -> None:
+def test_selected_and_joined_rays_keep_all_polylines() -> None:
     path = Snell(branches="all")(_rays(20), Ball().double())
     rows = torch.tensor([7, 2, 2, 11])
     chosen = path.of_rays(rows)

@@ -45,7 +45,7 @@ def _trace(rays: Rays, squared: Squared, dtype: torch.dtype = torch.float64) -> 
 
 @pytest.mark.parametrize("width", [0.1, 0.3, 1.5])
 @pytest.mark.parametrize(("before", "after"), [(1.0, 1.5), (1.5, 1.0), (1.33, 1.52)])
-def test_layers_refract_as_a_plane_does_however_blurred(before: float, after: float, width: float) -> None:
+def test_blurred_layers_refract_like_a_plane(before: float, after: float, width: float) -> None:
     steepest = min(0.9 * math.asin(min(after / before, 1.0)), math.radians(60))
     angles = torch.linspace(0, steepest, 7, dtype=torch.float64)
     directions = torch.stack([angles.sin(), 0 * angles, angles.cos()], -1)
@@ -71,7 +71,7 @@ def test_layers_reflect_totally_beyond_the_critical_angle() -> None:
 
 
 @pytest.mark.parametrize("impact", [0.2, 0.5, 0.7, 0.8, 0.9])
-def test_blurred_ball_deviates_as_its_quadrature(impact: float) -> None:
+def test_deviation_of_a_blurred_ball_matches_quadrature(impact: float) -> None:
     sigma, ior = 0.012, 1.52
 
     def n_of(r: float) -> float:
@@ -106,7 +106,7 @@ def test_luneburg_path_is_an_ellipse(dtype: torch.dtype, level: float) -> None:
 
 
 @LEVELS
-def test_a_parallel_beam_meets_at_the_luneburg_focus(dtype: torch.dtype, level: float) -> None:
+def test_parallel_beam_converges_at_the_luneburg_focus(dtype: torch.dtype, level: float) -> None:
     for height in (0.2, 0.5, 0.8):
         entry = torch.tensor([-math.sqrt(1 - height**2), height, 0.0], dtype=torch.float64)
         p0 = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
@@ -142,7 +142,7 @@ def _fisheye_circle(start: Tensor, degrees: float) -> tuple[Tensor, Tensor, floa
 
 @LEVELS
 @pytest.mark.parametrize("distance", [1.0, 0.85])
-def test_fisheye_rays_are_circles_that_meet_in_the_image(dtype: torch.dtype, level: float, distance: float) -> None:
+def test_fisheye_rays_are_circles_through_the_image_point(dtype: torch.dtype, level: float, distance: float) -> None:
     start = distance * torch.nn.functional.normalize(torch.tensor([0.7, 0.2, -0.1], dtype=torch.float64), dim=0)
     image = -start / (start @ start)
     size = float((image - start).norm())
@@ -211,7 +211,7 @@ def test_linear_index_gives_the_catenary(dtype: torch.dtype, level: float) -> No
 
 @pytest.mark.parametrize(("integrator", "order"), [(euler, 1.0), (leapfrog, 2.0)])
 @pytest.mark.parametrize("lens", ["luneburg", "fibre"])
-def test_observed_order(integrator: Integrator, order: float, lens: str) -> None:
+def test_integrators_have_their_order_of_convergence(integrator: Integrator, order: float, lens: str) -> None:
     # Both have closed-form positions as functions of sigma, and s(sigma) by quadrature.
     if lens == "luneburg":
         start, direction, profile = [-1.0, 0.6, 0.2], [1.0, 0.1, 0.0], luneburg

@@ -1,4 +1,4 @@
-"""Sampling from a remembered density: the compiled kernel against its plain twin, and where samples go."""
+"""Sampling from a density grid: the compiled kernel against the reference implementation, and sample positions."""
 
 from dataclasses import replace
 
@@ -33,7 +33,7 @@ def trained_sampler(**space: float) -> DensityGridSampler:
 
 
 @pytest.mark.parametrize("space", [{}, ALL_OF_SPACE])
-def test_compiled_kernel_draws_what_the_plain_twin_draws(space: dict) -> None:
+def test_compiled_sampler_matches_the_reference(space: dict) -> None:
     sampler, path = trained_sampler(**space), example_path(64)
     for draws in (None, example_draws(64)):
         plain, compiled = sampler.draw(path, draws), sampler.draw_compiled(path, draws)
@@ -47,7 +47,7 @@ def test_compiled_kernel_draws_what_the_plain_twin_draws(space: dict) -> None:
         assert close.float().mean() > 0.99  # a sample within rounding of a vertex may lie on either side
 
 
-def test_samples_gather_where_the_density_is() -> None:
+def test_samples_concentrate_at_the_density() -> None:
     sampler, path = trained_sampler(), example_path(64)
     samples = sampler(path, None)
     dense = (path.at(torch.linspace(2, 6, 400).expand(64, -1).contiguous())[0].norm(dim=-1) < RADIUS * 0.8).any(-1)
@@ -57,9 +57,7 @@ def test_samples_gather_where_the_density_is() -> None:
 
 
 @pytest.mark.parametrize(("max_bin_alpha", "behind"), [(1.0, 0.0), (0.4, 0.26)])
-def test_what_stands_behind_a_cell_of_which_a_ray_meets_the_empty_part_gets_samples(
-    max_bin_alpha: float, behind: float
-) -> None:
+def test_content_behind_a_partly_empty_cell_gets_samples(max_bin_alpha: float, behind: float) -> None:
     sampler = DensityGridSampler(num_samples=64, num_bins=64, resolution=32, uniform=0.01, max_bin_alpha=max_bin_alpha)
     sampler.density[15:17] = 1e3  # four bins look opaque: two of a cell that something fills in part, and two behind
     path = straight(torch.tensor([0.0, 8.0]), 0.1)
@@ -68,21 +66,21 @@ def test_what_stands_behind_a_cell_of_which_a_ray_meets_the_empty_part_gets_samp
     assert share == pytest.approx(behind, abs=0.05)
 
 
-def straight(s: torch.Tensor, aside: float) -> Path:
+def straight(s: torch.Tensor, impact_parameter: float) -> Path:
     """One line along x past the origin, with vertices at arc lengths `s` from a camera at x = -4."""
     ones = torch.ones_like(s)
-    positions = torch.stack([s - 4, aside * ones, 0 * ones], -1)[None]
+    positions = torch.stack([s - 4, impact_parameter * ones, 0 * ones], -1)[None]
     directions = torch.stack([ones, 0 * ones, 0 * ones], -1)[None]
     return Path.unbranched(positions, directions, s[None], torch.zeros(1).bool(), torch.zeros(1))
 
 
-@pytest.mark.parametrize("aside", [0.0, 0.5, 2.0])
-def test_samples_of_all_space_hold_all_contracted_length(aside: float) -> None:
+@pytest.mark.parametrize("impact_parameter", [0.0, 0.5, 2.0])
+def test_samples_of_all_space_cover_the_contracted_length(impact_parameter: float) -> None:
     sampler = trained_sampler(**ALL_OF_SPACE)
-    path = straight(torch.tensor([2.0, 3.0, 3.5, 6.0]), aside)
+    path = straight(torch.tensor([2.0, 3.0, 3.5, 6.0]), impact_parameter)
     samples = sampler(path, None)
     shorter = contraction_scale(samples.positions, torch.zeros(3), 0.7)
-    ends = contracted_length(torch.tensor([0.3 - 4, 1e6]), torch.tensor(aside), 0.7)
+    ends = contracted_length(torch.tensor([0.3 - 4, 1e6]), torch.tensor(impact_parameter), 0.7)
     torch.testing.assert_close((samples.deltas * shorter).sum(), ends[1] - ends[0], rtol=1e-3, atol=0)
     assert samples.edges[0, 0] == pytest.approx(0.3, abs=1e-3)  # though the path begins at 2
     assert samples.edges[0, -1] > 1e3  # though it ends at 6
@@ -95,13 +93,13 @@ def test_samples_of_all_space_do_not_depend_on_where_a_line_has_vertices() -> No
     torch.testing.assert_close(few.deltas[:, :-1], many.deltas[:, :-1], rtol=1e-3, atol=1e-5)
 
 
-def test_pictures_have_their_own_number_of_samples() -> None:
+def test_evaluation_has_its_own_number_of_samples() -> None:
     sampler = DensityGridSampler(num_samples=16, num_samples_evaluation=40)
     assert sampler(example_path(4), None, example_draws(4)).s.shape == (4, 16)
     assert sampler(example_path(4), None).s.shape == (4, 40)
 
 
-def test_grid_remembers_the_field_it_looked_at() -> None:
+def test_updated_grid_holds_the_density_of_the_field() -> None:
     sampler = trained_sampler()
     points = torch.rand(500, 3) * 2 - 1
     away = (points.norm(dim=-1) - RADIUS).abs() > 0.15
@@ -147,7 +145,7 @@ def test_branches_are_sampled_by_their_weight_in_training() -> None:
     assert torch.equal(drawn.edges[::2], drawn.edges[1::2])
 
 
-def test_a_ray_that_does_not_split_is_sampled_as_ever() -> None:
+def test_main_polylines_are_sampled_like_unsplit_rays() -> None:
     sampler, path = trained_sampler(), example_path(64)
     alone = sampler(path, None, example_draws(64))
     whole = sampler(split_in_two((1.0, 1.0)), None, example_draws(64))
@@ -156,7 +154,7 @@ def test_a_ray_that_does_not_split_is_sampled_as_ever() -> None:
 
 
 @pytest.mark.parametrize("resolution", [8, 9])
-def test_every_place_of_the_world_is_in_a_cell_that_is_updated(resolution: int) -> None:
+def test_every_position_is_in_an_updated_cell(resolution: int) -> None:
     sampler = DensityGridSampler(box_min=[-1] * 3, box_max=[1] * 3, radius=1.0, resolution=resolution)
     middle = (torch.arange(301) - 150) / 150.5  # of the cube around the ball; some lie in all cells that touch it
     places = torch.cartesian_prod(middle, middle, middle[::7])

@@ -1,4 +1,4 @@
-"""Colours that part: Cauchy's index, the rainbow and a prism in closed form, and bands as rays of one colour."""
+"""Dispersion: Cauchy's equation, the rainbow and a prism in closed form, and bands as rays of one wavelength."""
 
 import math
 from pathlib import Path as FilePath
@@ -27,7 +27,7 @@ def cauchy(n: float, abbe: float, wavelength: float) -> float:
     return n - b / 587.56**2 + b / wavelength**2
 
 
-def test_the_index_is_cauchys() -> None:
+def test_index_follows_cauchys_equation() -> None:
     medium = Ball(0.8, 1.52, abbe=[60.0]).double()
     lines = {name: float(medium.at_wavelength(w).iors[0]) for name, w in (("d", 587.56), ("F", 486.13), ("C", 656.27))}
     assert lines["d"] == pytest.approx(1.52, abs=1e-12)
@@ -37,7 +37,7 @@ def test_the_index_is_cauchys() -> None:
 
 
 @pytest.mark.parametrize(("wavelength", "degrees"), [(680.0, 42.4), (400.0, 40.6)])
-def test_the_primary_rainbow_has_its_colours_at_its_angles(wavelength: float, degrees: float) -> None:
+def test_angles_of_the_primary_rainbow_match_closed_form(wavelength: float, degrees: float) -> None:
     n = cauchy(*WATER, wavelength)
     i = math.acos(math.sqrt((n * n - 1) / 3)) + 1e-3 * torch.linspace(-1, 1, 201, dtype=torch.float64)
     medium = Ball(0.8, WATER[0], abbe=[WATER[1]]).double()
@@ -52,7 +52,7 @@ def test_the_primary_rainbow_has_its_colours_at_its_angles(wavelength: float, de
     assert math.degrees(float(back.max())) == pytest.approx(degrees, abs=0.05)
 
 
-def test_a_prism_parts_colours_as_its_formula(tmp_path: FilePath) -> None:
+def test_dispersion_of_a_prism_matches_closed_form(tmp_path: FilePath) -> None:
     apex, n, abbe = math.radians(50), 1.5, 40.0
     _prism(apex, 0.9).export(tmp_path / "prism.ply")
     medium = SdfGrid(str(tmp_path / "prism.ply"), n, resolution=48, abbe=[abbe], cache=False)
@@ -88,18 +88,18 @@ def test_every_band_is_traced_as_a_ray_of_its_colour(branches: str) -> None:
         torch.testing.assert_close(mine.exit_directions, alone.exit_directions, atol=1e-9, rtol=0)
         torch.testing.assert_close(mine.throughput[:, band], alone.throughput[:, 0], atol=1e-9, rtol=0)
         if band == 0:
-            main = sampler.main(rays, medium)
+            main = sampler.trace_main(rays, medium)
             assert main.ray.tolist() == list(range(60))
             torch.testing.assert_close(main.exit_directions, single.first_of_ray(single.exit_directions))
 
 
-def test_bands_bring_their_gradients_to_the_one_index() -> None:
+def test_gradients_of_all_bands_reach_the_index() -> None:
     def exits(step: Tensor, refine: bool) -> Tensor:
         medium: Solid = Ball(abbe=[30.0]).double()
         medium = medium.with_indices(medium.iors + step)
         with torch.no_grad():
             path = sampler(rays, medium)
-        path = sampler.refine(path, rays, medium) if refine else path
+        path = sampler.replay(path, rays, medium) if refine else path
         return path.exit_directions
 
     rays, sampler = beam(torch.linspace(-0.6, 0.6, 7).double()), Snell()
@@ -110,12 +110,12 @@ def test_bands_bring_their_gradients_to_the_one_index() -> None:
     assert found.shape == (21, 3)
 
 
-def test_an_index_that_learns_keeps_its_abbe_number() -> None:
+def test_learned_index_keeps_its_abbe_number() -> None:
     index = torch.tensor([1.5], dtype=torch.float64, requires_grad=True)
     medium = Ball(abbe=[30.0]).with_indices(index)
     (gradient,) = torch.autograd.grad(medium.at_wavelength(450).iors.sum(), index)
     assert float(gradient) == pytest.approx((cauchy(1.6, 30, 450) - cauchy(1.5, 30, 450)) / 0.1)
 
 
-def test_what_cannot_be_dispersed_is_refused() -> None:
+def test_unsupported_dispersion_is_refused() -> None:
     refused("path=snell", lambda: Eikonal()(random_rays(2, 2.0, seed=3, far=6), Ball(abbe=[30.0])))

@@ -81,7 +81,7 @@ def test_tolerance_bounds_the_distance_to_the_tangents() -> None:
         assert gap < 2.5 * tolerance * 2 * math.sqrt(3)
 
 
-def test_limit_of_steps_lets_rays_go_straight_on() -> None:
+def test_rays_continue_straight_after_the_limit_of_steps() -> None:
     path, exceeded = march_adaptive(make_rays([[-3, 0.5, 0]], [[1, 0, 0]], 0.5, 6), Luneburg().double(), 1e-4, 50)
     assert exceeded.all()
     assert path.far[0] == 6
@@ -97,7 +97,7 @@ def _grids() -> tuple[VoxelGrid, SdfGrid]:
     return voxels, SdfGrid.from_distances(torch.stack([radius - 0.9, radius - 0.4]), BOX, [1.5, 1.2], 0.02)
 
 
-def test_compiled_uniform_steps_are_those_of_torch() -> None:
+def test_compiled_uniform_steps_match_the_reference() -> None:
     voxels, _ = _grids()
     rays = random_rays(40, 1.4, seed=1, far=7)
     compiled = Eikonal("euler", 96)(rays, voxels)
@@ -109,7 +109,7 @@ def test_compiled_uniform_steps_are_those_of_torch() -> None:
 
 
 @pytest.mark.parametrize("kind", ["voxels", "solid"])
-def test_compiled_adaptive_steps_are_those_of_torch(kind: str) -> None:
+def test_compiled_adaptive_steps_match_the_reference(kind: str) -> None:
     voxels, solid = _grids()
     medium: Medium = voxels if kind == "voxels" else solid
     rays = random_rays(200, 1.4, seed=1, far=7)

@@ -1,4 +1,4 @@
-"""Fine samples go where the coarse rendering has weight."""
+"""Fine samples follow the weights of the coarse rendering."""
 
 from dataclasses import replace
 
@@ -36,7 +36,7 @@ def spike(num_samples: int, index: int) -> Tensor:
 
 
 @pytest.mark.parametrize("draws", [None, example_draws()])
-def test_all_fine_samples_fall_around_the_one_sample_with_weight(draws: Draws | None) -> None:
+def test_all_fine_samples_lie_around_the_single_weighted_sample(draws: Draws | None) -> None:
     path = example_path()
     sampler = Hierarchical(16, 32)
     coarse = render(path, sampler, spike(16, 9))
@@ -47,7 +47,7 @@ def test_all_fine_samples_fall_around_the_one_sample_with_weight(draws: Draws | 
     assert (fine <= bins[:, 9:10] + 1e-5).all()
 
 
-def test_fine_samples_are_shared_out_in_proportion_to_the_weights() -> None:
+def test_fine_samples_are_proportional_to_the_weights() -> None:
     path = straight_path(example_rays())
     sampler = Hierarchical(8, 1000)
     weights = torch.tensor([9.0, 1, 0, 3, 0, 0, 4, 9])  # the first and the last have no bin of their own
@@ -59,7 +59,7 @@ def test_fine_samples_are_shared_out_in_proportion_to_the_weights() -> None:
         assert (inside - 1000 * weight / 8).abs().max() <= 2
 
 
-def test_union_holds_every_coarse_sample_and_is_sorted() -> None:
+def test_union_contains_every_coarse_sample_and_is_sorted() -> None:
     path = example_path()
     sampler = Hierarchical(16, 24)
     coarse = render(path, sampler, torch.rand(16))
@@ -69,7 +69,7 @@ def test_union_holds_every_coarse_sample_and_is_sorted() -> None:
     assert ((fine.s[:, None] - coarse.samples.s[..., None]).abs().min(-1).values == 0).all()
 
 
-def test_no_gradient_flows_through_where_samples_lie() -> None:
+def test_sample_positions_have_no_gradient() -> None:
     path = example_path()
     sampler = Hierarchical(16, 24)
     weights = torch.rand(16, requires_grad=True)

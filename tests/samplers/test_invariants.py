@@ -1,4 +1,4 @@
-"""What every path conserves: |v| = n, moments, reversibility, phase-space volume, and straightness where n = 1."""
+"""Invariants of paths: |v| = n, moments, reversibility, phase-space volume, and straight rays for n = 1."""
 
 import pytest
 import torch
@@ -47,7 +47,7 @@ def _steps(x: Tensor, v: Tensor, medium: Medium, dsigma: float, num_steps: int) 
 
 
 @pytest.mark.parametrize("squared", SMOOTH)
-def test_steps_of_fixed_dsigma_run_backwards_to_their_start(squared: Squared) -> None:
+def test_steps_of_fixed_dsigma_are_reversible(squared: Squared) -> None:
     medium = FunctionMedium(squared)
     x0, d = _launch()
     v0 = d * medium(x0)[0][:, None]
@@ -80,7 +80,7 @@ def test_steps_of_fixed_dsigma_keep_the_phase_space_volume(squared: Squared) -> 
 
 
 @pytest.mark.parametrize("squared", [luneburg, fisheye, blurred_ball(1.52, 0.05)])
-def test_velocity_keeps_the_length_n_and_radial_media_the_moment(squared: Squared) -> None:
+def test_speed_equals_the_index_and_radial_media_conserve_the_moment(squared: Squared) -> None:
     medium = FunctionMedium(squared)
     x0, d = torch.tensor([[-1.2, 0.6, 0.1]], dtype=torch.float64), torch.tensor([[1.0, 0.1, 0.0]]).double()
     d = torch.nn.functional.normalize(d, dim=-1)
@@ -133,7 +133,7 @@ POINTS = pytest.mark.parametrize(
 
 @POINTS
 @pytest.mark.parametrize("name", _of_index_one())
-def test_samples_are_those_of_straight_rays_bit_for_bit(name: str, points: PointSampler) -> None:
+def test_index_one_gives_the_samples_of_straight_rays_bit_for_bit(name: str, points: PointSampler) -> None:
     sampler, medium = _of_index_one()[name]
     rays, points = example_rays(300), points.eval()
     plain, path = Straight()(rays, Vacuum()), sampler(rays, medium)

@@ -1,4 +1,4 @@
-"""A bent path ends where it has left the object for good, however short `far` is."""
+"""A bent path ends after its last exit from the object, for any `far`."""
 
 import functools
 from pathlib import Path as FilePath
@@ -51,7 +51,7 @@ def test_far_does_not_cut_a_path_inside_the_object(tmp_path: FilePath, sampler: 
 
 
 @pytest.mark.parametrize(("sampler", "kind"), [(Snell("sdf", 2), "grid"), (Snell("mesh", 2), "grid")])
-def test_rays_that_meet_the_limit_of_events_end_outside_too(tmp_path: FilePath, sampler: Snell, kind: str) -> None:
+def test_rays_at_the_limit_of_events_end_outside(tmp_path: FilePath, sampler: Snell, kind: str) -> None:
     medium = _medium(tmp_path, kind)
     trace = sampler.trace(_rays(far=SHORT), medium)
     assert trace.exceeded.any()

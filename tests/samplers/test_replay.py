@@ -115,7 +115,7 @@ CASES += [("eikonal-nested-grid", "coefficients")]
 
 
 @pytest.mark.parametrize(("name", "what"), CASES)
-def test_derivatives_are_those_of_central_differences(name: str, what: str, tmp_path: FilePath) -> None:
+def test_derivatives_match_central_differences(name: str, what: str, tmp_path: FilePath) -> None:
     sampler, make = SCENES[name]
     rays, medium = _rays(40), make(tmp_path)
     shift = _shifted(what, rays, medium)
@@ -127,7 +127,7 @@ def test_derivatives_are_those_of_central_differences(name: str, what: str, tmp_
         shifted = shift(step)
         with torch.no_grad():
             path = sampler(shifted, medium)
-        return _vertices(sampler.refine(path, shifted, medium))
+        return _vertices(sampler.replay(path, shifted, medium))
 
     _, found = torch.autograd.functional.jvp(
         refined, torch.zeros((), dtype=torch.float64), torch.ones((), dtype=torch.float64)
@@ -167,7 +167,7 @@ def _voxels() -> VoxelGrid:
 
 
 @pytest.mark.parametrize(("sampler", "make"), REFINED)
-def test_values_are_the_traced_ones_and_gradients_finite(
+def test_replayed_values_equal_traced_values_with_finite_gradients(
     sampler: PathSampler, make: Callable[[FilePath], Medium], tmp_path: FilePath
 ) -> None:
     rays, medium = _rays(300).to(torch.float32), make(tmp_path).float()
@@ -175,7 +175,7 @@ def test_values_are_the_traced_ones_and_gradients_finite(
     path = sampler(rays, medium)
     path = replace(path, samples=Samples.along(path, path.s[:, 1:], path.s))
     assert not path.positions.requires_grad
-    found = sampler.refine(path, rays, medium)
+    found = sampler.replay(path, rays, medium)
     for name in ("positions", "directions", "s", "exit_directions", "refracted", "body", "ray"):
         assert torch.equal(getattr(found, name), getattr(path, name))
     assert found.samples is path.samples
@@ -184,30 +184,30 @@ def test_values_are_the_traced_ones_and_gradients_finite(
     assert (gradient != 0).any(-1).all()
 
 
-def test_straight_rows_have_the_derivatives_of_lines_beside_bent_ones() -> None:
+def test_straight_paths_beside_bent_paths_have_derivatives_of_lines() -> None:
     rays = make_rays([[-3, 0.3, 0], [-3, 1.1, 0]], [[1, 0, 0], [1, 0, 0]], 0.5, 4.0)
     d = rays.directions.clone().requires_grad_()
     rays = replace(rays, directions=d)
     sampler, medium = Snell(), Ball(0.8, 1.5).double()
-    path = sampler.refine(sampler(rays, medium), rays, medium)
+    path = sampler.replay(sampler(rays, medium), rays, medium)
     assert path.refracted.tolist() == [True, False]
     for vertex, s in enumerate([0.5, 4.0, 4.0, 4.0]):
         (gradient,) = torch.autograd.grad(path.positions[1, vertex, 1], d, retain_graph=True)
         assert gradient.tolist() == [[0, 0, 0], [0, s, 0]]
 
 
-def test_polylines_of_one_ray_bring_it_their_gradients_together() -> None:
+def test_gradients_of_polylines_are_summed_at_their_ray() -> None:
     sampler, medium, rays = Snell(), Ball(0.8, 1.5).double(), _rays(3)
     rays.origins.requires_grad_()
     path = sampler(rays, medium)
     twice = torch.tensor([0, 0, 1, 2])
     split = replace(path[twice], splits=True, ray=twice)
-    (single,) = torch.autograd.grad(sampler.refine(path, rays, medium).exit_directions.sum(), rays.origins)
-    (double,) = torch.autograd.grad(sampler.refine(split, rays, medium).exit_directions.sum(), rays.origins)
+    (single,) = torch.autograd.grad(sampler.replay(path, rays, medium).exit_directions.sum(), rays.origins)
+    (double,) = torch.autograd.grad(sampler.replay(split, rays, medium).exit_directions.sum(), rays.origins)
     torch.testing.assert_close(double, single * torch.tensor([[2.0], [1.0], [1.0]]))
 
 
-def test_smallest_cosine_is_that_of_the_angles_at_a_ball() -> None:
+def test_smallest_cosine_matches_the_angles_at_a_ball() -> None:
     # Entry and exit are alike: outside cos i with sin i = b / R, inside cos t, which is larger.
     heights = torch.tensor([0.0, 0.3, 0.7, 0.79, 0.9], dtype=torch.float64)
     medium = Ball(0.8, 1.5).double()

@@ -81,7 +81,7 @@ def test_each_total_reflection_within_a_ball_turns_by_pi_less_twice_its_angle(bo
     torch.testing.assert_close(chords, torch.full_like(chords, 1.6 * math.cos(t)))
 
 
-def test_slab_shifts_and_does_not_turn() -> None:
+def test_slab_shifts_rays_and_keeps_their_direction() -> None:
     angles = torch.linspace(0, 85, 18, dtype=torch.float64).deg2rad()
     directions = torch.stack([angles.sin(), 0 * angles, angles.cos()], -1)
     path = Snell()(_rays(-5 * directions, directions, 0, 12), Slab(0.5, 1.5).double())
@@ -91,7 +91,7 @@ def test_slab_shifts_and_does_not_turn() -> None:
     torch.testing.assert_close(moved, shift, atol=1e-9, rtol=0)
 
 
-def test_rounded_cube_is_traced_as_by_its_pieces() -> None:
+def test_rounded_cube_matches_tracing_of_its_pieces() -> None:
     generator = np.random.default_rng(0)
     directions = generator.normal(size=(400, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -116,7 +116,7 @@ def _prism(apex: float, height: float) -> trimesh.Trimesh:
     return trimesh.convex.convex_hull(np.array(corners))
 
 
-def test_least_deviation_of_a_prism_tells_its_index(tmp_path: FilePath) -> None:
+def test_minimum_deviation_of_a_prism_matches_its_index(tmp_path: FilePath) -> None:
     apex, n = math.radians(50), 1.5
     medium = _mesh_medium(_prism(apex, 0.9), tmp_path, n)
     least = 2 * math.asin(n * math.sin(apex / 2)) - apex
@@ -153,7 +153,7 @@ def test_right_angle_prism_reflects_totally_above_root_two(tmp_path: FilePath, n
 
 
 @pytest.mark.parametrize("interface", ["mesh", "sdf"])
-def test_smooth_mesh_refracts_as_the_ball_that_it_stands_for(tmp_path: FilePath, interface: str) -> None:
+def test_smooth_mesh_refracts_like_the_ball(tmp_path: FilePath, interface: str) -> None:
     heights = torch.linspace(-0.95, 0.95, 60, dtype=torch.float64) * 0.8
     medium = _mesh_medium(trimesh.creation.icosphere(4, 0.8), tmp_path, resolution=64)
     path = Snell(interface)(beam(heights), medium)  # type: ignore[arg-type]
@@ -210,7 +210,7 @@ def test_paths_through_a_cavity_do_not_depend_on_the_winding_of_triangles(tmp_pa
     assert angle(path.exit_directions, exact)[(heights - 0.45).abs() > 0.02].median() < 0.03
 
 
-def test_water_that_exactly_fills_its_glass_bends_as_in_closed_form(tmp_path: FilePath) -> None:
+def test_water_that_exactly_fills_its_glass_matches_closed_form(tmp_path: FilePath) -> None:
     heights = torch.linspace(0.02, 0.8, 40, dtype=torch.float64)
     water = trimesh.creation.icosphere(4, 0.7)
     trimesh.util.concatenate([trimesh.creation.icosphere(4, 0.9), water]).export(tmp_path / "glass.ply")
@@ -248,7 +248,7 @@ def test_rays_that_begin_beside_an_edge_are_inside_of_their_box(tmp_path: FilePa
 
 
 @pytest.mark.parametrize("inverted", [False, True])
-def test_the_winding_of_an_open_mesh_does_not_decide_where_rays_begin(tmp_path: FilePath, inverted: bool) -> None:
+def test_winding_of_an_open_mesh_does_not_decide_where_rays_begin(tmp_path: FilePath, inverted: bool) -> None:
     """The winding of a mesh with a hole cannot be corrected."""
     dome = trimesh.creation.icosphere(4, 0.8)
     dome.update_faces(dome.triangles_center[:, 2] > -0.6)
@@ -293,7 +293,7 @@ def _through_ball(x: np.ndarray, d: np.ndarray, centre: np.ndarray, radius: floa
 
 
 @pytest.mark.parametrize("interface", ["mesh", "sdf"])
-def test_rays_may_enter_again(tmp_path: FilePath, interface: str) -> None:
+def test_rays_may_enter_a_body_again(tmp_path: FilePath, interface: str) -> None:
     first, second = np.array([-0.7, 0.0, 0.0]), np.array([0.7, 0.1, 0.0])
     shape = trimesh.util.concatenate(
         [trimesh.creation.icosphere(5, 0.5).apply_translation(centre) for centre in (first, second)]
@@ -311,7 +311,7 @@ def test_rays_may_enter_again(tmp_path: FilePath, interface: str) -> None:
 # --- bookkeeping ---
 
 
-def test_compiled_paths_are_those_of_torch() -> None:
+def test_compiled_paths_match_the_reference() -> None:
     p = grid_points(1.5, 40)
     torus = (((p[..., 0] ** 2 + p[..., 1] ** 2).sqrt() - 0.8) ** 2 + p[..., 2] ** 2).sqrt() - 0.4
     medium = _grid(torch.stack([torus, torus + 0.2]), [1.5, 1.3])
@@ -342,7 +342,7 @@ def test_rays_with_too_many_events_are_flagged_and_go_straight_on() -> None:
     assert not Snell().trace(beam(torch.zeros(1).double()), Ball().double()).exceeded.any()
 
 
-def test_a_camera_inside_the_glass_sees_out(tmp_path: FilePath) -> None:
+def test_rays_from_inside_the_glass_leave_it(tmp_path: FilePath) -> None:
     medium = _mesh_medium(trimesh.creation.icosphere(4, 0.8), tmp_path)
     for interface in ("sdf", "mesh"):
         trace = Snell(interface).trace(_rays([[0.0, 0.3, 0.1]], [[0, 1, 0]], 0.0, 4), medium)  # type: ignore[arg-type]

@@ -33,7 +33,7 @@ def _recommended(capsys: pytest.CaptureFixture[str]) -> int:
     return int(found[1])
 
 
-def test_the_recommended_resolution_traces_a_thin_wall(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_recommended_resolution_traces_a_thin_wall(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     mesh = _hollow_ball(tmp_path / "hollow.ply", 0.1)
     expected = _exits(mesh, "mesh")
     assert "warning" not in capsys.readouterr().out
@@ -43,7 +43,7 @@ def test_the_recommended_resolution_traces_a_thin_wall(tmp_path: Path, capsys: p
     assert torch.dist(right, expected) < 0.1 * torch.dist(wrong, expected)
 
 
-def test_the_recommended_resolution_holds_for_walls_of_varying_thickness(
+def test_recommended_resolution_traces_walls_of_varying_thickness(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     mesh = _hollow_ball(tmp_path / "hollow.ply", 0.15, 0.1)
@@ -52,19 +52,19 @@ def test_the_recommended_resolution_holds_for_walls_of_varying_thickness(
     assert "warning" not in capsys.readouterr().out
 
 
-def test_a_solid_with_sharp_edges_has_no_thin_walls(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_solid_with_sharp_edges_has_no_thin_walls(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     trimesh.creation.cylinder(1.0, 1.5, sections=3).export(tmp_path / "prism.ply")
     _exits(tmp_path / "prism.ply", "sdf")
     assert "warning" not in capsys.readouterr().out
 
 
-def test_a_training_warns_of_thin_walls(tmp_path: Path, tiny_default_run: list[str], run_here: Runner) -> None:
+def test_training_warns_of_thin_walls(tmp_path: Path, tiny_default_run: list[str], run_here: Runner) -> None:
     mesh = _hollow_ball(tmp_path / "hollow.ply", 0.05)
     done = run_here("train", *tiny_default_run, f"medium.mesh={mesh}", "trainer.max_steps=1")
     assert "bounds walls of about" in done.out
 
 
-def test_without_embree_nothing_is_warned_of(
+def test_thin_walls_are_not_checked_without_embree(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     trimesh.creation.icosphere(2).export(tmp_path / "ball.ply")

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from tests.synthetic.renderer import Scene, Surface, find_scene, torus_angles
+from tests.synthetic.renderer import SurfaceMesh, SyntheticScene, find_scene, torus_angles
 
 
-def empty_glass(glass: Surface, sky: Callable[[np.ndarray], np.ndarray], **options: Any) -> Scene:
+def empty_glass(glass: SurfaceMesh, sky: Callable[[np.ndarray], np.ndarray], **options: Any) -> SyntheticScene:
     """Make a scene whose interior lies far outside the pictures, because every scene has one."""
     ring, _ = torus_angles(0.02, 0.005, spacing=0.005)
     interior = replace(ring, vertices=ring.vertices + np.float32(50), colours=np.ones_like(ring.vertices))

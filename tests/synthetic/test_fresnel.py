@@ -52,7 +52,7 @@ def test_reflected_and_transmitted_shares_are_fresnels_and_sum_to_one(n, percent
     assert weight == pytest.approx(1, abs=1e-5)
 
 
-def test_shares_are_the_same_both_ways_and_total_beyond_the_critical_angle():
+def test_reflectance_is_symmetric_and_total_beyond_the_critical_angle():
     n = 1.52
     angles = np.array([0.0, 0.3, 0.8, 1.3])
     inside = np.arcsin(np.sin(angles) / n)
@@ -63,7 +63,7 @@ def test_shares_are_the_same_both_ways_and_total_beyond_the_critical_angle():
     assert totally == pytest.approx(1, abs=1e-6)
 
 
-def test_a_slab_transmits_what_infinitely_many_reflections_leave():
+def test_transmittance_of_a_slab_sums_infinitely_many_reflections():
     """White in front of the camera, black behind it: T = 2 n / (n^2 + 1) at normal incidence."""
     n = 1.52
     slab = rounded_box((1.5, 1.5, 0.05), 0.01, edge_steps=2)

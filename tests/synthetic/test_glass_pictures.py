@@ -1,4 +1,4 @@
-"""Pictures of empty glass under a known sky: all branches of our rays against Mitsuba's path tracing."""
+"""Images of empty glass under a known sky: all branches of rays against the path tracer of Mitsuba."""
 
 from pathlib import Path as FilePath
 
@@ -17,7 +17,7 @@ from nerfro.types import Path, Rays
 from tests.cameras_at import cameras_at
 from tests.closed_forms import RoundedBox, grid_points
 from tests.synthetic.empty_glass import empty_glass
-from tests.synthetic.renderer import PathTracer, Pinhole, Surface, look_at_origin, path_tracer, rounded_box, sphere
+from tests.synthetic.renderer import PathTracer, Pinhole, SurfaceMesh, look_at_origin, path_tracer, rounded_box, sphere
 
 # Sums over a pixel of a cube converge slowly: an edge sees lamps in many directions.
 SIDE, ANGLE, SPP, PARTS = 12, 0.5, 4096, 16
@@ -41,7 +41,7 @@ def sky(directions: np.ndarray) -> np.ndarray:
 
 
 def path_traced(
-    glass: Surface, ior: float, absorption: tuple[float, float, float] = (0, 0, 0), inner: tuple | None = None
+    glass: SurfaceMesh, ior: float, absorption: tuple[float, float, float] = (0, 0, 0), inner: tuple | None = None
 ) -> Tensor:
     """Linear radiance by Mitsuba; `inner` is the surface and the index of a body inside."""
     scene = empty_glass(glass, sky, ior=ior, absorption=absorption)
@@ -88,7 +88,7 @@ def agreement(found: Tensor, expected: Tensor) -> float:
 @pytest.mark.slow
 @pytest.mark.usefixtures("mitsuba")
 @pytest.mark.parametrize("what", ["ball", "cube", "bottle"])
-def test_pictures_of_empty_glass_are_those_of_a_dielectric(what: str, tmp_path: FilePath) -> None:
+def test_images_of_empty_glass_match_the_dielectric_of_mitsuba(what: str, tmp_path: FilePath) -> None:
     interface, inner, glass = "sdf", None, BALL if what == "ball" else CUBE
     if what == "bottle":
         interface, glass, water = "mesh", *(rounded_box((a, a, b), 0.2, 12) for a, b in ((0.45, 0.7), (0.33, 0.5)))
@@ -115,7 +115,7 @@ def test_pictures_of_empty_glass_are_those_of_a_dielectric(what: str, tmp_path: 
 @pytest.mark.slow
 @pytest.mark.usefixtures("mitsuba")
 @pytest.mark.parametrize("what", ["ball", "cube"])
-def test_absorption_is_that_of_the_path_and_is_learned_from_a_picture(what: str) -> None:
+def test_absorption_matches_the_path_tracer_and_is_learned_from_an_image(what: str) -> None:
     expected = path_traced(BALL if what == "ball" else CUBE, 1.5, COLOURED).float()
     given, learner = on_grid(what, absorption=list(COLOURED)), on_grid(what, learn_absorption=True)
 
@@ -137,7 +137,7 @@ def test_absorption_is_that_of_the_path_and_is_learned_from_a_picture(what: str)
 
 
 @pytest.mark.usefixtures("mitsuba")
-def test_a_dispersive_cube_is_that_of_three_colours() -> None:
+def test_dispersive_cube_matches_the_path_tracer_at_three_wavelengths() -> None:
     medium, rays = on_grid("cube", abbe=[5.0]), rays_of_picture()
     iors = [float(medium.at_wavelength(wavelength).iors) for wavelength in BRANCHES.wavelengths]
     assert iors[2] - iors[0] > 0.1

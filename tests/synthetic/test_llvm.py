@@ -1,4 +1,4 @@
-"""Which LLVM library Dr.Jit loads, and that an old one, or none, costs time but does not end the process."""
+"""The LLVM library of Dr.Jit: an old or missing library costs time but does not end the process."""
 
 from pathlib import Path
 
@@ -33,11 +33,11 @@ print(tracer.mitsuba.variant(), tracer.render(look_at_origin([0, 0.1, 4]), spp=1
         ("libLTO.so.19.1", None),
     ],
 )
-def test_a_file_name_states_the_version(name: str, version: int | None) -> None:
+def test_file_name_states_the_version(name: str, version: int | None) -> None:
     assert version_in_name(Path(name)) == version
 
 
-def test_the_newest_library_is_chosen_and_old_ones_are_not() -> None:
+def test_newest_supported_library_is_chosen() -> None:
     old = [Path("libLLVM-14.so.1"), Path("libLLVM-15.so.1"), Path("libLLVM.so")]
     assert newest([]) is None
     assert newest(old) is None

@@ -75,7 +75,7 @@ def angle(first, second):
 
 
 @pytest.mark.usefixtures("mitsuba")
-def test_rays_through_a_ball_leave_as_snells_law_says():
+def test_rays_through_a_ball_follow_snells_law():
     radius = 0.8
     generator = np.random.default_rng(0)
     directions = generator.normal(size=(500, 3))
@@ -92,7 +92,7 @@ def test_rays_through_a_ball_leave_as_snells_law_says():
 
 
 @pytest.mark.usefixtures("mitsuba")
-def test_a_ray_that_meets_a_side_of_a_cube_is_reflected_totally():
+def test_ray_at_a_side_of_a_cube_is_reflected_totally():
     """Down through the top at 45 degrees, mirrored once at a side, out through the bottom: (x, y, z) -> (-x, y, z)."""
     heights = np.random.default_rng(1).uniform(-0.1, 0.1, 200)
     entry = np.stack([0.45 + heights, 3 * heights, np.full(200, 0.75)], -1)
@@ -133,7 +133,7 @@ def test_background_pixels_show_the_sky_in_the_direction_of_the_pixel(poses):
         assert np.abs(picture - expected)[background].max() < 2e-3
 
 
-def test_a_missing_mitsuba_is_told_with_the_extra_to_install():
+def test_missing_mitsuba_names_the_extra_to_install():
     """In a process of its own, which has not imported Mitsuba before."""
     code = "import sys; sys.modules['mitsuba'] = None; from nerfro.registry import discover; discover()\n"
     code += "import nerfro_plugins.synthetic_scenes.path_tracer as t; t.load_mitsuba()"
@@ -142,7 +142,7 @@ def test_a_missing_mitsuba_is_told_with_the_extra_to_install():
     assert "pip install 'nerfro[synthesize]'" in errors
 
 
-def test_an_unknown_variant_names_the_known_ones():
+def test_unknown_variant_names_the_known_variants():
     with pytest.raises(NerfroError, match="choose auto, llvm_ad_rgb"):
         load_mitsuba("llvm")
 

@@ -42,7 +42,7 @@ def test_triangulation_lies_on_the_surface_and_faces_outward():
     ],
     ids=["block", "capsule", "ellipsoid", "star", "smooth_union"],
 )
-def test_distances_never_change_faster_than_the_way_travelled(solid):
+def test_signed_distances_are_lipschitz_continuous(solid):
     """The bound that lets `triangulate` skip blocks."""
     generator = np.random.default_rng(0)
     points = generator.uniform(-0.8, 0.8, (4000, 3))
@@ -52,7 +52,7 @@ def test_distances_never_change_faster_than_the_way_travelled(solid):
 
 
 @pytest.mark.parametrize("name", [name for name in SCENES if name != "dolphin_capture"])
-def test_scene_is_closed_inside_the_box_and_worth_looking_at(name):
+def test_scene_is_closed_inside_the_box_and_has_contrast(name):
     scene = find_scene(name).build(spacing=0.02)
     glass = scene.glass.as_trimesh()
     assert glass.is_watertight

@@ -43,17 +43,17 @@ def rays() -> Rays:
 
 @pytest.fixture(scope="module")
 def by_mitsuba(mitsuba: ModuleType, rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
-    """Directions beyond the glass; which rays have met water on their way; and which of these an edge is not near.
+    """Exit directions; which rays pass through water; and which of these rays are not near an edge.
 
-    Near an edge, rays a voxel beside each other go different ways, and after several total reflections, too.
+    Near an edge, and after several total reflections, the paths of rays one voxel apart differ.
     """
     dry, wet = _interfaces(mitsuba)
     axes = torch.eye(3, dtype=torch.float64)
     shifts = VOXEL * torch.cat([torch.zeros(1, 3, dtype=torch.float64), axes, -axes])
     origins, directions = (rays.origins + shifts[:, None]).flatten(0, 1), rays.directions.repeat(len(shifts), 1)
-    traced, met = _trace(mitsuba, make_rays(origins, directions, 0.5, 9.0), dry, wet)
+    traced, reached_water = _trace(mitsuba, make_rays(origins, directions, 0.5, 9.0), dry, wet)
     found, *beside = traced.split(len(rays))
-    through_water = met[: len(rays)]
+    through_water = reached_water[: len(rays)]
     steady = torch.stack([angle(each, found) < STEADY for each in beside]).all(0)
     return found, through_water, through_water & steady
 
@@ -127,7 +127,7 @@ def _errors(medium: Solid, rays: Rays, by_mitsuba: tuple[Tensor, Tensor, Tensor]
     return errors[through_water], errors[steady]
 
 
-def test_rays_through_a_half_full_glass_leave_as_mitsubas_do(
+def test_rays_through_a_half_full_glass_match_mitsuba(
     mesh: str, rays: Rays, by_mitsuba: tuple[Tensor, Tensor, Tensor]
 ) -> None:
     _, through_water, steady = by_mitsuba

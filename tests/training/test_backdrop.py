@@ -1,4 +1,4 @@
-"""Photographs that are cut out on one colour are found, and that colour is beyond the volume then."""
+"""Detection of photographs that are cut out on one colour, which becomes the backdrop of the volume."""
 
 from pathlib import Path
 
@@ -20,12 +20,12 @@ def photographs(num_views: int = 10, colour: float = GREY) -> torch.Tensor:
     return pictures
 
 
-def test_what_is_cut_out_is_found_whatever_the_colour() -> None:
+def test_cut_out_photographs_are_detected_for_any_colour() -> None:
     for colour in (0.0, GREY, 1.0):
         assert find_backdrop(photographs(colour=colour)) == pytest.approx([colour] * 3)
 
 
-def test_a_view_that_cuts_the_object_off_and_rounding_are_forgiven() -> None:
+def test_cropped_objects_and_rounding_are_tolerated() -> None:
     pictures = photographs()
     pictures[3, :, 8:] = torch.rand(16, 8, 3)
     pictures[5, 0, 0] += 1 / 255
@@ -41,7 +41,7 @@ def test_photographs_of_rooms_have_no_backdrop() -> None:
     assert find_backdrop(of_different_colours) is None
 
 
-def test_the_black_rim_of_a_lens_is_no_backdrop() -> None:
+def test_black_rim_of_a_lens_is_no_backdrop() -> None:
     pictures = torch.rand(10, 32, 32, 3)
     pictures[:, :2] = pictures[:, -2:] = 0
     pictures[:, :, :2] = pictures[:, :, -2:] = 0
@@ -56,16 +56,16 @@ def cut_out(tiny_scene: Path, tmp_path: Path) -> Path:
     return repaint(tiny_scene, tmp_path / "cut_out", lambda levels: np.where(outside, np.uint8(102), levels))
 
 
-@pytest.mark.parametrize(("options", "told"), [([], True), (["loss.backdrop.weight=0"], False)])
+@pytest.mark.parametrize(("options", "has_backdrop"), [([], True), (["loss.backdrop.weight=0"], False)])
 def test_straight_rays_end_on_the_backdrop(
-    train_here: Runner, cut_out: Path, tmp_path: Path, options: list[str], told: bool
+    train_here: Runner, cut_out: Path, tmp_path: Path, options: list[str], has_backdrop: bool
 ) -> None:
     run = tmp_path / "run"
     few = ["+experiment=straight", f"data.root={cut_out}", "trainer.max_steps=2", "batches.size=64", *QUIET]
     finished = train_here(*few, f"hydra.run.dir={run}", *options)
-    assert ("plain backdrop (102, 102, 102)" in finished.out) == told
+    assert ("plain backdrop (102, 102, 102)" in finished.out) == has_backdrop
     config = OmegaConf.load(run / "config.yaml")
-    if told:
+    if has_backdrop:
         assert config.boundary.rgb == pytest.approx([((GREY + 0.055) / 1.055) ** 2.4] * 3, rel=1e-4)
         assert config.loss.backdrop.colour == pytest.approx([GREY] * 3)
     else:

@@ -21,8 +21,8 @@ from nerfro.fields.hash_grid import HashGridField
 from nerfro.light import to_srgb
 from nerfro.training.build import build
 from nerfro.training.callbacks import steps_by_phase
-from nerfro.training.phases.background import Background
-from nerfro.training.phases.base import Run
+from nerfro.training.phases.background import BackgroundSteps
+from nerfro.training.phases.base import TrainingRun
 from nerfro.training.ray_batches import RayBatches
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
 from nerfro.types import Exits
@@ -41,7 +41,7 @@ def weights(train: Runner, tmp_path: Path) -> Callable[..., dict[str, Tensor]]:
     return run
 
 
-def test_the_boundary_alone_has_learned_before_the_first_step(weights: Callable[..., dict[str, Tensor]]) -> None:
+def test_only_the_background_is_fitted_before_the_first_step(weights: Callable[..., dict[str, Tensor]]) -> None:
     without, learned = weights("without", "phase.background.steps=0"), weights("with", "phase.background.steps=20")
     changed = {name for name, value in learned.items() if not torch.equal(value, without[name])}
     assert changed == {"renderer.scene.boundary.texels"}
@@ -53,7 +53,7 @@ def test_directions_behind_the_object_are_learned_through_it(
     module, data = build(overrides=[*tiny_default_run, "medium.ior=1.0001", "trainer.max_steps=1"])
     views = BlenderData(str(tiny_scene), near=2.0, far=6.0).load("train")
     optimizer = torch.optim.Adam(module.parameters())
-    run, phase = Run(module.renderer, data.batches, views, optimizer, 0.0), Background(steps=4, start=8)
+    run, phase = TrainingRun(module.renderer, data.batches, views, optimizer, 0.0), BackgroundSteps(steps=4, start=8)
     state, towards_the_ball = phase.begin(run), -torch.nn.functional.normalize(views.cameras.camera_to_world[:, :, 3])
     sky, background = 0.5 + 0.4 * towards_the_ball, module.renderer.scene.boundary
 
@@ -70,7 +70,7 @@ def test_directions_behind_the_object_are_learned_through_it(
     assert phase.begin(run) == {}, "a given background stays"
 
 
-def test_pretraining_leaves_time_for_the_scene(
+def test_pretraining_takes_a_bounded_share_of_the_time(
     weights: Callable[..., dict[str, Tensor]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     seconds, fits, fit = itertools.count(), [], EnvironmentMap.fit
@@ -85,7 +85,7 @@ def test_pretraining_leaves_time_for_the_scene(
     assert read_metrics_json(tmp_path / "run" / "metrics.json").steps_by_phase == phases
 
 
-def test_a_signal_ends_these_steps_and_a_resumed_run_takes_the_others(
+def test_signal_interrupts_pretraining_and_a_resumed_run_completes_it(
     weights: Callable[..., dict[str, Tensor]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     options, drawn, rows = ("phase.background.steps=20", "trainer.max_steps=2"), [], RayBatches.rows

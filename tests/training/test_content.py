@@ -1,4 +1,4 @@
-"""Which space a run covers, and how fine its background is."""
+"""The space that a run covers, and the resolution of its background."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def of_all_space(**content: object) -> DictConfig:
     return config.content
 
 
-def test_ball_lies_where_the_cameras_look() -> None:
+def test_content_ball_lies_at_the_target_of_the_cameras() -> None:
     content = of_all_space()
     np.testing.assert_allclose(np.mean([content.box_min, content.box_max], axis=0), MIDDLE, atol=1e-4)
     assert content.radius == 1.5
@@ -44,19 +44,19 @@ def test_ball_lies_where_the_cameras_look() -> None:
     assert "contracted beyond 1.5 around (0.4, -2, 1)" in describe(content)
 
 
-def test_what_is_given_is_kept() -> None:
+def test_explicit_settings_are_kept() -> None:
     given = {"box_min": [0.0, 0.0, 0.0], "box_max": [2.0, 2.0, 2.0], "radius": 5.0, "near": 0.0, "cells": 77}
     content = of_all_space(**given)
     assert {name: content[name] for name in given} == given
 
 
-def test_axes_that_are_parallel_are_followed_to_a_usual_depth() -> None:
+def test_parallel_cameras_have_a_default_depth() -> None:
     centres = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])
     forward = np.tile([0.0, 0.0, -1.0], (4, 1))
     np.testing.assert_allclose(common_target(centres, forward, 4.0), [0.5, 0.5, -4.0], atol=1e-9)
 
 
-def test_a_box_covers_nothing_else_and_needs_no_cameras() -> None:
+def test_content_in_a_box_needs_no_cameras() -> None:
     config = OmegaConf.structured(TrainConfig)
     config.content.box_min, config.content.box_max = [0.0] * 3, [1.0] * 3
     derive_content(config, Vacuum())

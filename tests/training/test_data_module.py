@@ -1,4 +1,4 @@
-"""Batches made one step ahead are the ones that a step would make, and whatever goes wrong is told."""
+"""Prefetched batches equal the batches of their steps, and errors of the thread are raised."""
 
 import gc
 import threading
@@ -54,7 +54,7 @@ def ahead():
     assert not running()
 
 
-def test_paths_made_ahead_are_those_of_the_step_in_any_order(ahead, ball: SdfGrid) -> None:
+def test_prefetched_paths_equal_those_of_the_step_in_any_order(ahead, ball: SdfGrid) -> None:
     sampler = Snell()
     make: Any = lambda step: sampler(random_rays(300, 1.6, step, 6.0), ball)  # noqa: E731
     one = ahead(make)
@@ -65,7 +65,7 @@ def test_paths_made_ahead_are_those_of_the_step_in_any_order(ahead, ball: SdfGri
             assert torch.equal(getattr(got, name), getattr(expected, name))
 
 
-def test_the_next_one_is_made_while_the_step_works(ahead) -> None:
+def test_next_batch_is_made_during_the_step(ahead) -> None:
     begun = threading.Event()
     one = ahead(lambda step: begun.set() if step == 1 else None)
     one(0)
@@ -73,7 +73,7 @@ def test_the_next_one_is_made_while_the_step_works(ahead) -> None:
     assert begun.wait(10), "nobody has asked for step 1 yet"
 
 
-def test_what_goes_wrong_in_the_thread_is_raised_where_the_batch_is_asked_for(ahead) -> None:
+def test_prefetcher_reraises_errors_of_its_thread(ahead) -> None:
     def make(step: int) -> int:
         if step == 2:
             raise ValueError("no rays")
@@ -87,7 +87,7 @@ def test_what_goes_wrong_in_the_thread_is_raised_where_the_batch_is_asked_for(ah
 
 
 @pytest.mark.parametrize(("width", "available", "expected"), [(8, 3, 2), (512, 3, 3), (8, 16, 7), (512, 16, 16)])
-def test_torch_has_one_thread_less_and_at_most_seven_unless_matrices_are_large(
+def test_prefetcher_limits_the_threads_of_torch_unless_matrices_are_large(
     width: int, available: int, expected: int
 ) -> None:
     threads, renderer = torch.get_num_threads(), Mock(spec=Renderer, modules=lambda: [torch.nn.Linear(width, width)])
@@ -105,7 +105,7 @@ def test_torch_has_one_thread_less_and_at_most_seven_unless_matrices_are_large(
         torch.set_num_threads(threads)
 
 
-def test_nothing_is_traced_ahead_where_paths_learn_or_python_is_needed(ball: SdfGrid, monkeypatch) -> None:
+def test_paths_are_not_prefetched_if_they_learn_or_need_python(ball: SdfGrid, monkeypatch) -> None:
     monkeypatch.setattr("os.sched_getaffinity", lambda pid: {0, 1}, raising=False)
 
     def model(path_sampler, learns: bool = False) -> Any:
@@ -142,7 +142,7 @@ def test_weights_depend_neither_on_the_thread_nor_on_an_interruption(
 
 
 @pytest.mark.parametrize("learns", [True, False])
-def test_a_batch_is_made_when_its_step_begins_if_paths_learn(
+def test_batch_is_made_when_its_step_begins_if_paths_learn(
     learns: bool, ball: SdfGrid, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Lightning fetches one step early, so what it fetches must not be the batch."""
@@ -171,7 +171,7 @@ def test_a_batch_is_made_when_its_step_begins_if_paths_learn(
     assert not running()
 
 
-def test_there_is_one_copy_of_the_training_pixels(train: Runner, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_pixels_have_one_copy(train: Runner, monkeypatch: pytest.MonkeyPatch) -> None:
     """They move to the training device once, and steps of the cameras and of the background use them there."""
     moves, move = [], PixelStore.to
     monkeypatch.setattr(PixelStore, "to", lambda self, device: moves.append(device) or move(self, device))

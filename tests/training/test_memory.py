@@ -1,4 +1,4 @@
-"""What a run needs is counted, compared with what there is, and refused where it does not fit."""
+"""Estimates of the memory of a run, and the refusal of runs that exceed the available memory."""
 
 import math
 import re
@@ -34,7 +34,7 @@ def model_of(width: int, boundary: Boundary | None = None) -> Renderer:
     return RefractiveModel(Components(*parts, chunk_size=256))
 
 
-def test_what_autograd_keeps_is_counted_and_grows_with_the_network() -> None:
+def test_saved_tensors_are_counted_and_grow_with_the_network() -> None:
     rays, samples = example_rays(), 8
     kept = [memory._kept_bytes(model_of(width), rays) for width in (64, 256)]
     # Each of eight layers keeps its activations of 4 bytes.
@@ -47,7 +47,7 @@ def test_tables_of_a_fine_background_are_not_counted_for_each_ray() -> None:
     assert fine == pytest.approx(coarse, rel=0.1)
 
 
-def test_run_that_does_not_fit_is_refused_with_what_to_change(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_run_that_exceeds_the_memory_is_refused_with_advice(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(memory, "available_bytes", lambda: 1e6)
     message = r"needs about \d.* kB are for each ray: take a smaller batches\.size"
     refused(message, require_memory, model_of(16), example_rays(), torch.device("cpu"))
@@ -58,7 +58,7 @@ def test_run_that_does_not_fit_is_refused_with_what_to_change(monkeypatch: pytes
 @pytest.mark.parametrize(
     ("limit", "free"), [("5000000\n", 5_000_000 - 3_000_000 + 1_000_000), ("max\n", math.inf), (None, math.inf)]
 )
-def test_limit_of_a_control_group_counts_without_files_that_can_go(
+def test_limit_of_a_control_group_ignores_reclaimable_files(
     limit: str | None, free: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     system = available_bytes()
@@ -71,7 +71,7 @@ def test_limit_of_a_control_group_counts_without_files_that_can_go(
     assert available_bytes() == free if free < math.inf else available_bytes() > 1e8
 
 
-def test_what_does_not_fit_is_refused_before_it_is_begun(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_array_that_exceeds_the_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(available, "available_bytes", lambda: 2e9)
     require_bytes(1e9, "medium.resolution=100")
     refused(r"=900 needs about 3\.0 GB of memory, but 2\.0 GB are free", require_bytes, 3e9, "medium.resolution=900")
@@ -95,7 +95,7 @@ def test_checkpoint_is_counted_with_weights_gradients_and_moments(monkeypatch: p
     assert needed_gigabytes(model, monkeypatch) - small > 6.5 * weights / 1e9
 
 
-def test_memory_of_a_gpu_is_estimated_there_and_holds_the_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_of_a_gpu_is_estimated_with_the_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
     model, free = model_of(16), 1e9
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (free, free))
     with PretendedGpu():

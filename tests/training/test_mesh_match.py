@@ -1,4 +1,4 @@
-"""A mesh that does not belong to the photographs is named before training: unit, axes, or place."""
+"""A mesh with another unit, axes or position than the photographs is reported before training."""
 
 import re
 from pathlib import Path
@@ -38,7 +38,7 @@ def views() -> Views:
     ],
     ids=["right", "small", "large", "axes", "place"],
 )
-def test_unit_axes_and_place_of_a_mesh_are_compared_with_the_masks(
+def test_unit_axes_and_position_of_a_mesh_are_compared_with_the_masks(
     matrix: np.ndarray, shift: tuple[int, ...], message: str | None, views: Views, tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip

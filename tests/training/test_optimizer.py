@@ -1,4 +1,4 @@
-"""The learning rate's endpoints, and how far a run is."""
+"""The schedule of the learning rate, the progress of a run, and groups of parameters."""
 
 import itertools
 import math
@@ -67,14 +67,14 @@ class StoppedClock(Timer):
         (1000, -1, None, 0.0),  # without a budget
     ],
 )
-def test_progress_is_the_spent_share_of_the_budget(
+def test_progress_is_the_used_fraction_of_the_budget(
     step: int, max_steps: int, spent: float | None, progress: float
 ) -> None:
     timer = None if spent is None else StoppedClock(60, spent)
     assert training_progress(run(step, max_steps, timer)) == pytest.approx(progress)
 
 
-def test_the_last_matching_pattern_decides_and_a_misspelt_one_is_refused() -> None:
+def test_last_matching_pattern_decides_and_unmatched_pattern_is_refused() -> None:
     names = ["fields.0.table", "background.texels", "bodies.glass.material.ior", "bodies.water.material.ior"]
     parameters = {name: torch.nn.Parameter(torch.tensor(float(i))) for i, name in enumerate(names)}
 

@@ -16,7 +16,7 @@ from nerfro.training.trainer import lightning_precision, training_accelerator
 
 
 @pytest.mark.parametrize(("precision", "model"), [("64-true", "train"), ("bf16-mixed", "train_paper")])
-def test_a_run_ends_with_finite_scores(
+def test_run_in_every_precision_ends_with_finite_scores(
     precision: str, model: str, request: pytest.FixtureRequest, tmp_path: Path
 ) -> None:
     request.getfixturevalue(model)("trainer.max_steps=2", f"trainer.precision={precision}")
@@ -24,7 +24,7 @@ def test_a_run_ends_with_finite_scores(
     assert all(math.isfinite(value) for value in scores.values() if isinstance(value, float))
 
 
-def test_auto_trains_on_the_cpu_and_says_so_where_there_is_a_gpu(
+def test_accelerator_auto_trains_on_the_cpu_and_reports_an_unused_gpu(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for there in (False, True):
@@ -41,7 +41,7 @@ def has_units(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -
     return bool(request.param)
 
 
-def test_a_field_multiplies_in_what_the_machine_does_fast(has_units: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_field_uses_bfloat16_if_the_machine_supports_it(has_units: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     used: list[torch.dtype] = []
 
     def spy(inputs: list[Tensor], weights: list[Tensor], dtype: torch.dtype) -> Tensor:
@@ -55,7 +55,7 @@ def test_a_field_multiplies_in_what_the_machine_does_fast(has_units: bool, monke
     assert used == [torch.bfloat16 if has_units else torch.float32, torch.bfloat16, torch.float32]
 
 
-def test_the_trainer_takes_the_fastest_where_it_is_told_to(has_units: bool) -> None:
+def test_precision_fastest_uses_bfloat16_if_the_machine_supports_it(has_units: bool) -> None:
     def named(precision: str) -> str:
         trainer: DictConfig = OmegaConf.create({"trainer": {"precision": precision, "accelerator": "cpu"}})
         return lightning_precision(trainer)

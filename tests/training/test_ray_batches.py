@@ -1,4 +1,4 @@
-"""Random training pixels: which ones, how often, and the same ones after a resume."""
+"""Random training pixels: their selection, frequency and reproducibility."""
 
 import functools
 from dataclasses import replace
@@ -107,7 +107,7 @@ def test_masked_batch_of_one_image_is_different_usable_pixels_of_it(masked):
         assert len((batch.pixel_number // (HEIGHT * WIDTH)).unique()) == 1
 
 
-def test_a_share_of_the_pixels_is_of_the_object(views, masked):
+def test_object_fraction_of_the_pixels_is_of_the_object(views, masked):
     masks = torch.zeros(NUM_VIEWS, HEIGHT, WIDTH)
     masks[1, 2:5, 3:7] = 1.0
     masks[4, 6, 6:9] = 0.7
@@ -128,7 +128,7 @@ def test_a_share_of_the_pixels_is_of_the_object(views, masked):
         assert min(int(wanted[index].sum()) for index in processes) >= 8
 
 
-def test_without_masks_there_are_no_pixels_of_the_object(views, capsys):
+def test_object_fraction_is_ignored_without_masks(views, capsys):
     batches = RayBatches(views, 64, "all_images", seed=3, object_fraction=0.25)
     assert "not every training photograph has a mask" in capsys.readouterr().out
     assert torch.equal(batches.batch(5).pixel_number, RayBatches(views, 64, "all_images", seed=3).batch(5).pixel_number)
@@ -159,7 +159,7 @@ def test_every_view_has_its_own_usable_pixels(views, masked):
 
 
 @pytest.mark.parametrize(("batching", "size"), [("single_image", 1), ("all_images", 30)])
-def test_masks_hold_while_precropped_and_in_every_share(masked, batching, size):
+def test_masks_apply_to_precropped_and_distributed_batches(masked, batching, size):
     whole = RayBatches(masked, size, batching, seed=3, precrop_steps=20)
     for step in (*range(5), *range(20, 25)):
         batch = whole.batch(step)

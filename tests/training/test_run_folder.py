@@ -1,4 +1,4 @@
-"""A folder belongs to one run: what another run, a user or another process has there is never touched."""
+"""A folder belongs to one run: files of other runs, users and processes are kept."""
 
 import functools
 import math
@@ -43,7 +43,7 @@ def evaluate(begun: Path, evaluate_here: Runner) -> Runner:
 
 @pytest.mark.parametrize("file", ["config.yaml", "notes/mine.txt"])
 @pytest.mark.parametrize("going_on", ["null", "last", "elsewhere"])
-def test_what_the_run_did_not_make_stays(
+def test_files_of_others_in_the_run_folder_are_kept(
     file: str, going_on: str, train: Runner, trained_run: Path, tmp_path: Path
 ) -> None:
     folder = tmp_path / "run"
@@ -71,7 +71,7 @@ def test_run_without_checkpoints_is_not_replaced_and_begins_again_on_request(tra
     assert all(weights[name].equal(again[name]) for name in weights)
 
 
-def test_checkpoint_in_a_removed_folder_is_not_made_again(
+def test_checkpoint_in_a_removed_folder_is_not_recreated(
     train: Runner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fit = RayDataModule.train_dataloader
@@ -85,7 +85,7 @@ def test_checkpoint_in_a_removed_folder_is_not_made_again(
     assert not (tmp_path / "run").exists()
 
 
-def test_evaluation_replaces_only_what_an_evaluation_wrote(evaluate: Runner, tmp_path: Path) -> None:
+def test_evaluation_replaces_only_files_of_an_evaluation(evaluate: Runner, tmp_path: Path) -> None:
     mine = tmp_path / "mine"
     (mine / "images").mkdir(parents=True)
     (mine / "images" / "test_000.png").write_text("mine")
@@ -108,14 +108,14 @@ def test_refused_evaluation_leaves_no_folder(evaluate: Runner, tmp_path: Path) -
 
 
 @pytest.mark.parametrize("below", ["", "run"])
-def test_file_in_place_of_the_run_folder_is_told(below: str, train: Runner, tmp_path: Path) -> None:
+def test_file_in_place_of_the_run_folder_is_refused(below: str, train: Runner, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("mine")
     refused = train(f"hydra.run.dir={tmp_path / 'file' / below}", code=1).error
     assert "choose another hydra.run.dir" in refused
     assert (tmp_path / "file").read_text() == "mine"
 
 
-def test_what_killed_processes_were_writing_goes_and_what_others_write_stays(train: Runner, begun: Path) -> None:
+def test_temporary_files_of_killed_processes_are_removed_and_others_kept(train: Runner, begun: Path) -> None:
     killed, written = (begun / "images" / f".{name}.png.{'a1' * 8}.partial" for name in ("killed", "written"))
     foreign = begun / "images" / ".foreign.partial"
     for path in (killed, written, foreign):
@@ -126,7 +126,7 @@ def test_what_killed_processes_were_writing_goes_and_what_others_write_stays(tra
     assert [path.exists() for path in (killed, written, foreign)] == [False, True, True]
 
 
-def test_nothing_foreseen_is_one_line_and_a_file(
+def test_unexpected_error_gives_one_line_and_a_traceback_file(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def broken(config: object) -> None:
@@ -155,7 +155,7 @@ def test_nothing_foreseen_is_one_line_and_a_file(
         (OSError(28, "No space left on device", "a.png"), "no space is left for a.png; free some"),
     ],
 )
-def test_what_the_machine_lacks_is_told_as_such(
+def test_lack_of_resources_is_not_reported_as_a_bug(
     error: Exception, words: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def broken(config: object) -> None:

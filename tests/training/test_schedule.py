@@ -16,7 +16,7 @@ from nerfro.data.base import Views
 from nerfro.errors import NerfroError
 from nerfro.rendering import Renderer
 from nerfro.training.callbacks import steps_by_phase
-from nerfro.training.phases.base import Phase, Run
+from nerfro.training.phases.base import Phase, TrainingRun
 from nerfro.training.ray_batches import RayBatches
 from nerfro.training.schedule import Schedule
 from tests.conftest import refused
@@ -28,14 +28,14 @@ class Counted(Phase):
     def __init__(self, record: list[tuple[str, int, int]], name: str, end: int) -> None:
         self.record, self.name, self.end = record, name, end
 
-    def begin(self, run: Run) -> dict[str, Any]:
+    def begin(self, run: TrainingRun) -> dict[str, Any]:
         self.record.append((self.name, -1, -1))
         return {"begun": len(self.record)}
 
     def steps_before(self, training_step: int) -> int:
         return 3 + training_step // 2
 
-    def step(self, run: Run, number: int, state: dict[str, Any]) -> bool:
+    def step(self, run: TrainingRun, number: int, state: dict[str, Any]) -> bool:
         self.record.append((self.name, number, state["begun"]))
         return number < self.end
 
@@ -59,14 +59,14 @@ def test_step_without_a_result_is_refused() -> None:
 
 def test_step_without_parameters_is_refused() -> None:
     renderer = Mock(spec=Renderer, parameters_by_name=lambda: {"background.colour": nn.Parameter(torch.zeros(()))})
-    run = Run(renderer, Mock(spec=RayBatches), Mock(spec=Views), Mock(spec=Adam), 0.0)
+    run = TrainingRun(renderer, Mock(spec=RayBatches), Mock(spec=Views), Mock(spec=Adam), 0.0)
     with pytest.raises(NerfroError, match=r"backgroud\.\* matches no learned .* choose from background\.colour"):
         run.parameters(["background.*", "backgroud.*"])
     refused("changes no parameter", run.descend, torch.zeros(()), run.parameters(["cameras.*"]))
 
 
 @pytest.mark.parametrize("stop", [0, 2, 3])
-def test_steps_of_phases_are_those_of_an_undisturbed_run(stop: int) -> None:
+def test_resumed_run_takes_the_phase_steps_of_an_uninterrupted_run(stop: int) -> None:
     def schedule(record: list[tuple[str, int, int]]) -> Schedule:
         return Schedule({name: Counted(record, name, end) for name, end in (("a", 9), ("b", 1))}, Mock(spec=Views))
 
@@ -94,13 +94,13 @@ def test_no_step_between_training_steps_begins_after_the_limit_of_time() -> None
     assert [number for _, number, _ in record] == [-1, 0, 1, 2, 3, 4, 5, 6]
 
 
-def test_a_step_of_a_phase_moves_only_its_parameters() -> None:
+def test_step_of_a_phase_changes_only_its_parameters() -> None:
     moved, other = nn.Parameter(torch.ones(1)), nn.Parameter(torch.ones(1))
     optimizer = Adam([moved, other])
     (moved + other).sum().backward()
     optimizer.step()  # Lightning keeps the gradients until the next training step
     before = other.item()
-    Run(Mock(spec=Renderer), Mock(spec=RayBatches), Mock(spec=Views), optimizer, 0.0).descend(
+    TrainingRun(Mock(spec=Renderer), Mock(spec=RayBatches), Mock(spec=Views), optimizer, 0.0).descend(
         moved.square().sum(), [moved]
     )
     assert other.item() == before

@@ -1,4 +1,4 @@
-"""What each setting says about a run, and that resuming, sweeps and tables go by the same statement."""
+"""The meaning of settings for resuming, sweeps and tables."""
 
 import inspect
 

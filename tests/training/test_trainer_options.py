@@ -1,4 +1,4 @@
-"""Arguments of Lightning's Trainer act or are refused with a reason, and callbacks are chosen by name."""
+"""Arguments of Lightning's Trainer take effect or are refused with a reason, and callbacks are selected by name."""
 
 import inspect
 import json
@@ -23,7 +23,7 @@ from nerfro.training.config import TrainConfig, TrainerConfig, clock_time, resol
 from nerfro.training.ray_batches import RayBatches
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
 from nerfro.training.trainer import _OWN
-from tests.conftest import Runner, refused
+from tests.conftest import Runner, refused, weights_of
 
 REFUSED = {
     name: reason
@@ -52,7 +52,7 @@ class StepFile(Callback):
 '''
 
 
-def test_every_argument_of_lightnings_trainer_is_known() -> None:
+def test_every_argument_of_lightnings_trainer_is_covered() -> None:
     arguments = set(inspect.signature(pl.Trainer.__init__).parameters) - {"self"}
     fields = set(TrainerConfig.__dataclass_fields__)
     assert arguments <= fields
@@ -67,7 +67,9 @@ def test_every_argument_of_lightnings_trainer_is_known() -> None:
         "optimized_metric=beauty",
     ],
 )
-def test_cfg_refuses_what_training_refuses_in_the_same_line(override: str, train: Runner, tmp_path: Path) -> None:
+def test_cfg_refuses_the_settings_that_training_refuses_with_the_same_error(
+    override: str, train: Runner, tmp_path: Path
+) -> None:
     printed, trained = train(override, "--cfg", "job", code=1), train(override, code=1)
     assert printed.out == ""
     assert printed.error == trained.error
@@ -81,7 +83,7 @@ def test_settings_may_refer_to_hydra(key: str, train: Runner) -> None:
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_arguments_without_a_meaning_are_refused_with_a_reason(name: str) -> None:
+def test_unsupported_arguments_are_refused_with_a_reason(name: str) -> None:
     config = OmegaConf.structured(TrainConfig)
     config.trainer[name] = 3
     message = refused("is not allowed", check_settings, config, TrainConfig)
@@ -149,15 +151,16 @@ def test_training_without_evaluation_ends_after_its_time(train: Runner, tmp_path
     assert not (tmp_path / "run" / "metrics.json").exists()
 
 
-def test_least_number_of_steps_ends_after_the_time(train: Runner, tmp_path: Path) -> None:
+def test_minimum_number_of_steps_exceeds_the_limit_of_time(train: Runner, tmp_path: Path) -> None:
     train("trainer.max_time=1s", "trainer.min_steps=3", "trainer.max_steps=3000", "evaluation=none")
     checkpoint, _ = load_checkpoint(tmp_path / "run" / LAST_CHECKPOINT)
     assert 3 <= checkpoint["global_step"] < 3000
 
 
 @pytest.mark.parametrize("options", [["trainer.precision=64-true"], ["batches.size=1"]])
-def test_unusual_precision_and_size_train(options: list[str], train: Runner) -> None:
-    train(*options, "trainer.max_steps=4", "evaluation=none")
+def test_unusual_precision_and_size_train(options: list[str], train: Runner, tmp_path: Path) -> None:
+    assert "4 steps in" in train(*options, "trainer.max_steps=4", "evaluation=none").out
+    assert all(bool(values.isfinite().all()) for values in weights_of(tmp_path / "run").values())
 
 
 @pytest.mark.parametrize(
@@ -202,7 +205,7 @@ def test_overfitting_repeats_batches(train: Runner, monkeypatch: pytest.MonkeyPa
     assert re.search(r"100%.*step 6,.*train PSNR", finished.err), "a log ends with the last step"
 
 
-def test_a_run_is_profiled_and_has_neither_bar_nor_checkpoints_on_its_way(train: Runner, tmp_path: Path) -> None:
+def test_profiled_run_has_no_progress_bar_and_no_intermediate_checkpoints(train: Runner, tmp_path: Path) -> None:
     quiet = ["trainer.enable_progress_bar=false", "trainer.enable_checkpointing=false"]
     finished = train("trainer.max_steps=2", "trainer.profiler=simple", *quiet)
     assert "train PSNR" not in finished.err

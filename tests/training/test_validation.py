@@ -55,33 +55,35 @@ def learn(train: Runner) -> Runner:
     return functools.partial(train, *box, *quick, *parts, *steps)
 
 
-def test_photographs_known_by_heart_are_told_once(learn: Runner, noise: Path, tmp_path: Path) -> None:
+def test_overfitting_warns_once(learn: Runner, noise: Path, tmp_path: Path) -> None:
     finished = learn(f"data.root={noise}", "logger=tensorboard", "trainer.log_every_n_steps=1")
-    told = [line for line in finished.out.splitlines() if LINE in line]
-    assert len(told) == 1
-    assert "docs/tutorials/photographs.md, Few photographs" in told[0]
+    warnings = [line for line in finished.out.splitlines() if LINE in line]
+    assert len(warnings) == 1
+    assert "docs/tutorials/photographs.md, Few photographs" in warnings[0]
     with (tmp_path / "run" / "csv" / "metrics.csv").open() as file:
         rows = list(csv.DictReader(file))
     held = [float(row["val/psnr"]) for row in rows if row["val/psnr"]]
-    assert len(held) == 15, "a look every ten steps"
+    assert len(held) == 15, "a validation every ten steps"
     training = [float(row["train/psnr"]) for row in rows if row["train/psnr"]]
     assert held[-1] + 4 < np.mean(training[-10:])
 
 
 @pytest.mark.parametrize(
-    ("looks", "told"),
+    ("validations", "warned"),
     [
         ([(20, 21), (20, 23.9), (20.1, 24.2), (20.1, 24.3), (20.1, 27)], [3]),  # 4 dB below, twice
         ([(20, 24.1), (20, 23), (20, 24.1), (20, 23)], []),  # never twice in succession
         ([(8, 9), (20, 21), (24, 27.9), (25, 28.9), (26, 29.9)], []),  # within 4 dB
     ],
 )
-def test_a_gap_in_two_successive_validations_is_overfitting(looks: list[tuple[float, float]], told: list[int]) -> None:
+def test_gap_in_two_successive_validations_is_overfitting(
+    validations: list[tuple[float, float]], warned: list[int]
+) -> None:
     warning = OverfittingWarning()
-    assert [step for step, look in enumerate(looks) if warning.judge(step, *look) is not None] == told
+    assert [step for step, psnr in enumerate(validations) if warning.judge(step, *psnr) is not None] == warned
 
 
-def test_a_resumed_run_remembers_and_says_nothing_twice() -> None:
+def test_resumed_run_does_not_repeat_the_warning() -> None:
     before, later, again = OverfittingWarning(), OverfittingWarning(), OverfittingWarning()
     assert before.judge(1, 21, 22) is None
     assert before.judge(2, 20, 24) is None
@@ -92,7 +94,7 @@ def test_a_resumed_run_remembers_and_says_nothing_twice() -> None:
     assert again.judge(4, 20, 26) is None
 
 
-def test_the_same_usable_pixels_are_watched_each_time(tiny_scene: Path) -> None:
+def test_validation_pixels_are_usable_and_constant(tiny_scene: Path) -> None:
     views = BlenderData(str(tiny_scene), near=2.0, far=6.0).load("val")
     usable = torch.zeros(2, 16, 16, dtype=torch.bool)
     usable[:, 3:7] = True
@@ -115,12 +117,12 @@ def bending() -> Any:
         spec=Renderer,
         scene=Mock(spec=Scene, device=torch.device("cpu"), medium=ball, colour_space=ColourSpace.LINEAR),
         path_sampler=sampler,
-        exit_directions=lambda rays: sampler.main(rays, ball).exit_directions,
+        exit_directions=lambda rays: sampler.trace_main(rays, ball).exit_directions,
     )
 
 
 @pytest.mark.parametrize("contrast", [None, 0.015])
-def test_watched_pixels_have_the_rays_that_training_gives_them(contrast: float | None, tiny_scene: Path) -> None:
+def test_validation_pixels_have_the_rays_of_training(contrast: float | None, tiny_scene: Path) -> None:
     views = BlenderData(str(tiny_scene), near=2.0, far=6.0).load("val")
     model = bending()
     batches = RayBatches(views, 256, "single_image")
@@ -137,9 +139,7 @@ def test_watched_pixels_have_the_rays_that_training_gives_them(contrast: float |
 
 @pytest.mark.parametrize("side", [1, 2])
 @pytest.mark.parametrize("learns", [False, True])
-def test_where_exposures_learn_each_watched_view_has_the_gain_that_suits_it(
-    learns: bool, side: int, tiny_scene: Path
-) -> None:
+def test_validation_views_have_fitted_gains_if_exposures_learn(learns: bool, side: int, tiny_scene: Path) -> None:
     views = BlenderData(str(tiny_scene), near=2.0, far=6.0).load("val")
     watched, model = (
         ValidationPixels.of(Views(views.cameras.select([0, 0]), torch.rand(2, 16, 16, 3), None, ["a"])),
@@ -161,7 +161,7 @@ def rays_of_pixels(rays: Rays, index: torch.Tensor) -> dict[int, torch.Tensor]:
 
 
 @pytest.mark.parametrize(("every", "looks"), [(0, 0), (1, 1), (4, 1), (11, 2), (500, 100)])
-def test_looks_come_five_times_as_often_as_pictures(every: int, looks: int, tiny_scene: Path) -> None:
+def test_validations_are_five_times_as_frequent_as_images(every: int, looks: int, tiny_scene: Path) -> None:
     assert validation_interval(every) == looks
     if not every:
         return
