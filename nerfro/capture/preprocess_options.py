@@ -18,7 +18,7 @@ from nerfro.cameras import Cameras
 from nerfro.data.base import DataSource
 from nerfro.data.frames import require_root
 from nerfro.errors import NerfroError
-from nerfro.geometry.mesh import TriangleMesh, load_mesh, local_origin
+from nerfro.geometry.mesh import TriangleMesh, load_mesh, local_origin, num_decimals
 from nerfro.media.base import Medium
 from nerfro.media.bodies import ordered_settings
 from nerfro.overrides import as_overrides, is_given, print_hint, print_next
@@ -170,7 +170,7 @@ def surface_settings(
     names = ("medium.box_min", "medium.box_max", "medium.bodies")  # each of several bodies has a box of its own
     if not any(is_given(name, request.overrides) for name in names):
         centre, half_side = mesh.bounds.mean(0) + origin, (0.5 + _MARGIN) * float(np.ptp(mesh.bounds, axis=0).max())
-        digits = max(0, 3 - int(np.floor(np.log10(half_side))))
+        digits = max(0, num_decimals(half_side, 7))
         for name, corner in (("box_min", centre - half_side), ("box_max", centre + half_side)):
             settings[name] = [round(float(x), digits) for x in corner]
     is_vessel = "wall" in request.config.medium

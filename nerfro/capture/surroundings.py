@@ -256,6 +256,7 @@ class Room(Boundary):
     def __init__(self, bounds: Float[np.ndarray, "2 3"], radius: float) -> None:
         super().__init__()
         low, high = bounds.tolist()
+        self.radius = radius
         self.field = HashGridField(
             low, high, radius, finest_resolution=512, log2_table_size=17, direction_bands=1, initial_depth=3.0
         )
@@ -273,7 +274,7 @@ class Room(Boundary):
         """
         assert exits.positions is not None
         ones = torch.ones_like(exits.positions[:, 0])
-        rays = Rays(exits.positions, exits.directions, exits.radii * ones, 0 * ones, ones)
+        rays = Rays(exits.positions, exits.directions, exits.radii * ones, 0 * ones, self.radius * ones)
         path = straight_path(rays)
         samples = self.sampler(path, None, draws)
         radiance = self.field(samples)

@@ -64,7 +64,7 @@ class TriangleMesh:
         write_atomically(path, header.encode() + self.vertices.astype("<f8").tobytes() + faces.tobytes())
 
 
-_THINNEST = 1e-4  # world units; boxes are stored with six decimals
+_THINNEST = 1e-4  # relative to the longest side; boxes are stored with seven significant digits
 # Distance from the origin, in sizes of the object, beyond which rays have coordinates relative to the object. Rays are
 # in single precision, whose relative spacing of 1.2e-7 turns exit directions by up to 0.01 degrees at this distance.
 _FAR = 100
@@ -83,6 +83,11 @@ def local_origin(points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "3"
     if not 0 < _FAR * size < np.abs(centre).max():
         return np.zeros(3)
     return centre.round(math.ceil(-math.log10(size)))
+
+
+def num_decimals(size: float, digits: int) -> int:
+    """Return the number of decimals with which lengths of the given size have so many significant digits."""
+    return digits - 1 - math.floor(math.log10(size))
 
 
 def origin_of_file(path: Path) -> Float[np.ndarray, "3"]:
@@ -119,11 +124,11 @@ def load_mesh(path: Path, accept_open_mesh: bool = False) -> TriangleMesh:
         raise NerfroError(f"mesh {path} has triangles with indices of missing vertices; export it again")
     check(f"mesh {path} reaches too far; scale it to about one unit: ", {"coordinate": Coordinate},
           {"coordinate": float(vertices.flat[np.abs(vertices).argmax()])})  # fmt: skip
-    extent = float(np.ptp(vertices, axis=0).min())
-    if extent < _THINNEST:
+    extents = np.ptp(vertices, axis=0)
+    if extents.min() <= _THINNEST * extents.max():
         raise NerfroError(
-            f"mesh {path} is {extent:g} world units thin, so it has no inside; "
-            "export a solid, and scale cameras and mesh so that it is about one unit wide"
+            f"mesh {path} is {extents.min():g} world units thin and {extents.max():g} long, so it has no inside; "
+            "export a solid"
         )
     # trimesh computes normals on demand; before the first access, the cache holds only normals from the file.
     read = np.asarray(loaded.vertex_normals, np.float64) if "vertex_normals" in loaded._cache else None

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from nerfro.allowed import corners_of_box
 from nerfro.errors import NerfroError
+from nerfro.geometry.mesh import num_decimals
 
 _AIR = 4  # voxels around the object if its box is not given
 BYTES_PER_VERTEX = 64  # peak memory while a grid is built
@@ -60,12 +61,13 @@ def check_margin(bounds: Float[np.ndarray, "2 3"], box: Float[np.ndarray, "2 3"]
             f"medium.resolution={resolution} has no room for {voxels} voxels of air on each side; increase it"
         )
     margin = 0.5 * (high - low).max() * share / (1 - share)
+    decimals = num_decimals(float((high - low).max()), 3)
     raise NerfroError(
         f"the object does not fit into the box with {voxels} voxels of air; it needs a box such as "
-        f"medium.box_min={_rounded(low - margin, -1)} medium.box_max={_rounded(high + margin, 1)}"
+        f"medium.box_min={_rounded(low - margin, -1, decimals)} medium.box_max={_rounded(high + margin, 1, decimals)}"
     )
 
 
-def _rounded(corner: Float[np.ndarray, "3"], direction: int) -> str:
+def _rounded(corner: Float[np.ndarray, "3"], direction: int, decimals: int) -> str:
     outward = np.floor if direction < 0 else np.ceil
-    return "[" + ",".join(f"{value:.12g}" for value in outward(corner * 100) / 100) + "]"
+    return "[" + ",".join(f"{value:.12g}" for value in outward(corner * 10.0**decimals) / 10.0**decimals) + "]"

@@ -87,7 +87,8 @@ class MovingMesh:
 
 def unit(vectors: Float[np.ndarray, "vectors 3"]) -> Float[np.ndarray, "vectors 3"]:
     """Normalize vectors; zero vectors stay zero."""
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True).clip(1e-12)
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return vectors / np.where(length > 0, length, 1)
 
 
 def solve_symmetric(system: sparse.spmatrix, right: Float[np.ndarray, " vectors"]) -> Float[np.ndarray, " vectors"]:

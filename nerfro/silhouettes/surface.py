@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from nerfro.data.base import Views
 from nerfro.errors import NerfroError, first_of, warn
-from nerfro.geometry.mesh import TriangleMesh
+from nerfro.geometry.mesh import TriangleMesh, num_decimals
 from nerfro.progress import fraction_bar
 from nerfro.silhouettes.pose_conventions import overlap
 from nerfro.silhouettes.revolution import Symmetry, fit_revolution
@@ -184,7 +184,7 @@ def _warn_of_open_hull(silhouettes: Silhouettes, box: Float[np.ndarray, "2 3"]) 
         reason = f"all cameras look from within {spread:.0f} degrees, so silhouettes do not bound the object in depth"
     else:
         reason = "the masks that would bound the hull are cut by their frames, or the box is too small"
-    corners = np.round(box, 3).tolist()
+    corners = np.round(box, num_decimals(float(np.ptp(box, axis=0).max()), 4)).tolist()
     warn(f"the box {corners} cuts the visual hull: {reason}; set the box with box_min= and box_max=")
 
 

@@ -93,16 +93,18 @@ class Silhouettes:
             Distances in world units, negative inside.
         """
         largest = torch.full((wrong_masks + 1, len(points)), -torch.inf)
-        num_seen = torch.zeros(len(points), dtype=torch.int32)
+        num_seen, pixel = torch.zeros(len(points), dtype=torch.int32), torch.full((len(points),), torch.inf)
         for view in range(len(self)):
             inside, width = self.depth_inside(view, points)
             known = inside < torch.inf
             num_seen += known
+            pixel = torch.minimum(pixel, width.abs())
             value = torch.where(known, -inside * width, -torch.inf)
             for rank in range(wrong_masks + 1):
                 largest[rank], value = torch.maximum(largest[rank], value), torch.minimum(largest[rank], value)
-        far = torch.where(largest[0].isfinite(), largest[0].abs(), 1.0)
-        return torch.where(num_seen < max(_MIN_VIEWS, wrong_masks + 1), far, largest[-1])
+        # Unseen points are outside by a pixel, so that finer levels of the grid examine the border of the seen space.
+        outside = torch.where(largest[0].isfinite(), largest[0].abs(), pixel)
+        return torch.where(num_seen < max(_MIN_VIEWS, wrong_masks + 1), outside, largest[-1])
 
 
 def centre_lines(silhouettes: Silhouettes) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "V 3"]]:

@@ -13,7 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from nerfro.allowed import Count, NotNegative, Positive
 from nerfro.cameras import Cameras
 from nerfro.errors import NerfroError
-from nerfro.geometry.mesh import local_origin
+from nerfro.geometry.mesh import local_origin, num_decimals
 from nerfro.media.analytic import Vacuum
 from nerfro.media.base import Medium
 from nerfro.media.bodies import surfaces_of
@@ -155,13 +155,18 @@ def _depth(cameras: Cameras) -> float:
 def _box(config: DictConfig, medium: Medium) -> Float[np.ndarray, "2 3"] | None:
     """Return the bounds of the object from the medium or its surfaces; None without both."""
     if not isinstance(medium, Vacuum):
-        return medium.content_box.double().numpy().round(6)
+        return _rounded(medium.content_box.double().numpy())
     surfaces = surfaces_of(config.medium)
     if surfaces and all(resolve_path(surface.get("file", ".")).exists() for surface in surfaces):
         # Straight rays need no medium, but the baselines get the same bounds as the refractive model.
         bounds = np.stack([make_surface(surface, accept_open_mesh=True).bounds for surface in surfaces])
-        return (np.stack([bounds[:, 0].min(0), bounds[:, 1].max(0)]) - local_origin(bounds[0])).round(6)
+        return _rounded(np.stack([bounds[:, 0].min(0), bounds[:, 1].max(0)]) - local_origin(bounds[0]))
     return None
+
+
+def _rounded(box: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, "2 3"]:
+    """Round a box to at least seven significant digits of its longest side, and to six decimals."""
+    return box.round(max(6, num_decimals(float((box[1] - box[0]).max()), 7)))
 
 
 def _require_no_box(config: DictConfig) -> None:

@@ -16,7 +16,7 @@ from nerfro.data.base import Views
 from nerfro.errors import NerfroError, warn
 from nerfro.geometry.intersection import MeshIntersector
 from nerfro.geometry.lines import nearest_point
-from nerfro.geometry.mesh import TriangleMesh
+from nerfro.geometry.mesh import TriangleMesh, num_decimals
 from nerfro.geometry.orientation import area_vectors
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
@@ -153,13 +153,14 @@ class _Comparison(NamedTuple):
         areas = self.masks.sum(1).numpy() * (depths / self.cameras.fx.double().numpy()) ** 2
         scale = float(np.sqrt(areas.mean() / area))
         scale = 1.0 if abs(scale - 1) < 0.1 else scale
+        decimals = num_decimals(scale * float(np.ptp(self.mesh.bounds, axis=0).max()), 4)
         for turn in (_SAME, *turns):
             matrix = scale * turn.matrix
             shift = target - matrix @ self.mesh.bounds.mean(0)
             ours = self.silhouettes(_Change(matrix, shift, ""))
             shift += target - self._middle(ours) if ours.any(1).all() else 0
             words = [f"scaled by {scale:.3g}"] * (scale != 1) + [turn.description] * bool(turn.description)
-            yield _Change(matrix, shift, " and ".join([*words, f"moved by {shift.round(3).tolist()}"]))
+            yield _Change(matrix, shift, " and ".join([*words, f"moved by {shift.round(decimals).tolist()}"]))
 
     def _middle(self, pixels: Bool[Tensor, "V Q"]) -> Float[np.ndarray, "3"]:
         """Return the point nearest to the rays through the centres of some pixels in each view."""

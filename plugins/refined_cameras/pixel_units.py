@@ -75,7 +75,10 @@ def gauge_basis(poses: Float[Tensor, "V 3 4"], weights: Float[Tensor, "V 6"]) ->
     axes = torch.eye(3, dtype=poses.dtype)[:, None].expand(3, *centres.shape)
     zeros = torch.zeros_like(axes)
     rotations = torch.cat([axes, torch.linalg.cross(axes, centres.expand_as(axes))], -1)
-    motions = torch.cat([rotations, torch.cat([zeros, axes], -1), torch.cat([zeros[:1], centres[None]], -1)])
+    # Translations by the typical distance of the scene have the size of the other motions in any world unit.
+    distance = weights[:, :3].mean() / weights[:, 3:].mean()
+    translations = torch.cat([zeros, distance * axes], -1)
+    motions = torch.cat([rotations, translations, torch.cat([zeros[:1], centres[None]], -1)])
     own = motions.unflatten(-1, (2, 3)) @ poses[..., :3]  # in camera axes
     u, values, _ = torch.linalg.svd((own.flatten(-2) * weights).flatten(1).T, full_matrices=False)
     return u[:, values > _RANK_TOLERANCE * values.max()].T.unflatten(-1, (len(poses), 6))

@@ -132,6 +132,15 @@ def test_similarity_is_recovered() -> None:
             torch.testing.assert_close(found.scale, made.scale)
 
 
+@pytest.mark.parametrize("scale", [2.0**-22, 1.0, 2.0**21])
+def test_gauge_freedom_has_seven_dimensions_in_any_world_unit(scale: float) -> None:
+    given = cameras()
+    poses = torch.cat([given.camera_to_world[..., :3], scale * given.camera_to_world[..., 3:]], -1)
+    given = replace(given, camera_to_world=poses, near=scale * given.near, far=scale * given.far)
+    weights = pixel_units.even_weights(pixel_units.pixel_motions(given, pixel_units.object_distances(given)))
+    assert len(pixel_units.gauge_basis(poses, weights)) == 7
+
+
 def test_checkpoints_with_the_old_name_of_the_gauge_basis_are_read() -> None:
     made, restored = part(cameras()), refined.RefinedCamera(lens=True).double()
     stored = made.state_dict()

@@ -99,6 +99,14 @@ def test_mesh_without_an_interior_is_refused(medium: type, shape: str, tmp_path:
     refused("no vertex of the grid lies inside the mesh", medium, str(tmp_path / "mesh.ply"), **BOX)
 
 
+def test_thin_plate_is_loaded_in_any_world_unit(tmp_path: Path) -> None:
+    for size in (2.0**-10, 2.0**10):
+        trimesh.creation.box((1.5 * size, 1.5 * size, 0.09 * size)).export(tmp_path / "plate.ply")
+        assert load_mesh(tmp_path / "plate.ply").is_closed
+    trimesh.creation.box((1.5, 1.5, 1e-5)).export(tmp_path / "plate.ply")
+    refused("1e-05 world units thin and 1.5 long, so it has no inside", load_mesh, tmp_path / "plate.ply")
+
+
 @pytest.mark.parametrize("medium", [SdfGrid, VoxelGrid])
 def test_open_mesh_is_accepted_on_request(medium: type, tmp_path: Path) -> None:
     mesh = ball(0.6)

@@ -7,7 +7,7 @@ import torch
 
 from nerfro.errors import NerfroError
 from nerfro.samplers.paths.straight import straight_path
-from nerfro.samplers.points.stratified import LAST_DELTA, Stratified
+from nerfro.samplers.points.stratified import LAST_FRACTION, Stratified
 from nerfro.testing import example_draws, example_rays
 from nerfro.types import Path
 from tests.closed_forms import Luneburg
@@ -49,7 +49,7 @@ def test_offset_moves_the_samples_of_evaluation(bent: Path) -> None:
 def test_intervals_reach_from_sample_to_sample_and_the_last_is_thin(bent: Path) -> None:
     samples = Stratified(16)(bent, None, example_draws(200))
     torch.testing.assert_close(samples.deltas[:, :-1], samples.s.diff(dim=1))
-    torch.testing.assert_close(samples.deltas[:, -1], torch.full((200,), LAST_DELTA), atol=1e-6, rtol=0)
+    torch.testing.assert_close(samples.deltas[:, -1], LAST_FRACTION * (bent.far - bent.near), atol=1e-6, rtol=0)
 
 
 def test_vertices_are_drawn_one_from_each_group_with_offsets_that_differ_between_rays(bent: Path) -> None:

@@ -56,6 +56,15 @@ def test_outlines_of_a_sharp_body_lie_at_its_edges() -> None:
     assert np.median(np.abs(off)) < 0.04
 
 
+@pytest.mark.parametrize("size", [2.0**-16, 2.0**10])
+def test_normals_and_creases_are_independent_of_the_world_unit(size: float) -> None:
+    made = trimesh.creation.icosphere(4)
+    mesh = MovingMesh(np.asarray(made.faces))
+    one, other = mesh.geometry(np.asarray(made.vertices)), mesh.geometry(size * np.asarray(made.vertices))
+    np.testing.assert_array_equal(one.normals, other.normals)
+    np.testing.assert_array_equal(one.creases, other.creases)
+
+
 def test_only_sharp_bodies_have_creases() -> None:
     ball, sharp = trimesh.creation.icosphere(3), box().subdivide_to_size(0.1)
     for made, expected in ((ball, False), (sharp, True)):

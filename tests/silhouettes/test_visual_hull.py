@@ -191,3 +191,16 @@ def test_shuffled_masks_are_refused(odd_shape: trimesh.Trimesh) -> None:
     shuffled = Silhouettes.of(silhouettes.cameras, silhouettes.masks.roll(5, 0))
     with pytest.raises(NerfroError, match="none of the known pose conventions explains the difference"):
         require_consistent_poses(shuffled, [str(view) for view in range(16)], wrong_masks=0)
+
+
+@pytest.mark.parametrize("scale", [2.0**-10, 2.0**10])
+def test_hull_of_a_cut_object_is_independent_of_the_world_unit(scale: float) -> None:
+    hulls = []
+    for unit in (1.0, scale):
+        made = trimesh.creation.box((unit, 0.8 * unit, 6 * unit))
+        cameras = cameras_around(6, 32, distance=4 * unit)
+        silhouettes = photographed(made, cameras)
+        assert silhouettes.cut.any()
+        distances, corner, spacing = carve_grid(silhouettes, unit * np.array([[-1.2] * 3, [1.2] * 3]), 24)
+        hulls.append(extract_surface(distances, corner, spacing).vertices / unit)
+    np.testing.assert_array_equal(*hulls)

@@ -16,8 +16,10 @@ from nerfro.registry import register
 from nerfro.samplers.base import PointSampler
 from nerfro.types import Path, Rendering, Samples
 
-# Width of the interval of the last point sample, as in the authors' code; the background is seen behind it.
+# Width of the interval of the last point sample, behind which the background is seen: in world units for
+# `draw=vertices`, as in the authors' code, and relative to the length of the path for other arc lengths.
 LAST_DELTA = 1e-3
+LAST_FRACTION = LAST_DELTA / 4  # rays of the authors' scenes are 4 units long
 
 
 @register("sampler/points", "stratified")
@@ -94,7 +96,8 @@ class Stratified(PointSampler):
         s = path.s.gather(1, vertex)
         index = vertex[..., None].expand(-1, -1, 3)
         positions, directions = path.positions.gather(1, index), path.directions.gather(1, index)
-        return Samples(positions, directions, s, _edges_from_starts(s), path.radii)
+        edges = _edges_from_starts(s, torch.full_like(path.near, LAST_DELTA))
+        return Samples(positions, directions, s, edges, path.radii)
 
 
 def point_samples(path: Path, s: Float[Tensor, "P N"]) -> Samples:
@@ -105,9 +108,10 @@ def point_samples(path: Path, s: Float[Tensor, "P N"]) -> Samples:
         s: arc lengths [P, N] in ascending order along each polyline, world units.
 
     Returns:
-        Samples with positions and directions on the paths. The interval of each sample ends at the next sample.
+        Samples with positions and directions on the paths. The interval of each sample ends at the next sample, and
+        the last one is `LAST_FRACTION` of the path long.
     """
-    return Samples.along(path, s, _edges_from_starts(s))
+    return Samples.along(path, s, _edges_from_starts(s, LAST_FRACTION * (path.far - path.near)))
 
 
 def cone_samples(path: Path, edges: Float[Tensor, "P E"]) -> Samples:
@@ -115,5 +119,5 @@ def cone_samples(path: Path, edges: Float[Tensor, "P E"]) -> Samples:
     return Samples.along(path, 0.5 * (edges[:, 1:] + edges[:, :-1]), edges)
 
 
-def _edges_from_starts(s: Float[Tensor, "P N"]) -> Float[Tensor, "P N+1"]:
-    return torch.cat([s, s[:, -1:] + LAST_DELTA], dim=1)
+def _edges_from_starts(s: Float[Tensor, "P N"], last: Float[Tensor, "P"]) -> Float[Tensor, "P N+1"]:
+    return torch.cat([s, s[:, -1:] + last[:, None]], dim=1)
