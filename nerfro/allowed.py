@@ -209,7 +209,7 @@ def _refusal(value: Any, hint: Any) -> str | None:
     if origin is Annotated and isinstance(hints[1], Refused):
         return str(hints[1])
     if origin is Annotated and isinstance(hints[1], Range) and isinstance(value, str):
-        return "take a number without quotes"
+        return "take a number, not text"
     if origin is Annotated and isinstance(hints[1], Range):
         return f"take {hints[1]}" if value not in hints[1] else None
     if origin is Annotated:

@@ -6,6 +6,7 @@ import difflib
 import re
 import warnings
 from collections.abc import Sequence
+from typing import Any
 
 _SHOWN = 3
 _LONGEST_LINE = 1000  # characters of an error; the middle of longer ones is left out
@@ -41,16 +42,24 @@ def one_line(text: str) -> str:
     return line if len(line) <= _LONGEST_LINE else f"{line[: _LONGEST_LINE // 2]} ... {line[-_LONGEST_LINE // 4 :]}"
 
 
-def warn_of_old_name(old: str, new: str) -> None:
-    """Warn the caller of a function that a Python name has changed."""
-    warnings.warn(f"{old} is called {new}; the next release removes the old name", stacklevel=3)
+def warn_of_old_name(old: str, new: str, stacklevel: int = 3) -> None:
+    """Warn that a Python name has changed; by default, the caller of the calling function."""
+    warnings.warn(f"{old} is called {new}; the next release removes the old name", stacklevel=stacklevel)
 
 
-def follow_old_method(cls: type, old: str, new: str) -> None:
-    """Let a class that defines a method under its old name define it under the new one, with a warning."""
-    if (method := cls.__dict__.get(old)) is not None:
-        warn_of_old_name(f"{cls.__name__}.{old}", new)
-        setattr(cls, new, method)
+def accept_old_method(cls: type, old: str, new: str) -> None:
+    """Let a class that defines a method under one name, old or new, be used by both; the old one with a warning."""
+    former, present = cls.__dict__.get(old), cls.__dict__.get(new)
+    if former is not None and present is None:
+        warn_of_old_name(f"{cls.__name__}.{old}", new, stacklevel=4)
+        setattr(cls, new, former)
+    elif former is None and present is not None:
+
+        def renamed(self: Any, *args: Any) -> Any:
+            warn_of_old_name(f"{cls.__name__}.{old}", new)
+            return present(self, *args)
+
+        setattr(cls, old, renamed)
 
 
 def warn(message: str) -> None:

@@ -57,6 +57,11 @@ MOVED_CLASSES = (
     }
 )
 
+# Fields whose positions were always in world units before the setting `unit` existed.
+_FIELDS_IN_WORLD_UNITS = frozenset(
+    f"{PLUGINS_PACKAGE}.paper.{module}" for module in ("nerf.NerfField", "mip_nerf.MipNerfField")
+)
+
 # Old spellings of configuration keys and of options, which work for one release with a warning. Add one line for each
 # name that you change; command lines, YAML files of users, run folders and checkpoints then follow. Three forms:
 #   "batches.hold_back": "batches.num_validation_views"   a setting or a node with all settings below it
@@ -160,13 +165,23 @@ def renamed_override(override: str) -> str:
 def renamed_config(config: DictConfig, origin: Path) -> DictConfig:
     """Replace old names in the configuration of an old run, with one warning, and drop removed settings."""
     found = [f"{old} is called {new}" for old, new in RENAMED.items() if _move(config, old, new) and new]
-    for name in ("data", "camera", "field", "model", "sampler.path", "sampler.points", "phase.cameras"):
-        node = OmegaConf.select(config, name)
-        if isinstance(node, DictConfig) and str(node.get("_target_")) in MOVED_CLASSES:
-            node._target_ = MOVED_CLASSES[node._target_]
+    _rename_classes(config)
+    field = OmegaConf.select(config, "field")
+    if isinstance(field, DictConfig) and str(field.get("_target_")) in _FIELDS_IN_WORLD_UNITS:
+        field.setdefault("unit", 1.0)
     if found:
         warn(f"{origin} has old names of settings, which can be read for one more release: {', '.join(found)}")
     return config
+
+
+def _rename_classes(config: DictConfig) -> None:
+    """Replace former places of classes in all nodes of a configuration."""
+    for _, node in config.items_ex(resolve=False):
+        if not isinstance(node, DictConfig) or node._is_none() or node._is_missing() or node._is_interpolation():
+            continue
+        if str(node.get("_target_")) in MOVED_CLASSES:
+            node._target_ = MOVED_CLASSES[str(node._target_)]
+        _rename_classes(node)
 
 
 def rename_in_file(config: DictConfig, package: str, file: str) -> None:

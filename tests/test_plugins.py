@@ -20,6 +20,7 @@ from torch import nn
 from nerfro import camera, types
 from nerfro.data.base import DataSource, Views
 from nerfro.data.blender import BlenderData
+from nerfro.losses import boundary
 from nerfro.losses.base import Loss
 from nerfro.media.base import Medium
 from nerfro.media.shapes import Ball
@@ -29,6 +30,7 @@ from nerfro.registry import KINDS, discover, find, plugins, register
 from nerfro.samplers.base import PathSampler, PointSampler
 from nerfro.samplers.paths.snell import Snell
 from nerfro.testing import ContractError, check, check_export, example_batch, example_draws, example_rays, example_views
+from nerfro.training.phases import background
 from nerfro.training.phases import base as phase_base
 from nerfro.training.phases.base import Phase, TrainingRun
 from nerfro.training.ray_batches import RayBatches
@@ -260,9 +262,19 @@ def test_old_names_work_with_a_warning() -> None:
     with pytest.warns(UserWarning, match="Bent.refine is called replay"):
         bent = type("Bent", (PathSampler,), {"refine": lambda sampler, path, rays, medium: 7, "forward": None})
     assert bent().replay(None, None, None) == 7
+    with pytest.warns(UserWarning, match="Snell.refine is called replay"):
+        again = Snell().refine(path, example_rays(), Ball())
+    assert torch.equal(again.positions, path.positions)
+    with pytest.warns(UserWarning, match="BoundaryRegularizer"):
+        assert boundary.BoundaryRegulariser is boundary.BoundaryRegularizer
+    with pytest.warns(UserWarning, match="BackgroundSteps"):
+        assert background.Background is background.BackgroundSteps
     batches = RayBatches(example_views(), 4)
     with pytest.warns(UserWarning, match="for_rank"):
         assert torch.equal(batches.share(1, 2).batch(0).rgb, batches.for_rank(1, 2).batch(0).rgb)
+    # For both releases: nothing is replaced.
+    both = {"refine": lambda sampler, *given: sampler.replay(*given), "replay": lambda *given: 7, "forward": None}
+    assert type("Both", (PathSampler,), both)().refine(None, None, None) == 7
 
 
 def test_views_refuse_a_list_of_images() -> None:

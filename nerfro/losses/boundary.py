@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.distributed import rank_and_size, sum_over_processes
+from nerfro.errors import warn_of_old_name
 from nerfro.losses.base import Loss
 from nerfro.registry import register
 from nerfro.rendering import Scene
@@ -44,3 +47,10 @@ class BoundaryRegularizer(Loss):
         error = (shown - batch.rgb).abs().sum(-1)
         # Gradients are averaged over processes, so each process multiplies its sum by the number of processes.
         return (error * counted).sum() * rank_and_size()[1] / (sum_over_processes(counted.sum()) + 1)
+
+
+def __getattr__(name: str) -> Any:
+    if name == "BoundaryRegulariser":
+        warn_of_old_name("nerfro.losses.boundary.BoundaryRegulariser", "BoundaryRegularizer")
+        return BoundaryRegularizer
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

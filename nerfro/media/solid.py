@@ -81,7 +81,7 @@ class Solid(Medium):
         self.names = list(names) or body_names(len(materials))
 
     def scale_absorption(self, bounds: Iterable[Float[Tensor, "2 3"]]) -> None:
-        """Set learned absorptions to their initial values, from the bounds of each body in world units.
+        """Set learned absorptions to their initial values, from the bounds of each body or its grid in world units.
 
         Constructors call this method once, so that the training is independent of the world unit.
         """

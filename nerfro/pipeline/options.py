@@ -29,7 +29,8 @@ class ReconstructConfig:
         outlines: boxes or polygons around the object in some photographs, as for `python -m nerfro.mask`.
         out: output folder.
         trial_steps: number of steps of the training that tries each hypothesis about the object on validation
-            photographs; 0 skips the comparison and trains the first hypothesis with bent rays (`hypotheses`).
+            photographs (straight rays, solid body, vessel); 0 skips the comparison and trains with bent rays, of a
+            vessel or of several bodies if the scene file describes them.
         pixels: maximum length of the longer side of the photographs in training; `data.downscale` has precedence.
         calibrate: further options of `python -m nerfro.calibrate`, separated by spaces.
         mask: further options of `python -m nerfro.mask`: `view=true` opens a page for drawing outlines, and

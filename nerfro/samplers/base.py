@@ -10,11 +10,13 @@ from jaxtyping import Bool
 from torch import Tensor, nn
 
 from nerfro.draws import Draws
-from nerfro.errors import follow_old_method
+from nerfro.errors import accept_old_method
 from nerfro.fields.base import Field
 from nerfro.media.base import Medium
 from nerfro.samplers.paths.branching import ONE_PATH
 from nerfro.types import Path, Rays, Rendering, Samples
+
+_OLD_METHODS = {"refine": "replay", "main": "trace_main"}
 
 
 class PathSampler(nn.Module, ABC):
@@ -30,8 +32,8 @@ class PathSampler(nn.Module, ABC):
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
-        follow_old_method(cls, "refine", "replay")
-        follow_old_method(cls, "main", "trace_main")
+        for old, new in _OLD_METHODS.items():
+            accept_old_method(cls, old, new)
 
     @abstractmethod
     def forward(self, rays: Rays, medium: Medium) -> Path:
@@ -65,6 +67,10 @@ class PathSampler(nn.Module, ABC):
         return False
 
 
+for _old, _new in _OLD_METHODS.items():
+    accept_old_method(PathSampler, _old, _new)
+
+
 class PointSampler(nn.Module, ABC):
     """Choose arc lengths on a path.
 
@@ -76,7 +82,7 @@ class PointSampler(nn.Module, ABC):
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
-        follow_old_method(cls, "after_step", "update")
+        accept_old_method(cls, "after_step", "update")
 
     @abstractmethod
     def forward(self, path: Path, previous: Rendering | None, draws: Draws | None = None) -> Samples:

@@ -183,7 +183,7 @@ def _warn_of_open_hull(silhouettes: Silhouettes, box: Float[np.ndarray, "2 3"]) 
     if spread < _ONE_SIDE:
         reason = f"all cameras look from within {spread:.0f} degrees, so silhouettes do not bound the object in depth"
     else:
-        reason = "the masks that would bound the hull are cut by their frames, or the box is too small"
+        reason = "the image border cuts the masks that would bound the hull, or the box is too small"
     corners = np.round(box, num_decimals(float(np.ptp(box, axis=0).max()), 4)).tolist()
     warn(f"the box {corners} cuts the visual hull: {reason}; set the box with box_min= and box_max=")
 

@@ -98,7 +98,8 @@ class Silhouettes:
             inside, width = self.depth_inside(view, points)
             known = inside < torch.inf
             num_seen += known
-            pixel = torch.minimum(pixel, width.abs())
+            centre, focal_length = self.cameras.camera_to_world[view, :, 3], self.cameras.fx[view]
+            pixel = torch.minimum(pixel, (points - centre).norm(dim=-1) / focal_length)
             value = torch.where(known, -inside * width, -torch.inf)
             for rank in range(wrong_masks + 1):
                 largest[rank], value = torch.maximum(largest[rank], value), torch.minimum(largest[rank], value)

@@ -166,7 +166,8 @@ def _box(config: DictConfig, medium: Medium) -> Float[np.ndarray, "2 3"] | None:
 
 def _rounded(box: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, "2 3"]:
     """Round a box to at least seven significant digits of its longest side, and to six decimals."""
-    return box.round(max(6, num_decimals(float((box[1] - box[0]).max()), 7)))
+    size = float((box[1] - box[0]).max())
+    return box.round(max(6, num_decimals(size, 7)) if 0 < size < math.inf else 6)
 
 
 def _require_no_box(config: DictConfig) -> None:

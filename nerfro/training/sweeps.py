@@ -21,6 +21,7 @@ from nerfro.failures import in_one_line
 from nerfro.files.atomic import write_atomically
 from nerfro.files.folder_lock import lock_folder
 from nerfro.files.reading import read_json
+from nerfro.old_names import MOVED_CLASSES
 from nerfro.paths import resolve_path, scene_name
 from nerfro.training.run_folder import CELL_FILE, CONFIG_FILE, in_sweep
 from nerfro.training.settings import RESULT, first_difference, settings
@@ -80,7 +81,8 @@ def _require_same_cell(folder: Path, identity: Mapping[str, Any]) -> None:
         raise NerfroError(f"{folder} holds a run that is no cell of a sweep; {advice}")
     try:
         record = read_json(folder / CELL_FILE, advice)
-        old, new = settings(record["settings"], RESULT), identity["settings"]
+        recorded = {key: MOVED_CLASSES.get(str(value), value) for key, value in record["settings"].items()}
+        old, new = settings(recorded, RESULT), identity["settings"]
         same_data = record["data"] == identity["data"]
     except (NerfroError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise NerfroError(f"{folder / CELL_FILE} is damaged; {advice}") from error

@@ -14,7 +14,7 @@ from nerfro.draws import Draws
 from nerfro.registry import register
 from nerfro.samplers.base import PointSampler
 from nerfro.samplers.points.stepfun import invert_cdf, midpoints, spread_uniform
-from nerfro.samplers.points.stratified import Stratified, cone_samples, point_samples
+from nerfro.samplers.points.stratified import LAST_DELTA, Stratified, cone_samples, point_samples
 from nerfro.types import Path, Rendering, Samples
 
 # Weight that mip-NeRF adds to each bin before sampling.
@@ -60,7 +60,8 @@ class Hierarchical(PointSampler):
         # Weights belong to samples, so the bins of the distribution lie between the midpoints of samples.
         u = spread_uniform(path, self.num_fine, draws, "fine samples")
         s = _draw(midpoints(previous.samples.s), previous.weights[:, 1:-1], u)
-        return point_samples(path, torch.cat([previous.samples.s, s], dim=1).sort(dim=1).values)
+        last = LAST_DELTA if self.coarse.draw == "vertices" else None
+        return point_samples(path, torch.cat([previous.samples.s, s], dim=1).sort(dim=1).values, last)
 
 
 @torch.no_grad()

@@ -30,7 +30,7 @@ class FieldInBox(Field):
 
     box: Float[Tensor, "2 3"]
 
-    def __init__(self, box_min: Sequence[float], box_max: Sequence[float], unit: float | None) -> None:
+    def __init__(self, box_min: Sequence[float], box_max: Sequence[float], unit: float | None = 1.0) -> None:
         super().__init__()
         self.unit = 1.0 if unit is None else unit
         box = corners_of_box(box_min, box_max, bounded=False)

@@ -26,7 +26,7 @@ from .refined import RefinedCamera
 _FIRST_DIFFERENCE, _MIN_DIFFERENCE, _DECAY = 2.0, 0.5, 0.85
 # Number of full steps. The fraction of later steps decreases, so that errors of single steps average out.
 _FULL_STEPS = 10
-# Scale of the robust error (sRGB) per pixel of difference, and maximum motion of a camera in pixels.
+# Scale of the robust loss (sRGB) per pixel of difference, and maximum motion of a camera in pixels.
 _ERROR_SCALE, _MAX_PIXELS = 0.5, 1.0
 # Candidates that are drawn for each pixel; the candidates with the most contrast are used.
 _NUM_CANDIDATES = 6

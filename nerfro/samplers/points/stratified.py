@@ -96,28 +96,24 @@ class Stratified(PointSampler):
         s = path.s.gather(1, vertex)
         index = vertex[..., None].expand(-1, -1, 3)
         positions, directions = path.positions.gather(1, index), path.directions.gather(1, index)
-        edges = _edges_from_starts(s, torch.full_like(path.near, LAST_DELTA))
-        return Samples(positions, directions, s, edges, path.radii)
+        return Samples(positions, directions, s, torch.cat([s, s[:, -1:] + LAST_DELTA], dim=1), path.radii)
 
 
-def point_samples(path: Path, s: Float[Tensor, "P N"]) -> Samples:
+def point_samples(path: Path, s: Float[Tensor, "P N"], last: float | None = None) -> Samples:
     """Create samples at given arc lengths.
 
     Args:
         path: P polylines.
         s: arc lengths [P, N] in ascending order along each polyline, world units.
+        last: width of the last interval, world units; by default `LAST_FRACTION` of the path.
 
     Returns:
-        Samples with positions and directions on the paths. The interval of each sample ends at the next sample, and
-        the last one is `LAST_FRACTION` of the path long.
+        Samples with positions and directions on the paths. The interval of each sample ends at the next sample.
     """
-    return Samples.along(path, s, _edges_from_starts(s, LAST_FRACTION * (path.far - path.near)))
+    width = LAST_FRACTION * (path.far - path.near) if last is None else torch.full_like(path.near, last)
+    return Samples.along(path, s, torch.cat([s, s[:, -1:] + width[:, None]], dim=1))
 
 
 def cone_samples(path: Path, edges: Float[Tensor, "P E"]) -> Samples:
     """Create samples at the middle of intervals between ascending edges."""
     return Samples.along(path, 0.5 * (edges[:, 1:] + edges[:, :-1]), edges)
-
-
-def _edges_from_starts(s: Float[Tensor, "P N"], last: Float[Tensor, "P"]) -> Float[Tensor, "P N+1"]:
-    return torch.cat([s, s[:, -1:] + last[:, None]], dim=1)
