@@ -67,8 +67,8 @@ DAMAGES: dict[str, tuple[Callable[[Path], object], list[str]]] = {
     "no mesh": (lambda root: (root / "mesh.ply").unlink(), ["mesh.ply does not exist"]),
     "unreadable mesh": (lambda root: (root / "mesh.ply").write_bytes(b"ply?"), ["mesh.ply"]),
     "open mesh": (open_mesh, ["not watertight", "medium.accept_open_mesh=true"]),
-    "flat mesh": (flat_mesh, ["0 world units thin, so it has no inside"]),
-    "mesh as small as a speck": (tiny_mesh, ["4e-05 world units thin, so it has no inside"]),
+    "flat mesh": (flat_mesh, ["0 world units thin and 1 long, so it has no inside"]),
+    "mesh as small as a speck": (tiny_mesh, ["no vertex of the grid lies inside the mesh"]),
     "object outside the box": (large_mesh, ["does not fit into the box", "medium.box_min=[", "medium.box_max=["]),
 }
 

@@ -104,7 +104,7 @@ FRAME = r"transforms_train\.json: frame 1 \('train/r_2'\)"
         (lambda d: d.pop("camera_angle_x"), r"transforms_train\.json: 'train/r_1' has no focal length; add fl_x"),
         (
             lambda d: d.update(camera_angle_x="wide"),
-            "camera_angle_x='wide' is not allowed; take more than 0 and",
+            "camera_angle_x='wide' is not allowed; take a number, not text",
         ),
         (lambda d: d.update(camera_angle_x=39.6), "camera_angle_x=39.6 is not allowed; take more than 0"),
         (lambda d: d["frames"][1].pop("file_path"), r"transforms_train\.json: frame 1 has no 'file_path'"),
@@ -115,7 +115,7 @@ FRAME = r"transforms_train\.json: frame 1 \('train/r_2'\)"
         (lambda d: d["frames"][1].update(file_path="train/no"), r"\('train/no'\): image .*no\.png does not exist"),
         (lambda d: d["frames"][1].update(file_path="a" * 5000), r"image .*a\.png does not exist"),
         (lambda d: d["frames"][1].update(mask_path="a" * 5000), r"mask .*a of .*r_2\.png does not exist"),
-        (lambda d: d.update(w="wide", h=6), "w='wide' is not allowed; take at least 1"),
+        (lambda d: d.update(w="wide", h=6), "w='wide' is not allowed; take a number, not text"),
         (matrix(lambda m: np.put(m, 3, math.nan)), FRAME + ": transform_matrix holds NaN or infinite numbers"),
         (matrix(lambda m: np.put(m, 3, math.inf)), FRAME + ": transform_matrix holds NaN or infinite numbers"),
         (matrix(lambda m: np.put(m, 3, "x")), FRAME + ": transform_matrix is not a matrix of numbers; give 4x4 or 3x4"),
