@@ -43,7 +43,7 @@ def measure(folder: Path, data: Path) -> dict[str, float]:
     lens, true_poses = read_cameras(folder / "truth")
     found_lens, _ = read_cameras(data)
     found, true = matched_poses(folder, data)
-    to_truth = align_to_truth(folder, data)
+    to_truth = _fit_centres(found, true)
     angles, shifts = (values.numpy() for values in motion_between(to_truth.apply(found), true))
     true, moved = true.numpy(), to_truth.apply(found).numpy()
     surface = load_mesh(folder / "truth" / "mesh.ply")
@@ -84,9 +84,7 @@ def align_to_truth(folder: Path, data: Path) -> Similarity:
     Raises:
         NerfroError: there are fewer than three estimated cameras, or one of them has no true pose.
     """
-    found, true = matched_poses(folder, data)
-    weights = torch.ones(len(true), dtype=true.dtype)
-    return similarity(found, true, 0 * weights, weights)
+    return _fit_centres(*matched_poses(folder, data))
 
 
 def matched_poses(folder: Path, data: Path) -> tuple[Float[Tensor, "V 3 4"], Float[Tensor, "V 3 4"]]:
@@ -98,6 +96,11 @@ def matched_poses(folder: Path, data: Path) -> tuple[Float[Tensor, "V 3 4"], Flo
         raise NerfroError(f"{folder / 'truth'} has no pose of {unknown[0]}")
     estimated, exact = (torch.from_numpy(np.stack([poses[name] for name in sorted(found)])) for poses in (found, true))
     return estimated, exact
+
+
+def _fit_centres(found: Float[Tensor, "V 3 4"], true: Float[Tensor, "V 3 4"]) -> Similarity:
+    weights = torch.ones(len(true), dtype=true.dtype)
+    return similarity(found, true, 0 * weights, weights)
 
 
 def transformed(mesh: TriangleMesh, similarity: Similarity) -> TriangleMesh:

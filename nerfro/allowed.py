@@ -208,14 +208,13 @@ def _refusal(value: Any, hint: Any) -> str | None:
         return None if value in hints else f"choose {', '.join(map(repr, hints))}"
     if origin is Annotated and isinstance(hints[1], Refused):
         return str(hints[1])
-    if origin is Annotated and isinstance(hints[1], Range) and isinstance(value, str):
+    has_range = origin is Annotated and isinstance(hints[1], Range)
+    if (has_range or hint in (float, int)) and isinstance(value, str):  # the value of an interpolation may be text
         return "take a number, not text"
-    if origin is Annotated and isinstance(hints[1], Range):
+    if has_range:
         return f"take {hints[1]}" if value not in hints[1] else None
     if origin is Annotated:
         return _refusal(value, hints[1])
-    if hint in (float, int) and isinstance(value, str):  # the value of an interpolation may be text
-        return "take a number"
     if hint is str:
         return None if isinstance(value, (str, Path)) else "take text"
     if hint is float:

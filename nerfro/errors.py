@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 _SHOWN = 3
@@ -47,19 +47,40 @@ def warn_of_old_name(old: str, new: str, stacklevel: int = 3) -> None:
     warnings.warn(f"{old} is called {new}; the next release removes the old name", stacklevel=stacklevel)
 
 
-def accept_old_method(cls: type, old: str, new: str) -> None:
-    """Let a class that defines a method under one name, old or new, be used by both; the old one with a warning."""
-    former, present = cls.__dict__.get(old), cls.__dict__.get(new)
-    if former is not None and present is None:
-        warn_of_old_name(f"{cls.__name__}.{old}", new, stacklevel=4)
-        setattr(cls, new, former)
-    elif former is None and present is not None:
+def renamed_classes(module: str, **classes: type) -> Callable[[str], Any]:
+    """Return the function `__getattr__` of a module, which finds classes by their old names, with a warning."""
 
-        def renamed(self: Any, *args: Any) -> Any:
-            warn_of_old_name(f"{cls.__name__}.{old}", new)
-            return present(self, *args)
+    def find(name: str) -> Any:
+        if name not in classes:
+            raise AttributeError(f"module {module!r} has no attribute {name!r}")
+        warn_of_old_name(f"{module}.{name}", f"{module}.{classes[name].__name__}")
+        return classes[name]
 
-        setattr(cls, old, renamed)
+    return find
+
+
+def accept_old_methods(cls: type, names: Mapping[str, str]) -> None:
+    """Let methods that a class defines under one name, old or new, be used by both; the old one with a warning.
+
+    Args:
+        cls: a base class, or a class in `__init_subclass__` of its base class.
+        names: new names by old name.
+    """
+    for old, new in names.items():
+        former, present = cls.__dict__.get(old), cls.__dict__.get(new)
+        if former is not None and present is None:
+            warn_of_old_name(f"{cls.__name__}.{old}", new, stacklevel=4)
+            setattr(cls, new, former)
+        elif former is None and present is not None:
+            setattr(cls, old, _under_old_name(present, f"{cls.__name__}.{old}", new))
+
+
+def _under_old_name(method: Callable[..., Any], old: str, new: str) -> Callable[..., Any]:
+    def renamed(self: Any, *args: Any) -> Any:
+        warn_of_old_name(old, new)
+        return method(self, *args)
+
+    return renamed
 
 
 def warn(message: str) -> None:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any
 
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from nerfro.camera.exposure import Exposure
 from nerfro.cameras import Cameras
-from nerfro.errors import warn_of_old_name
+from nerfro.errors import renamed_classes
 from nerfro.rays import Rays
 
 
@@ -67,8 +66,4 @@ class CameraModel(nn.Module, ABC):
         return {} if self.exposure is None else {"cameras.gain_spread": self.exposure.spread}
 
 
-def __getattr__(name: str) -> Any:
-    if name == "Camera":
-        warn_of_old_name("nerfro.camera.base.Camera", "nerfro.camera.base.CameraModel")
-        return CameraModel
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__ = renamed_classes(__name__, Camera=CameraModel)

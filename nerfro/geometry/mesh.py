@@ -82,7 +82,7 @@ def local_origin(points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "3"
     centre, size = 0.5 * (low + high), float((high - low).max())
     if not 0 < _FAR * size < np.abs(centre).max():
         return np.zeros(3)
-    return centre.round(math.ceil(-math.log10(size)))
+    return centre.round(num_decimals(size, 1))
 
 
 def num_decimals(size: float, digits: int) -> int:

@@ -30,7 +30,7 @@ def corner_normals(mesh: TriangleMesh) -> Float[np.ndarray, "F 3 3"]:
     forward = np.roll(triangles, -1, axis=1) - triangles
     backward = np.roll(triangles, 1, axis=1) - triangles
     crosses = np.cross(forward, backward)
-    flat = _unit(crosses[:, 0])
+    flat = unit(crosses[:, 0])
     areas = np.linalg.norm(crosses, axis=-1).ravel()
     lengths = ((forward**2).sum(-1) * (backward**2).sum(-1)).ravel()
     weights = np.divide(areas, lengths, out=np.zeros(areas.shape), where=lengths > 0)
@@ -49,7 +49,7 @@ def corner_normals(mesh: TriangleMesh) -> Float[np.ndarray, "F 3 3"]:
     uneven = np.maximum.reduceat(group_areas, group_starts) > _UNEVEN * np.minimum.reduceat(group_areas, group_starts)
     contribution = (np.where(uneven[first], areas[second], weights[second]) * smooth)[:, None] * flat[second // 3]
     sums = np.add.reduceat(contribution, group_starts)
-    smoothed = np.where((sums != 0).any(-1, keepdims=True), _unit(sums), np.repeat(flat, 3, 0)).reshape(-1, 3, 3)
+    smoothed = np.where((sums != 0).any(-1, keepdims=True), unit(sums), np.repeat(flat, 3, 0)).reshape(-1, 3, 3)
     if mesh.normals is None:
         return smoothed
     # Averages tilt where large flat triangles meet small curved ones; normals of the file are exact there.
@@ -57,7 +57,7 @@ def corner_normals(mesh: TriangleMesh) -> Float[np.ndarray, "F 3 3"]:
     return np.where(trusted, mesh.normals, smoothed)
 
 
-def _unit(vectors: Float[np.ndarray, "vectors 3"]) -> Float[np.ndarray, "vectors 3"]:
+def unit(vectors: Float[np.ndarray, "vectors 3"]) -> Float[np.ndarray, "vectors 3"]:
     """Normalize vectors; zero vectors stay zero."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return vectors / np.where(length > 0, length, 1.0)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.distributed import rank_and_size, sum_over_processes
-from nerfro.errors import warn_of_old_name
+from nerfro.errors import renamed_classes
 from nerfro.losses.base import Loss
 from nerfro.registry import register
 from nerfro.rendering import Scene
@@ -49,8 +47,4 @@ class BoundaryRegularizer(Loss):
         return (error * counted).sum() * rank_and_size()[1] / (sum_over_processes(counted.sum()) + 1)
 
 
-def __getattr__(name: str) -> Any:
-    if name == "BoundaryRegulariser":
-        warn_of_old_name("nerfro.losses.boundary.BoundaryRegulariser", "BoundaryRegularizer")
-        return BoundaryRegularizer
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__ = renamed_classes(__name__, BoundaryRegulariser=BoundaryRegularizer)

@@ -188,13 +188,13 @@ class Material(nn.Module):
         self.dispersion = dispersion
         # Double precision, as the kernels need; scalar tensors do not promote float32 operands.
         index = torch.tensor(ior, dtype=torch.float64)
-        given = self._given_absorption = torch.tensor(absorption, dtype=torch.float32)
+        given = torch.tensor(absorption, dtype=torch.float32)
         if "ior" in learn:
             self.ior = nn.Parameter(index)
         else:
             self.register_buffer("ior", index, persistent=False)
         if "absorption" in learn:
-            self._absorption = nn.Parameter(given.clone())
+            self._absorption, self._given_absorption = nn.Parameter(given.clone()), given
             self.register_buffer("absorption_length", torch.tensor(1.0))
             self.scale_absorption(1.0)
         else:

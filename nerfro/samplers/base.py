@@ -10,7 +10,7 @@ from jaxtyping import Bool
 from torch import Tensor, nn
 
 from nerfro.draws import Draws
-from nerfro.errors import accept_old_method
+from nerfro.errors import accept_old_methods
 from nerfro.fields.base import Field
 from nerfro.media.base import Medium
 from nerfro.samplers.paths.branching import ONE_PATH
@@ -32,8 +32,7 @@ class PathSampler(nn.Module, ABC):
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
-        for old, new in _OLD_METHODS.items():
-            accept_old_method(cls, old, new)
+        accept_old_methods(cls, _OLD_METHODS)
 
     @abstractmethod
     def forward(self, rays: Rays, medium: Medium) -> Path:
@@ -67,8 +66,7 @@ class PathSampler(nn.Module, ABC):
         return False
 
 
-for _old, _new in _OLD_METHODS.items():
-    accept_old_method(PathSampler, _old, _new)
+accept_old_methods(PathSampler, _OLD_METHODS)
 
 
 class PointSampler(nn.Module, ABC):
@@ -82,7 +80,7 @@ class PointSampler(nn.Module, ABC):
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
-        accept_old_method(cls, "after_step", "update")
+        accept_old_methods(cls, {"after_step": "update"})
 
     @abstractmethod
     def forward(self, path: Path, previous: Rendering | None, draws: Draws | None = None) -> Samples:

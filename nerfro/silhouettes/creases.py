@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy import sparse
 
-from nerfro.silhouettes.moving_mesh import MeshGeometry, MovingMesh, solve_symmetric, unit
+from nerfro.geometry.normals import unit
+from nerfro.silhouettes.moving_mesh import MeshGeometry, MovingMesh, solve_symmetric
 from nerfro.silhouettes.rims import Rims
 
 # Number of smoothing rounds of the triangle normals, and angular width of the filter, in radians.

@@ -10,6 +10,8 @@ from jaxtyping import Float, Int
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
+from nerfro.geometry.normals import unit
+
 # Cosine of the smallest angle between the triangles at a crease, and between the normals on both sides beyond them.
 _CREASE = np.cos(np.radians(30))
 # Fraction of the tangential way to the centroid of the neighbours that vertices move in one step.
@@ -83,12 +85,6 @@ class MovingMesh:
         """Move vertices tangentially towards the centroid of their neighbours, which equalizes the triangles."""
         normals, towards = self.normals(vertices), self.mean @ vertices - vertices
         return vertices + _SPREADING * (towards - (towards * normals).sum(1, keepdims=True) * normals)
-
-
-def unit(vectors: Float[np.ndarray, "vectors 3"]) -> Float[np.ndarray, "vectors 3"]:
-    """Normalize vectors; zero vectors stay zero."""
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return vectors / np.where(length > 0, length, 1)
 
 
 def solve_symmetric(system: sparse.spmatrix, right: Float[np.ndarray, " vectors"]) -> Float[np.ndarray, " vectors"]:

@@ -14,7 +14,8 @@ from torch import Tensor
 from nerfro.cameras import Cameras
 from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.silhouettes.moving_mesh import MeshGeometry, MovingMesh, unit
+from nerfro.geometry.normals import unit
+from nerfro.silhouettes.moving_mesh import MeshGeometry, MovingMesh
 from nerfro.silhouettes.visual_hull import Silhouettes
 
 # By view: the index of the outline pixel nearest to each pixel.

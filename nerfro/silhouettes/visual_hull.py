@@ -93,19 +93,25 @@ class Silhouettes:
             Distances in world units, negative inside.
         """
         largest = torch.full((wrong_masks + 1, len(points)), -torch.inf)
-        num_seen, pixel = torch.zeros(len(points), dtype=torch.int32), torch.full((len(points),), torch.inf)
+        num_seen = torch.zeros(len(points), dtype=torch.int32)
         for view in range(len(self)):
             inside, width = self.depth_inside(view, points)
             known = inside < torch.inf
             num_seen += known
-            centre, focal_length = self.cameras.camera_to_world[view, :, 3], self.cameras.fx[view]
-            pixel = torch.minimum(pixel, (points - centre).norm(dim=-1) / focal_length)
             value = torch.where(known, -inside * width, -torch.inf)
             for rank in range(wrong_masks + 1):
                 largest[rank], value = torch.maximum(largest[rank], value), torch.minimum(largest[rank], value)
-        # Unseen points are outside by a pixel, so that finer levels of the grid examine the border of the seen space.
-        outside = torch.where(largest[0].isfinite(), largest[0].abs(), pixel)
+        outside, unseen = largest[0].abs(), num_seen == 0
+        # Outside by a pixel, so that finer levels of the grid examine the border of the seen space.
+        outside[unseen] = self._pixel_width(points[unseen])
         return torch.where(num_seen < max(_MIN_VIEWS, wrong_masks + 1), outside, largest[-1])
+
+    def _pixel_width(self, points: Float[Tensor, "points 3"]) -> Float[Tensor, " points"]:
+        """Return the smallest width of a pixel of any view at the distance of each point, in world units."""
+        width = torch.full_like(points[:, 0], torch.inf)
+        for centre, focal_length in zip(self.cameras.camera_to_world[..., 3], self.cameras.fx, strict=True):
+            width = torch.minimum(width, (points - centre).norm(dim=-1) / focal_length)
+        return width
 
 
 def centre_lines(silhouettes: Silhouettes) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "V 3"]]:

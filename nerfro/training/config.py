@@ -40,7 +40,7 @@ from nerfro.subdivision import Subdivision
 from nerfro.synthetic import SCENES
 from nerfro.training.angular_resolution import derive_angular_resolution
 from nerfro.training.backdrop import derive_backdrop
-from nerfro.training.content import ContentConfig, derive_content, require_contraction
+from nerfro.training.content import ContentConfig, derive_content, derive_unit, require_contraction
 from nerfro.training.optimizer import OptimizerConfig
 
 MetricName = Annotated[str, Names(lambda: [plugin.name for plugin in plugins("metric")])]  # of a region: mask.NAME
@@ -360,6 +360,7 @@ def build_model(config: DictConfig, training: Views | None = None) -> Renderer:
     if training is not None:
         derive_backdrop(config, training.images)
         derive_angular_resolution(config, training.cameras)
+        derive_unit(config, training.cameras)
         camera.begin(training.cameras)
     components = Components(
         medium=medium,

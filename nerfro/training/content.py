@@ -55,7 +55,7 @@ class ContentConfig:
 
 
 def derive_content(config: DictConfig, medium: Medium, cameras: Cameras | None = None) -> None:
-    """Derive the missing settings of `config.content`, and the missing unit of a field that encodes positions.
+    """Derive the missing settings of `config.content`.
 
     Args:
         config: configuration of a run, see `TrainConfig`; it is changed.
@@ -76,15 +76,18 @@ def derive_content(config: DictConfig, medium: Medium, cameras: Cameras | None =
             content.box_min, content.box_max = box.tolist()
         elif content.space == "box":
             _require_no_box(config)
-    lacks_ball = content.space == "all" and None in (content.box_min, content.radius, content.near, content.cells)
-    field = OmegaConf.select(config, "field")  # None if no field is selected
-    lacks_unit = field is not None and field.get("unit", 1) is None
-    if not (lacks_ball or lacks_unit):
-        return
-    cameras = build(config.data).load("train").cameras if cameras is None else cameras
-    if lacks_ball:
-        _derive_ball(content, cameras)
-    if lacks_unit:
+    if content.space == "all" and None in (content.box_min, content.radius, content.near, content.cells):
+        _derive_ball(content, build(config.data).load("train").cameras if cameras is None else cameras)
+
+
+def derive_unit(config: DictConfig, cameras: Cameras) -> None:
+    """Derive the missing unit of a field that encodes positions, `field.unit`.
+
+    Args:
+        config: configuration of a run, see `TrainConfig`; it is changed.
+        cameras: cameras of the training views.
+    """
+    if config.field.get("unit", 1) is None:
         config.field.unit = (cameras.far - cameras.near) / _RANGE_OF_RAYS
 
 

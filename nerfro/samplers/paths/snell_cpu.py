@@ -304,16 +304,8 @@ def _follow(solids, settings, scratch, rows, row, branch, num_pending):
         if event.share > 0.0:
             if not settings.main_only:
                 _flip(scratch)
-                num_pending = _push(
-                    scratch,
-                    num_pending,
-                    branch,
-                    event.mirrored,
-                    branch.s + before,
-                    weight * event.share,
-                    hit + 1,
-                    across,
-                )
+                s, share = branch.s + before, weight * event.share
+                num_pending = _push(scratch, num_pending, branch, event.mirrored, s, share, hit + 1, across)
                 _flip(scratch)
             weight *= 1.0 - event.share
         if event.reflected:

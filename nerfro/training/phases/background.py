@@ -11,7 +11,7 @@ from torch import Tensor
 
 from nerfro.allowed import Count, Natural, Share
 from nerfro.boundaries.envmap import EnvironmentMap, Observed
-from nerfro.errors import warn, warn_of_old_name
+from nerfro.errors import renamed_classes, warn
 from nerfro.fields.base import Field
 from nerfro.geometry.interpolation import misses
 from nerfro.rays import Rays
@@ -175,8 +175,4 @@ def occupied_box(renderer: Renderer) -> Float[Tensor, "2 3"] | None:
     return torch.stack([low.amin(0), high.amax(0)])
 
 
-def __getattr__(name: str) -> Any:
-    if name == "Background":
-        warn_of_old_name("nerfro.training.phases.background.Background", "BackgroundSteps")
-        return BackgroundSteps
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__ = renamed_classes(__name__, Background=BackgroundSteps)

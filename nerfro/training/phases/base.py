@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerfro.data.base import Views
-from nerfro.errors import NerfroError, warn_of_old_name
+from nerfro.errors import NerfroError, renamed_classes
 from nerfro.rendering import Renderer
 from nerfro.training.optimizer import require_matches
 from nerfro.training.ray_batches import RayBatches
@@ -106,8 +106,4 @@ class Phase(ABC):
         """
 
 
-def __getattr__(name: str) -> Any:
-    if name == "Run":
-        warn_of_old_name("nerfro.training.phases.base.Run", "nerfro.training.phases.base.TrainingRun")
-        return TrainingRun
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__ = renamed_classes(__name__, Run=TrainingRun)
