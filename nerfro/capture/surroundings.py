@@ -248,6 +248,8 @@ class Observations:
 class Room(Boundary):
     """Near surroundings: a radiance field in all of space, rendered along the exit rays.
 
+    The initial values of the field are fixed, so that results do not depend on earlier work of the process.
+
     Args:
         bounds: corners of the bounding box of the object, world units.
         radius: radius of the ball around the object outside which space is contracted; best the camera distance.
@@ -257,9 +259,11 @@ class Room(Boundary):
         super().__init__()
         low, high = bounds.tolist()
         self.radius = radius
-        self.field = HashGridField(
-            low, high, radius, finest_resolution=512, log2_table_size=17, direction_bands=1, initial_depth=3.0
-        )
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(0)
+            self.field = HashGridField(
+                low, high, radius, finest_resolution=512, log2_table_size=17, direction_bands=1, initial_depth=3.0
+            )
         self.sampler = DensityGridSampler(box_min=low, box_max=high, radius=radius, update_fraction=0.25, decay=0.6)
 
     def forward(self, exits: Exits, draws: Draws | None = None) -> Float[Tensor, "P 3"]:

@@ -105,6 +105,14 @@ def test_surface_that_loses_overlap_with_the_masks_is_rejected(monkeypatch: pyte
     assert refined(before, replace(shrinking, max_overlap_loss=math.inf)).medium is not before
 
 
+def test_reconstructed_room_is_independent_of_earlier_random_numbers() -> None:
+    first = Room(mesh().bounds, 3.0)
+    torch.rand(1000)
+    second = Room(mesh().bounds, 3.0)
+    for one, other in zip(first.parameters(), second.parameters(), strict=True):
+        assert torch.equal(one, other)
+
+
 class PaintedShell(Room):
     """The sky's colours on a ball around the object, just beyond the cameras."""
 
