@@ -34,7 +34,7 @@ class _Prior(NamedTuple):
     last: float  # final strength
     typical_curvature: bool  # whether bending is relative to the typical curvature around a vertex, or to zero
     edge: float  # curvature (see `_mean_curvature`) above which the weights decrease, because it belongs to an edge
-    steady: float  # weight of changes of curvature in the last steps, per squared validation error
+    steady: float  # weight of changes of curvature in the last steps, per squared misfit
 
 
 # Chosen on the scenes `torus` and `ship` with antialiased masks.
@@ -88,7 +88,8 @@ def fit_surface(
         g sum_edges w_ij (h (H_i - H_j))^2
 
     where w decreases from 1 along the direction of smallest curvature to 0 across it, so that an edge keeps one profile
-    along its length and flat sides stay flat. The weight g is proportional to the squared validation error.
+    along its length and flat sides stay flat. The weight g is proportional to the squared mean misfit, an estimate of
+    the noise of the masks. The validation error would not be one: with few views it contains what they do not show.
 
     For accurate binary masks, the last steps use the probit model of `by_pixel_sides`. If the second surface has
     creases, two variants with sharp edges are made (see `sharpened`), and validation views select among all surfaces.
@@ -120,7 +121,7 @@ def fit_surface(
     if contour_error is not None:
         strength, last_steps = _PROBIT_STRENGTH * strength, _PROBIT_STEPS
         total += _PROBIT_STEPS - _LAST_STEPS
-    steady = strength / best.strength * best.prior.steady * (best.misfit / fit.size) ** 2
+    steady = strength / best.strength * best.prior.steady * (fit.misfit(vertices, outlines) / fit.size) ** 2
     for left in reversed(range(last_steps)):
         vertices = fit.moved(vertices, outlines, best.prior, strength, steady, contour_error, spread=left > 0)
         step()

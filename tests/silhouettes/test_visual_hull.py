@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy.spatial import cKDTree
 
 from nerfro.errors import NerfroError
-from nerfro.geometry.mesh import TriangleMesh
+from nerfro.geometry.mesh import TriangleMesh, load_mesh
+from nerfro.paths import ASSETS_DIR
 from nerfro.silhouettes import surface
 from nerfro.silhouettes.pose_conventions import overlap, require_consistent_poses
 from nerfro.silhouettes.silhouette_fit import fit_surface
@@ -151,6 +153,18 @@ def test_fit_is_smooth_despite_uneven_triangles_of_marching_cubes() -> None:
     cosine = (normals * outwards).sum(1) / (np.linalg.norm(normals, axis=1) * np.linalg.norm(outwards, axis=1))
     assert np.degrees(np.arccos(cosine.clip(max=1))).mean() < 0.8  # 2.6 with vertices as marching cubes leave them
     assert np.linalg.norm(fitted.vertices, axis=1) == pytest.approx(0.7, rel=0.005)
+
+
+def test_fit_to_few_views_is_closer_to_the_body_than_their_hull() -> None:
+    embedded = load_mesh(ASSETS_DIR / "torus" / "mesh.ply")
+    body = trimesh.Trimesh(embedded.vertices * 1.4 / np.ptp(embedded.bounds, axis=0).max(), embedded.faces)
+    silhouettes = photographed(body, cameras_around(12, 64))
+    carved = hull(silhouettes, 32)
+    nearest = cKDTree(body.sample(100_000, seed=0))
+    before, after = (
+        np.sqrt(np.mean(nearest.query(each.vertices)[0] ** 2)) for each in (carved, fit_surface(carved, silhouettes))
+    )
+    assert after < 0.6 * before  # 0.9 if the last steps weigh the prior by the misfit to views that were left out
 
 
 def test_fit_is_invariant_to_the_unit_of_length() -> None:
