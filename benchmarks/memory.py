@@ -3,7 +3,8 @@
     python benchmarks/memory.py [--steps 300] [ROW ...]
 
 Writes folders of noise images, trains on them, evaluates one view, and prints a Markdown table. ROW is `embedded` or
-COUNTxWIDTHxHEIGHT of the training images. Load on the machine changes the times but not the memory.
+COUNTxWIDTHxHEIGHT of the training images. Load on the machine changes the times but not the memory
+without mapped files.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ def main() -> None:
     parser.add_argument("--options", nargs="+", default=[], help="of nerfro.train, for all rows")
     arguments = parser.parse_args()
     print(f"{os.cpu_count()} CPU cores, torch {torch.__version__}, {arguments.steps} steps, {date.today()}\n")
-    print("| training images | first step, s | MiB after it | a minute later | at the last step | peak | with files |")
+    print("| training images | first step, s | MiB after it | a minute later | last step | peak | with files |")
     print("|---|---|---|---|---|---|---|")
     for name in arguments.rows or ROWS:
         count, width, height = (0, 128, 128) if name == "embedded" else map(int, name.split("x"))
@@ -77,7 +78,7 @@ def measure(options: list[str]) -> list[str]:
 
     Returns:
         Seconds; memory of the process after the first step, a minute later, at the last step, and at its peak; and the
-        peak together with mapped files, such as photographs, whose pages the system may drop.
+        peak together with mapped files, such as photographs and libraries, whose pages the system may drop.
     """
     begun = time.perf_counter()
     process = subprocess.Popen(
@@ -104,12 +105,12 @@ def measure(options: list[str]) -> list[str]:
     if status != 0:
         raise SystemExit(f"failed: {' '.join(options)}\n{shown}")
     at = [next((m for t, m in reversed(samples) if t <= when), math.nan) for when in (first + 1, first + 60, last)]
-    memory = [*at, max(megabytes for _, megabytes in samples), usage.ru_maxrss / 1024]
+    memory = [*at, max((megabytes for _, megabytes in samples), default=math.nan), usage.ru_maxrss / 1024]
     return [f"{first:.0f}", *(f"{megabytes:.0f}" for megabytes in memory)]
 
 
 def _own_memory(pid: int) -> Iterator[float]:
-    """Yield the resident memory of a process without files in MiB until the process ends."""
+    """Yield the resident memory of a process that no file backs, in MiB, until the process ends."""
     while True:
         try:
             found = re.findall(r"(?:RssAnon|RssShmem):\s+(\d+)", Path(f"/proc/{pid}/status").read_text())

@@ -248,7 +248,7 @@ class Observations:
 class Room(Boundary):
     """Near surroundings: a radiance field in all of space, rendered along the exit rays.
 
-    The initial values of the field are fixed, so that results do not depend on earlier work of the process.
+    The field is initialized with a fixed seed, so that results do not depend on random numbers drawn earlier.
 
     Args:
         bounds: corners of the bounding box of the object, world units.
@@ -260,7 +260,7 @@ class Room(Boundary):
         low, high = bounds.tolist()
         self.radius = radius
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(0)
+            torch.default_generator.manual_seed(0)
             self.field = HashGridField(
                 low, high, radius, finest_resolution=512, log2_table_size=17, direction_bands=1, initial_depth=3.0
             )

@@ -40,11 +40,11 @@ class _Prior(NamedTuple):
 # Chosen on the scenes `torus` and `ship` with antialiased masks.
 _ROUND = _Prior(area=3e-6, bending=1e-5, first=100, last=0.01, typical_curvature=True, edge=np.inf, steady=0)
 _FLAT = _Prior(area=3e-6, bending=5e-9, first=100, last=0.1, typical_curvature=False, edge=0.02, steady=4)
-# Number of steps with decreasing strength, and of final steps with all views and the selected strength.
+# Number of steps with decreasing strength, and of last steps with the selected strength.
 _STEPS, _LAST_STEPS = 22, 6
-# Binary masks: number of final steps with the probit model of pixels, factor of the strength for these steps, and mean
-# contour error in pixels above which masks count as inaccurate. Exact masks have 0.10 to 0.16, and masks displaced in
-# waves by half a pixel 0.28.
+# Accurate binary masks: number of last steps with the probit model of pixels, factor of the strength for these steps,
+# and mean contour error in pixels above which masks count as inaccurate. Exact masks have 0.10 to 0.16, and masks
+# displaced in waves by half a pixel 0.28.
 _PROBIT_STEPS, _PROBIT_STRENGTH, _MAX_PROBIT_ERROR = 14, 0.3, 0.2
 # Factor of bending in steps that also penalize changes of curvature: strong bending would round the edges.
 _REDUCED_BENDING = 0.1
@@ -81,18 +81,20 @@ def fit_surface(
     number of observations.
 
     This prior rounds sharp edges. Therefore a second surface is fitted without C and p, and with smaller weights at
-    vertices of large curvature. Validation views select between the two surfaces, and select the strength of the prior.
-
-    If the second surface is selected, the last steps replace most of the bending term by
+    vertices of large curvature. Validation views select the strength of each prior. The last steps of the second
+    surface replace most of the bending term by
 
         g sum_edges w_ij (h (H_i - H_j))^2
 
     where w decreases from 1 along the direction of smallest curvature to 0 across it, so that an edge keeps one profile
     along its length and flat sides stay flat. The weight g is proportional to the squared mean misfit, an estimate of
-    the noise of the masks. The validation error would not be one: with few views it contains what they do not show.
+    the noise of the masks. The validation error is not such an estimate, because with few views it also contains errors
+    in regions that no training view determines.
 
     For accurate binary masks, the last steps use the probit model of `by_pixel_sides`. If the second surface has
-    creases, two variants with sharp edges are made (see `sharpened`), and validation views select among all surfaces.
+    creases, two variants with sharp edges are made (see `sharpened`), whose last steps use distances. Each surface
+    makes its last steps with the training views, and the validation views select one. The selected surface then makes
+    its last steps with all views.
 
     Args:
         mesh: closed mesh with triangles of similar size, as marching cubes produces.
@@ -100,41 +102,35 @@ def fit_surface(
         smoothing: factor of the selected strength; larger values suit masks drawn by hand.
         progress: called with the completed fraction.
     """
-    count, total = itertools.count(1), 2 * _STEPS + _LAST_STEPS
+    fit = _Fit(mesh, silhouettes)
+    count, total = itertools.count(1), 2 * _STEPS + 3 * _LAST_STEPS
 
     def step() -> None:
         progress(next(count) / total)
 
-    fit, outlines = _Fit(mesh, silhouettes), outlines_of(silhouettes)
-    found = [fit.search(prior, outlines, step) for prior in (_ROUND, _FLAT)]
-    if has_creases(fit.mesh.geometry(found[1].vertices)):
-        total = 2 * _STEPS + 3 * STEPS
-        facets, curved = (fit.with_creases(found[1], sides, outlines, step) for sides in (FACETS, CURVED))
-        found.append(facets if facets.misfit <= _TOLERANCE * curved.misfit else curved)
-    best = min(found, key=lambda each: each.misfit)
-    vertices = best.vertices
+    found = [fit.search(prior, step) for prior in (_ROUND, _FLAT)]
+    contour_error = fit.binary_mask_error([each.vertices for each in found])
+    num_last_steps = _LAST_STEPS if contour_error is None else _PROBIT_STEPS
+    total = 2 * _STEPS + 3 * num_last_steps
+    candidates = [fit.tried(each, contour_error, step) for each in found]
+    flat = found[-1]
+    if has_creases(fit.mesh.geometry(flat.vertices)):
+        total += 2 * STEPS
+        facets, curved = (fit.with_creases(flat, sides, contour_error, step) for sides in (FACETS, CURVED))
+        candidates.append(facets if facets.error <= _TOLERANCE * curved.error else curved)
+    best = min(candidates, key=lambda each: each.error)
     if best.sides is not None:
-        sides = best.sides._replace(flat=smoothing * best.sides.flat)
-        return TriangleMesh(fit.sharpened(vertices, sides, outlines, step), mesh.faces)
-    strength, last_steps = smoothing * best.strength, _LAST_STEPS
-    contour_error = fit.binary_mask_error(vertices, outlines)
-    if contour_error is not None:
-        strength, last_steps = _PROBIT_STRENGTH * strength, _PROBIT_STEPS
-        total += _PROBIT_STEPS - _LAST_STEPS
-    steady = strength / best.strength * best.prior.steady * (fit.misfit(vertices, outlines) / fit.size) ** 2
-    for left in reversed(range(last_steps)):
-        vertices = fit.moved(vertices, outlines, best.prior, strength, steady, contour_error, spread=left > 0)
-        step()
-    return TriangleMesh(vertices, mesh.faces)
+        total += STEPS - num_last_steps
+    return TriangleMesh(fit.finished(best, fit.outlines, contour_error, step, smoothing), mesh.faces)
 
 
-class _Found(NamedTuple):
-    """The surface of one prior with the smallest validation error, and this error (mean misfit in world units)."""
+class _Candidate(NamedTuple):
+    """A surface from which the last steps start."""
 
     prior: _Prior
     strength: float
     vertices: Float[np.ndarray, "vertices 3"]
-    misfit: float
+    error: float  # mean misfit to the validation views in world units, see `_Fit.search`, `tried` and `with_creases`
     sides: Sides | None = None  # prior of the sides, for a surface with sharp edges
 
 
@@ -149,29 +145,63 @@ class _Fit:
         # Sparse matrix that maps values at vertices to differences along edges.
         signs, number = np.repeat([1.0, -1.0], len(edges)), np.tile(np.arange(len(edges)), 2)
         self.across = sparse.csr_matrix((signs, (number, edges.T.ravel())), (len(edges), len(mesh.vertices)))
+        self.outlines = outlines_of(silhouettes)
+        self.training, self.validation = _split_views(self.outlines)
 
-    def search(self, prior: _Prior, outlines: Outlines, step: Callable[[], None]) -> _Found:
+    def search(self, prior: _Prior, step: Callable[[], None]) -> _Candidate:
         """Fit with decreasing strength of the prior, and select the strength by validation views."""
-        training, validation = _split_views(outlines)
         vertices, found = self.start, []
         for strength in np.geomspace(prior.first, prior.last, _STEPS).tolist():
-            vertices = self.moved(vertices, training, prior, strength)
-            found.append(_Found(prior, strength, vertices, self.misfit(vertices, validation)))
+            vertices = self.moved(vertices, self.training, prior, strength)
+            found.append(_Candidate(prior, strength, vertices, self.misfit(vertices, self.validation)))
             step()
-        limit = _TOLERANCE * min(each.misfit for each in found)
-        return next(each for each in found if each.misfit <= limit)
+        limit = _TOLERANCE * min(each.error for each in found)
+        return next(each for each in found if each.error <= limit)
 
-    def with_creases(self, blunt: _Found, sides: Sides, outlines: Outlines, step: Callable[[], None]) -> _Found:
-        """Sharpen the edges of a surface, and compute the validation error of the result."""
-        training, validation = _split_views(outlines)
-        vertices = self.sharpened(blunt.vertices, sides, training, step)
-        return blunt._replace(vertices=vertices, misfit=self.misfit(vertices, validation), sides=sides)
+    def tried(self, candidate: _Candidate, contour_error: float | None, step: Callable[[], None]) -> _Candidate:
+        """Compute the validation error after trial steps, which are the last steps with the training views."""
+        vertices = self.finished(candidate, self.training, contour_error, step)
+        return candidate._replace(error=self.validation_error(vertices, contour_error))
 
-    def sharpened(
-        self, vertices: Float[np.ndarray, "vertices 3"], sides: Sides, outlines: Outlines, step: Callable[[], None]
+    def with_creases(
+        self, blunt: _Candidate, sides: Sides, contour_error: float | None, step: Callable[[], None]
+    ) -> _Candidate:
+        """Sharpen the edges with the training views, and compute the validation error; last steps start there."""
+        candidate = blunt._replace(sides=sides)
+        vertices = self.finished(candidate, self.training, contour_error, step)
+        return candidate._replace(vertices=vertices, error=self.validation_error(vertices, contour_error))
+
+    def finished(
+        self,
+        candidate: _Candidate,
+        outlines: Outlines,
+        contour_error: float | None,
+        step: Callable[[], None],
+        smoothing: float = 1.0,
     ) -> Float[np.ndarray, "vertices 3"]:
-        """Move the vertices until edges are sharp (see `creases.sharpened`)."""
-        return sharpened(vertices, self.mesh, lambda moved: self.rims(moved, outlines), sides, step)
+        """Make the last steps of a candidate and return its vertices.
+
+        Args:
+            candidate: the surface before these steps.
+            outlines: outlines of the views that are used.
+            contour_error: see `binary_mask_error`; None for distances instead of the probit model.
+            step: called after each step.
+            smoothing: factor of the strength.
+        """
+        vertices, prior, sides = candidate.vertices, candidate.prior, candidate.sides
+        if sides is not None:
+            sides = sides._replace(flat=smoothing * sides.flat)
+            return sharpened(vertices, self.mesh, lambda moved: self.rims(moved, outlines), sides, step)
+        factor, num_steps, own_error = smoothing, _LAST_STEPS, None
+        if contour_error is not None:
+            factor, num_steps = _PROBIT_STRENGTH * smoothing, _PROBIT_STEPS
+            own_error = self.contour_error(vertices, outlines)
+        steady = factor * prior.steady * (self.misfit(vertices, outlines) / self.size) ** 2
+        strength = factor * candidate.strength
+        for left in reversed(range(num_steps)):
+            vertices = self.moved(vertices, outlines, prior, strength, steady, own_error, spread=left > 0)
+            step()
+        return vertices
 
     def rims(self, vertices: Float[np.ndarray, "vertices 3"], outlines: Outlines) -> Rims:
         """Find the contour points of a surface with the given vertices."""
@@ -181,13 +211,30 @@ class _Fit:
         """Compute the mean distance of the contour points to the outlines of the masks, in world units."""
         return float(np.abs(self.rims(vertices, outlines).misfit).mean())
 
-    def binary_mask_error(self, vertices: Float[np.ndarray, "vertices 3"], outlines: Outlines) -> float | None:
-        """Compute the mean contour error in pixels for accurate binary masks; None for other masks."""
+    def validation_error(self, vertices: Float[np.ndarray, "vertices 3"], contour_error: float | None) -> float:
+        """Compute the mean misfit to the validation views, in world units.
+
+        For accurate binary masks, misfits are those of `by_pixel_sides`, because the noise of interpolated outlines
+        would hide differences between surfaces. Surfaces that are too inaccurate for the probit model keep their
+        misfits to the outlines, which are larger.
+        """
+        own_error = self.contour_error(vertices, self.validation)
+        if contour_error is None or own_error > _MAX_PROBIT_ERROR:
+            return self.misfit(vertices, self.validation)
+        rims = by_pixel_sides(self.rims(vertices, self.validation), self.silhouettes, own_error)
+        return float(np.average(np.abs(rims.misfit), weights=rims.weight)) if rims.weight.any() else np.inf
+
+    def contour_error(self, vertices: Float[np.ndarray, "vertices 3"], outlines: Outlines) -> float:
+        """Compute the mean distance of the contour points to the outlines of the masks, in pixels."""
+        rims = self.rims(vertices, outlines)
+        return float(np.abs(rims.misfit / rims.width).mean())
+
+    def binary_mask_error(self, surfaces: list[Float[np.ndarray, "vertices 3"]]) -> float | None:
+        """Compute the smallest contour error of surfaces in pixels for accurate binary masks; None for other masks."""
         if is_antialiased(self.silhouettes.masks.numpy(), self.silhouettes.distances.numpy()):
             return None
-        rims = self.rims(vertices, outlines)
-        contour_error = float(np.abs(rims.misfit / rims.width).mean())
-        return contour_error if contour_error < _MAX_PROBIT_ERROR else None
+        smallest = min(self.contour_error(vertices, self.training) for vertices in surfaces)
+        return smallest if smallest < _MAX_PROBIT_ERROR else None
 
     def moved(
         self,

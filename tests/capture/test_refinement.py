@@ -108,9 +108,11 @@ def test_surface_that_loses_overlap_with_the_masks_is_rejected(monkeypatch: pyte
 def test_reconstructed_room_is_independent_of_earlier_random_numbers() -> None:
     first = Room(mesh().bounds, 3.0)
     torch.rand(1000)
+    state = torch.get_rng_state()
     second = Room(mesh().bounds, 3.0)
     for one, other in zip(first.parameters(), second.parameters(), strict=True):
         assert torch.equal(one, other)
+    assert torch.equal(torch.get_rng_state(), state)
 
 
 class PaintedShell(Room):
