@@ -109,19 +109,19 @@ def fit_surface(
         progress(next(count) / total)
 
     found = [fit.search(prior, step) for prior in (_ROUND, _FLAT)]
-    contour_error = fit.binary_mask_error([each.vertices for each in found])
-    num_last_steps = _LAST_STEPS if contour_error is None else _PROBIT_STEPS
+    probit = fit.has_accurate_binary_masks(found)
+    num_last_steps = _PROBIT_STEPS if probit else _LAST_STEPS
     total = 2 * _STEPS + 3 * num_last_steps
-    candidates = [fit.tried(each, contour_error, step) for each in found]
+    candidates = [fit.tried(each, probit, step) for each in found]
     flat = found[-1]
     if has_creases(fit.mesh.geometry(flat.vertices)):
         total += 2 * STEPS
-        facets, curved = (fit.with_creases(flat, sides, contour_error, step) for sides in (FACETS, CURVED))
+        facets, curved = (fit.with_creases(flat, sides, probit, step) for sides in (FACETS, CURVED))
         candidates.append(facets if facets.error <= _TOLERANCE * curved.error else curved)
     best = min(candidates, key=lambda each: each.error)
     if best.sides is not None:
         total += STEPS - num_last_steps
-    return TriangleMesh(fit.finished(best, fit.outlines, contour_error, step, smoothing), mesh.faces)
+    return TriangleMesh(fit.finished(best, fit.outlines, probit, step, smoothing), mesh.faces)
 
 
 class _Candidate(NamedTuple):
@@ -158,24 +158,22 @@ class _Fit:
         limit = _TOLERANCE * min(each.error for each in found)
         return next(each for each in found if each.error <= limit)
 
-    def tried(self, candidate: _Candidate, contour_error: float | None, step: Callable[[], None]) -> _Candidate:
+    def tried(self, candidate: _Candidate, probit: bool, step: Callable[[], None]) -> _Candidate:
         """Compute the validation error after trial steps, which are the last steps with the training views."""
-        vertices = self.finished(candidate, self.training, contour_error, step)
-        return candidate._replace(error=self.validation_error(vertices, contour_error))
+        vertices = self.finished(candidate, self.training, probit, step)
+        return candidate._replace(error=self.validation_error(vertices, probit))
 
-    def with_creases(
-        self, blunt: _Candidate, sides: Sides, contour_error: float | None, step: Callable[[], None]
-    ) -> _Candidate:
+    def with_creases(self, blunt: _Candidate, sides: Sides, probit: bool, step: Callable[[], None]) -> _Candidate:
         """Sharpen the edges with the training views, and compute the validation error; last steps start there."""
         candidate = blunt._replace(sides=sides)
-        vertices = self.finished(candidate, self.training, contour_error, step)
-        return candidate._replace(vertices=vertices, error=self.validation_error(vertices, contour_error))
+        vertices = self.finished(candidate, self.training, probit, step)
+        return candidate._replace(vertices=vertices, error=self.validation_error(vertices, probit))
 
     def finished(
         self,
         candidate: _Candidate,
         outlines: Outlines,
-        contour_error: float | None,
+        probit: bool,
         step: Callable[[], None],
         smoothing: float = 1.0,
     ) -> Float[np.ndarray, "vertices 3"]:
@@ -184,7 +182,7 @@ class _Fit:
         Args:
             candidate: the surface before these steps.
             outlines: outlines of the views that are used.
-            contour_error: see `binary_mask_error`; None for distances instead of the probit model.
+            probit: whether to use the probit model of binary masks instead of distances.
             step: called after each step.
             smoothing: factor of the strength.
         """
@@ -192,14 +190,15 @@ class _Fit:
         if sides is not None:
             sides = sides._replace(flat=smoothing * sides.flat)
             return sharpened(vertices, self.mesh, lambda moved: self.rims(moved, outlines), sides, step)
-        factor, num_steps, own_error = smoothing, _LAST_STEPS, None
-        if contour_error is not None:
+        factor, num_steps, contour_error = smoothing, _LAST_STEPS, None
+        rims = self.rims(vertices, outlines)
+        if probit:
             factor, num_steps = _PROBIT_STRENGTH * smoothing, _PROBIT_STEPS
-            own_error = self.contour_error(vertices, outlines)
-        steady = factor * prior.steady * (self.misfit(vertices, outlines) / self.size) ** 2
+            contour_error = _contour_error(rims)
+        steady = factor * prior.steady * (float(np.abs(rims.misfit).mean()) / self.size) ** 2
         strength = factor * candidate.strength
         for left in reversed(range(num_steps)):
-            vertices = self.moved(vertices, outlines, prior, strength, steady, own_error, spread=left > 0)
+            vertices = self.moved(vertices, outlines, prior, strength, steady, contour_error, spread=left > 0)
             step()
         return vertices
 
@@ -211,30 +210,28 @@ class _Fit:
         """Compute the mean distance of the contour points to the outlines of the masks, in world units."""
         return float(np.abs(self.rims(vertices, outlines).misfit).mean())
 
-    def validation_error(self, vertices: Float[np.ndarray, "vertices 3"], contour_error: float | None) -> float:
+    def validation_error(self, vertices: Float[np.ndarray, "vertices 3"], probit: bool) -> float:
         """Compute the mean misfit to the validation views, in world units.
 
         For accurate binary masks, misfits are those of `by_pixel_sides`, because the noise of interpolated outlines
         would hide differences between surfaces. Surfaces that are too inaccurate for the probit model keep their
         misfits to the outlines, which are larger.
         """
-        own_error = self.contour_error(vertices, self.validation)
-        if contour_error is None or own_error > _MAX_PROBIT_ERROR:
-            return self.misfit(vertices, self.validation)
-        rims = by_pixel_sides(self.rims(vertices, self.validation), self.silhouettes, own_error)
-        return float(np.average(np.abs(rims.misfit), weights=rims.weight)) if rims.weight.any() else np.inf
+        rims, weights = self.rims(vertices, self.validation), None
+        contour_error = _contour_error(rims)
+        if probit and contour_error < _MAX_PROBIT_ERROR:
+            rims = by_pixel_sides(rims, self.silhouettes, contour_error)
+            weights = rims.weight
+            if not weights.any():
+                return np.inf
+        return float(np.average(np.abs(rims.misfit), weights=weights))
 
-    def contour_error(self, vertices: Float[np.ndarray, "vertices 3"], outlines: Outlines) -> float:
-        """Compute the mean distance of the contour points to the outlines of the masks, in pixels."""
-        rims = self.rims(vertices, outlines)
-        return float(np.abs(rims.misfit / rims.width).mean())
-
-    def binary_mask_error(self, surfaces: list[Float[np.ndarray, "vertices 3"]]) -> float | None:
-        """Compute the smallest contour error of surfaces in pixels for accurate binary masks; None for other masks."""
+    def has_accurate_binary_masks(self, candidates: list[_Candidate]) -> bool:
+        """Test whether the masks are binary, and accurate for at least one candidate."""
         if is_antialiased(self.silhouettes.masks.numpy(), self.silhouettes.distances.numpy()):
-            return None
-        smallest = min(self.contour_error(vertices, self.training) for vertices in surfaces)
-        return smallest if smallest < _MAX_PROBIT_ERROR else None
+            return False
+        errors = [_contour_error(self.rims(each.vertices, self.training)) for each in candidates]
+        return min(errors) < _MAX_PROBIT_ERROR
 
     def moved(
         self,
@@ -311,6 +308,11 @@ class _Fit:
         alike = sparse.diags(_along_edges(vertices, normals, self.edges, self.mesh.mean))
         changes = curvature.change.T @ self.across.T @ alike @ self.across
         return _Term(changes @ curvature.change, -changes @ curvature.value)
+
+
+def _contour_error(rims: Rims) -> float:
+    """Compute the mean distance of the contour points to the outlines of the masks, in pixels."""
+    return float(np.abs(rims.misfit / rims.width).mean())
 
 
 class _Term(NamedTuple):
