@@ -14,7 +14,7 @@ from torch import Tensor
 
 from nerfro.draws import Draws
 from nerfro.errors import NerfroError
-from nerfro.lens import distort, undistort
+from nerfro.lens import distort_without_fold, undistort
 from nerfro.rays import Rays
 
 # The up direction is an axis of the world if the mean up direction of the photographs is closer than this to the axis.
@@ -193,9 +193,7 @@ class Cameras:
         right, up, back = (offset @ self.camera_to_world[:, :, :3]).unbind(-1)
         x, y = right / -back, up / back
         if self.distortion is not None:
-            flat = torch.stack([x, y], -1).flatten(0, 1)
-            distorted, _ = distort(flat, self.distortion.repeat_interleave(x.shape[1], 0))
-            x, y = distorted.view(*x.shape, 2).unbind(-1)
+            x, y = distort_without_fold(torch.stack([x, y], -1), self.distortion).unbind(-1)
         columns = self.fx[:, None] * x + self.cx[:, None]
         rows = self.fy[:, None] * y + self.cy[:, None]
         return torch.stack([columns, rows], -1), -back

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -12,6 +13,8 @@ from torch import Tensor
 _NEWTON_STEPS = 8
 # Length of the last step, at unit depth: the next step would be below single precision.
 _LAST_STEP = 1e-5
+# Angles from the optical axis at which `fold_radius` searches, and the largest one in degrees.
+_NUM_ANGLES, _MAX_ANGLE = 1024, 89.9
 
 
 def coefficients(
@@ -60,6 +63,39 @@ def distort(
     derivatives = [radial + x * x * slope + 2 * p1 * y + 6 * p2 * x, mixed]
     derivatives.append(radial + y * y * slope + 6 * p1 * y + 2 * p2 * x)
     return distorted, torch.stack(derivatives, -1)
+
+
+def distort_without_fold(
+    points: Float[Tensor, "V points 2"], lens: Float[Tensor, "V 9"]
+) -> Float[Tensor, "V points 2"]:
+    """Distort points at any angle from the optical axis; no point outside of the image lands in the image.
+
+    Beyond some radius, polynomials move points inwards again, which no lens does. From this radius on, the displacement
+    by the lens is constant.
+
+    Args:
+        points: points of the ideal image plane of each view, see `distort`.
+        lens: coefficients of each view.
+
+    Returns:
+        Distorted points.
+    """
+    radius = torch.linalg.vector_norm(points, dim=-1, keepdim=True)
+    inner = points * (fold_radius(lens)[:, None, None] / radius.clamp(min=1e-12)).clamp(max=1)
+    distorted, _ = distort(inner.flatten(0, 1), lens.repeat_interleave(points.shape[1], 0))
+    return distorted.view_as(points) + (points - inner)
+
+
+def fold_radius(lens: Float[Tensor, "V 9"]) -> Float[Tensor, "V"]:
+    """Return the radius at unit depth at which the radial distortion stops growing; infinity if it always grows."""
+    radius = torch.linspace(0, math.radians(_MAX_ANGLE), _NUM_ANGLES, dtype=torch.float64, device=lens.device).tan()
+    radial = lens.double().clone()
+    radial[:, 4:6] = 0
+    points = torch.stack([radius, torch.zeros_like(radius)], -1).repeat(len(lens), 1)
+    _, derivatives = distort(points, radial.repeat_interleave(_NUM_ANGLES, 0))
+    folded = derivatives[:, 0].view(len(lens), _NUM_ANGLES) <= 0
+    first = radius[folded.to(torch.int8).argmax(1)]
+    return torch.where(folded.any(1), first, torch.inf).to(lens)
 
 
 def undistort(

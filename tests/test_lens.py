@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -82,3 +83,17 @@ def test_radii_follow_the_area_of_the_pixel(cameras):
     area = torch.linalg.cross(across, down).norm(dim=-1) / 4
     expected = 2 / 12**0.5 * area.sqrt() / plane[1:-1, 1:-1].norm(dim=-1)
     torch.testing.assert_close(rays.radii.double().reshape(36, 48)[1:-1, 1:-1], expected, rtol=2e-3, atol=0)
+
+
+@pytest.mark.parametrize("k1", [-0.1, -0.3, 0.2])
+def test_points_outside_the_field_of_view_project_outside_the_image(k1):
+    camera = cameras_at(np.eye(4)[None, :3], 400, 400, 400.0)
+    camera = replace(camera, distortion=torch.tensor([coefficients([k1, -0.05])]))
+    corners = camera.rays(*(torch.tensor(x) for x in ([0] * 4, [0, 0, 399, 399], [0, 399, 0, 399])))
+    field_of_view = torch.rad2deg(torch.acos(-corners.directions[:, 2])).max()
+    angle, turn = torch.cartesian_prod(torch.arange(1, 89.5, 0.5), torch.arange(0.0, 360, 15)).deg2rad().unbind(-1)
+    points = torch.stack([angle.tan() * turn.cos(), angle.tan() * turn.sin(), -torch.ones_like(angle)], -1)
+    pixels, depth = camera.project(points)
+    inside = ((pixels[0] >= 0) & (pixels[0] <= 400)).all(-1) & (depth[0] > 0)
+    assert inside.any()
+    assert torch.rad2deg(angle[inside]).max() <= field_of_view + 0.5

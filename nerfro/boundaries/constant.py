@@ -18,7 +18,7 @@ class ConstantBoundary(Boundary):
     """Represent the background by one radiance in all directions, black by default as in NeRF and mip-NeRF.
 
     Args:
-        rgb: linear radiance of the three channels.
+        rgb: radiance of the three channels in the colour space of the model.
     """
 
     rgb: Float[Tensor, "3"]
@@ -26,7 +26,7 @@ class ConstantBoundary(Boundary):
     def __init__(self, rgb: list[NotNegative] = (0.0, 0.0, 0.0)) -> None:  # type: ignore[assignment]
         super().__init__()
         if len(rgb) != 3:
-            raise NerfroError(f"boundary=constant: rgb={list(rgb)} has {len(rgb)} numbers; give three, linear radiance")
+            raise NerfroError(f"boundary=constant: rgb={list(rgb)} has {len(rgb)} numbers; give three")
         self.register_buffer("rgb", torch.tensor(list(rgb)), persistent=False)
 
     def forward(self, exits: Exits) -> Float[Tensor, "*batch 3"]:

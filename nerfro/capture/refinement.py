@@ -386,8 +386,8 @@ class _Descent:
     def validation_error(self, medium: SdfGrid) -> float:
         """Compute the mean robust error of the validation pixels.
 
-        Pixels with unknown surroundings for the new surface keep their initial error, so that visibility of known
-        surroundings changes nothing.
+        Pixels with unknown surroundings for the new surface keep their initial error, so that a surface cannot
+        lower its error by hiding pixels.
         """
         errors, known = self._validation_errors(medium)
         return float(torch.where(known, errors, self.initial_errors).mean())

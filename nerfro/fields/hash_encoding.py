@@ -48,8 +48,9 @@ class GridLevels:
 
 
 def grid_levels(num_levels: int, base_resolution: int, finest_resolution: int, log2_table_size: int) -> GridLevels:
-    """Return levels with resolutions in geometric progression (Eqns. 2 and 3)."""
+    """Return levels with resolutions in geometric progression (Eqns. 2 and 3); a single level is the finest."""
     growth = math.log(finest_resolution / base_resolution) / max(num_levels - 1, 1)
+    base_resolution = base_resolution if num_levels > 1 else finest_resolution
     # The small addend prevents the last level from being rounded down to one cell less than requested.
     resolutions = [math.floor(base_resolution * math.exp(level * growth) + 1e-6) for level in range(num_levels)]
     sizes = [min((n + 1) ** 3, 2**log2_table_size) for n in resolutions]

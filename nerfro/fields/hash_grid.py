@@ -100,11 +100,16 @@ class HashGridField(Field):
     def forward(self, samples: Samples) -> Radiance:
         if self.radius is None:
             return evaluate_selected(self.decode, samples, inside_box(samples.positions, self.box_min, self.box_max))
-        positions = samples.positions.flatten(0, 1)
+        return evaluate_selected(self._decode_world, samples)
+
+    def _decode_world(
+        self, positions: Float[Tensor, "points 3"], directions: Float[Tensor, "points 3"]
+    ) -> tuple[Float[Tensor, " points"], Float[Tensor, "points 3"]]:
+        """Evaluate density per world unit and colour at positions in world space that is contracted."""
+        assert self.radius is not None
         places = contract(positions, self.centre, self.radius)
-        density, rgb = self.decode(places, samples.directions.flatten(0, 1))
-        density = self._world_density(density, positions, places)
-        return Radiance(density.view(samples.s.shape), rgb.view(samples.positions.shape))
+        density, rgb = self.decode(places, directions)
+        return self._world_density(density, positions, places), rgb
 
     def decode(
         self, positions: Float[Tensor, "points 3"], directions: Float[Tensor, "points 3"]

@@ -13,17 +13,24 @@ Decoder = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 """Maps positions and unit directions [points, 3] to density [points] and colour [points, 3]."""
 
 
-def evaluate_selected(decoder: Decoder, samples: Samples, selected: Bool[Tensor, "P N"]) -> Radiance:
+def evaluate_selected(decoder: Decoder, samples: Samples, selected: Bool[Tensor, "P N"] | None = None) -> Radiance:
     """Evaluate a decoder at selected samples that may be occupied; elsewhere, density and colour are zero.
 
     On a GPU, counting the selected samples costs one synchronization with the host.
+
+    Args:
+        decoder: see `Decoder`.
+        samples: all samples.
+        selected: samples to evaluate; None for all.
     """
+    positions, directions = samples.positions.flatten(0, 1), samples.directions.flatten(0, 1)
     if samples.occupied is not None:
-        selected = selected & samples.occupied
+        selected = samples.occupied if selected is None else selected & samples.occupied
+    if selected is None:
+        density, rgb = decoder(positions, directions)
+        return Radiance(density.view(samples.s.shape), rgb.view(samples.positions.shape))
     index = selected.flatten().nonzero().squeeze(1)
-    positions = samples.positions.flatten(0, 1).index_select(0, index)
-    directions = samples.directions.flatten(0, 1).index_select(0, index)
-    density, rgb = decoder(positions, directions)
+    density, rgb = decoder(positions.index_select(0, index), directions.index_select(0, index))
     # Out of place, so that gradients flow from the full tensors back to the selected samples.
     all_density = density.new_zeros(selected.numel()).index_copy(0, index, density)
     all_rgb = rgb.new_zeros(selected.numel(), 3).index_copy(0, index, rgb)

@@ -41,8 +41,8 @@ class BoundaryRegularizer(Loss):
         if self.refracted_only:
             counted = counted & (batch.per_pixel(path.first_of_ray(path.refracted).to(fine.rgb)) > 0.5)
         background = path.per_ray(fine.transmittance[:, None] * fine.boundary_rgb.detach())
-        shown = scene.colour_space.to_srgb(batch.per_pixel(background))
-        error = (shown - batch.rgb).abs().sum(-1)
+        predicted, target = scene.colour_space.prediction_and_target(batch.per_pixel(background), batch.rgb)
+        error = (predicted - target).abs().sum(-1)
         # Gradients are averaged over processes, so each process multiplies its sum by the number of processes.
         return (error * counted).sum() * rank_and_size()[1] / (sum_over_processes(counted.sum()) + 1)
 

@@ -15,8 +15,8 @@ from nerfro.types import Batch, Rendering
 class Opaque(Loss):
     """Penalize the squared final transmittance of each ray, for fields that cover all of space.
 
-    Otherwise, a background of constant colour would replace objects of the same colour. The loss equals the mean cost
-    of a background of random grey with unit variance.
+    Without this loss, a background of constant colour would replace objects of the same colour. The loss is the
+    expected squared error that a background of random grey levels (variance 1) would cause.
     """
 
     weight = 1e-2

@@ -56,14 +56,14 @@ class Profile:
         axis: unit direction of the axis.
         height: distance between the ends.
         radii: radii at evenly spaced heights.
-        edge: radius by which the edges of the ends are rounded.
+        edge: radius by which the edges of the ends are rounded in `distance`, above 0.
     """
 
     foot: Float[Tensor, "3"]
     axis: Float[Tensor, "3"]
     height: Float[Tensor, ""]
     radii: Float[Tensor, " profile"]
-    edge: float = 0.0
+    edge: float
 
     def in_plane(self, points: Float[Tensor, "*points 3"]) -> tuple[Float[Tensor, "*points"], Float[Tensor, "*points"]]:
         """Return the distance of points from the axis, and their height above the foot."""
@@ -72,7 +72,7 @@ class Profile:
         return (offset - along[..., None] * self.axis).square().sum(-1).clamp(min=1e-20).sqrt(), along
 
     def distance(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
-        """Compute an approximate signed distance, negative inside, with an exact zero level."""
+        """Compute an approximate signed distance, negative inside; exactly zero on the surface except at its edges."""
         radius, along = self.in_plane(points)
         step = self.height / (len(self.radii) - 1)
         place = (along / step).clamp(0, len(self.radii) - 1.001)

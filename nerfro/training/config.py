@@ -255,6 +255,11 @@ def check_run(config: DictConfig) -> None:
     if check_node(config.sampler.path).needs_medium:  # type: ignore[attr-defined]
         check_node(config.medium)
     require_contraction(config)
+    if config.boundary.get("image") and config.model.get("colour") == "srgb":
+        raise NerfroError(
+            "boundary.image holds linear radiance, but fields and background have sRGB values with model.colour=srgb; "
+            "take model.colour=linear"
+        )
     if limit is None and config.trainer.max_steps < 0 and not (config.debug or config.trainer.fast_dev_run):
         raise NerfroError("the run would never end; set trainer.max_time, such as 5m, trainer.max_steps, or both")
 

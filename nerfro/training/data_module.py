@@ -44,8 +44,9 @@ class RayDataModule(LightningDataModule):
     Each validation (`validation_interval`) evaluates the validation pixels, and every fifth one also renders a view.
 
     Lightning fetches data one step early. Therefore the loader yields the numbers of steps, and the batch is made when
-    its step begins, or one step ahead if no learned parameter bends paths. Phases that precede the step come after the
-    batch: directly after a step of `phase=cameras`, paths of one batch belong to the previous cameras.
+    its step begins, or one step ahead if no learned parameter bends paths. The rays of a
+    batch are traced before the phases of its step: after a step of `phase=cameras`, one batch has paths of the previous
+    cameras.
     """
 
     def __init__(

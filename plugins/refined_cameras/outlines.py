@@ -34,7 +34,8 @@ _MAX_STEP = 2.0  # pixels
 _ACCURACY, _CORRELATED = 0.02, 3.0
 # Standard deviation of the prior of each parameter, in pixels, which fixes parameters that outlines do not determine.
 _PRIOR_DEVIATION = 1.0
-# Largest final distance, in pixels, between the surface and its masks; otherwise mesh and masks differ.
+# Largest final distance between the surface and its masks, in pixels of the reduced masks; otherwise mesh and masks
+# differ.
 _MAX_DISTANCE = 0.2
 
 
@@ -102,7 +103,7 @@ def align_to_outlines(
     distance = float((error - error.median()).abs().median())
     if distance > _MAX_DISTANCE:
         camera.restore(initial, torch.ones(len(cameras), dtype=torch.bool), lens=True)
-        print(f"outlines: the surface is {distance:.2f} pixels off its masks at best, so the cameras are not aligned")
+        print(f"outlines: the surface is {distance:.2f} pixels off its reduced masks, so the cameras are not aligned")
         return None
     matrix, vector = normal_equations(slopes, error, weights, view, len(cameras), damping=0.0)
     information = _without_width(matrix, vector)[0] / (_CORRELATED * variance)

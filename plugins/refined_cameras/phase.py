@@ -65,8 +65,8 @@ class CameraSteps(Phase):
     def step(self, run: TrainingRun, number: int, state: dict[str, Any]) -> bool:
         """Take a Gauss-Newton step of all cameras with newly drawn pixels of high contrast.
 
-        If the panorama has aligned the rotations, pixels of the background are not used for rotations, because the
-        background was learned from the same cameras.
+        If the panorama has aligned the rotations, pixels of the background are excluded, because the background was
+        learned from the same cameras.
         """
         renderer, batches = run.renderer, run.batches
         camera, box = renderer.scene.camera, occupied_box(renderer)

@@ -105,3 +105,8 @@ def test_hashed_vertices_spread_over_the_table() -> None:
     counts = table.grad[LEVELS.offsets[-1] :, 0]
     assert counts.min() > 268 * 0.5
     assert counts.max() < 268 * 2
+
+
+def test_a_single_level_has_the_finest_resolution() -> None:
+    levels = hash_encoding.grid_levels(num_levels=1, base_resolution=16, finest_resolution=48, log2_table_size=20)
+    assert levels.resolutions == (48,)

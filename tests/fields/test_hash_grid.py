@@ -1,5 +1,7 @@
 """The hash-grid field and its evaluation of selected samples."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -64,6 +66,16 @@ def test_only_samples_inside_the_box_are_evaluated() -> None:
     radiance = field(samples)
     assert torch.equal(radiance.density > 0, inside)
     assert torch.equal(inside_box(torch.full((2, 3), float("nan")), field.box_min, field.box_max), torch.zeros(2) > 0)
+
+
+@pytest.mark.parametrize("radius", [None, 3.0])
+def test_only_occupied_samples_are_evaluated(radius: float | None) -> None:
+    field, samples = make_field(box_min=[-2, -2, -2], box_max=[2, 2, 2], radius=radius), make_samples()
+    occupied = torch.rand(6, 9, generator=torch.Generator().manual_seed(5)) < 0.4
+    whole, part = field(samples), field(replace(samples, occupied=occupied))
+    assert (whole.density > 0).all()
+    torch.testing.assert_close(part.density, torch.where(occupied, whole.density, 0))
+    torch.testing.assert_close(part.rgb, torch.where(occupied[..., None], whole.rgb, 0))
 
 
 def decoded_in_double(

@@ -186,6 +186,15 @@ def test_boundary_regularizer_uses_the_background_of_pixels() -> None:
     torch.testing.assert_close(BoundaryRegularizer()([rendered], given, MODEL.scene), expected)
 
 
+def test_boundary_regularizer_adds_no_density_in_front_of_overexposed_pixels() -> None:
+    passed = torch.full((8,), 0.9, requires_grad=True)
+    rendered = replace(rendering(torch.rand(8, 3), torch.full((8, 3), 2.0), passed), transmittance=passed)
+    given = replace(batch(), rgb=torch.ones(3, 3))
+    value = BoundaryRegularizer()([rendered], given, MODEL.scene)
+    assert value.item() == 0
+    assert not torch.autograd.grad(value, passed)[0].any()
+
+
 @pytest.mark.parametrize("absorbs", [False, True])
 def test_background_learns_from_selected_rays_and_the_medium_from_all(absorbs: bool) -> None:
     sky = EnvironmentMap([4])

@@ -70,6 +70,18 @@ def test_directions_behind_the_object_are_learned_through_it(
     assert phase.begin(run) == {}, "a given background stays"
 
 
+def test_rays_that_split_into_colours_do_not_show_the_background(
+    tiny_scene: Path, tiny_default_run: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module, data = build(overrides=[*tiny_default_run, "medium.abbe=[30]", "trainer.max_steps=1"])
+    views = BlenderData(str(tiny_scene), near=2.0, far=6.0).load("train")
+    run = TrainingRun(module.renderer, data.batches, views, torch.optim.Adam(module.parameters()), 0.0)
+    phase = BackgroundSteps(steps=2, start=8)
+    state = phase.begin(run)
+    monkeypatch.setattr(module.renderer, "trace", lambda *given: pytest.fail("rays through the object are traced"))
+    assert all(phase.step(run, number, state) for number in range(4))
+
+
 def test_pretraining_takes_a_bounded_share_of_the_time(
     weights: Callable[..., dict[str, Tensor]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

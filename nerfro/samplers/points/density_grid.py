@@ -101,7 +101,8 @@ class DensityGridSampler(PointSampler):
         radius: radius of a ball around the middle of the box, world units. With it, samples cover all of space, evenly
             in the length of the path in space that is contracted outside the ball (see `field=hash_grid`). None for the
             box alone.
-        near: arc length at which samples begin if there is a radius; they reach practical infinity.
+        near: arc length at which samples begin if there is a radius, or less if a surface is closer; they reach
+            practical infinity.
         resolution: cells along each side of the grid.
         uniform: fraction of the samples that is spread evenly.
         update_every: training steps between two updates of the grid.

@@ -14,7 +14,7 @@ from nerfro.kernels.lookup import box_span
 from nerfro.kernels.philox import fill_uniform
 
 _BLOCK = 64  # rays that share a thread's scratch memory
-_THIN = 0.05  # optical depth whose fifth power is nothing in single precision
+_THIN = 0.05  # optical depth up to which four terms of the exponential series are exact in single precision
 _DARK = 1e-9  # transmittance behind which nothing is seen
 _EPS = float(np.finfo(np.float32).eps)
 

@@ -46,7 +46,8 @@ class BackgroundSteps(Phase):
 
     A step of Adam changes each texel by about the learning rate, for any number of rays. The mean of all rays, see
     `EnvironmentMap.fit`, is more accurate. Other backgrounds, and backgrounds behind a volume that covers all of space,
-    skip the phase.
+    skip the phase. With dispersion, no pass uses rays through the object, because each colour has its own exit
+    direction.
 
     Args:
         steps: number of steps of a pass, which share the rows of the photographs; 0 for no pass. The exposures of the
@@ -96,7 +97,7 @@ class BackgroundSteps(Phase):
                 observed_pixels = _observe_beside_object(run, beside, rays, fits_gains=turn > 0)
                 background.fit(observed_pixels, torch.zeros_like(state["weights"]))
         observed = [_observe_beside_object(run, beside, rays)]
-        if number_of_pass > 0:
+        if number_of_pass > 0 and not run.renderer.scene.medium.disperses:
             assert self.start is not None
             num_trained = self.start * 2 ** (number_of_pass - 1) * run.batches.batch_size
             num_rays = min(_SHARE * num_trained, _MAX_RAYS)
