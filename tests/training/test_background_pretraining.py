@@ -70,6 +70,26 @@ def test_directions_behind_the_object_are_learned_through_it(
     assert phase.begin(run) == {}, "a given background stays"
 
 
+def test_fits_of_few_pixels_use_the_pixels_of_larger_fits(
+    tiny_scene: Path, tiny_default_run: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    used, rows = [], RayBatches.rows
+    monkeypatch.setattr(RayBatches, "rows", lambda *given: used.append(rows(*given)) or used[-1])
+    of_limit = {}
+    for limit in (10**6, 64):
+        module, data = build(overrides=[*tiny_default_run, "trainer.max_steps=1"])
+        views = BlenderData(str(tiny_scene), near=2.0, far=6.0).load("train")
+        run = TrainingRun(module.renderer, data.batches, views, torch.optim.Adam(module.parameters()), 0.0)
+        phase = BackgroundSteps(steps=2)
+        state = phase.begin(run)
+        monkeypatch.setattr("nerfro.training.phases.background._MAX_FITTED_PIXELS", limit)
+        assert all(phase.step(run, number, state) for number in range(2))
+        of_limit[limit] = torch.cat(used).sort().values, state["weights"].sum()
+        used.clear()
+    assert torch.equal(of_limit[64][0], of_limit[10**6][0])
+    torch.testing.assert_close(of_limit[64][1], of_limit[10**6][1])
+
+
 def test_rays_that_split_into_colours_do_not_show_the_background(
     tiny_scene: Path, tiny_default_run: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -23,6 +23,8 @@ from nerfro.types import Exits
 
 # Largest number of pixels of a pass beside the object, relative to the texels of the finest level.
 _MAX_PIXELS = 8
+# Largest number of pixels of one fit, which bounds the memory.
+_MAX_FITTED_PIXELS = 2**21
 # Largest number of rays of a pass through the object: relative to the pixels of all training steps so far, which bounds
 # the share of the time, and absolute, which bounds the duration of a step.
 _SHARE, _MAX_RAYS = 0.15, 2**19
@@ -88,23 +90,30 @@ class BackgroundSteps(Phase):
         state["weights"] = state["weights"].to(background.texels.device)
         if part == 0:
             state["weights"].zero_()
-        most_pixels = min(run.batches.num_pixels, _MAX_PIXELS * background.levels.sizes[-1])
-        num_parts = self.steps * run.batches.num_pixels // most_pixels
-        pixels = run.batches.rows(part * num_parts // self.steps, num_parts)
-        beside, rays, crossing = _divided(run, pixels, box)
-        if number == 0 and run.renderer.scene.camera.exposure is not None:
-            for turn in range(_TURNS):
-                observed_pixels = _observe_beside_object(run, beside, rays, fits_gains=turn > 0)
-                background.fit(observed_pixels, torch.zeros_like(state["weights"]))
-        observed = [_observe_beside_object(run, beside, rays)]
-        if number_of_pass > 0 and not run.renderer.scene.medium.disperses:
-            assert self.start is not None
-            num_trained = self.start * 2 ** (number_of_pass - 1) * run.batches.batch_size
-            num_rays = min(_SHARE * num_trained, _MAX_RAYS)
-            crossing = crossing[:: max(1, math.ceil(len(crossing) * self.steps / num_rays))]
-            observed += [_observe_through_object(run, chunk) for chunk in crossing.split(run.renderer.chunk_size)]
-        state["weights"] += background.fit(Observed.joined(observed), state["weights"])
+        num_pixels = run.batches.num_pixels
+        most_pixels = min(num_pixels, _MAX_PIXELS * background.levels.sizes[-1])
+        fits_per_step = math.ceil(most_pixels / (self.steps * _MAX_FITTED_PIXELS))
+        num_fits = self.steps * fits_per_step  # of the pass
+        num_parts = num_fits * num_pixels // most_pixels
+        for fit in range(part * fits_per_step, (part + 1) * fits_per_step):
+            pixels = run.batches.rows(fit * num_parts // num_fits, num_parts)
+            beside, rays, crossing = _divided(run, pixels, box)
+            if number_of_pass == fit == 0 and run.renderer.scene.camera.exposure is not None:
+                for turn in range(_TURNS):
+                    observed_pixels = _observe_beside_object(run, beside, rays, fits_gains=turn > 0)
+                    background.fit(observed_pixels, torch.zeros_like(state["weights"]))
+            observed = [_observe_beside_object(run, beside, rays)]
+            if number_of_pass > 0 and not run.renderer.scene.medium.disperses:
+                chosen = crossing[:: self._spacing(run, len(crossing) * num_fits, number_of_pass)]
+                observed += [_observe_through_object(run, chunk) for chunk in chosen.split(run.renderer.chunk_size)]
+            state["weights"] += background.fit(Observed.joined(observed), state["weights"])
         return True
+
+    def _spacing(self, run: TrainingRun, num_crossing: int, number_of_pass: int) -> int:
+        """Return the spacing of the used pixels among `num_crossing` pixels of a pass through the object."""
+        assert self.start is not None
+        num_trained = self.start * 2 ** (number_of_pass - 1) * run.batches.batch_size
+        return max(1, math.ceil(num_crossing / min(_SHARE * num_trained, _MAX_RAYS)))
 
 
 def _divided(
