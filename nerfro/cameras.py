@@ -187,7 +187,8 @@ class Cameras:
 
         Returns:
             Pixel coordinates (column, row), integers at the corners of pixels, and depth along the optical axis in
-            world units. Pixel coordinates are invalid at depth 0 or less.
+            world units. Pixel coordinates are invalid at depth 0 or less. Points beyond the radius at which the lens
+            model folds back lie outside the image.
         """
         offset = points - self.camera_to_world[:, None, :, 3]
         right, up, back = (offset @ self.camera_to_world[:, :, :3]).unbind(-1)

@@ -87,15 +87,17 @@ def distort_without_fold(
 
 
 def fold_radius(lens: Float[Tensor, "V 9"]) -> Float[Tensor, "V"]:
-    """Return the radius at unit depth at which the radial distortion stops growing; infinity if it always grows."""
+    """Return the radius at unit depth from which on the distorted radius decreases; infinity if it always grows.
+
+    Tangential terms are left out.
+    """
     radius = torch.linspace(0, math.radians(_MAX_ANGLE), _NUM_ANGLES, dtype=torch.float64, device=lens.device).tan()
     radial = lens.double().clone()
     radial[:, 4:6] = 0
     points = torch.stack([radius, torch.zeros_like(radius)], -1).repeat(len(lens), 1)
-    _, derivatives = distort(points, radial.repeat_interleave(_NUM_ANGLES, 0))
-    folded = derivatives[:, 0].view(len(lens), _NUM_ANGLES) <= 0
-    first = radius[folded.to(torch.int8).argmax(1)]
-    return torch.where(folded.any(1), first, torch.inf).to(lens)
+    distorted = distort(points, radial.repeat_interleave(_NUM_ANGLES, 0))[0][:, 0].view(len(lens), _NUM_ANGLES)
+    folds = ~(distorted.diff(dim=1) > 0)
+    return torch.where(folds.any(1), radius[folds.to(torch.int8).argmax(1)], torch.inf).to(lens)
 
 
 def undistort(

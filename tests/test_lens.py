@@ -85,15 +85,27 @@ def test_radii_follow_the_area_of_the_pixel(cameras):
     torch.testing.assert_close(rays.radii.double().reshape(36, 48)[1:-1, 1:-1], expected, rtol=2e-3, atol=0)
 
 
-@pytest.mark.parametrize("k1", [-0.1, -0.3, 0.2])
-def test_points_outside_the_field_of_view_project_outside_the_image(k1):
-    camera = cameras_at(np.eye(4)[None, :3], 400, 400, 400.0)
-    camera = replace(camera, distortion=torch.tensor([coefficients([k1, -0.05])]))
-    corners = camera.rays(*(torch.tensor(x) for x in ([0] * 4, [0, 0, 399, 399], [0, 399, 0, 399])))
-    field_of_view = torch.rad2deg(torch.acos(-corners.directions[:, 2])).max()
-    angle, turn = torch.cartesian_prod(torch.arange(1, 89.5, 0.5), torch.arange(0.0, 360, 15)).deg2rad().unbind(-1)
-    points = torch.stack([angle.tan() * turn.cos(), angle.tan() * turn.sin(), -torch.ones_like(angle)], -1)
+@pytest.mark.parametrize(
+    ("lens", "focal"),
+    [
+        (coefficients([-0.25]), 40.0),
+        (coefficients([0.5, -0.2]), 25.0),
+        (coefficients([], [], [-0.5]), 40.0),  # the radius is infinite at 55 degrees
+    ],
+    ids=["barrel", "pincushion", "rational"],
+)
+def test_directions_beyond_the_field_of_view_project_outside_the_image(lens, focal):
+    camera = replace(cameras_at(np.eye(4)[None, :3], 48, 36, focal), distortion=torch.tensor([lens]))
+    corners = camera.rays(torch.zeros(4, dtype=torch.long), torch.tensor([0, 0, 36, 36]), torch.tensor([0, 48] * 2),
+                          torch.zeros(2))  # fmt: skip
+    widest = torch.acos(-corners.directions[:, 2].min().double())
+    angle = torch.linspace(float(widest) + 0.01, np.radians(89.9), 200)
+    azimuth = torch.linspace(0, 2 * np.pi, 60)
+    sine, cosine = torch.sin(angle)[:, None], -torch.cos(angle)[:, None].expand(-1, 60)
+    points = torch.stack([sine * torch.cos(azimuth), sine * torch.sin(azimuth), cosine], -1).reshape(-1, 3)
     pixels, depth = camera.project(points)
-    inside = ((pixels[0] >= 0) & (pixels[0] <= 400)).all(-1) & (depth[0] > 0)
-    assert inside.any()
-    assert torch.rad2deg(angle[inside]).max() <= field_of_view + 0.5
+    assert (depth > 0).all()
+    assert not ((pixels >= 0) & (pixels <= torch.tensor([48, 36]))).all(-1).any()
+    torch.testing.assert_close(
+        camera.project(corners.directions)[0][0], torch.tensor([[0, 0], [48, 0], [0, 36], [48, 36.0]])
+    )
