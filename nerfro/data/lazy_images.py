@@ -159,8 +159,10 @@ class LazyImages:
         return replace(self, files=[self.files[view] for view in views])
 
     def joined(self, other: LazyImages) -> LazyImages:
-        """Append images of the same size that are read in the same way."""
-        return replace(self, files=[*self.files, *other.files], dtype=np.promote_types(self.dtype, other.dtype))
+        """Append images of the same size; each file is read as before."""
+        others, dtype = frozenset(other.files), np.promote_types(self.dtype, other.dtype)
+        read = lambda path: (other.read if path in others else self.read)(path)  # noqa: E731
+        return replace(self, files=[*self.files, *other.files], read=read, dtype=dtype)
 
     def cut(self, window: Window) -> LazyImages:
         """Restrict every image to a window."""

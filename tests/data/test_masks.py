@@ -1,5 +1,6 @@
 """Where silhouettes are looked for, and what they are read as."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,8 @@ import pytest
 import torch
 from PIL import Image
 
-from nerfro.data.masks import find_mask, find_masks
+from nerfro.data.blender import BlenderData
+from nerfro.data.masks import find_mask, find_masks, with_other_splits
 from tests.conftest import refused
 
 
@@ -59,6 +61,24 @@ def test_transparency_is_the_mask_without_mask_files(tmp_path: Path) -> None:
     share = find_masks(paths, [None, None], 2, (4, 2))
     assert share is not None
     torch.testing.assert_close(torch.stack(list(share)), torch.tensor([[[0.5, 0.8]], [[1.0, 1.0]]]))
+
+
+def test_masks_of_all_splits_are_read_by_their_own_kind(tmp_path: Path) -> None:
+    # The mask is the transparency of the training images and a file beside the test images.
+    mask = np.zeros((4, 6), np.uint8)
+    mask[1:3, 2:5] = 255
+    opaque, frame = np.full((4, 6, 3), 90, np.uint8), {"transform_matrix": np.eye(4).tolist()}
+    for split, image in (("train", np.dstack([opaque, mask])), ("test", opaque)):
+        (tmp_path / split).mkdir()
+        Image.fromarray(image).save(tmp_path / split / "a.png")
+        document = {"camera_angle_x": 0.7, "frames": [frame | {"file_path": f"{split}/a.png"}]}
+        (tmp_path / f"transforms_{split}.json").write_text(json.dumps(document))
+    Image.fromarray(mask).save(tmp_path / "test" / "mask_a.png")
+    source = BlenderData(str(tmp_path))
+    for first in ("train", "test"):
+        views = with_other_splits(source.load(first), source, first)
+        assert views.masks is not None
+        np.testing.assert_array_equal(torch.stack(list(views.masks)), [mask / 255] * 2)
 
 
 @pytest.mark.parametrize("mode", ["RGB", "RGBA"])
