@@ -72,7 +72,7 @@ def _read(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
     import OpenImageIO
 
     configuration = OpenImageIO.ImageSpec()
-    configuration.attribute("oiio:UnassociatedAlpha", 1)  # Otherwise, colours are multiplied by alpha.
+    configuration.attribute("oiio:UnassociatedAlpha", 1)  # Otherwise, OpenImageIO multiplies colours by alpha.
     image = OpenImageIO.ImageInput.open(str(path), configuration)
     if image is None:
         raise OSError(OpenImageIO.geterror().partition("\n")[0])
@@ -84,4 +84,8 @@ def _read(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
         raise OSError(error.partition("\n")[0])
     if pixels.dtype == np.uint16 and image.spec().get_int_attribute("tiff:PhotometricInterpretation", 1) == 0:
         pixels[..., 0] = 65535 - pixels[..., 0]  # white is zero, which OpenImageIO only converts for 8 bits
+    alpha, is_associated = image.spec().alpha_channel, not image.spec().get_int_attribute("oiio:UnassociatedAlpha")
+    if pixels.dtype == np.uint16 and alpha >= 0 and is_associated:
+        colours = 65535 * pixels[..., :alpha].astype(np.float64) / pixels[..., alpha:].clip(1)
+        pixels[..., :alpha] = np.rint(colours).clip(0, 65535)  # TIFF files may hold colours multiplied by alpha
     return pixels, tuple(image.spec().channelnames)

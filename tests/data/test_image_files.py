@@ -65,6 +65,19 @@ def test_16bit_grey_tiff_files_may_have_alpha_or_zero_for_white(num_channels: in
     np.testing.assert_array_equal(image_files.read_levels(tmp_path / "a.tif"), picture)
 
 
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_colours_of_tiff_files_that_are_multiplied_by_alpha_are_divided_by_it(dtype: type, tmp_path: Path):
+    random, most = np.random.default_rng(0), np.iinfo(dtype).max
+    picture = random.integers(0, most, (9, 7, 4), dtype=dtype, endpoint=True)
+    picture[..., 3] = random.integers(most // 2, most, (9, 7), dtype=dtype, endpoint=True)
+    picture[0, 0] = 0
+    stored = picture.copy()
+    stored[..., :3] = np.rint(picture[..., :3] * (picture[..., 3:] / most))
+    tifffile.imwrite(tmp_path / "a.tif", stored, photometric="rgb", extrasamples=["assocalpha"])
+    found = image_files.read_levels(tmp_path / "a.tif").astype(int)
+    assert np.abs(found - picture).max() <= 2  # levels, of the rounding of the product
+
+
 @pytest.mark.parametrize("mode", ["L", "P", "1"])
 def test_grey_palette_and_bilevel_images_become_rgb(save, mode):
     grey = np.where(levels(5, 4) > 127, 255, 0).astype(np.uint8)
