@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nerfro.allowed import Coordinate
+from nerfro.data.lenses import Lens
 from nerfro.errors import NerfroError
 from nerfro.geometry.lines import nearest_point
 
@@ -23,7 +24,7 @@ _OUTLIER_QUANTILE = 0.001
 
 
 def find_bounds(
-    poses: Float[np.ndarray, "V 3 4"], slopes: Float[np.ndarray, "V 2"], points: Float[np.ndarray, "points 3"]
+    poses: Float[np.ndarray, "V 3 4"], edges: Float[np.ndarray, "V 2 2"], points: Float[np.ndarray, "points 3"]
 ) -> tuple[float, float]:
     """Estimate the near and far bounds of all cameras.
 
@@ -33,7 +34,7 @@ def find_bounds(
 
     Args:
         poses: camera-to-world matrices with OpenGL axes, world units.
-        slopes: half the width and height of each image, divided by the focal length.
+        edges: lower left and upper right corner of each image at unit depth, see `image_edges`.
         points: sparse points in world units; may be empty.
 
     Returns:
@@ -43,7 +44,7 @@ def find_bounds(
         NerfroError: no points are in view and the cameras have no common target.
     """
     centres, forward = poses[:, :, 3], -poses[:, :, 2]
-    distances_in_view = [_distances_in_view(points, *camera) for camera in zip(poses, slopes, strict=True)]
+    distances_in_view = [_distances_in_view(points, *camera) for camera in zip(poses, edges, strict=True)]
     quantiles = [_OUTLIER_QUANTILE, 1 - _OUTLIER_QUANTILE]
     ranges = np.array([np.quantile(each, quantiles) for each in distances_in_view if len(each)])
     if len(ranges):
@@ -59,6 +60,12 @@ def find_bounds(
     return _NEAR_FRACTION * float(distances.min()), 2 * float(distances.max())
 
 
+def image_edges(lens: Lens, width: int, height: int) -> Float[np.ndarray, "2 2"]:
+    """Return the lower left and the upper right corner of an image at unit depth, x right and y up, undistorted."""
+    left, right = -lens.cx / lens.fx, (width - lens.cx) / lens.fx
+    return np.array([[left, (lens.cy - height) / lens.fy], [right, lens.cy / lens.fy]])
+
+
 def usable_points(points: Float[np.ndarray, "points 3"], file: Path) -> Float[np.ndarray, "usable 3"]:
     """Return the points of a file within the coordinates that nerfro accepts; outliers may lie beyond these.
 
@@ -71,9 +78,10 @@ def usable_points(points: Float[np.ndarray, "points 3"], file: Path) -> Float[np
 
 
 def _distances_in_view(
-    points: Float[np.ndarray, "points 3"], pose: Float[np.ndarray, "3 4"], slope: Float[np.ndarray, "2"]
+    points: Float[np.ndarray, "points 3"], pose: Float[np.ndarray, "3 4"], edges: Float[np.ndarray, "2 2"]
 ) -> Float[np.ndarray, " usable"]:
     """Compute the distances of the points inside the view frustum; distortion is neglected."""
     local = (points - pose[:, 3]) @ pose[:, :3]
-    inside = (np.abs(local[:, :2]) < -slope * local[:, 2:]).all(1)
+    low, high = edges[:, None] * -local[:, 2:]
+    inside = ((low < local[:, :2]) & (local[:, :2] < high)).all(1)
     return np.linalg.norm(local[inside], axis=1)

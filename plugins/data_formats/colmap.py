@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from nerfro.data.base import Frame
 from nerfro.data.frames import Every, FrameSet, PosedImages
@@ -14,7 +15,7 @@ from nerfro.data.masks import find_mask
 from nerfro.errors import NerfroError
 from nerfro.registry import register
 
-from .bounds import find_bounds, usable_points
+from .bounds import find_bounds, image_edges, usable_points
 from .colmap_model import MODEL_FOLDERS, ColmapImage, ColmapModel, find_model_folder, lens_of, read_colmap
 
 
@@ -52,8 +53,8 @@ class ColmapData(PosedImages):
         near, far = self.near, self.far
         if near is None or far is None:
             poses = np.stack([image.camera_to_world for image in model.images]) * [1.0, -1.0, -1.0, 1.0]
-            slopes = np.array([self._slopes(model, image, folder) for image in model.images])
-            near, far = find_bounds(poses, slopes, usable_points(model.points, folder))
+            edges = np.array([self._edges(model, image, folder) for image in model.images])
+            near, far = find_bounds(poses, edges, usable_points(model.points, folder))
         images = self.held_out(model.images, self.test_every, split)
         frames = []
         for image in images:
@@ -68,11 +69,9 @@ class ColmapData(PosedImages):
             lenses.append(lens_of(camera, where).resized((camera.width, camera.height), size, where))
         return FrameSet(frames, lenses, "opencv", near, far)
 
-    def _slopes(self, model: ColmapModel, image: ColmapImage, folder: Path) -> tuple[float, float]:
-        """Return half the width and height of an image, divided by the focal lengths."""
+    def _edges(self, model: ColmapModel, image: ColmapImage, folder: Path) -> Float[np.ndarray, "2 2"]:
         camera = model.cameras[image.camera]
-        lens = lens_of(camera, f"{folder}: camera {image.camera}")
-        return 0.5 * camera.width / lens.fx, 0.5 * camera.height / lens.fy
+        return image_edges(lens_of(camera, f"{folder}: camera {image.camera}"), camera.width, camera.height)
 
     def _model_folder(self) -> Path:
         folders = [self.root / name for name in ((self.model,) if self.model is not None else MODEL_FOLDERS)]

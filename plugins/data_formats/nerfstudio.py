@@ -18,7 +18,7 @@ from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import load_points
 from nerfro.registry import register
 
-from .bounds import find_bounds, usable_points
+from .bounds import find_bounds, image_edges, usable_points
 
 _SINGLE, _MASK_KEY = "transforms.json", "object_mask_path"
 
@@ -82,9 +82,9 @@ class NerfstudioData(PosedImages):
         check(f"{manifest.path}: ", {"ply_file_path": str}, {"ply_file_path": file})
         if isinstance(file, str) and os.path.isfile(self.root / file):  # False for a name that is too long
             points = usable_points(load_points(self.root / file), self.root / file)
-        half = 0.5 * np.array(read_size(manifest.frames[0].image)[:2])
-        slopes = half / [(lens.fx, lens.fy) for lens in manifest.lenses()]
-        return find_bounds(np.stack([frame.camera_to_world for frame in manifest.frames]), slopes, points)
+        width, height, _ = read_size(manifest.frames[0].image)
+        edges = np.stack([image_edges(lens, width, height) for lens in manifest.lenses()])
+        return find_bounds(np.stack([frame.camera_to_world for frame in manifest.frames]), edges, points)
 
     def _choose(self, manifest: Manifest, split: str) -> list[int]:
         """Return the indices of the frames of a split."""

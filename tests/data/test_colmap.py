@@ -100,14 +100,15 @@ def test_bounds_default_to_the_sparse_points(write):
     assert views.cameras.far == pytest.approx(1.1 * distance.max(), rel=1e-3)
 
 
-def test_bounds_use_both_focal_lengths(write):
-    lens = (FX, 3 * FX, WIDTH / 2, HEIGHT / 2)
-    cameras = load(write(cameras={1: ("PINHOLE", lens)}), near=None, far=None).cameras
+@pytest.mark.parametrize("lens", [(FX, 3 * FX, WIDTH / 2, HEIGHT / 2), (FX, FX, 0.1 * WIDTH, 0.8 * HEIGHT)])
+def test_bounds_are_those_of_the_points_within_the_images(write, lens):
+    points = np.random.default_rng(0).uniform(-1, 1, (400, 3))
+    cameras = load(write(cameras={1: ("PINHOLE", lens)}, points=points), near=None, far=None).cameras
     in_view = []
     for seed in range(6):
-        pixels = project(seed, POINTS, lens)
+        pixels = project(seed, points, lens)
         inside = ((pixels > 0) & (pixels < [WIDTH, HEIGHT])).all(1)
-        distances = np.linalg.norm(POINTS[inside] - camera_to_world(seed, "opencv")[:3, 3], axis=1)
+        distances = np.linalg.norm(points[inside] - camera_to_world(seed, "opencv")[:3, 3], axis=1)
         in_view.append(np.quantile(distances, [0.001, 0.999]))
     assert cameras.near == pytest.approx(0.9 * min(low for low, _ in in_view))
     assert cameras.far == pytest.approx(1.1 * max(high for _, high in in_view))
