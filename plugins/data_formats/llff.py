@@ -33,7 +33,7 @@ class LlffData(PosedImages):
         near: arc length at which rays begin, in units of the chosen frame. The default is 0.9 times the nearest depth
             in the file.
         far: arc length at which rays end. The default is the arc length to the farthest depth in the file (at most 2
-            for `frame=eikonal`, as in Eikonal Fields) in the corner of the image.
+            for `frame=eikonal`, as in Eikonal Fields) in the corner of the image with the widest field of view.
         options: see `PosedImages`.
         images: folder of the images within the root, such as images_8. The intrinsics are scaled to the image size.
         frame: world frame. `file` keeps the world of the file; `llff` scales by 1 / (0.75 nearest depth) and recentres;
@@ -60,9 +60,9 @@ class LlffData(PosedImages):
         transform = frame_transform(poses, depths, self.frame)
         # LLFF measures depths along the optical axis. The arc length to a depth is longest in the corner of the image.
         depths = depths * np.cbrt(np.linalg.det(transform[:3, :3]))
-        height, width, focal = sizes[0]
+        height, width, focal = sizes.T
         farthest = min(float(depths.max()), _EIKONAL_FAR if self.frame == "eikonal" else math.inf)
-        farthest *= math.hypot(1, 0.5 * width / focal, 0.5 * height / focal)
+        farthest *= float(np.sqrt(1 + 0.25 * (width**2 + height**2) / focal**2).max())
         folder = self.root
         if self.video is not None and split != "train":
             folder = self.root / self.video.replace("\\", "/")

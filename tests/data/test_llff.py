@@ -90,6 +90,15 @@ def test_bounds_are_scaled_to_the_frame(write):
     assert (given.near, given.far) == (0.1, 7.0)
 
 
+def test_far_encloses_the_farthest_depth_in_the_image_with_the_widest_field_of_view(write):
+    root = write()
+    rows = np.load(root / "poses_bounds.npy")
+    rows[3, 14] = FX / 3  # focal length of a test view
+    np.save(root / "poses_bounds.npy", rows)
+    expected = FAR * np.hypot(1, np.hypot(WIDTH, HEIGHT) / 2 / (FX / 3))
+    assert [load(root, split).cameras.far for split in ("train", "test")] == pytest.approx([expected] * 2)
+
+
 @pytest.mark.parametrize("frame", ["file", "llff", "eikonal"])
 def test_video_frames_are_mapped_with_the_training_transformation(write, frame):
     # Videos of other depths and another path: a transformation of their own would be another one.
