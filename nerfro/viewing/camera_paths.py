@@ -35,7 +35,8 @@ class CaptureGeometry:
         centre: centre of the object, world units.
         up: unit up direction, see `up_direction`.
         distance: median distance of the cameras from the centre, world units.
-        camera: one of the cameras, without distortion; its lens and resolution are the defaults of new cameras.
+        camera: one of the cameras, without distortion and with a centred principal point; its lens and resolution are
+            the defaults of new cameras.
     """
 
     centre: Float[Tensor, "3"]
@@ -48,12 +49,10 @@ class CaptureGeometry:
         """Measure the geometry of photographs of an object in the given bounds."""
         cameras, centre = cameras.to("cpu"), bounds.mean(0)
         distance = torch.linalg.vector_norm(cameras.camera_to_world[:, :, 3] - centre, dim=-1).median()
-        return cls(
-            centre,
-            up_direction(cameras.camera_to_world[:, :, 1]),
-            float(distance),
-            replace(cameras.select([0]), distortion=None),
-        )
+        first = cameras.select([0])
+        cx, cy = (torch.full_like(first.cx, 0.5 * side) for side in (first.width, first.height))
+        camera = replace(first, cx=cx, cy=cy, distortion=None)
+        return cls(centre, up_direction(cameras.camera_to_world[:, :, 1]), float(distance), camera)
 
     def pose_at(self, position: OrbitPosition) -> Float[Tensor, "3 4"]:
         """Return the pose of an upright camera that looks at the centre, also from above and below.

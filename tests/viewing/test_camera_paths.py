@@ -38,6 +38,15 @@ def test_all_cameras_look_at_the_centre_upright(name: str, around: CaptureGeomet
     assert cameras.far >= distances.max() - around.distance + around.camera.far - 1e-4
 
 
+def test_target_is_in_the_centre_of_the_image_although_photographs_are_off_centre(scene: TrainedScene) -> None:
+    photographs = scene.cameras("train")
+    photographs = replace(photographs, cx=photographs.cx - 11, cy=photographs.cy + 7)
+    geometry = CaptureGeometry.of(photographs, torch.stack([CENTRE - 1, CENTRE + 1]))
+    target = torch.tensor([0.1, 0.3, -0.2])
+    cameras = geometry.look_at(torch.tensor([[3.0, 1.0, 2.0], [-2.0, 3.0, 0.5]]), target)
+    torch.testing.assert_close(cameras.project(target[None])[0][:, 0], torch.full((2, 2), 16.0), atol=1e-3, rtol=0)
+
+
 def test_orbit_is_a_circle_that_does_not_repeat_its_first_camera(around: CaptureGeometry) -> None:
     cameras = path_cameras(around, "orbit", OrbitPosition(0, 30, 5.0), 8)
     offsets = cameras.camera_to_world[:, :, 3] - CENTRE
