@@ -17,7 +17,9 @@ from torch import Tensor
 
 from nerfro.allowed import Count, Positive, Range
 from nerfro.cameras import Cameras
+from nerfro.data.lenses import Lens, check_lenses
 from nerfro.errors import NerfroError
+from nerfro.lens import distort, fold_radius
 from nerfro.paths import user_path
 from nerfro.subdivision import SubdivisionChanges
 from nerfro.variants import variant
@@ -109,9 +111,11 @@ def find_shots(config: DictConfig, scene: TrainedScene) -> Shots:
     shots = _views(config.views, scene) if config.views is not None else _free_cameras(config, scene)
     cameras = shots.cameras
     if config.fov is not None:
-        focal = torch.full_like(cameras.fx, 0.5 * cameras.width / math.tan(0.5 * math.radians(config.fov)))
-        cameras = replace(cameras, fx=focal, fy=focal * cameras.fy / cameras.fx)
-    return replace(shots, cameras=_resized(cameras, *_size(config, cameras.width, cameras.height)))
+        cameras = _with_field_of_view(cameras, config.fov)
+    cameras = _resized(cameras, *_size(config, cameras.width, cameras.height))
+    if config.fov is not None or config.resolution is not None:
+        _require_invertible(cameras, shots.names)
+    return replace(shots, cameras=cameras)
 
 
 def _free_cameras(config: DictConfig, scene: TrainedScene) -> Shots:
@@ -142,6 +146,32 @@ def _views(given: str, scene: TrainedScene) -> Shots:
     if not number.isdecimal() or int(number) >= len(cameras):
         raise NerfroError(f"views={given}: {split} has views 0 to {len(cameras) - 1}; give one of these numbers")
     return Shots(cameras.select([int(number)]), [names[int(number)]], False)
+
+
+def _with_field_of_view(cameras: Cameras, degrees: float) -> Cameras:
+    """Change the horizontal field of view of an image whose principal point is in the centre."""
+    edge = cameras.fx.new_tensor([math.tan(0.5 * math.radians(degrees)), 0.0]).expand(len(cameras), 2)
+    if cameras.distortion is not None:
+        fold, _ = fold_radius(cameras.distortion)
+        if bool((edge[:, 0] >= fold).any()):
+            widest = 2 * math.degrees(math.atan(float(fold.min())))
+            raise NerfroError(
+                f"fov={degrees:g} is not allowed, because the lens distortion is invertible up to {widest:.0f} "
+                "degrees; take less"
+            )
+        edge, _ = distort(edge, cameras.distortion)
+    focal = 0.5 * cameras.width / edge[:, 0]
+    return replace(cameras, fx=focal, fy=focal * cameras.fy / cameras.fx)
+
+
+def _require_invertible(cameras: Cameras, names: Sequence[str]) -> None:
+    """Refuse images that are larger than the region in which the lens distortion is invertible."""
+    if cameras.distortion is None:
+        return
+    numbers = torch.stack([cameras.fx, cameras.fy, cameras.cx, cameras.cy], -1).tolist()
+    both = zip(numbers, cameras.distortion.tolist(), strict=True)
+    lenses = [Lens(fx, fy, cx, cy, tuple(distortion)) for (fx, fy, cx, cy), distortion in both]
+    check_lenses(lenses, names, (cameras.width, cameras.height))
 
 
 def _resized(cameras: Cameras, width: int, height: int) -> Cameras:

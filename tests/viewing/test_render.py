@@ -2,23 +2,30 @@
 
 import functools
 import json
+import math
 import sys
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import OpenImageIO
 import pytest
 import torch
+from omegaconf import OmegaConf
 from PIL import Image
 
 import nerfro.render
+from nerfro.cameras import Cameras
 from nerfro.files.lat_long import save_lat_long
+from nerfro.lens import coefficients
 from nerfro.registry import discover
 from nerfro.subdivision import Subdivision
+from nerfro.viewing.render_request import RenderConfig, find_shots
 from nerfro.viewing.trained_scene import TrainedScene
-from tests.conftest import Runner
+from tests.conftest import Runner, refused
 
 
 @pytest.fixture
@@ -114,6 +121,26 @@ def test_still_from_numbers_shows_the_expected_content(render: Runner) -> None:
     linear = np.array([0.4, 0.4, 0.4 + 0.5 * 0.34])
     middle = read("O/frame_0000.png")[4, 4] / 255
     np.testing.assert_allclose(middle, 1.055 * linear ** (1 / 2.4) - 0.055, atol=0.06)
+
+
+def test_field_of_view_is_that_of_the_rays_through_a_distorting_lens(
+    scene: TrainedScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cameras = replace(scene.cameras("test"), distortion=torch.tensor([coefficients([-0.25])] * 3))
+    monkeypatch.setattr(TrainedScene, "cameras", lambda self, split: cameras)
+
+    def shots(**options: Any) -> Cameras:
+        return find_shots(
+            OmegaConf.structured(RenderConfig(checkpoint="a.ckpt", views="test", **options)), scene
+        ).cameras
+
+    wide = shots(fov=60.0, resolution=24)
+    both, sides = torch.zeros(2, dtype=torch.long), torch.tensor([0, 24])
+    left, right = wide.rays(both, torch.tensor([12, 12]), sides, torch.zeros(2)).directions
+    assert math.degrees(math.acos(float(left @ right))) == pytest.approx(60, abs=1e-3)
+    # x - 0.25 x^3 grows up to x = 1.155, which is 49 degrees.
+    refused("fov=110 is not allowed, because the lens distortion is invertible up to 98 degrees", shots, fov=110.0)
+    refused("test_000: the lens distortion is not invertible everywhere in the image", shots, resolution=[8, 32])
 
 
 @pytest.mark.parametrize("what", ["depth", "normals", "opacity", "exits", "glass", "inside", "sky"])
