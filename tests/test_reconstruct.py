@@ -6,16 +6,22 @@ import os
 import shlex
 import shutil
 import signal
+import struct
 import time
+import zlib
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
+import tifffile
 import torch
 from PIL import ExifTags, Image
 
 import nerfro.reconstruct
 import nerfro.train
 from nerfro.capture import refinement
+from nerfro.data import image_files
 from nerfro.data.masks import find_mask
 from nerfro.errors import NerfroError
 from nerfro.evaluation.metrics import ImageMetrics
@@ -106,6 +112,32 @@ def test_other_photographs_are_named_and_no_file_is_deleted(
     assert ": lying.jpg" in printed
     collection.link_photographs(out / "images", None, out)
     assert sorted((out / "images").iterdir()) == before
+
+
+@pytest.mark.parametrize("num_colours", [1, 3])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+def test_photographs_of_every_depth_become_upright_without_other_changes(
+    suffix: str, dtype: type, num_colours: int, tmp_path: Path
+) -> None:
+    slope = np.linspace(0, 1, 24 * 16).reshape(16, 24)
+    levels = np.rint(np.iinfo(dtype).max * slope).astype(dtype)
+    levels = levels if num_colours == 1 else np.repeat(levels[..., None], 3, -1)
+    (tmp_path / "photos").mkdir()
+    file = tmp_path / "photos" / f"a{suffix}"
+    if suffix == ".tif":
+        photometric = "rgb" if num_colours == 3 else "minisblack"
+        tifffile.imwrite(file, levels, photometric=photometric, extratags=[(274, "H", 1, 6, True)])
+    else:
+        exif = Image.Exif()
+        exif[ExifTags.Base.Orientation] = 6
+        _, content = cv2.imencode(".png", levels)
+        chunk = b"eXIf" + exif.tobytes().removeprefix(b"Exif\0\0")
+        chunk = struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
+        file.write_bytes(content.tobytes()[:33] + chunk + content.tobytes()[33:])  # after the header of 33 bytes
+    collection.link_photographs(tmp_path / "photos", None, tmp_path / "out")
+    found = image_files.read_levels(tmp_path / "out" / "images" / "a.jpg")
+    np.testing.assert_allclose(found, np.repeat(255 * np.rot90(slope, -1)[..., None], 3, -1), atol=4)
 
 
 @pytest.mark.parametrize("suffix", [".JPG", ".heic"])

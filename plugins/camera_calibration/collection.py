@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 from omegaconf import DictConfig
-from PIL import ImageOps
+from PIL import ExifTags, Image, ImageOps
 
 from nerfro.data.frames import list_images
-from nerfro.data.image_files import IMAGE_SUFFIXES
+from nerfro.data.image_files import IMAGE_SUFFIXES, to_unit
 from nerfro.errors import NerfroError, first_of, warn
 from nerfro.files.atomic import atomic_file
+from nerfro.files.deep_images import read_16bit
 from nerfro.files.reading import open_image, orientation_of
 from nerfro.paths import user_path
 from nerfro.progress import track
@@ -21,6 +23,8 @@ from .photographs import HEIF_SUFFIXES, PHOTOGRAPH_SUFFIXES, one_of_each_pair, r
 from .video import extract_frames
 
 _QUALITY = 95  # of converted photographs
+# EXIF data of 16-bit files that are kept; others describe the file.
+_KEPT_TAGS = (ExifTags.Base.Orientation, ExifTags.Base.Make, ExifTags.Base.Model)
 
 
 def collect_photographs(config: DictConfig, out: Path) -> list[Path]:
@@ -132,10 +136,23 @@ def _place_photograph(file: Path, folder: Path, replaces: bool) -> None:
         if existing.exists() and not (replaces and _links_to_other(existing, file)):
             return
         existing.unlink(missing_ok=True)
-    with open_image(file, upright=False) as (image, _):
+    with open_image(file, upright=False) as (image, bits):
         if file.suffix.lower() in HEIF_SUFFIXES or orientation_of(image) in range(2, 9):
-            upright = ImageOps.exif_transpose(image).convert("RGB")
+            upright = ImageOps.exif_transpose(_as_stored(file, image, bits)).convert("RGB")
             with atomic_file(converted) as output:
                 upright.save(output, "JPEG", quality=_QUALITY, exif=upright.getexif())
             return
     place.symlink_to(file.resolve())
+
+
+def _as_stored(file: Path, image: Image.Image, bits: int) -> Image.Image:
+    """Return a photograph in the orientation of its file, with 8 bits per channel and its EXIF data."""
+    if bits <= 8:
+        return image
+    levels = read_16bit(file)  # Pillow clips 16-bit grey levels
+    colours = levels[..., 0] if levels.shape[-1] < 3 else levels[..., :3]
+    stored = Image.fromarray(np.uint8(np.rint(255 * to_unit(colours))))
+    exif, given = Image.Exif(), Image.Image.getexif(image)
+    exif.update({tag: given[tag] for tag in _KEPT_TAGS if tag in given})
+    stored.info["exif"] = exif.tobytes()
+    return stored
