@@ -192,7 +192,9 @@ def _text_rows(
         except ValueError as error:
             raise NerfroError(f"{path}, line {i} is not {form}: {line[:60]!r}") from error
         yield f"{path}, line {i}", words
-        if features and len(next(numbered, (0, ""))[1].split()) % 3 != 0:
+        # A line of features ends with a whole number, and a line of an image with its name.
+        seen = next(numbered, (0, ""))[1].split() if features else []
+        if len(seen) % 3 != 0 or not all(word.removeprefix("-").isdecimal() for word in seen[-1:]):
             raise NerfroError(f"{path}: after line {i} there is no line of features, which may be empty; add the line")
 
 

@@ -194,6 +194,15 @@ def test_wrong_text_files_are_refused(write, file, old, new, message):
     refused(message, load, root)
 
 
+@pytest.mark.parametrize("spaces", range(3))
+def test_text_files_without_lines_of_features_are_refused_whatever_the_names_are(write, spaces):
+    root = write("text", points=np.zeros((0, 3)))
+    path = root / "sparse/0/images.txt"
+    rows = [line.replace("/v", "/" + " ".join("v" * (spaces + 1))) for line in path.read_text().splitlines() if line]
+    path.write_text("\n".join(rows) + "\n")
+    refused("there is no line of features, which may be empty; add the line", load, root)
+
+
 def test_missing_files_are_named(write, tmp_path):
     refused("there is no COLMAP model", load, tmp_path)
     refused(r"sparse/7; set data\.model to its folder", load, tmp_path, model="sparse/7")
