@@ -160,8 +160,12 @@ class LazyImages:
 
     def joined(self, other: LazyImages) -> LazyImages:
         """Append images of the same size; each file is read as before."""
-        others, dtype = frozenset(other.files), np.promote_types(self.dtype, other.dtype)
-        read = lambda path: (other.read if path in others else self.read)(path)  # noqa: E731
+        others = frozenset(other.files)
+
+        def read(path: Path) -> np.ndarray:
+            return other.read(path) if path in others else self.read(path)
+
+        dtype = np.promote_types(self.dtype, other.dtype)
         return replace(self, files=[*self.files, *other.files], read=read, dtype=dtype)
 
     def cut(self, window: Window) -> LazyImages:

@@ -152,7 +152,7 @@ def _with_field_of_view(cameras: Cameras, degrees: float) -> Cameras:
     """Change the horizontal field of view of an image whose principal point is in the centre."""
     edge = cameras.fx.new_tensor([math.tan(0.5 * math.radians(degrees)), 0.0]).expand(len(cameras), 2)
     if cameras.distortion is not None:
-        fold, _ = fold_radius(cameras.distortion)
+        fold = fold_radius(cameras.distortion)
         if bool((edge[:, 0] >= fold).any()):
             widest = 2 * math.degrees(math.atan(float(fold.min())))
             raise NerfroError(
