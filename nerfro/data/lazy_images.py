@@ -162,7 +162,7 @@ class LazyImages:
         """Append images of the same size; each file is read as before."""
         others = frozenset(other.files)
 
-        def read(path: Path) -> np.ndarray:
+        def read(path: Path) -> Levels:
             return other.read(path) if path in others else self.read(path)
 
         dtype = np.promote_types(self.dtype, other.dtype)

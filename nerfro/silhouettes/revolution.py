@@ -56,14 +56,14 @@ class Profile:
         axis: unit direction of the axis.
         height: distance between the ends.
         radii: radii at evenly spaced heights.
-        edge: radius by which the edges of the ends are rounded in `distance`, above 0.
+        edge: radius by which `distance` rounds the edges of the ends; `distance` needs a positive one.
     """
 
     foot: Float[Tensor, "3"]
     axis: Float[Tensor, "3"]
     height: Float[Tensor, ""]
     radii: Float[Tensor, " profile"]
-    edge: float
+    edge: float = 0.0
 
     def in_plane(self, points: Float[Tensor, "*points 3"]) -> tuple[Float[Tensor, "*points"], Float[Tensor, "*points"]]:
         """Return the distance of points from the axis, and their height above the foot."""
