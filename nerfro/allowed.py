@@ -77,6 +77,22 @@ class Refused(str):
     """Reason why a setting has no meaning, and what to use instead."""
 
 
+@dataclass(frozen=True)
+class OnlyWith:
+    """Condition without which a setting has no effect: the value of another setting.
+
+    Attributes:
+        setting: name of the other setting in the same component, or full name of a setting or a component.
+        values: values with which the setting has an effect, or names of plugins; empty for all values except null, 0
+            and false.
+        attribute: attribute of the class of the other component that must be true, instead of `values`.
+    """
+
+    setting: str
+    values: tuple[str, ...] = ()
+    attribute: str | None = None
+
+
 _FURTHEST = 10**7  # world units, as in georeferenced data
 
 AnyNumber = Annotated[float, None]  # including infinity and NaN
@@ -208,6 +224,8 @@ def _refusal(value: Any, hint: Any) -> str | None:
         return None if value in hints else f"choose {', '.join(map(repr, hints))}"
     if origin is Annotated and isinstance(hints[1], Refused):
         return str(hints[1])
+    if origin is Annotated and isinstance(hints[1], OnlyWith):
+        return _refusal(value, hints[0])
     has_range = origin is Annotated and isinstance(hints[1], Range)
     if (has_range or hint in (float, int)) and isinstance(value, str):  # the value of an interpolation may be text
         return "take a number, not text"

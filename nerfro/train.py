@@ -25,9 +25,9 @@ from nerfro.fields.networks import compile_networks
 from nerfro.overrides import prints_hints
 from nerfro.rendering.scene_file import with_scene
 from nerfro.subdivision import Subdivision
-from nerfro.training.build import build_training, check_before_training
+from nerfro.training.build import build_training, check_before_training, check_command
 from nerfro.training.callbacks import StopOnSignal, Throughput, steps_by_phase
-from nerfro.training.config import TrainConfig, build_data, check_run, resolve_trainer_options
+from nerfro.training.config import TrainConfig, build_data, resolve_trainer_options
 from nerfro.training.mesh_match import require_match
 from nerfro.training.run_folder import LAST_CHECKPOINT, begin, lock_run, next_steps, require_same_run, resume_advice
 from nerfro.training.sweeps import run_cell
@@ -36,7 +36,7 @@ from nerfro.training.viewer import Viewer
 from nerfro.viewing.camera_files import write_cameras
 
 
-@entry_point("train", TrainConfig, check=check_run, expand=with_scene)
+@entry_point("train", TrainConfig, check=check_command, expand=with_scene)
 def main(config: DictConfig) -> float | None:
     """Train one experiment, evaluate it, and return `optimized_metric`, which sweepers of Hydra optimize."""
     folder = Path(HydraConfig.get().runtime.output_dir)

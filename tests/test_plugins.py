@@ -330,7 +330,7 @@ TEMPLATES = {
     "example_data": ["data=numpy_views"],
     "example_field": ["field=blobs"],
     "example_loss": ["+loss.opacity_entropy.weight=0.1"],
-    "example_medium": ["medium=gradient_rod", "sampler/path=eikonal", "sampler.path.num_steps=64"],
+    "example_medium": ["medium=gradient_rod", "sampler/path=eikonal"],
     "example_model": ["model=haze"],
     "example_path_sampler": ["sampler/path=mirror_floor"],
     "example_phase": ["+phase.extra_steps.every=1"],

@@ -9,14 +9,18 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
+from nerfro.allowed import OnlyWith
 from nerfro.errors import NerfroError, nearest_of
+
+# Whether training learns a quantity of the medium, which only some path samplers trace.
+Learns = Annotated[bool, OnlyWith("sampler.path", attribute="needs_medium")]
 
 # Initial optical depth of a learned absorption across half of the body. With a larger value, the absorption would
 # explain the content.

@@ -20,7 +20,7 @@ from nerfro.media.base import Medium, Vectors
 from nerfro.media.bodies import Body, mesh_surface, read_bodies
 from nerfro.media.distance_grid import DistanceGrid, DistanceGrids
 from nerfro.media.grid_box import BYTES_PER_VERTEX, grid_box
-from nerfro.media.material import learned_quantities, materials_of
+from nerfro.media.material import Learns, learned_quantities, materials_of
 from nerfro.media.solid import Solid, body_names
 from nerfro.media.surface import Grid, make_surface
 from nerfro.registry import register
@@ -77,9 +77,9 @@ class SdfGrid(Solid):
         shell_voxels: Positive = 0.1,
         accept_open_mesh: bool = False,
         absorption: Sequence[NotNegative] = (),
-        learn_absorption: bool = False,
+        learn_absorption: Learns = False,
         abbe: Sequence[Positive] = (),
-        learn_ior: bool = False,
+        learn_ior: Learns = False,
         cache: bool = True,
         bodies: dict[str, Any] | None = None,
     ) -> None:

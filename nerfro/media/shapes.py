@@ -11,6 +11,7 @@ from torch.nn import functional
 
 from nerfro.allowed import NotNegative, Positive
 from nerfro.media.base import Vectors
+from nerfro.media.material import Learns
 from nerfro.media.solid import Solid
 from nerfro.registry import register
 
@@ -37,7 +38,7 @@ class Ball(Solid):
         ior: Positive = 1.5,
         shell: Positive = 0.002,
         absorption: Sequence[NotNegative] = (),
-        learn_absorption: bool = False,
+        learn_absorption: Learns = False,
         abbe: Sequence[Positive] = (),
     ) -> None:
         super().__init__([ior], shell, absorption, learn_absorption, abbe)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from lightning.pytorch import seed_everything
 from omegaconf import DictConfig
@@ -17,6 +18,7 @@ from nerfro.errors import NerfroError, warn
 from nerfro.failures import in_one_line
 from nerfro.old_names import renamed_override
 from nerfro.options import describe_command
+from nerfro.overrides import prints_hints
 from nerfro.paths import CONF_DIR
 from nerfro.registry import discover
 from nerfro.rendering import Renderer
@@ -24,6 +26,7 @@ from nerfro.rendering.scene_file import with_scene
 from nerfro.samplers.paths.thin_walls import warn_of_thin_walls
 from nerfro.training.config import TrainConfig, build_data, build_each, build_model, check_run, resolve_trainer_options
 from nerfro.training.data_module import RayDataModule, traced
+from nerfro.training.effects import require_effect
 from nerfro.training.memory import require_memory
 from nerfro.training.module import TrainingModule
 from nerfro.training.ray_batches import RayBatches
@@ -60,12 +63,26 @@ def build(experiment: str | None = None, overrides: Sequence[str] = ()) -> tuple
         raise NerfroError(in_one_line(error)) from error
     check_configuration(config, TrainConfig, CONF_DIR)
     check_run(config)
+    require_effect(config, given)
     resolve_trainer_options(config)
     if config.callbacks:
         warn("nerfro.build ignores callbacks; give them to your own Trainer: lightning.Trainer(callbacks=[...])")
     seed_everything(config.seed, verbose=False)
     source = build_data(config)
     return build_training(config, source, source.load("train"))
+
+
+def check_command(config: DictConfig) -> None:
+    """Check the configuration of `nerfro.train`: `check_run`, and `require_effect` of the command line.
+
+    A program that runs commands gives the same settings to several trainings, so that some may have no effect.
+
+    Raises:
+        NerfroError: the configuration cannot train, or a setting has no effect.
+    """
+    check_run(config)
+    if prints_hints():
+        require_effect(config, HydraConfig.get().overrides.task)
 
 
 def build_training(config: DictConfig, source: DataSource, training: Views) -> tuple[TrainingModule, RayDataModule]:

@@ -20,6 +20,7 @@ from nerfro.allowed import (
     Natural,
     NotNegative,
     NumRays,
+    OnlyWith,
     Positive,
     Range,
     Refused,
@@ -66,7 +67,8 @@ class BatchesConfig:
     # Number of training views, spread over the positions of the cameras, that are used for validation instead.
     num_validation_views: Natural = 0
     precrop_steps: Natural = 0  # number of first steps that see only the central window of the images
-    precrop_fraction: Annotated[float, Range(more_than=0, at_most=1)] = 0.5  # relative side of the window
+    # Relative side of the window.
+    precrop_fraction: Annotated[float, Range(more_than=0, at_most=1), OnlyWith("precrop_steps")] = 0.5
     # Which pixels get several rays, in training and in validation.
     subdivision: Subdivision = dataclasses.field(default_factory=lambda: Subdivision(divergence=8.0))
 
@@ -109,7 +111,7 @@ class TrainerConfig:
     # `fastest` selects bf16-mixed if the machine has bfloat16 units, else 32-true.
     precision: Annotated[str, Literal["32-true", "fastest", "16-mixed", "bf16-mixed", "64-true"]] = "32-true"
     gradient_clip_val: Optional[Positive] = None  # noqa: UP045
-    gradient_clip_algorithm: Annotated[Optional[str], Literal["norm", "value"]] = None  # noqa: UP045
+    gradient_clip_algorithm: Annotated[Optional[str], Literal["norm", "value"], OnlyWith("gradient_clip_val")] = None  # noqa: UP045
     log_every_n_steps: Count = 50
     deterministic: Any = None
     benchmark: Optional[bool] = None  # noqa: UP045

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from omegaconf import DictConfig, OmegaConf
 
-from nerfro.allowed import Count, NotNegative, Positive
+from nerfro.allowed import Count, NotNegative, OnlyWith, Positive
 from nerfro.cameras import Cameras
 from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import local_origin, num_decimals
@@ -34,6 +34,7 @@ _MIN_CELLS, _MAX_CELLS = 128, 4096
 _RANGE_OF_RAYS = 4.0
 # Smallest eigenvalue with which the point nearest to all optical axes is determined along an eigenvector.
 _PARALLEL = 0.01
+_WITH_BALL = OnlyWith("space", ("all",))
 
 
 @dataclass
@@ -48,10 +49,11 @@ class ContentConfig:
     box_min: Optional[list[float]] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
     box_max: Optional[list[float]] = None  # noqa: UP045 - upper corner of the box
     # Radius of the ball, world units. None derives this and the next settings from the cameras.
-    radius: Optional[Positive] = None  # noqa: UP045
-    near: Optional[NotNegative] = None  # noqa: UP045 - arc length of the first samples, world units
+    radius: Annotated[Optional[Positive], _WITH_BALL] = None  # noqa: UP045
+    # Arc length of the first samples, world units.
+    near: Annotated[Optional[NotNegative], _WITH_BALL] = None  # noqa: UP045
     # Number of cells of the finest grid along the cube around contracted space.
-    cells: Optional[Count] = None  # noqa: UP045
+    cells: Annotated[Optional[Count], _WITH_BALL] = None  # noqa: UP045
 
 
 def derive_content(config: DictConfig, medium: Medium, cameras: Cameras | None = None) -> None:

@@ -7,11 +7,11 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import Optional
+from typing import Annotated, Optional
 
 from torch import nn
 
-from nerfro.allowed import Natural, NotNegative, Positive, checked
+from nerfro.allowed import Natural, NotNegative, OnlyWith, Positive, checked
 from nerfro.errors import NerfroError
 
 # Patterns that have no effect in a scene without these parameters.
@@ -46,7 +46,8 @@ class OptimizerConfig:
     # decay. Of several matching patterns the last one decides.
     groups: dict[str, GroupConfig] = dataclasses.field(default_factory=dict)
     warmup_steps: Natural = 2500  # length of the warm-up; 0 for none
-    warmup_factor: NotNegative = 0.01  # factor of the learning rate at its first step
+    # Factor of the learning rate at its first step.
+    warmup_factor: Annotated[NotNegative, OnlyWith("warmup_steps")] = 0.01
     adam_epsilon: Positive = 1e-8  # epsilon of Adam
 
     def group(self, name: str) -> GroupConfig:

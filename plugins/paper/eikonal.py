@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from nerfro.allowed import Count, Positive, Range
+from nerfro.allowed import Count, OnlyWith, Positive, Range
 from nerfro.errors import NerfroError
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.kernels.tolerances import STEPS_PER_SHELL
@@ -45,9 +45,9 @@ class Eikonal(PathSampler):
     def __init__(
         self,
         integrator: Literal["adaptive", "euler"] = "adaptive",
-        num_steps: Annotated[int, Range(at_least=2, at_most=8192)] = 768,
-        tolerance: Positive = 2e-4,
-        max_steps: Count = 16384,
+        num_steps: Annotated[int, Range(at_least=2, at_most=8192), OnlyWith("integrator", ("euler",))] = 768,
+        tolerance: Annotated[Positive, OnlyWith("integrator", ("adaptive",))] = 2e-4,
+        max_steps: Annotated[Count, OnlyWith("integrator", ("adaptive",))] = 16384,
     ) -> None:
         super().__init__()
         self.integrator, self.num_steps, self.tolerance, self.max_steps = integrator, num_steps, tolerance, max_steps

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerfro.allowed import Count, Natural
+from nerfro.allowed import Count, Natural, OnlyWith
 from nerfro.geometry.interpolation import misses
 from nerfro.rays import Rays
 from nerfro.registry import register
@@ -30,6 +30,7 @@ _FULL_STEPS = 10
 _ERROR_SCALE, _MAX_PIXELS = 0.5, 1.0
 # Candidates that are drawn for each pixel; the candidates with the most contrast are used.
 _NUM_CANDIDATES = 6
+_WITH_REFINED = OnlyWith("camera", ("refined",))
 
 
 @register("phase", "cameras")
@@ -45,7 +46,12 @@ class CameraSteps(Phase):
         num_pixels: number of pixels of each photograph in a Gauss-Newton step.
     """
 
-    def __init__(self, start: Natural = 50, every: Count = 50, num_pixels: Count = 300) -> None:
+    def __init__(
+        self,
+        start: Annotated[Natural, _WITH_REFINED] = 50,
+        every: Annotated[Count, _WITH_REFINED] = 50,
+        num_pixels: Annotated[Count, _WITH_REFINED] = 300,
+    ) -> None:
         self.start, self.every, self.num_pixels = start, every, num_pixels
 
     def begin(self, run: TrainingRun) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from nerfro.kernels.available import require_bytes
 from nerfro.media.base import Medium
 from nerfro.media.distance_grid import DistanceGrid
 from nerfro.media.grid_box import BYTES_PER_VERTEX, grid_box
-from nerfro.media.material import Material, materials_of
+from nerfro.media.material import Learns, Material, materials_of
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.surface import Grid, MeshSurface, cached_distances, direction
 from nerfro.registry import register
@@ -81,7 +81,7 @@ class SdfVessel(SdfGrid):
         shell_voxels: Positive = 0.1,
         accept_open_mesh: bool = False,
         absorption: Sequence[NotNegative] = (),
-        learn_absorption: bool = False,
+        learn_absorption: Learns = False,
         abbe: Sequence[Positive] = (),
         cache: bool = True,
         fillet: NotNegative = 0.0,

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import one_hot
 
-from nerfro.allowed import Positive, Range, Share
+from nerfro.allowed import OnlyWith, Positive, Range, Share
 from nerfro.errors import NerfroError
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.kernels.tolerances import MIN_SEARCH_STEP
@@ -58,7 +58,7 @@ class Snell(PathSampler):
         interface: Literal["sdf", "mesh"] = "sdf",
         max_events: Annotated[int, Range(at_least=1, at_most=1000)] = 16,
         branches: Literal["none", "first", "all"] = "none",
-        least_weight: Share = 0.02,
+        least_weight: Annotated[Share, OnlyWith("branches", ("first", "all"))] = 0.02,
         wavelengths: Sequence[Positive] = (610.0, 550.0, 465.0),
     ) -> None:
         super().__init__()

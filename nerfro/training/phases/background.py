@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerfro.allowed import Count, Natural, Share
+from nerfro.allowed import Count, Natural, OnlyWith, Share
 from nerfro.boundaries.envmap import EnvironmentMap, Observed
 from nerfro.errors import renamed_classes, warn
 from nerfro.fields.base import Field
@@ -34,6 +34,7 @@ _BACKGROUND = 0.7
 _CHUNK = 2**18
 # Turns between background and exposures in the first step.
 _TURNS = 10
+_WITH_MAP, _WITH_BOX = OnlyWith("boundary", ("envmap",)), OnlyWith("content.space", ("box",))
 
 
 @register("phase", "background")
@@ -59,7 +60,12 @@ class BackgroundSteps(Phase):
         start: training step of the first pass that also uses rays through the object; None for no such pass.
     """
 
-    def __init__(self, steps: Natural = 10, time_share: Share = 0.2, start: Count | None = 250) -> None:
+    def __init__(
+        self,
+        steps: Annotated[Natural, _WITH_MAP, _WITH_BOX] = 10,
+        time_share: Annotated[Share, _WITH_MAP, _WITH_BOX, OnlyWith("steps")] = 0.2,
+        start: Annotated[Count | None, _WITH_MAP, _WITH_BOX, OnlyWith("steps")] = 250,
+    ) -> None:
         self.steps, self.time_share, self.start = steps, time_share, start
 
     def begin(self, run: TrainingRun) -> dict[str, Any]:
