@@ -195,6 +195,24 @@ def check(where: str, hints: Mapping[str, Any], values: Mapping[str, Any]) -> No
             raise NerfroError(f"{where}{name}={value!r} is not allowed; {reason}")
 
 
+def refuse_unused(config: DictConfig, schema: type, names: Iterable[str], reason: str) -> None:
+    """Refuse settings that are neither off (null, 0, false or empty) nor at their defaults, but have no effect.
+
+    Args:
+        config: the configuration.
+        schema: dataclass with the defaults.
+        names: names of the settings without effect.
+        reason: end of the sentence "NAME=VALUE has no effect".
+
+    Raises:
+        NerfroError: a setting has such a value.
+    """
+    defaults = OmegaConf.structured(schema)
+    for name in names:
+        if config[name] and config[name] != defaults[name]:
+            raise NerfroError(f"{name}={config[name]} has no effect {reason}; remove it")
+
+
 def corners_of_box(
     box_min: Sequence[float], box_max: Sequence[float], bounded: bool = True
 ) -> Float[np.ndarray, "2 3"]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from omegaconf import DictConfig
 
 import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
+from nerfro.allowed import refuse_unused
 from nerfro.cli import entry_point
 from nerfro.files.atomic import refuse_existing
 from nerfro.paths import user_path
@@ -22,6 +23,7 @@ def main(config: DictConfig) -> None:
     """Check the request, load the scene, and write the file."""
     out = user_path(config.out)
     export = find_export(config.what, out)
+    refuse_unused(config, ExportConfig, export.unused, f"with what={config.what}")
     refuse_existing(export.files(out), config.overwrite)
     scene = load(config.checkpoint, config.device, config.root)
     if config.sky is not None:

@@ -46,7 +46,8 @@ def preprocess(capture: Path, run_here: Callable) -> Callable[..., str]:
     """Run the entry point in this process on the capture; returns what it printed, or its one line of error."""
 
     def run(*overrides: str) -> str:
-        common = [f"data.root={capture}", "resolution=24", "medium.resolution=32", "medium.cache=false"]
+        common = [f"data.root={capture}", "medium.resolution=32", "medium.cache=false"]
+        common += [] if any(text.startswith("mesh=") for text in overrides) else ["resolution=24"]
         common += [] if any(text.startswith(("medium.ior=", "refine=")) for text in overrides) else ["medium.ior=1.5"]
         done = run_here("preprocess", *common, *overrides, code=None)
         return done.err if done.code else done.out
@@ -133,6 +134,12 @@ def test_supplied_mesh_is_compared_and_kept(preprocess: Callable[..., str], capt
     assert read_scene_file(capture / "scene.json").bodies["object"].mesh == str(tmp_path / "my ball.ply")
     assert not (capture / "mesh.ply").exists()
     assert json.loads((capture / "overlaps.json").read_text())["mean"] > 0.97
+
+
+def test_options_of_the_hull_are_refused_beside_a_mesh(preprocess: Callable[..., str], tmp_path: Path) -> None:
+    mesh().save(tmp_path / "ball.ply")
+    printed = preprocess(f"mesh={tmp_path / 'ball.ply'}", "smoothing=0.5")
+    assert "smoothing=0.5 has no effect with mesh=..., which replaces the hull; remove it" in printed
 
 
 def test_index_of_a_named_body_without_material_is_estimated(preprocess: Callable[..., str], capture: Path) -> None:

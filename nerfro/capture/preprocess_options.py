@@ -13,7 +13,7 @@ from hydra.core.hydra_config import HydraConfig
 from jaxtyping import Float
 from omegaconf import MISSING, DictConfig, OmegaConf
 
-from nerfro.allowed import Count, Natural, NotNegative, Range, corners_of_box
+from nerfro.allowed import Count, Natural, NotNegative, Range, corners_of_box, refuse_unused
 from nerfro.cameras import Cameras
 from nerfro.data.base import DataSource
 from nerfro.data.frames import require_root
@@ -33,6 +33,7 @@ MESH = "mesh.ply"
 INDEX, FIGURES = "index.json", "refinement.json"
 # Margin of the index grid around the object, as a fraction of the object's size.
 _MARGIN = 0.15
+_OF_HULL = ("resolution", "keep", "smoothing", "symmetry")
 
 
 @dataclass
@@ -128,6 +129,8 @@ class Request:
             raise NerfroError("the box needs two corners; give both box_min and box_max, or neither")
         if config.box_min is not None:
             corners_of_box(config.box_min, config.box_max)
+        if config.mesh is not None:
+            refuse_unused(config, PreprocessConfig, _OF_HULL, "with mesh=..., which replaces the hull")
         if config.refine and "shell_voxels" not in config.medium:
             raise NerfroError("refine=true needs a distance grid; set medium=object or medium=vessel")
         if config.vessel and ("shell_voxels" not in config.medium or "wall" in config.medium):

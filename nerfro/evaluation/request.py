@@ -14,7 +14,7 @@ from typing import Annotated, Literal, Optional
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from nerfro.allowed import Natural, NumRays
+from nerfro.allowed import Natural, NumRays, refuse_unused
 from nerfro.errors import Interrupted, NerfroError, warn
 from nerfro.files.atomic import refuse_existing, write_atomically
 from nerfro.files.folder_lock import lock_folder, require_only
@@ -58,10 +58,7 @@ def require_one_task(config: DictConfig) -> None:
         task, others = "predictions", ("split", "chunk_size", "subdivision")
     else:
         task, others = "checkpoint", ("references", "masks", "mask_labels", "alpha")
-    default = OmegaConf.structured(EvaluateConfig)
-    for name in others:
-        if config[name] != default[name]:
-            raise NerfroError(f"{name}={config[name]} has no effect with {task}=...; remove it")
+    refuse_unused(config, EvaluateConfig, others, f"with {task}=...")
 
 
 @contextmanager

@@ -67,10 +67,11 @@ def segment(config: DictConfig, options: list[str], root: Path) -> None:
 def preprocess(config: DictConfig, options: list[str], root: Path, folder: Path) -> Path:
     """Reconstruct surface and index in a folder, and return the scene file."""
     inputs = [*root.glob("transforms*.json"), *(file for place in _MASKS for file in root.glob(place))]
-    automatic = [*as_overrides({"out": folder}), "refine=true", "wrong_masks=null", "symmetry=auto", "overwrite=true"]
+    given = shlex.split(config.preprocess)
+    automatic = [*as_overrides({"out": folder}), "refine=true", "wrong_masks=null", "overwrite=true"]
+    automatic += [] if is_given("mesh", given) else ["symmetry=auto"]
     if "wall" not in config.medium and "shell_voxels" in config.medium and config.medium.get("bodies") is None:
         automatic.append("vessel=true")
-    given = shlex.split(config.preprocess)
     options = [*options, *not_given(automatic, given), *given]
     old = (folder / OLD_SCENE).is_file() and not (folder / SCENE).is_file()  # written by an earlier release
     scene = folder / (OLD_SCENE if old else SCENE)

@@ -48,11 +48,13 @@ class Export:
         suffixes: allowed endings of the file.
         write: writes the file and returns a short description of the content.
         companions: endings of further files; `_sky.hdr` stands for `scene_sky.hdr` beside `scene.xml`.
+        unused: options of `ExportConfig` without effect on the file.
     """
 
     suffixes: tuple[str, ...]
     write: Callable[[TrainedScene, Path, DictConfig], str]
     companions: tuple[str, ...] = ()
+    unused: tuple[str, ...] = ()
 
     def files(self, out: Path) -> list[Path]:
         """Return all files that `write` may write."""

@@ -161,4 +161,4 @@ def _write(scene: TrainedScene, out: Path, config: DictConfig) -> str:
     return f"an interactive page of {len(page) / 1e6:.1f} MB"
 
 
-EXPORT = Export((".html",), _write)
+EXPORT = Export((".html",), _write, unused=("half_depth",))

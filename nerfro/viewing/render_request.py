@@ -15,7 +15,7 @@ from jaxtyping import Float
 from omegaconf import MISSING, DictConfig, ListConfig
 from torch import Tensor
 
-from nerfro.allowed import Count, Positive, Range
+from nerfro.allowed import Count, Positive, Range, refuse_unused
 from nerfro.cameras import Cameras
 from nerfro.data.lenses import Lens, check_lenses
 from nerfro.errors import NerfroError
@@ -28,6 +28,7 @@ from nerfro.viewing.camera_paths import PATHS, CaptureGeometry, OrbitPosition, p
 from nerfro.viewing.trained_scene import TrainedScene
 
 Angle = Annotated[float, Range(more_than=0, less_than=180)]
+_OF_PATHS = ("frames", "azimuth", "elevation", "distance")  # options of paths around the object
 FilmFormat = Annotated[str, Literal["mp4", "gif"]]
 
 
@@ -95,6 +96,12 @@ def check_request(config: DictConfig) -> None:
     if config.path is not None and config.path not in PATHS and not config.path.endswith(".json"):
         raise NerfroError(f"path={config.path} is not known; give {', '.join(PATHS)}, or a FILE.json of cameras")
     _size(config, 1, 1)
+    if config.path not in PATHS:
+        refuse_unused(config, RenderConfig, _OF_PATHS, f"without path={' or '.join(PATHS)}")
+    if config.path is None:
+        refuse_unused(config, RenderConfig, ("seconds", "film"), "on still images")
+    elif config.format == "exr":
+        refuse_unused(config, RenderConfig, ("seconds", "film"), "with format=exr, of which no film is made")
 
 
 def prepared(config: DictConfig, scene: TrainedScene) -> TrainedScene:

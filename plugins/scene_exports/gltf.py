@@ -91,4 +91,4 @@ def _glass_material(
     return {"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.0}, "extensions": extensions}
 
 
-EXPORT = Export((".glb",), write_mesh)
+EXPORT = Export((".glb",), write_mesh, unused=("sky",))

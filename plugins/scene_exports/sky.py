@@ -18,4 +18,4 @@ def write_sky(scene: TrainedScene, out: Path, config: DictConfig) -> str:
     return f"the sky: {sky.shape[1]}x{sky.shape[0]} pixels, lat-long, z up"
 
 
-EXPORT = Export((".hdr", ".exr", ".png"), write_sky)
+EXPORT = Export((".hdr", ".exr", ".png"), write_sky, unused=("half_depth",))

@@ -19,4 +19,4 @@ def write_volume(scene: TrainedScene, out: Path, config: DictConfig) -> str:
     return f"the inside: {'x'.join(map(str, volume.density.shape))} vertices with density and linear rgb"
 
 
-EXPORT = Export((".npz",), write_volume)
+EXPORT = Export((".npz",), write_volume, unused=("half_depth", "sky"))

@@ -23,9 +23,9 @@ from nerfro.light import to_linear, to_srgb
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.subdivision import Subdivision
 from nerfro.viewing.changes import with_changed_scene
-from nerfro.viewing.exports import ExportConfig, find_export
+from nerfro.viewing.exports import ExportConfig, export_of, find_export
 from nerfro.viewing.trained_scene import TrainedScene
-from tests.conftest import refused
+from tests.conftest import Runner, refused
 from tests.viewing.conftest import INSIDE_CENTRE, INSIDE_RADIUS, IOR, RADIUS, colour, sky_of
 
 CELL = 2.12 * RADIUS / 47  # of the box with its margin of air
@@ -251,3 +251,15 @@ def test_mitsuba_renders_the_same_image(
 def test_unknown_exports_and_endings_are_refused(what: str, name: str, message: str) -> None:
     with pytest.raises(NerfroError, match=message):
         find_export(what, Path(name))
+
+
+@pytest.mark.parametrize(
+    ("what", "option"),
+    [("page", "half_depth=1"), ("sky", "half_depth=1"), ("volume", "sky=a.hdr"), ("mesh", "sky=a.hdr")],
+)
+def test_option_without_effect_on_an_export_is_refused(
+    what: str, option: str, run_here: Runner, tmp_path: Path
+) -> None:
+    out = tmp_path / f"file{export_of(what).suffixes[0]}"
+    exported = run_here("export", "checkpoint=none", f"what={what}", f"out={out}", option, code=1)
+    assert f"has no effect with what={what}; remove it" in exported.error
