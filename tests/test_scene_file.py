@@ -81,11 +81,12 @@ def test_bodies_with_materials_keep_their_names(tmp_path: Path) -> None:
     assert short["medium.inner_meshes"] == [str(tmp_path / "c.ply")]
     assert (short["medium.ior"], short["medium.inner_iors"]) == (1.5, [1.33])
     bodies["water"] = {"mesh": "c.ply", "material": "water", "learn": ["absorption"]}
+    bodies["glass"]["learn"] = []  # nothing, whatever `medium.learn_ior` is
     offset = {"name": "offset", "surface": {"name": "mesh", "file": "d.ply"}, "distance": -0.5}
     bodies["air"] = {"surface": offset, "ior": 1.0}
     file = write(tmp_path / "scene.json", data=DATA, bodies=bodies)
     assert settings(f"scene={file}")["medium.bodies"] == {
-        "glass": {"mesh": str(tmp_path / "a b.ply"), "ior": 1.5},
+        "glass": {"mesh": str(tmp_path / "a b.ply"), "ior": 1.5, "learn": []},
         "water": {"mesh": str(tmp_path / "c.ply"), "material": "water", "learn": ["absorption"]},
         "air": {"surface": offset | {"surface": {"name": "mesh", "file": str(tmp_path / "d.ply")}}, "ior": 1.0},
     }

@@ -35,8 +35,8 @@ class BodySettings:
         abbe: Abbe number; without one, the index of a body with `ior` is the same for all colours.
         absorption: coefficients of red, green and blue per world unit, or one for all.
         priority: where bodies overlap, the one with the highest priority decides; of equal ones the last.
-        learn: quantities that are learned in training: `ior`, `absorption`; by default those of `medium.learn_ior` and
-            `medium.learn_absorption`.
+        learn: quantities that are learned in training: `ior`, `absorption`; an empty list for none. By default those of
+            `medium.learn_ior` and `medium.learn_absorption`.
     """
 
     mesh: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
@@ -46,7 +46,7 @@ class BodySettings:
     abbe: Optional[Positive] = None  # noqa: UP045
     absorption: list[float] = dataclasses.field(default_factory=list)
     priority: int = 0
-    learn: list[str] = dataclasses.field(default_factory=list)
+    learn: Optional[list[str]] = None  # noqa: UP045
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ def _settings(name: str, given: Any) -> BodySettings:
     check(f"{where}.", hints | {"absorption": Sequence[NotNegative]}, vars(settings))
     if len(settings.absorption) not in (0, 1, 3):
         raise NerfroError(f"{where}.absorption={settings.absorption} is not allowed; give red, green and blue, or one")
-    unknown = [quantity for quantity in settings.learn if quantity not in _LEARNED]
+    unknown = [quantity for quantity in settings.learn or [] if quantity not in _LEARNED]
     if unknown:
         raise NerfroError(f"{where}.learn={settings.learn} is not allowed; choose {' and '.join(_LEARNED)}")
     return settings
@@ -157,7 +157,7 @@ def _surface(name: str, given: BodySettings, mesh: str | None) -> Mapping[str, A
 def _material(name: str, given: BodySettings, learn: Sequence[str]) -> Material:
     if (given.ior is None) == (given.material is None):
         raise NerfroError(f"bodies.{name} needs one of ior and material; write ior: 1.5, or material: water")
-    learn = given.learn or learn
+    learn = learn if given.learn is None else given.learn
     absorption = given.absorption * 3 if len(given.absorption) == 1 else given.absorption or [0.0] * 3
     if given.material is None:
         dispersion = None if given.abbe is None else Abbe(given.abbe)

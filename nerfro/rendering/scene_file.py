@@ -255,4 +255,5 @@ def with_scene(arguments: Sequence[str], names: Collection[str]) -> list[str]:
 
 def _given(body: BodySettings | Provenance) -> dict[str, object]:
     """Return the settings with other values than the defaults, for JSON."""
-    return {name: value for name, value in dataclasses.asdict(body).items() if value not in (None, [], {}, 0, "")}
+    defaults = dataclasses.asdict(type(body)())
+    return {name: value for name, value in dataclasses.asdict(body).items() if value != defaults[name]}

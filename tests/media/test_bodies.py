@@ -159,6 +159,13 @@ def test_index_and_absorption_of_two_bodies_are_learned_together(tmp_path: Path)
     assert colours == pytest.approx(sigma.tolist(), abs=5e-3)
 
 
+def test_empty_list_of_learned_quantities_keeps_a_body_constant(tmp_path: Path) -> None:
+    files = [_ball(tmp_path, centre) for centre in CENTRES]
+    bodies = {"glass": {"mesh": files[0], "ior": 1.45}, "water": {"mesh": files[1], "ior": 1.33, "learn": []}}
+    medium = SdfGrid(bodies=bodies, learn_ior=True, resolution=16, cache=False)
+    assert list(medium.parameters_by_name()) == ["bodies.glass.material.ior"]
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
