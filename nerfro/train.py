@@ -61,7 +61,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetr
     metrics = prepared_metrics()
     module, datamodule = build_training(config, source, training)
     renderer = module.renderer
-    require_same_run(folder, checkpoint, config, module.parameter_groups())
+    require_same_run(folder, checkpoint, config, module.parameter_groups(), training.cameras)
     throughput, interruption = Throughput(), StopOnSignal()
     trainer = make_trainer(config, folder, throughput, [interruption, Viewer(config, source, test)])
     device = trainer.strategy.root_device

@@ -108,7 +108,8 @@ def build_training(config: DictConfig, source: DataSource, training: Views) -> t
     data = RayDataModule(
         traced(batches, renderer, config), validation, config.evaluation.every, config.trainer.overfit_batches
     )
-    return TrainingModule.of(renderer, config, [Schedule(build_each("phase", config.phase), training)]), data
+    schedule = Schedule(build_each("phase", config.phase), training)
+    return TrainingModule.of(renderer, config, [schedule], training.cameras), data
 
 
 def check_before_training(renderer: Renderer, batches: RayBatches, device: torch.device) -> str:

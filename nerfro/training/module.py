@@ -13,12 +13,14 @@ from lightning.pytorch.callbacks import Timer
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor, nn
 
+from nerfro.cameras import Cameras
 from nerfro.errors import NerfroError
 from nerfro.losses.base import Loss
 from nerfro.paths import user_path
 from nerfro.registry import discover
 from nerfro.rendering import Renderer, Scene
 from nerfro.training.config import build_each
+from nerfro.training.inputs import INPUTS, inputs_of
 from nerfro.training.optimizer import OptimizerConfig, learning_rate_factor
 from nerfro.training.run_folder import load_checkpoint, restore
 from nerfro.types import Batch
@@ -33,6 +35,7 @@ class TrainingModule(LightningModule):
         optimizer: settings of Adam and of the learning rate schedule.
         callbacks: callbacks that are a part of the method; every Trainer adds them to its own.
         configuration: resolved configuration of the run (YAML), which every checkpoint contains.
+        inputs: description of the inputs of the run, which every checkpoint contains, see `training.inputs`.
     """
 
     def __init__(
@@ -42,20 +45,28 @@ class TrainingModule(LightningModule):
         optimizer: OptimizerConfig,
         callbacks: Sequence[Callback] = (),
         configuration: str | None = None,
+        inputs: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__()
-        self._callbacks, self._configuration = list(callbacks), configuration
+        self._callbacks, self._configuration, self._inputs = list(callbacks), configuration, inputs
         self.renderer = renderer
         self.losses = nn.ModuleDict(dict(losses))
         self.optimizer_config = optimizer
         self._is_logged_step = True
 
     @classmethod
-    def of(cls, renderer: Renderer, config: DictConfig, callbacks: Sequence[Callback] = ()) -> TrainingModule:
-        """Create the module from a configuration."""
+    def of(
+        cls,
+        renderer: Renderer,
+        config: DictConfig,
+        callbacks: Sequence[Callback] = (),
+        cameras: Cameras | None = None,
+    ) -> TrainingModule:
+        """Create the module from a configuration, and the cameras of the training views if they are known."""
         configuration = OmegaConf.to_yaml(config, resolve=True)
         optimizer = cast(OptimizerConfig, OmegaConf.to_object(config.optimizer))
-        return cls(renderer, build_each("loss", config.loss), optimizer, callbacks, configuration)
+        inputs = inputs_of(config, cameras)
+        return cls(renderer, build_each("loss", config.loss), optimizer, callbacks, configuration, inputs)
 
     @classmethod
     def load_from_checkpoint(  # type: ignore[override]
@@ -82,6 +93,8 @@ class TrainingModule(LightningModule):
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         if self._configuration is not None:
             checkpoint["nerfro_config"] = self._configuration
+        if self._inputs is not None:
+            checkpoint[INPUTS] = self._inputs
 
     @property
     def scene(self) -> Scene:

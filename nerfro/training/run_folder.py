@@ -18,7 +18,8 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor, nn
 
-from nerfro.errors import Interrupted, NerfroError, first_of
+from nerfro.cameras import Cameras
+from nerfro.errors import Interrupted, NerfroError, first_of, warn
 from nerfro.files.atomic import require_room, write_atomically
 from nerfro.files.folder_lock import lock_folder, require_only
 from nerfro.files.foreign_config import foreign_config, read_foreign_config
@@ -29,6 +30,7 @@ from nerfro.provenance import command_line, versions
 from nerfro.rendering import Renderer
 from nerfro.training import backdrop, content
 from nerfro.training.config import build_model, check_trained, training_device
+from nerfro.training.inputs import changed_file, require_same_inputs
 from nerfro.training.settings import RESUMING, first_difference, settings
 
 LAST_CHECKPOINT = Path("checkpoints", "last.ckpt")
@@ -209,6 +211,9 @@ def restore(checkpoint: dict, config: DictConfig) -> Renderer:
     prefix = "renderer."
     weights = {n.removeprefix(prefix): w for n, w in checkpoint["state_dict"].items() if n.startswith(prefix)}
     renderer = build_model(config)
+    changed = changed_file(checkpoint, config) if renderer.path_sampler.needs_medium else None
+    if changed is not None:
+        warn(f"the content of the file {changed} has changed since the training, so rays now meet another surface")
     try:
         renderer.load_state_dict(weights)
     except RuntimeError as error:
@@ -220,7 +225,11 @@ def restore(checkpoint: dict, config: DictConfig) -> Renderer:
 
 
 def require_same_run(
-    folder: Path, checkpoint: Path | None, config: DictConfig, groups: Mapping[str, list[nn.Parameter]]
+    folder: Path,
+    checkpoint: Path | None,
+    config: DictConfig,
+    groups: Mapping[str, list[nn.Parameter]],
+    cameras: Cameras,
 ) -> None:
     """Refuse to resume from an unsuitable checkpoint, or in the folder of another run.
 
@@ -229,11 +238,13 @@ def require_same_run(
         checkpoint: checkpoint to resume from, if there is one.
         config: configuration of the run.
         groups: parameters by optimizer group.
+        cameras: cameras of the training views.
     """
     begun = folder / CONFIG_FILE
     if checkpoint is not None:
         content, trained = load_checkpoint(checkpoint)
         require_same_configuration(checkpoint, trained, config)
+        require_same_inputs(content, checkpoint, config, cameras)
         require_optimizer_fits(content, groups, checkpoint)
         done, most = content["global_step"], config.trainer.max_steps
         if 0 <= most < done:

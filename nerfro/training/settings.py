@@ -70,9 +70,7 @@ def role(name: str) -> Role:
 
 def settings(config: DictConfig | Mapping[str, Any], roles: frozenset[Role]) -> dict[str, Any]:
     """Return the settings of some roles by full name: `{"field": {"width": 64}}` becomes `{"field.width": 64}`."""
-    if isinstance(config, DictConfig):
-        config = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
-    return {name: value for name, value in _flat(config, "").items() if role(name) in roles}
+    return {name: value for name, value in flat(config, "").items() if role(name) in roles}
 
 
 def first_difference(old: Mapping[str, Any], new: Mapping[str, Any]) -> str | None:
@@ -80,8 +78,11 @@ def first_difference(old: Mapping[str, Any], new: Mapping[str, Any]) -> str | No
     return next((name for name in sorted(old.keys() | new.keys()) if old.get(name) != new.get(name)), None)
 
 
-def _flat(node: Any, prefix: str) -> dict[str, Any]:
+def flat(node: Any, prefix: str) -> dict[str, Any]:
+    """Return all settings of a node by full name; `prefix` is the name of the node."""
+    if isinstance(node, DictConfig):
+        node = OmegaConf.to_container(node, resolve=True)
     if not isinstance(node, Mapping):
         return {prefix: node}
-    children = (_flat(child, f"{prefix}.{name}" if prefix else str(name)) for name, child in node.items())
+    children = (flat(child, f"{prefix}.{name}" if prefix else str(name)) for name, child in node.items())
     return {name: value for child in children for name, value in child.items()}

@@ -23,6 +23,7 @@ from nerfro.files.folder_lock import lock_folder
 from nerfro.files.reading import read_json
 from nerfro.old_names import MOVED_CLASSES
 from nerfro.paths import resolve_path, scene_name
+from nerfro.training.inputs import file_hashes
 from nerfro.training.run_folder import CELL_FILE, CONFIG_FILE, in_sweep
 from nerfro.training.settings import RESULT, first_difference, settings
 
@@ -35,8 +36,9 @@ OmegaConf.register_new_resolver("scene_name", scene_name, replace=True)
 
 
 def identity_of(config: DictConfig) -> dict[str, Any]:
-    """Return the settings that determine the result of a run, and a hash of the data files."""
-    return {"settings": settings(config, RESULT), "data": _hash_of_files(resolve_path(config.data.root))}
+    """Return the settings that determine the result of a run, and hashes of the files of data set and medium."""
+    data = _hash_of_files(resolve_path(config.data.root))
+    return {"settings": settings(config, RESULT), "data": data, "files": file_hashes(config)}
 
 
 def run_cell(config: DictConfig, folder: Path, train: Callable[[], RunMetrics | None]) -> RunMetrics | None:
@@ -84,11 +86,15 @@ def _require_same_cell(folder: Path, identity: Mapping[str, Any]) -> None:
         recorded = {key: MOVED_CLASSES.get(str(value), value) for key, value in record["settings"].items()}
         old, new = settings(recorded, RESULT), identity["settings"]
         same_data = record["data"] == identity["data"]
+        # Cells of earlier releases lack the hashes of the files of the medium.
+        changed = first_difference(record.get("files", identity["files"]), identity["files"])
     except (NerfroError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise NerfroError(f"{folder / CELL_FILE} is damaged; {advice}") from error
     key = first_difference(old, new)
     if key is not None:
         raise NerfroError(f"{folder} holds a run with {key}={old.get(key)}, not {new.get(key)}; {advice}")
+    if changed is not None:
+        raise NerfroError(f"{folder} holds a run with another content of the file {changed}; {advice}")
     if not same_data:
         raise NerfroError(f"{folder} holds a run with other files in its data folder; {advice}")
 
