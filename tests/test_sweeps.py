@@ -179,6 +179,17 @@ def test_recalibrated_data_are_different_data(name: str, tmp_path: Path) -> None
     assert identity() != before
 
 
+def test_results_of_a_sweep_inside_the_data_folder_are_no_data(tmp_path: Path) -> None:
+    config = composed(f"data.root={tmp_path}")
+    (tmp_path / "transforms.json").write_bytes(b"data")
+    (tmp_path / "sweep").mkdir()
+    before = identity_of(config, tmp_path / "sweep")
+    assert before == identity_of(config, tmp_path) == identity_of(config, tmp_path.parent / "sweep")
+    (tmp_path / "sweep" / "multirun.yaml").write_bytes(b"result")
+    assert identity_of(config, tmp_path / "sweep") == before
+    assert identity_of(config, tmp_path.parent / "sweep") != before
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
 def test_stopped_sweep_is_resumed(

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from nerfro.data.image_files import IMAGE_SUFFIXES
@@ -35,9 +37,14 @@ _MAX_HASHED = 64 * 2**20  # bytes
 OmegaConf.register_new_resolver("scene_name", scene_name, replace=True)
 
 
-def identity_of(config: DictConfig) -> dict[str, Any]:
-    """Return the settings that determine the result of a run, and hashes of the files of data set and medium."""
-    data = _hash_of_files(resolve_path(config.data.root))
+def identity_of(config: DictConfig, sweep: Path | None = None) -> dict[str, Any]:
+    """Return the settings that determine the result of a run, and hashes of the files of data set and medium.
+
+    Args:
+        config: configuration of the run.
+        sweep: folder of the sweep, which is no part of the data set around it.
+    """
+    data = _hash_of_files(resolve_path(config.data.root), sweep)
     return {"settings": settings(config, RESULT), "data": data, "files": file_hashes(config)}
 
 
@@ -56,7 +63,7 @@ def run_cell(config: DictConfig, folder: Path, train: Callable[[], RunMetrics | 
     """
     if not in_sweep():
         return train()
-    identity = identity_of(config)
+    identity = identity_of(config, Path(HydraConfig.get().sweep.dir))
     with lock_folder(folder, "hydra.sweep.dir"):
         if (folder / CONFIG_FILE).is_file():
             _require_same_cell(folder, identity)
@@ -99,10 +106,10 @@ def _require_same_cell(folder: Path, identity: Mapping[str, Any]) -> None:
         raise NerfroError(f"{folder} holds a run with other files in its data folder; {advice}")
 
 
-def _hash_of_files(root: Path) -> str:
+def _hash_of_files(root: Path, sweep: Path | None) -> str:
     """Hash the names and sizes of all files below a folder, and the content of files other than images."""
     digest = hashlib.sha256()
-    for file in sorted(_visible_files(root)):
+    for file in sorted(_visible_files(root, sweep)):
         num_bytes = file.stat().st_size
         digest.update(f"{file.relative_to(root).as_posix()}:{num_bytes};".encode())
         if file.suffix.lower() not in IMAGE_SUFFIXES and num_bytes <= _MAX_HASHED:
@@ -110,5 +117,8 @@ def _hash_of_files(root: Path) -> str:
     return digest.hexdigest()[:16]
 
 
-def _visible_files(root: Path) -> Iterator[Path]:
-    return (path for path in root.rglob("*") if path.is_file() and not path.name.startswith("."))
+def _visible_files(root: Path, sweep: Path | None) -> Iterator[Path]:
+    inner = None if sweep is None else os.path.relpath(sweep.resolve(), root.resolve())
+    omitted = root if inner in (None, ".") else root / inner
+    files = (path for path in root.rglob("*") if path.is_file() and not path.name.startswith("."))
+    return (path for path in files if omitted == root or not path.is_relative_to(omitted))
