@@ -124,6 +124,16 @@ def test_resuming_a_finished_run_with_more_steps_trains_the_rest(
     assert checkpoint["callbacks"]["Throughput"]["num_rays"] >= 5 * 32
 
 
+def test_scores_of_fewer_steps_are_removed_when_a_finished_run_is_resumed(
+    train: Runner, trained_run: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(trained_run, tmp_path / "run")
+    shutil.copytree(trained_run, tmp_path / "run" / "evaluate_test")
+    assert list((tmp_path / "run").glob("metrics.*"))
+    train("evaluation.every=0", "evaluation.split=null", "trainer.max_steps=3", "ckpt_path=last")
+    assert not list((tmp_path / "run").rglob("metrics.json")), "a table would show them beside the new budget"
+
+
 def test_resuming_with_fewer_steps_than_the_checkpoint_has_is_refused(
     train: Runner, trained_run: Path, tmp_path: Path
 ) -> None:
