@@ -61,9 +61,9 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetr
     metrics = prepared_metrics()
     module, datamodule = build_training(config, source, training)
     renderer = module.renderer
-    require_same_run(folder, checkpoint, config, module.parameter_groups(), training.cameras)
+    num_steps = require_same_run(folder, checkpoint, config, module.parameter_groups(), training.cameras)
     throughput, interruption = Throughput(), StopOnSignal()
-    trainer = make_trainer(config, folder, throughput, [interruption, Viewer(config, source, test)])
+    trainer = make_trainer(config, folder, throughput, [interruption, Viewer(config, source, test)], num_steps)
     device = trainer.strategy.root_device
     require_match(renderer.scene.medium, training)
     # These batches are not kept, because the data module moves the pixels to the training device.

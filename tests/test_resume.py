@@ -134,6 +134,22 @@ def test_scores_of_fewer_steps_are_removed_when_a_finished_run_is_resumed(
     assert not list((tmp_path / "run").rglob("metrics.json")), "a table would show them beside the new budget"
 
 
+def test_log_of_a_resumed_run_has_each_step_once(train: Runner, trained_run: Path, tmp_path: Path) -> None:
+    shutil.copytree(trained_run, tmp_path / "run")
+    log = tmp_path / "run" / "csv" / "metrics.csv"
+    rows = log_rows(log)
+    lost = [rows[0] | {"step": str(step)} for step in (2, 3)]  # of a process that was killed after its checkpoint
+    with log.open("w", newline="") as stream:
+        writer = csv.DictWriter(stream, sorted({name for row in rows for name in row}))
+        writer.writeheader()
+        writer.writerows([*rows, *lost])
+    options = ["evaluation.every=0", "trainer.max_steps=5", "ckpt_path=last"]
+    train(*options, "logger=tensorboard", "trainer.log_every_n_steps=1")
+    trained = [row["step"] for row in log_rows(log) if "loss/total" in row]
+    assert trained == sorted(set(trained), key=int)
+    assert set(trained) >= {"2", "3", "4"}
+
+
 def test_resuming_with_fewer_steps_than_the_checkpoint_has_is_refused(
     train: Runner, trained_run: Path, tmp_path: Path
 ) -> None:

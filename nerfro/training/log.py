@@ -40,12 +40,18 @@ _LAYOUT = {
 }
 
 
-def keep_rows(logger: CSVLogger) -> None:
-    """Keep the rows of a run that is resumed; a new log of Lightning begins by deleting them."""
+def keep_rows(logger: CSVLogger, num_steps: int) -> None:
+    """Keep the rows of a run that is resumed; a new log of Lightning begins by deleting them.
+
+    Args:
+        logger: the new log.
+        num_steps: number of steps of the checkpoint. Rows of later steps are dropped, because the run repeats them.
+    """
     file = Path(logger.log_dir, "metrics.csv")
     if file.is_file():
         with reading(file, advice="remove it"), file.open(newline="", encoding="utf-8") as stream:
-            rows = list(csv.DictReader(stream))
+            # The row of training step n, counted from 0, and that of the scores after n steps have the same number.
+            rows = [row for row in csv.DictReader(stream) if int(row["step"]) < num_steps + (not row.get("loss/total"))]
         logger.experiment.metrics += [{name: value for name, value in row.items() if value} for row in rows]
         logger.save()
 

@@ -232,7 +232,7 @@ def require_same_run(
     config: DictConfig,
     groups: Mapping[str, list[nn.Parameter]],
     cameras: Cameras,
-) -> None:
+) -> int:
     """Refuse to resume from an unsuitable checkpoint, or in the folder of another run.
 
     Args:
@@ -241,6 +241,9 @@ def require_same_run(
         config: configuration of the run.
         groups: parameters by optimizer group.
         cameras: cameras of the training views.
+
+    Returns:
+        Number of steps of the checkpoint; 0 for a run that starts from the beginning.
     """
     begun = folder / CONFIG_FILE
     if checkpoint is not None:
@@ -251,8 +254,10 @@ def require_same_run(
         done, most = content["global_step"], config.trainer.max_steps
         if 0 <= most < done:
             raise NerfroError(f"{checkpoint} has {done} steps, and trainer.max_steps={most}; give at least {done}")
-    elif config.ckpt_path is not None:
+        return done
+    if config.ckpt_path is not None:
         require_same_configuration(begun, read_foreign_config(begun), config)
+    return 0
 
 
 def require_same_configuration(path: Path, trained: DictConfig, wanted: DictConfig) -> None:

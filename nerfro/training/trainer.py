@@ -38,8 +38,18 @@ _LOST_CONNECTION = re.compile("gloo|NCCL|[Cc]onnection (closed|reset)")  # in er
 _PROFILERS = {"simple": SimpleProfiler, "advanced": AdvancedProfiler, "pytorch": PyTorchProfiler}
 
 
-def make_trainer(config: DictConfig, folder: Path, throughput: Throughput, extra: list[Callback]) -> pl.Trainer:
-    """Create the Trainer of a run with its callbacks and loggers."""
+def make_trainer(
+    config: DictConfig, folder: Path, throughput: Throughput, extra: list[Callback], num_steps: int = 0
+) -> pl.Trainer:
+    """Create the Trainer of a run with its callbacks and loggers.
+
+    Args:
+        config: configuration of the run, see `TrainConfig`.
+        folder: folder of the run.
+        throughput: counter of rays and seconds.
+        extra: further callbacks.
+        num_steps: number of steps of the checkpoint from which the run resumes.
+    """
     seconds, every = config.checkpoint.every_seconds, config.evaluation.every
     checkpoints = Checkpoints(
         dirpath=folder / LAST_CHECKPOINT.parent,
@@ -82,7 +92,7 @@ def make_trainer(config: DictConfig, folder: Path, throughput: Throughput, extra
     trainer = build(given | {"accelerator": accelerator}, **ours)
     for logger in trainer.loggers:
         if isinstance(logger, CSVLogger) and trainer.is_global_zero:
-            keep_rows(logger)
+            keep_rows(logger, num_steps)
     trainer.callbacks = [_shared(callback) for callback in trainer.callbacks]
     if trainer.world_size > 1 and in_sweep():
         raise NerfroError("a sweep (-m) cannot use several devices; start its runs one by one")
