@@ -63,6 +63,10 @@ class Throughput(Callback):
         self.num_rays += len(batch.rays) * trainer.world_size
         pl_module.log("train/rays_per_second", self.num_rays / self.seconds)
 
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if self._last is not None:  # a run that is interrupted in a phase has no step that counts its time
+            self.seconds, self._last = self.seconds + time.perf_counter() - self._last, None
+
     def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._last = None
 

@@ -1,6 +1,7 @@
 """Phases take their steps before and between training steps, and continue after an interruption."""
 
 import copy
+import time
 from collections.abc import Sequence
 from typing import Any
 from unittest.mock import Mock
@@ -15,7 +16,7 @@ from torch.optim import Adam
 from nerfro.data.base import Views
 from nerfro.errors import NerfroError
 from nerfro.rendering import Renderer
-from nerfro.training.callbacks import steps_by_phase
+from nerfro.training.callbacks import Throughput, steps_by_phase
 from nerfro.training.phases.base import Phase, TrainingRun
 from nerfro.training.ray_batches import RayBatches
 from nerfro.training.schedule import Schedule
@@ -50,6 +51,14 @@ def steps(schedule: Schedule, first: int, last: int, callbacks: Sequence[Callbac
     for trainer.global_step in range(first, last):
         schedule.on_train_batch_start(trainer, module, None, 0)
     return copy.deepcopy(schedule.state_dict())
+
+
+def test_seconds_of_a_run_that_is_interrupted_in_a_phase_are_counted() -> None:
+    throughput, trainer, module = Throughput(), Mock(spec=Trainer), Mock(spec=LightningModule)
+    throughput.on_train_start(trainer, module)
+    time.sleep(0.05)
+    throughput.on_train_end(trainer, module)
+    assert throughput.state_dict()["seconds"] >= 0.05
 
 
 def test_step_without_a_result_is_refused() -> None:
