@@ -26,7 +26,6 @@ from nerfro.cli import entry_point
 from nerfro.data.base import Views
 from nerfro.data.masks import EVIDENCE, REVOLUTION, masked_views, method_of, with_other_splits
 from nerfro.errors import warn
-from nerfro.files.atomic import refuse_existing
 from nerfro.files.folder_lock import lock_folder
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.media.sdf_grid import SdfGrid
@@ -50,7 +49,7 @@ def main(config: DictConfig) -> None:
 
 def _preprocess(config: DictConfig, request: Request) -> None:
     source, mesh = request.read()
-    refuse_existing(request.files, config.overwrite)
+    request.clear_files()
     views, silhouettes = masked_views(source.load("train")), None
     outlined = with_other_splits(views, source, "train")
     if mesh is None or outlined.masks is not None:

@@ -120,11 +120,14 @@ def test_vessel_is_fitted_on_request(preprocess: Callable[..., str], capture: Pa
 
 
 def test_existing_files_are_not_overwritten(preprocess: Callable[..., str], capture: Path) -> None:
-    (capture / "mesh.ply").write_text("mine")
+    for name in ("mesh.ply", "index.json", "refinement.json"):
+        (capture / name).write_text("mine")
     assert "mesh.ply exists; give another out=... or overwrite=true" in preprocess()
     assert (capture / "mesh.ply").read_text() == "mine"
     assert "train on it" in preprocess("overwrite=true", "smoothing=0")
     assert load_mesh(capture / "mesh.ply").is_closed
+    assert not (capture / "index.json").exists(), "the earlier run searched the index, and this one did not"
+    assert not (capture / "refinement.json").exists()
 
 
 def test_supplied_mesh_is_compared_and_kept(preprocess: Callable[..., str], capture: Path, tmp_path: Path) -> None:

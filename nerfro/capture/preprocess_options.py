@@ -18,6 +18,7 @@ from nerfro.cameras import Cameras
 from nerfro.data.base import DataSource
 from nerfro.data.frames import require_root
 from nerfro.errors import NerfroError
+from nerfro.files.atomic import refuse_existing
 from nerfro.geometry.mesh import TriangleMesh, load_mesh, local_origin, num_decimals
 from nerfro.media.base import Medium
 from nerfro.media.bodies import ordered_settings
@@ -117,6 +118,16 @@ class Request:
         names += [INDEX] if self.searches_index else []
         names += [FIGURES] if config.refine else []
         return [self.folder / name for name in [*names, SCENE]]
+
+    def clear_files(self) -> None:
+        """Refuse existing files, or with `overwrite` remove those of an earlier run that this one may not write.
+
+        Raises:
+            NerfroError: a file exists, and `overwrite` is false.
+        """
+        refuse_existing(self.files, self.config.overwrite)
+        for name in (INDEX, FIGURES) if self.config.overwrite else ():
+            (self.folder / name).unlink(missing_ok=True)
 
     def check(self) -> None:
         """Check the options and the output folder.
