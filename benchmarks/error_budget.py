@@ -58,9 +58,9 @@ def classify(model: Renderer, cameras: Cameras, view: int, opacity: Tensor, edge
     parted, refracted = [], []
     for pixels in torch.arange(view * size, (view + 1) * size).split(model.chunk_size):
         own, beside = (model.trace(rays(cameras, pixels)) for rays in (pixel_rays, neighbour_rays))
-        leaving = [path.first_of_ray(path.exit_directions) for path in (own, beside)]
+        leaving = [path.main_polyline(path.exit_directions) for path in (own, beside)]
         parted.append(divergence(cameras, pixels, *leaving) >= edge)
-        refracted.append(own.first_of_ray(own.refracted))
+        refracted.append(own.main_polyline(own.refracted))
     order = (~torch.cat(refracted) & ~torch.cat(parted), opacity >= 0.5, torch.cat(parted))
     result = torch.full_like(opacity, len(order), dtype=torch.int64)
     for index in reversed(range(len(order))):

@@ -114,7 +114,7 @@ def picture(sampler: Snell, medium: SdfGrid, side: int, parts: int = 3) -> np.nd
         light = lat_long.sample(radiance_of_sky, path.exit_directions, width=4096)
         if path.absorbs:
             light = light * path.transmitted(path.far[:, None])[:, 0]
-        radiance.append(path.per_ray(light).view(-1, parts**2, 3).mean(1))
+        radiance.append(path.sum_polylines(light).view(-1, parts**2, 3).mean(1))
     return to_srgb(torch.cat(radiance)).clamp(0, 1).view(cameras.height, cameras.width, 3).numpy()
 
 

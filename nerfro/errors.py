@@ -76,9 +76,9 @@ def accept_old_methods(cls: type, names: Mapping[str, str]) -> None:
 
 
 def _under_old_name(method: Callable[..., Any], old: str, new: str) -> Callable[..., Any]:
-    def renamed(self: Any, *args: Any) -> Any:
+    def renamed(self: Any, *args: Any, **named: Any) -> Any:
         warn_of_old_name(old, new)
-        return method(self, *args)
+        return method(self, *args, **named)
 
     return renamed
 

@@ -111,14 +111,14 @@ def subdivide(
     angle = divergence(cameras, pixels, exits, neighbours)
     divided = angle >= subdivision.divergence
     if contrasts is not None and subdivision.contrast is not None:
-        rows = (path.first_of_ray(path.refracted) & ~divided).nonzero()[:, 0]
+        rows = (path.main_polyline(path.refracted) & ~divided).nonzero()[:, 0]
         divided = divided.index_put((rows,), contrasts(rows) >= subdivision.contrast)
     whole, parted = (~divided).nonzero()[:, 0], divided.nonzero()[:, 0]
     parts, pixel = part_rays(cameras, pixels[parted], subdivision.side), parted.repeat_interleave(num_parts)
     part = torch.arange(num_parts, device=pixels.device).repeat(len(parted))
     return PixelRays(
         rays=Rays.joined([rays[whole], parts]),
-        path=Path.joined([path.of_rays(whole), trace(parts, view[pixel])]),
+        path=Path.joined([path.select_rays(whole), trace(parts, view[pixel])]),
         ray_pixel=torch.cat([whole, pixel]),
         part=torch.cat([torch.zeros_like(whole), part]),
         diverges=angle >= DIVERGENT,
@@ -148,7 +148,7 @@ def neighbour_rays(cameras: Cameras, pixels: Int[Tensor, "R"]) -> Rays:
 
 def main_exits(path: Path) -> Float[Tensor, "R 3"]:
     """Return the exit direction of the main polyline of each ray."""
-    return path.first_of_ray(path.exit_directions)
+    return path.main_polyline(path.exit_directions)
 
 
 def contrast(

@@ -56,13 +56,13 @@ def main(config: DictConfig) -> None:
     save_arrays(out, {name: tensor.numpy() for name, tensor in arrays.items()})
     split = f" on {len(path.ray)} paths" if path.splits else ""
     rich.print(
-        f"{len(rays)} rays traced{split}, {int(path.first_of_ray(path.refracted).sum())} met the object; wrote {out}"
+        f"{len(rays)} rays traced{split}, {int(path.main_polyline(path.refracted).sum())} met the object; wrote {out}"
     )
     if num_exceeded:
         rich.print(f"{num_exceeded} paths reached the limit of {sampler.max_events} events and continue straight")
     if config.plot:
         shown = torch.linspace(0, len(rays) - 1, min(len(rays), _PLOTTED_RAYS)).round().long()
-        draw_paths(path.of_rays(shown), medium, out.with_suffix(".png"))
+        draw_paths(path.select_rays(shown), medium, out.with_suffix(".png"))
         rich.print(f"drew {len(shown)} rays in {out.with_suffix('.png')}")
 
 

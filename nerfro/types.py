@@ -30,7 +30,7 @@ from torch import Tensor
 
 from nerfro.cameras import Cameras
 from nerfro.draws import Draws
-from nerfro.errors import warn_of_old_name
+from nerfro.errors import accept_old_methods, warn_of_old_name
 from nerfro.rays import Rays
 
 __all__ = ["WORLD_ORIGIN", "Batch", "Exits", "Path", "Radiance", "Rays", "Rendering", "Samples"]
@@ -46,8 +46,9 @@ class Path:
     vertices. Rows with fewer vertices than others repeat their last vertex, including the arc length.
 
     If light splits at a surface, the ray has several polylines, each complete from the camera on. Rendering sums their
-    contributions (`per_ray`). `unbranched` creates an ordinary path with one polyline per ray, `dataclasses.replace`
-    derives a path from another, `path[rows]` and `of_rays` select rows, and `joined` concatenates paths.
+    contributions (`sum_polylines`). `unbranched` creates an ordinary path with one polyline per ray,
+    `dataclasses.replace` derives a path from another, `path[rows]` and `select_rays` select rows, and `joined`
+    concatenates paths.
 
     Attributes:
         positions: vertices, world units.
@@ -147,18 +148,18 @@ class Path:
         """Number of rays, equal to the number of polylines if no ray splits."""
         return int(self.ray[-1]) + 1 if self.splits and len(self.ray) else len(self.ray)
 
-    def per_ray(self, values: Float[Tensor, "P *C"]) -> Float[Tensor, "R *C"]:
+    def sum_polylines(self, values: Float[Tensor, "P *C"]) -> Float[Tensor, "R *C"]:
         """Sum the values of the polylines of each ray, weighted by their throughput."""
         if not self.splits:
             return values
         values = values * (self.throughput if values.ndim > 1 else self.throughput.mean(-1))
         return values.new_zeros(self.num_rays, *values.shape[1:]).index_add(0, self.ray, values)
 
-    def of_ray(self, values: Shaped[Tensor, "R *C"]) -> Shaped[Tensor, "P *C"]:
+    def broadcast_to_polylines(self, values: Shaped[Tensor, "R *C"]) -> Shaped[Tensor, "P *C"]:
         """Broadcast a value per ray to the polylines of the ray."""
         return values[self.ray] if self.splits else values
 
-    def first_of_ray(self, values: Shaped[Tensor, "P *C"]) -> Shaped[Tensor, "R *C"]:
+    def main_polyline(self, values: Shaped[Tensor, "P *C"]) -> Shaped[Tensor, "R *C"]:
         """Select the value of the main polyline of each ray, which is the first."""
         if not self.splits:
             return values
@@ -214,7 +215,7 @@ class Path:
         rows["ray"] = torch.arange(len(rows["s"]), device=self.s.device)
         return replace(self, samples=None, **rows)
 
-    def of_rays(self, rows: Int[Tensor, " selected"]) -> Path:
+    def select_rays(self, rows: Int[Tensor, " selected"]) -> Path:
         """Select rays with all their polylines."""
         if not self.splits:
             return self[rows]
@@ -258,6 +259,16 @@ class Path:
         vertex = torch.searchsorted(self.s.detach().contiguous(), s.detach().contiguous(), side="left") - 1
         return vertex.clamp(min=0)
 
+
+accept_old_methods(
+    Path,
+    {
+        "per_ray": "sum_polylines",
+        "of_ray": "broadcast_to_polylines",
+        "of_rays": "select_rays",
+        "first_of_ray": "main_polyline",
+    },
+)
 
 # Fields of `Path` with a column for each vertex, and fields without rows.
 _OF_VERTICES = frozenset({"positions", "directions", "s", "body", "surface_body", "across", "triangle"})
@@ -359,7 +370,7 @@ class Rendering:
 
     def exposed(self, gain: Float[Tensor, "R 3"]) -> Rendering:
         """Multiply linear radiance by the gain of the photograph of each ray."""
-        of_path = self.path.of_ray(gain)
+        of_path = self.path.broadcast_to_polylines(gain)
         return replace(self, rgb=self.rgb * gain, boundary_rgb=self.boundary_rgb * of_path, gain=of_path)
 
     @property
@@ -370,7 +381,7 @@ class Rendering:
 
     @property
     def opacity(self) -> Float[Tensor, "R"]:
-        return self.path.per_ray(self.weights.sum(-1))
+        return self.path.sum_polylines(self.weights.sum(-1))
 
     @property
     def depth(self) -> Float[Tensor, "R"]:
@@ -381,13 +392,13 @@ class Rendering:
         weight = self.opacity
         edges = self.samples.edges
         centres = self.samples.s if self.samples.lengths is not None else 0.5 * (edges[:, 1:] + edges[:, :-1])
-        depth = self.path.per_ray((self.weights * centres).sum(-1)) / weight.clamp(min=1e-6)
-        return torch.where(weight > 1e-6, depth, self.path.first_of_ray(self.path.far))
+        depth = self.path.sum_polylines((self.weights * centres).sum(-1)) / weight.clamp(min=1e-6)
+        return torch.where(weight > 1e-6, depth, self.path.main_polyline(self.path.far))
 
     @property
     def exit_directions(self) -> Float[Tensor, "R 3"]:
         """Unit exit direction of the main polyline of each ray."""
-        return self.path.first_of_ray(self.path.exit_directions)
+        return self.path.main_polyline(self.path.exit_directions)
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ class Distortion(Loss):
             weights, edges = torch.cat([weights, rendering.transmittance[:, None]], -1), torch.cat([measure, far], -1)
         # Paths of zero length have no weights; the clamp avoids a division by zero.
         edges = (edges - near) / (far - near).clamp(min=1e-6)
-        return batch.per_pixel(rendering.path.per_ray(distortion(weights, edges))).mean()
+        return batch.per_pixel(rendering.path.sum_polylines(distortion(weights, edges))).mean()
 
 
 def distortion(weights: Float[Tensor, "P N"], edges: Float[Tensor, "P N+1"]) -> Float[Tensor, "P"]:

@@ -33,6 +33,6 @@ class Haze(RefractiveModel):
     def render_path(
         self, path: Path, draws: Draws | None = None, teaches_background: Bool[Tensor, "R"] | None = None
     ) -> list[Rendering]:
-        clear = torch.exp(-self.log_density.exp() * path.first_of_ray(path.far - path.near))[:, None]
+        clear = torch.exp(-self.log_density.exp() * path.main_polyline(path.far - path.near))[:, None]
         renderings = super().render_path(path, draws, teaches_background)
         return [dataclasses.replace(r, rgb=clear * r.rgb + (1 - clear) * self.colour.sigmoid()) for r in renderings]

@@ -254,6 +254,14 @@ def test_old_names_work_with_a_warning() -> None:
     path = Snell()(example_rays(), Ball())
     with pytest.warns(UserWarning, match="Path.surface is called Path.surface_body, which counts from 1"):
         assert torch.equal(path.surface + 1, path.surface_body)
+    with pytest.warns(UserWarning, match="Path.per_ray is called sum_polylines"):
+        assert torch.equal(path.per_ray(values=path.far), path.sum_polylines(path.far))
+    with pytest.warns(UserWarning, match="Path.of_ray is called broadcast_to_polylines"):
+        assert torch.equal(path.of_ray(path.far), path.broadcast_to_polylines(path.far))
+    with pytest.warns(UserWarning, match="Path.of_rays is called select_rays"):
+        assert torch.equal(path.of_rays(path.ray[1:]).s, path.select_rays(path.ray[1:]).s)
+    with pytest.warns(UserWarning, match="Path.first_of_ray is called main_polyline"):
+        assert torch.equal(path.first_of_ray(path.far), path.main_polyline(path.far))
     with pytest.warns(UserWarning, match="TrainingRun"):
         assert phase_base.Run is TrainingRun
     with pytest.warns(UserWarning, match="after_step is called update"):

@@ -53,7 +53,7 @@ def plot_paths(axes: Axes, path: Path, medium: Medium) -> None:
     """
     vertices = path.positions.detach().cpu()
     centre = medium.box.mean(0).to(vertices)
-    across, up = _plane(path.first_of_ray(vertices), centre)
+    across, up = _plane(path.main_polyline(vertices), centre)
     half = (0.5 + _MARGIN) * float((medium.box[1] - medium.box[0]).max())
     steps = torch.linspace(-half, half, _RESOLUTION).to(centre)
     points = centre + steps[None, :, None] * across + steps[:, None, None] * up

@@ -49,5 +49,5 @@ class Backdrop(Loss):
         if self.colour is None:
             return batch.rgb.new_zeros(())
         rendering = renderings[-1]
-        stopped = rendering.path.per_ray(1 - rendering.transmittance)
+        stopped = rendering.path.sum_polylines(1 - rendering.transmittance)
         return (batch.per_pixel(stopped) * shows(batch.rgb, self.colour)).mean()

@@ -37,10 +37,10 @@ class BoundaryRegularizer(Loss):
     def forward(self, renderings: list[Rendering], batch: Batch, scene: Scene) -> Float[Tensor, ""]:
         fine = renderings[-1]
         path = fine.path
-        counted = batch.per_pixel(path.per_ray(fine.transmittance.detach())) > _MIN_TRANSMITTANCE
+        counted = batch.per_pixel(path.sum_polylines(fine.transmittance.detach())) > _MIN_TRANSMITTANCE
         if self.refracted_only:
-            counted = counted & (batch.per_pixel(path.first_of_ray(path.refracted).to(fine.rgb)) > 0.5)
-        background = path.per_ray(fine.transmittance[:, None] * fine.boundary_rgb.detach())
+            counted = counted & (batch.per_pixel(path.main_polyline(path.refracted).to(fine.rgb)) > 0.5)
+        background = path.sum_polylines(fine.transmittance[:, None] * fine.boundary_rgb.detach())
         predicted, target = scene.colour_space.prediction_and_target(batch.per_pixel(background), batch.rgb)
         error = (predicted - target).abs().sum(-1)
         # Gradients are averaged over processes, so each process multiplies its sum by the number of processes.

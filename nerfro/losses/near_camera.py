@@ -46,4 +46,4 @@ class NearCamera(Loss):
         cameras = (path.positions[:, 0] - path.near[:, None] * path.directions[:, 0]).detach()
         distance = (cameras - self.middle).norm(dim=-1).clamp(min=1e-6)
         closeness = (1 - rendering.samples.s / distance[:, None]).clamp(min=0)
-        return batch.per_pixel(path.per_ray((rendering.weights * closeness).sum(-1))).mean()
+        return batch.per_pixel(path.sum_polylines((rendering.weights * closeness).sum(-1))).mean()

@@ -23,4 +23,4 @@ class Opaque(Loss):
 
     def forward(self, renderings: list[Rendering], batch: Batch, scene: Scene) -> Float[Tensor, ""]:
         passed = renderings[-1].transmittance.square()
-        return batch.per_pixel(renderings[-1].path.per_ray(passed)).mean()
+        return batch.per_pixel(renderings[-1].path.sum_polylines(passed)).mean()

@@ -31,4 +31,4 @@ def composite(samples: Samples, radiance: Radiance, boundary_rgb: Float[Tensor, 
         rgb = rgb * path.transmitted(samples.s)
         boundary_rgb = boundary_rgb * path.transmitted(path.far[:, None])[:, 0]
     colour = (weights[..., None] * rgb).sum(-2) + transmittance[:, None] * boundary_rgb
-    return Rendering(path.per_ray(colour), weights, transmittance, boundary_rgb, samples, path)
+    return Rendering(path.sum_polylines(colour), weights, transmittance, boundary_rgb, samples, path)

@@ -150,7 +150,7 @@ class Renderer(nn.Module, ABC):
         Returns:
             Background radiance of each polyline, in the colour space of the scene.
         """
-        teaches = None if teaches_background is None else path.of_ray(teaches_background)
+        teaches = None if teaches_background is None else path.broadcast_to_polylines(teaches_background)
         return background_radiance(self.scene.boundary, path.exits(directions), teaches)
 
     def trace(self, rays: Rays, path: Path | None = None) -> Path:
@@ -210,7 +210,7 @@ class Renderer(nn.Module, ABC):
 
     def _render_chunk(self, rays: Rays) -> tuple[Tensor, ...]:
         path = self.trace(rays)
-        exits, normals = path.first_of_ray(path.exit_directions), first_normals(path, self.scene.medium)
+        exits, normals = path.main_polyline(path.exit_directions), first_normals(path, self.scene.medium)
         return *self._render_traced(rays, path), exits, normals
 
     def _render_traced(self, rays: Rays, path: Path) -> tuple[Tensor, Tensor, Tensor]:
@@ -220,12 +220,12 @@ class Renderer(nn.Module, ABC):
             rendering = self.render_path(path)[-1]
             return rendering.rgb, rendering.depth, rendering.opacity
         # Most rays of an image miss the object.
-        rgb, depth = torch.empty_like(rays.directions), path.first_of_ray(path.far).clone()
+        rgb, depth = torch.empty_like(rays.directions), path.main_polyline(path.far).clone()
         opacity = torch.zeros_like(depth)
         passing, rows = (~meets).nonzero()[:, 0], meets.nonzero()[:, 0]
         rgb[passing] = self.scene.boundary(Exits.unbent(rays[passing])).to(rgb)
         if len(rows):
-            rendering = self.render_path(path.of_rays(rows))[-1]
+            rendering = self.render_path(path.select_rays(rows))[-1]
             rgb[rows], depth[rows], opacity[rows] = (
                 part.to(rgb) for part in (rendering.rgb, rendering.depth, rendering.opacity)
             )

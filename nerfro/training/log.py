@@ -112,7 +112,7 @@ class TrainingLog(Callback):
         }
         if not isinstance(renderer.scene.medium, Vacuum):
             shown = torch.linspace(0, len(rays) - 1, min(_NUM_PATHS, len(rays))).long().to(rays.origins.device)
-            images["val/paths"] = image_of_paths(renderings[-1].path.of_rays(shown), renderer.scene.medium)
+            images["val/paths"] = image_of_paths(renderings[-1].path.select_rays(shown), renderer.scene.medium)
         for logger in loggers:
             _log_images(logger, images, trainer.global_step)
             for level, rendering in enumerate(renderings):

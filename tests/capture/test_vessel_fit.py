@@ -50,7 +50,7 @@ def observed(cylinder: Path, glass: Solid) -> Observations:
     silhouette = Snell()(pixel_rays(taken, index), SdfGrid(str(cylinder), **BOX)).refracted
     index = index[silhouette][:NUM_PIXELS].sort().values
     path = Snell(branches="all", least_weight=0.02)(pixel_rays(taken, index), glass)
-    seen = Pixels(taken, index, path.per_ray(sky(path.exits().directions)).float())
+    seen = Pixels(taken, index, path.sum_polylines(sky(path.exits().directions)).float())
     views = Views(taken, torch.zeros(NUM_VIEWS, SIZE, SIZE, 3), None, [""] * NUM_VIEWS)
     observations = Observations(views, load_mesh(cylinder), False)
     known = Surroundings(Sky(), None, 0.0, seen.radiance)  # type: ignore[arg-type]

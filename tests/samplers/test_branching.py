@@ -60,14 +60,14 @@ def test_weights_of_a_ray_sum_to_one(branches: str, tmp_path: FilePath) -> None:
     for interface, (_, medium) in zip(("sdf", "sdf", "mesh"), media, strict=True):
         sampler = Snell(interface, branches=branches)  # type: ignore[arg-type]
         trace = sampler.trace(rays, medium)
-        total = trace.path.per_ray(torch.ones(len(trace.path.s), 3, dtype=torch.float64))
+        total = trace.path.sum_polylines(torch.ones(len(trace.path.s), 3, dtype=torch.float64))
         torch.testing.assert_close(total, torch.ones(len(rays), 3).double(), atol=1e-5, rtol=0)
         assert (_weights(trace.path) >= 0.0199).all()
         counts = torch.bincount(trace.path.ray)
-        assert counts[trace.path.first_of_ray(trace.path.refracted)].float().mean() > (
+        assert counts[trace.path.main_polyline(trace.path.refracted)].float().mean() > (
             1.8 if branches == "first" else 2
         )
-        assert (counts[~trace.path.first_of_ray(trace.path.refracted)] == 1).all()
+        assert (counts[~trace.path.main_polyline(trace.path.refracted)] == 1).all()
 
 
 @pytest.mark.parametrize(("n", "reflected", "refracted"), [(1.5, 9.2, 83.6), (1.33, 6.6, 88.2)])
@@ -145,7 +145,7 @@ def test_absorbing_body_of_index_one_adds_no_event(medium: Solid) -> None:
 def test_first_polyline_of_a_ray_is_transmitted() -> None:
     rays, medium = _rays(300), _nested_grid()
     single, split = Snell()(rays, medium), Snell(branches="all")(rays, medium)
-    first = split.first_of_ray(split.exit_directions)
+    first = split.main_polyline(split.exit_directions)
     same = (first - single.exit_directions).norm(dim=-1) < 1e-6
     # At grazing rays, less than 2 % pass: they are reflected whole.
     assert same.float().mean() > 0.95
@@ -163,7 +163,7 @@ def test_main_polylines_equal_the_first_of_all_polylines(tracer: str, tmp_path: 
     every, main = sampler(rays, medium), sampler.trace_main(rays, medium)
     assert main.num_rays == len(main.s) == len(rays) < len(every.s)
     for name in ("throughput", "exit_directions"):
-        assert torch.equal(getattr(main, name), every.first_of_ray(getattr(every, name)))
+        assert torch.equal(getattr(main, name), every.main_polyline(getattr(every, name)))
 
 
 def test_weights_of_omitted_branches_are_added_to_the_others() -> None:
@@ -272,7 +272,7 @@ def test_gradients_at_touching_bodies_belong_to_the_intersected_body(what: str) 
 def test_selected_and_joined_rays_keep_all_polylines() -> None:
     path = Snell(branches="all")(_rays(20), Ball().double())
     rows = torch.tensor([7, 2, 2, 11])
-    chosen = path.of_rays(rows)
+    chosen = path.select_rays(rows)
     assert chosen.num_rays == 4
     for place, ray in enumerate(rows.tolist()):
         assert torch.equal(chosen.positions[chosen.ray == place], path.positions[path.ray == ray])
@@ -280,4 +280,4 @@ def test_selected_and_joined_rays_keep_all_polylines() -> None:
     both = Path.joined([chosen, Snell()(_rays(3), Ball().double())])
     assert both.num_rays == 7
     assert both.ray[-3:].tolist() == [4, 5, 6]
-    torch.testing.assert_close(both.per_ray(torch.ones(len(both.s), 3).double()), torch.ones(7, 3).double())
+    torch.testing.assert_close(both.sum_polylines(torch.ones(len(both.s), 3).double()), torch.ones(7, 3).double())

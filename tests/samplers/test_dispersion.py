@@ -78,9 +78,9 @@ def test_every_band_is_traced_as_a_ray_of_its_colour(branches: str) -> None:
     rays, sampler = random_rays(60, 2.0, seed=3, far=6), Snell(branches=branches)  # type: ignore[arg-type]
     medium = RoundedBox(abbe=[30.0]).double()
     path = sampler(rays, medium)
-    total = path.per_ray(torch.ones(len(path.s), 3).double())
+    total = path.sum_polylines(torch.ones(len(path.s), 3).double())
     torch.testing.assert_close(total, torch.ones_like(total))
-    assert (torch.bincount(path.ray)[~path.first_of_ray(path.refracted)] == 1).all()
+    assert (torch.bincount(path.ray)[~path.main_polyline(path.refracted)] == 1).all()
     for band, wavelength in enumerate(sampler.wavelengths):
         single = sampler(rays, RoundedBox(ior=cauchy(1.52, 30, wavelength)).double())
         mine = path[(path.band == band) & path.refracted]
@@ -90,7 +90,7 @@ def test_every_band_is_traced_as_a_ray_of_its_colour(branches: str) -> None:
         if band == 0:
             main = sampler.trace_main(rays, medium)
             assert main.ray.tolist() == list(range(60))
-            torch.testing.assert_close(main.exit_directions, single.first_of_ray(single.exit_directions))
+            torch.testing.assert_close(main.exit_directions, single.main_polyline(single.exit_directions))
 
 
 def test_gradients_of_all_bands_reach_the_index() -> None:

@@ -77,7 +77,7 @@ def rays_of_picture(parts: int = PARTS) -> Rays:
 def seen(path: Path, transmitted: Tensor | float = 1.0) -> Tensor:
     """Linear radiance of a picture of traced rays."""
     radiance = torch.from_numpy(sky(path.exit_directions.double().numpy())).float()
-    return path.per_ray(radiance * transmitted).view(SIDE, SIDE, -1, 3).mean(2)
+    return path.sum_polylines(radiance * transmitted).view(SIDE, SIDE, -1, 3).mean(2)
 
 
 def agreement(found: Tensor, expected: Tensor) -> float:

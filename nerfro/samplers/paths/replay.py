@@ -74,7 +74,7 @@ def indices_of(medium: Medium, like: Tensor) -> Float[Tensor, " media"]:
 
 def start_of(path: Path, rays: Rays) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"], Float[Tensor, "P"]]:
     """Return position, direction and arc length of the first vertices, with gradients with respect to the rays."""
-    origins, d, s = (path.of_ray(values) for values in (rays.origins, rays.directions, rays.near))
+    origins, d, s = (path.broadcast_to_polylines(values) for values in (rays.origins, rays.directions, rays.near))
     return origins + s[:, None] * d, d, s
 
 
@@ -131,7 +131,7 @@ def assembled(
         last: position, direction and arc length of each row after the last event.
     """
     x, d, s = last
-    ahead = distance_to_end(path.of_ray(rays.far).to(s), medium.box, path.refracted, x, d, s)
+    ahead = distance_to_end(path.broadcast_to_polylines(rays.far).to(s), medium.box, path.refracted, x, d, s)
     end = torch.cat([x + ahead[:, None] * d, d, (s + ahead)[:, None]], -1)
     rows, columns = (torch.cat([vertex[i] for vertex in vertices]) for i in range(2))
     values = torch.cat([torch.cat([*vertex[2:4], vertex[4][:, None]], -1) for vertex in vertices])

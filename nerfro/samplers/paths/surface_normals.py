@@ -22,7 +22,7 @@ def first_normals(path: Path, medium: Medium) -> Float[Tensor, "R 3"]:
     normals = path.directions.new_zeros(len(path.s), 3)
     rows = path.refracted.nonzero()[:, 0]  # only few rays of an image
     normals[rows] = _bent_normals(path[rows], medium).to(normals)
-    return path.first_of_ray(normals)
+    return path.main_polyline(normals)
 
 
 def _bent_normals(path: Path, medium: Medium) -> Float[Tensor, "P 3"]:

@@ -144,9 +144,9 @@ def _observe_through_object(run: TrainingRun, pixels: Int[Tensor, "Q"]) -> Obser
     neighbours = renderer.exit_directions(scene.camera(neighbour_rays(batches.cameras, pixels), view))
     widths = divergence(batches.cameras, pixels, main_exits(path), neighbours)
     steady = (widths < DIVERGENT).nonzero()[:, 0]
-    path, pixels, view, widths = path.of_rays(steady), pixels[steady], view[steady], widths[steady]
+    path, pixels, view, widths = path.select_rays(steady), pixels[steady], view[steady], widths[steady]
     rendering = renderer.render_path(path)[-1]
-    fraction, exits = path.first_of_ray(rendering.boundary_fraction), main_exits(path)
+    fraction, exits = path.main_polyline(rendering.boundary_fraction), main_exits(path)
     rgb = batches.photographed(pixels)
     difference = _photographed(run, rgb, view) - rendering.rgb
     radiance = scene.boundary(Exits(exits)) + difference / fraction.clamp(min=_BACKGROUND)
