@@ -44,7 +44,7 @@ def main(config: DictConfig) -> None:
         path, num_exceeded = trace.path, int(trace.exceeded.sum())
     else:
         path, num_exceeded = sampler(rays, medium), 0
-    positions, lengths = (path.exit_positions, path.far) if config.far is not None else leave_box(path, medium)
+    positions, lengths = (path.end_positions, path.far) if config.far is not None else leave_box(path, medium)
     arrays = {
         "exit_positions": positions + torch.from_numpy(medium.origin),
         "exit_directions": path.exit_directions,

@@ -200,9 +200,15 @@ class Path:
         return self.surface_body - 1
 
     @property
-    def exit_positions(self) -> Float[Tensor, "P 3"]:
+    def end_positions(self) -> Float[Tensor, "P 3"]:
         """End of each polyline, behind the last event."""
         return self.positions[:, -1]
+
+    @property
+    def exit_positions(self) -> Float[Tensor, "P 3"]:
+        """Old name of `end_positions`."""
+        warn_of_old_name("Path.exit_positions", "Path.end_positions")
+        return self.end_positions
 
     @property
     def exit_directions(self) -> Float[Tensor, "P 3"]:

@@ -254,6 +254,8 @@ def test_old_names_work_with_a_warning() -> None:
     path = Snell()(example_rays(), Ball())
     with pytest.warns(UserWarning, match="Path.surface is called Path.surface_body, which counts from 1"):
         assert torch.equal(path.surface + 1, path.surface_body)
+    with pytest.warns(UserWarning, match="Path.exit_positions is called Path.end_positions"):
+        assert torch.equal(path.exit_positions, path.end_positions)
     with pytest.warns(UserWarning, match="Path.per_ray is called sum_polylines"):
         assert torch.equal(path.per_ray(values=path.far), path.sum_polylines(path.far))
     with pytest.warns(UserWarning, match="Path.of_ray is called broadcast_to_polylines"):

@@ -64,7 +64,7 @@ class BoxMarch(PathSampler):
         chords = torch.nn.functional.normalize(inner.positions.diff(dim=1), dim=-1)
         far = torch.maximum(rays.far, inner.far)  # rounding may put the last step behind it
         start = rays.origins + rays.near[:, None] * rays.directions
-        stop = inner.exit_positions + (far - inner.far)[:, None] * inner.exit_directions
+        stop = inner.end_positions + (far - inner.far)[:, None] * inner.exit_directions
         return Path.unbranched(
             torch.cat([start[:, None], inner.positions, stop[:, None]], 1),
             torch.cat([rays.directions[:, None], chords, inner.exit_directions[:, None].expand(-1, 2, -1)], 1),

@@ -117,7 +117,7 @@ def test_parallel_beam_converges_at_the_luneburg_focus(dtype: torch.dtype, level
 
         length = quad(index, 0, math.pi / 2, epsabs=1e-13, epsrel=1e-13)[0]  # ds = n dsigma
         path = _trace(make_rays(entry[None], p0[None], 0, length), luneburg, dtype)
-        assert (path.exit_positions[0] - p0).norm() < 2 * level
+        assert (path.end_positions[0] - p0).norm() < 2 * level
         # From the plane x = -1 to the focus all optical paths are 1 + pi / 2 long.
         n, _ = FunctionMedium(luneburg)(path.positions[0])
         optical = 1 + float(entry[0]) + simpson(n.numpy(), dx=length / NUM_STEPS)
@@ -151,7 +151,7 @@ def test_fisheye_rays_are_circles_through_the_image_point(dtype: torch.dtype, le
         assert radius**2 == pytest.approx(1 + float(centre @ centre))
         path = _trace(make_rays(start[None], direction[None], 0, length), fisheye, dtype)
         assert ((path.positions[0] - centre).norm(dim=-1) - radius).abs().max() < size * level
-        to_image = image - path.exit_positions[0]
+        to_image = image - path.end_positions[0]
         assert torch.linalg.cross(to_image, path.exit_directions[0]).norm() < size * level
 
 
@@ -240,6 +240,6 @@ def test_integrators_have_their_order_of_convergence(integrator: Integrator, ord
 
     def error(num_steps: int) -> float:
         path = march_uniform(rays, medium, integrator, num_steps + 1)
-        return float((path.exit_positions[0] - target).norm())
+        return float((path.end_positions[0] - target).norm())
 
     assert math.log2(error(128) / error(256)) == pytest.approx(order, abs=0.1)

@@ -22,7 +22,7 @@ def test_adaptive_luneburg_lens_focuses_on_its_rim() -> None:
     path = Eikonal(tolerance=1e-6)(beam(heights, far=6), Luneburg().double())
     assert path.refracted.all()
     # Behind the focus rays go straight: their line passes through (R, 0, 0).
-    to_focus = torch.tensor([1.0, 0, 0], dtype=torch.float64) - path.exit_positions
+    to_focus = torch.tensor([1.0, 0, 0], dtype=torch.float64) - path.end_positions
     distance = torch.linalg.cross(to_focus, path.exit_directions).norm(dim=-1)
     assert distance.max() < 1e-4
 
@@ -35,7 +35,7 @@ def test_adaptive_steps_refract_exactly_at_a_flat_shell() -> None:
     # Exit parallel to entry, shifted by h sin(i) (1 - cos(i) / sqrt(n^2 - sin^2 i)).
     torch.testing.assert_close(path.exit_directions, directions, atol=1e-12, rtol=0)
     shift = 0.5 * angles.sin() * (1 - angles.cos() / (1.5**2 - angles.sin() ** 2).sqrt())
-    moved = torch.linalg.cross(path.exit_positions, directions).norm(dim=-1)
+    moved = torch.linalg.cross(path.end_positions, directions).norm(dim=-1)
     torch.testing.assert_close(moved, shift, atol=1e-3, rtol=0)
 
 

@@ -94,7 +94,7 @@ def test_autodiff_agrees_with_central_differences(
 
     def loss(parameter: Tensor) -> Tensor:
         path = march_uniform(rays, FunctionMedium(profile(parameter)), integrator, 129)
-        return (path.exit_positions * _double(0.3, 0.7, -0.4)).sum() + (path.exit_directions * _double(1, -2, 3)).sum()
+        return (path.end_positions * _double(0.3, 0.7, -0.4)).sum() + (path.exit_directions * _double(1, -2, 3)).sum()
 
     parameter = torch.tensor(value, dtype=torch.float64, requires_grad=True)
     (gradient,) = torch.autograd.grad(loss(parameter), parameter)
@@ -115,7 +115,7 @@ def test_gradient_of_a_voxel_grid_matches_central_differences() -> None:
     def loss(values: Tensor) -> Tensor:
         medium.table = values
         path = march_uniform(rays, medium, leapfrog, 65)
-        return (path.exit_positions * _double(0.3, 0.7, -0.4)).sum() + path.exit_directions[0, 1]
+        return (path.end_positions * _double(0.3, 0.7, -0.4)).sum() + path.exit_directions[0, 1]
 
     (gradient,) = torch.autograd.grad(loss(table.clone().requires_grad_()), medium.table)
     assert gradient.isfinite().all()
@@ -131,5 +131,5 @@ def test_gradients_are_finite_where_the_index_is_constant(integrator: Integrator
     index = torch.tensor(1.5, dtype=torch.float64, requires_grad=True)
     medium = FunctionMedium(lambda x: (index.square().expand(len(x)), torch.zeros_like(x)))
     path = march_uniform(make_rays([[0, 0, 0]], [[1, 2, 2]], 0, 2), medium, integrator, 9)
-    (gradient,) = torch.autograd.grad(path.exit_positions.sum() + path.exit_directions.sum(), index)
+    (gradient,) = torch.autograd.grad(path.end_positions.sum() + path.exit_directions.sum(), index)
     assert float(gradient) == pytest.approx(0, abs=1e-12)  # the index of everywhere bends nothing

@@ -47,7 +47,7 @@ def test_far_does_not_cut_a_path_inside_the_object(tmp_path: FilePath, sampler: 
     assert _outside(short, medium)[bent].all()
     # The end lies on the line along which the longer path goes on.
     at_short_end, _ = long.at(short.far[:, None])
-    torch.testing.assert_close(at_short_end[:, 0], short.exit_positions, atol=2e-5, rtol=0)
+    torch.testing.assert_close(at_short_end[:, 0], short.end_positions, atol=2e-5, rtol=0)
 
 
 @pytest.mark.parametrize(("sampler", "kind"), [(Snell("sdf", 2), "grid"), (Snell("mesh", 2), "grid")])
@@ -60,5 +60,5 @@ def test_rays_at_the_limit_of_events_end_outside(tmp_path: FilePath, sampler: Sn
 
 def _outside(path: Path, medium: Medium) -> Tensor:
     """Whether paths end where nothing of the medium's box lies ahead."""
-    _, leave = intersect_box(medium.box, path.exit_positions, path.exit_directions)
+    _, leave = intersect_box(medium.box, path.end_positions, path.exit_directions)
     return leave <= 0

@@ -87,7 +87,7 @@ def test_slab_shifts_rays_and_keeps_their_direction() -> None:
     path = Snell()(_rays(-5 * directions, directions, 0, 12), Slab(0.5, 1.5).double())
     torch.testing.assert_close(path.exit_directions, directions)
     shift = 0.5 * angles.sin() * (1 - angles.cos() / (1.5**2 - angles.sin() ** 2).sqrt())
-    moved = torch.linalg.cross(path.exit_positions, directions).norm(dim=-1)
+    moved = torch.linalg.cross(path.end_positions, directions).norm(dim=-1)
     torch.testing.assert_close(moved, shift, atol=1e-9, rtol=0)
 
 
