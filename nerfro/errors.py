@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import difflib
+import functools
+import operator
 import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -73,6 +75,27 @@ def accept_old_methods(cls: type, names: Mapping[str, str]) -> None:
             setattr(cls, new, former)
         elif former is None and present is not None:
             setattr(cls, old, _under_old_name(present, f"{cls.__name__}.{old}", new))
+
+
+def accept_old_fields(cls: Any, names: Mapping[str, str]) -> None:
+    """Let fields of a dataclass be read, and be passed to its constructor by keyword, under old names with a warning.
+
+    Args:
+        cls: a dataclass.
+        names: new names by old name.
+    """
+    construct = cls.__init__
+
+    @functools.wraps(construct)
+    def construct_renamed(self: Any, *values: Any, **named: Any) -> None:
+        for old in names.keys() & named.keys():
+            warn_of_old_name(f"{cls.__name__}.{old}", names[old])
+            named[names[old]] = named.pop(old)
+        construct(self, *values, **named)
+
+    cls.__init__ = construct_renamed
+    for old, new in names.items():
+        setattr(cls, old, property(_under_old_name(operator.attrgetter(new), f"{cls.__name__}.{old}", new)))
 
 
 def _under_old_name(method: Callable[..., Any], old: str, new: str) -> Callable[..., Any]:

@@ -30,7 +30,7 @@ from torch import Tensor
 
 from nerfro.cameras import Cameras
 from nerfro.draws import Draws
-from nerfro.errors import accept_old_methods, warn_of_old_name
+from nerfro.errors import accept_old_fields, accept_old_methods, warn_of_old_name
 from nerfro.rays import Rays
 
 __all__ = ["WORLD_ORIGIN", "Batch", "Exits", "Path", "Radiance", "Rays", "Rendering", "Samples"]
@@ -306,7 +306,8 @@ class Exits:
 class Samples:
     """Samples of the radiance field along a path; sample i represents the interval from edges[i] to edges[i + 1].
 
-    Point samples (NeRF) lie at the start of their interval, cone samples (mip-NeRF) in the middle.
+    Point samples (NeRF) lie at the start of their interval, cone samples (mip-NeRF) in the middle. `s` is metric arc
+    length, which mip-NeRF 360 writes t; `contracted_edges` plays the role of its normalized distance s.
 
     Attributes:
         positions: positions at which the field is evaluated.
@@ -317,7 +318,7 @@ class Samples:
         occupied: samples at which the field may be dense, and is evaluated; None for all.
         lengths: world lengths by which densities are multiplied, if space is contracted within the intervals; None for
             the lengths of the intervals.
-        measure: bounds of the intervals in contracted length; None without contraction.
+        contracted_edges: bounds of the intervals in contracted length; None without contraction.
     """
 
     positions: Float[Tensor, "P N 3"]
@@ -327,7 +328,7 @@ class Samples:
     radii: Float[Tensor, "P"]
     occupied: Bool[Tensor, "P N"] | None = None
     lengths: Float[Tensor, "P N"] | None = None
-    measure: Float[Tensor, "P N+1"] | None = None
+    contracted_edges: Float[Tensor, "P N+1"] | None = None
 
     @classmethod
     def along(cls, path: Path, s: Float[Tensor, "P N"], edges: Float[Tensor, "P N+1"]) -> Samples:
@@ -340,6 +341,9 @@ class Samples:
     def deltas(self) -> Float[Tensor, "P N"]:
         """Length by which the density of each sample is multiplied, in world units."""
         return self.lengths if self.lengths is not None else self.edges[:, 1:] - self.edges[:, :-1]
+
+
+accept_old_fields(Samples, {"measure": "contracted_edges"})
 
 
 @dataclass(frozen=True)

@@ -27,9 +27,10 @@ class Distortion(Loss):
         rendering = renderings[-1]
         weights, edges = rendering.weights, rendering.samples.edges
         near, far = rendering.path.near[:, None], rendering.path.far[:, None]
-        if (measure := rendering.samples.measure) is not None:
-            near, far = torch.zeros_like(near), measure[:, -1:]
-            weights, edges = torch.cat([weights, rendering.transmittance[:, None]], -1), torch.cat([measure, far], -1)
+        if (contracted_edges := rendering.samples.contracted_edges) is not None:
+            near, far = torch.zeros_like(near), contracted_edges[:, -1:]
+            weights = torch.cat([weights, rendering.transmittance[:, None]], -1)
+            edges = torch.cat([contracted_edges, far], -1)
         # Paths of zero length have no weights; the clamp avoids a division by zero.
         edges = (edges - near) / (far - near).clamp(min=1e-6)
         return batch.per_pixel(rendering.path.sum_polylines(distortion(weights, edges))).mean()

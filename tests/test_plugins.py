@@ -7,6 +7,7 @@ import os
 import shutil
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -29,7 +30,16 @@ from nerfro.paths import PLUGINS_DIR
 from nerfro.registry import KINDS, discover, find, plugins, register
 from nerfro.samplers.base import PathSampler, PointSampler
 from nerfro.samplers.paths.snell import Snell
-from nerfro.testing import ContractError, check, check_export, example_batch, example_draws, example_rays, example_views
+from nerfro.testing import (
+    ContractError,
+    check,
+    check_export,
+    example_batch,
+    example_draws,
+    example_rays,
+    example_samples,
+    example_views,
+)
 from nerfro.training.phases import background
 from nerfro.training.phases import base as phase_base
 from nerfro.training.phases.base import Phase, TrainingRun
@@ -264,6 +274,11 @@ def test_old_names_work_with_a_warning() -> None:
         assert torch.equal(path.of_rays(path.ray[1:]).s, path.select_rays(path.ray[1:]).s)
     with pytest.warns(UserWarning, match="Path.first_of_ray is called main_polyline"):
         assert torch.equal(path.first_of_ray(path.far), path.main_polyline(path.far))
+    samples = example_samples()
+    with pytest.warns(UserWarning, match="Samples.measure is called contracted_edges"):
+        samples = replace(samples, measure=samples.edges)
+    with pytest.warns(UserWarning, match="Samples.measure is called contracted_edges"):
+        assert samples.measure is samples.contracted_edges is samples.edges
     with pytest.warns(UserWarning, match="TrainingRun"):
         assert phase_base.Run is TrainingRun
     with pytest.warns(UserWarning, match="after_step is called update"):

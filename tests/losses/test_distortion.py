@@ -47,13 +47,13 @@ def test_prefix_sums_equal_the_double_loop(dtype: torch.dtype, tolerance: float)
     torch.testing.assert_close(ours.grad, reference.grad, rtol=tolerance, atol=tolerance)
 
 
-def loss(weights: torch.Tensor, s: torch.Tensor, measure: torch.Tensor | None = None) -> torch.Tensor:
+def loss(weights: torch.Tensor, s: torch.Tensor, contracted_edges: torch.Tensor | None = None) -> torch.Tensor:
     """Of weights on intervals between arc lengths [5, 7], which may have other lengths in contracted space."""
     ends = s[:, [0, -1]]
     vectors = torch.zeros(5, 2, 3)
     path = Path.unbranched(vectors, vectors, ends, torch.zeros(5, dtype=torch.bool), torch.ones(5))
     positions = torch.zeros(5, 6, 3)
-    samples = Samples(positions, positions, s[:, :-1], s, torch.ones(5), measure=measure)
+    samples = Samples(positions, positions, s[:, :-1], s, torch.ones(5), contracted_edges=contracted_edges)
     colour = torch.zeros(5, 3)
     rendering = Rendering(colour, weights, 1 - weights.sum(-1), colour, samples, path)
     return Distortion()([rendering], example_batch(len(colour)), SCENE)
@@ -69,7 +69,7 @@ def test_distances_are_contracted_with_space() -> None:
     edges[:, 0] = 0.0
     far_away = torch.tan(edges * 1.57)  # however long the last interval is
     weights = weights / weights.sum(-1, keepdim=True)  # nothing passes
-    contracted = loss(weights, far_away, measure=3.0 * edges)
+    contracted = loss(weights, far_away, contracted_edges=3.0 * edges)
     torch.testing.assert_close(contracted, loss(weights, edges), rtol=1e-4, atol=0)
 
 
@@ -77,6 +77,6 @@ def test_transmitted_light_counts_at_infinity_in_all_space() -> None:
     edges = torch.linspace(0, 1, 7).expand(5, -1)
     half = torch.tensor([0.0, 0.5, 0.0, 0.0, 0.0, 0.0]).expand(5, -1)
     # 2 x 1/2 x 1/2 x 3/4 between the two, and 1/3 x 1/4 x 1/6 within the first.
-    assert float(loss(half, edges, measure=edges)) == pytest.approx(0.375 + 1 / 72, rel=1e-4)
+    assert float(loss(half, edges, contracted_edges=edges)) == pytest.approx(0.375 + 1 / 72, rel=1e-4)
     assert float(loss(half, edges)) == pytest.approx(1 / 72, rel=1e-4)  # a sky stands beyond the path
-    assert float(loss(0 * half, edges, measure=edges)) == pytest.approx(0, abs=1e-6)
+    assert float(loss(0 * half, edges, contracted_edges=edges)) == pytest.approx(0, abs=1e-6)

@@ -153,7 +153,8 @@ class DensityGridSampler(PointSampler):
         if not path.positions.requires_grad:
             return samples
         along = Samples.along(path, samples.s, samples.edges)
-        return replace(along, occupied=samples.occupied, lengths=samples.lengths, measure=samples.measure)
+        contracted_edges = samples.contracted_edges
+        return replace(along, occupied=samples.occupied, lengths=samples.lengths, contracted_edges=contracted_edges)
 
     def choose_ahead(self, path: Path, draws: Draws) -> Path:
         return replace(path, samples=self._chosen(path, draws))
@@ -219,7 +220,7 @@ class DensityGridSampler(PointSampler):
             samples = Samples.along(path, arc_length(midpoints(places)).to(path.s.dtype), edges)
             scale = contraction_scale(samples.positions, self.centre, self.radius)
             lengths = (places.diff(dim=1) / scale).to(path.s.dtype)
-            samples = replace(samples, lengths=lengths, measure=places.to(path.s.dtype))
+            samples = replace(samples, lengths=lengths, contracted_edges=places.to(path.s.dtype))
         depth = self.lookup(self.contracted(samples.positions)) * places.diff(dim=1)
         return replace(samples, occupied=depth >= _EMPTY)
 
@@ -236,9 +237,9 @@ class DensityGridSampler(PointSampler):
         paths, box = tuple(arrays(path.positions, path.directions, path.s)), tuple(arrays(*self.box))
         [density], random = arrays(self.density), (*arrays(*of_path), key)
         drawn = draw(paths, box, density, random, num_samples, settings)
-        edges, s, positions, directions, occupied, *of_measure = (torch.from_numpy(array) for array in drawn)
-        lengths, measure = (None, None) if self.radius is None else of_measure
-        return Samples(positions, directions, s, edges, path.radii, occupied, lengths, measure)
+        edges, s, positions, directions, occupied, *contracted = (torch.from_numpy(array) for array in drawn)
+        lengths, contracted_edges = (None, None) if self.radius is None else contracted
+        return Samples(positions, directions, s, edges, path.radii, occupied, lengths, contracted_edges)
 
     @property
     def centre(self) -> Float[Tensor, "3"]:

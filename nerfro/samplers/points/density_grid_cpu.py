@@ -51,13 +51,13 @@ class Drawn(NamedTuple):
     directions: Float[np.ndarray, "P N 3"]
     occupied: Bool[np.ndarray, "P N"]
     lengths: Float[np.ndarray, "P N"]
-    measure: Float[np.ndarray, "P N+1"]
+    contracted_edges: Float[np.ndarray, "P N+1"]
 
 
 class Segments(NamedTuple):
     """The segments of one polyline; `closest`, `impact` and `start_length` are set for contracted space alone."""
 
-    cumulative: Float[np.ndarray, " segment_ends"]  # measure (arc length or contracted length) at the segment's start
+    cumulative: Float[np.ndarray, " segment_ends"]  # arc length or contracted length at the segment's start
     start_length: Float[np.ndarray, "S"]  # contracted length from the closest approach to the segment's start
     closest: Float[np.ndarray, "S"]  # arc length of the closest approach to the centre
     impact: Float[np.ndarray, "S"]  # distance from the centre there (impact parameter)
@@ -134,14 +134,14 @@ def _contracted_segments(path, centre, radius, near, segments):
 
 @compiled
 def _even_segments(s, cumulative):
-    """Fill the cumulative lengths where arc length itself is the measure, counted from the camera."""
+    """Fill the cumulative lengths where space is not contracted: arc length from the camera."""
     for segment in range(len(s)):
         cumulative[segment] = s[segment]
 
 
 @compiled
 def _arc_length(place, segment, segments, radius):
-    """Convert a value of the measure within a segment to arc length."""
+    """Convert a cumulative length within a segment to arc length."""
     if radius == 0.0:
         return place
     length = segments.start_length[segment] + place - segments.cumulative[segment]
@@ -289,7 +289,7 @@ def _predict(path, grid, settings, segments, weights):
     """Fill the segments of a path and the weights of its bins.
 
     Returns:
-        The measure at which the first bin begins, and the width of a bin; 0 if the path misses the box.
+        The cumulative length at which the first bin begins, and the width of a bin; 0 if the path misses the box.
     """
     if grid.radius > 0.0:
         first = 0.0
@@ -316,7 +316,7 @@ def _put_no_samples(path, segments, at, drawn):
         slope = directions[segment, axis]
         drawn.positions[:, axis] = positions[segment, axis] + (at - s[segment]) * slope
         drawn.directions[:, axis] = slope
-    drawn.edges[:], drawn.measure[:], drawn.s[:] = at, at, at
+    drawn.edges[:], drawn.contracted_edges[:], drawn.s[:] = at, at, at
     drawn.lengths[:], drawn.occupied[:] = 0.0, False
 
 
@@ -333,7 +333,7 @@ def _put_samples(path, grid, segments, bins, u, empty, drawn):
             index += 1
         inside = min(max((u[edge] - below) / weights[index], 0.0), 1.0)
         place = np.float32(first + (index + inside) * width)
-        drawn.measure[edge] = place
+        drawn.contracted_edges[edge] = place
         edge_segment = _segment(segments.cumulative, edge_segment, place)
         drawn.edges[edge] = _arc_length(place, edge_segment, segments, grid.radius)
         if edge > 0:
@@ -380,7 +380,7 @@ def draw(paths, box, density, random, num_samples, settings):
     headings = np.empty((num_rays, num_samples, 3), np.float32)
     occupied = np.empty((num_rays, num_samples), np.bool_)
     lengths = np.empty((num_rays, num_samples), np.float32)
-    measure = np.empty((num_rays, num_samples + 1), np.float32)
+    contracted_edges = np.empty((num_rays, num_samples + 1), np.float32)
     low, high = box
     centre, per_unit = np.empty(3), np.empty(3)
     for axis in range(3):
@@ -393,7 +393,7 @@ def draw(paths, box, density, random, num_samples, settings):
         for ray in range(block * _BLOCK, min((block + 1) * _BLOCK, num_rays)):
             path = positions[ray], directions[ray], s[ray]
             drawn = Drawn(
-                edges[ray], at[ray], points[ray], headings[ray], occupied[ray], lengths[ray], measure[ray]
+                edges[ray], at[ray], points[ray], headings[ray], occupied[ray], lengths[ray], contracted_edges[ray]
             )  # fmt: skip
             first, width = _predict(path, grid, settings, segments, weights)
             if width == 0.0:  # most rays of an image miss the object
@@ -404,4 +404,4 @@ def draw(paths, box, density, random, num_samples, settings):
             else:
                 _random_quantiles(u, num_intervals[ray], ray_index[ray], key)
             _put_samples(path, grid, segments, (first, width, weights), u, settings.empty, drawn)
-    return edges, at, points, headings, occupied, lengths, measure
+    return edges, at, points, headings, occupied, lengths, contracted_edges
