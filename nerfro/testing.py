@@ -44,7 +44,7 @@ from nerfro.samplers.paths.straight import Straight
 from nerfro.samplers.points.stratified import Stratified, point_samples
 from nerfro.training.phases.base import Phase, TrainingRun
 from nerfro.training.ray_batches import RayBatches
-from nerfro.types import Batch, Exits, Path, Radiance, Rays, Rendering, Samples
+from nerfro.types import Batch, Exits, FieldValues, Path, Rays, Rendering, Samples
 from nerfro.viewing.exports import ExportConfig, export_of
 from nerfro.viewing.trained_scene import TrainedScene
 
@@ -120,8 +120,8 @@ def example_rendering(path: Path | None = None, scale: float = 1.0) -> Rendering
     path = example_path() if path is None else path
     samples = example_samples(path)
     density = (scale * torch.exp(-samples.positions.square().sum(-1))).requires_grad_()
-    rgb = torch.sigmoid(samples.positions).requires_grad_()
-    return composite(samples, Radiance(density, rgb), torch.full((len(path.ray), 3), 0.3), path)
+    radiance = torch.sigmoid(samples.positions).requires_grad_()
+    return composite(samples, FieldValues(density, radiance), torch.full((len(path.ray), 3), 0.3), path)
 
 
 def example_views() -> Views:
@@ -291,8 +291,8 @@ def _check_point_sampler(sampler: PointSampler) -> None:
             samples = sampler(path, rendering, draws)
             _require_type(samples, Samples)
             _check_samples(samples, path)
-            radiance = Radiance(torch.ones_like(samples.s), samples.positions.sigmoid())
-            rendering = composite(samples, radiance, torch.zeros(NUM_RAYS, 3), path)
+            values = FieldValues(torch.ones_like(samples.s), samples.positions.sigmoid())
+            rendering = composite(samples, values, torch.zeros(NUM_RAYS, 3), path)
         return samples.s
 
     first = drawn(example_draws())
@@ -316,25 +316,25 @@ def _check_samples(samples: Samples, path: Path) -> None:
 
 def _check_field(field: Field) -> None:
     samples = example_samples()
-    radiance = field(samples)
-    _require_type(radiance, Radiance)
-    _require(radiance.density.shape == samples.s.shape, "density is [P, N]")
-    _require(radiance.rgb.shape == samples.positions.shape, "rgb is [P, N, 3]")
-    _require(bool((radiance.density >= 0).all()), "density is not negative")
-    _require(bool((radiance.rgb > -0.01).all()), "radiance is not negative")
-    (radiance.density.sum() + radiance.rgb.sum()).backward()
+    values = field(samples)
+    _require_type(values, FieldValues)
+    _require(values.density.shape == samples.s.shape, "density is [P, N]")
+    _require(values.radiance.shape == samples.positions.shape, "radiance is [P, N, 3]")
+    _require(bool((values.density >= 0).all()), "density is not negative")
+    _require(bool((values.radiance > -0.01).all()), "radiance is not negative")
+    (values.density.sum() + values.radiance.sum()).backward()
     _require_gradients(field)
 
 
 def _check_boundary(boundary: Boundary) -> None:
     directions = torch.nn.functional.normalize(torch.randn(4, 5, 3), dim=-1)
-    rgb = boundary(Exits(directions))
-    _require(rgb.shape == directions.shape, "forward keeps all leading axes: [..., 3] -> [..., 3]")
-    _require(bool((rgb > -0.01).all()), "radiance is not negative")
+    radiance = boundary(Exits(directions))
+    _require(radiance.shape == directions.shape, "forward keeps all leading axes: [..., 3] -> [..., 3]")
+    _require(bool((radiance > -0.01).all()), "radiance is not negative")
     exits = example_path().exits()
     _require(boundary(exits).shape == exits.directions.shape, "forward takes the exits of paths")
     if any(parameter.requires_grad for parameter in boundary.parameters()):
-        rgb.sum().backward()
+        radiance.sum().backward()
         _require_gradients(boundary)
 
 
@@ -358,7 +358,7 @@ def _check_loss(loss: Loss) -> None:
             value.requires_grad or float(value) == 0, "a loss depends on the renderings or on the scene with gradients"
         )
         if value.requires_grad:
-            inputs = [t for each in renderings for t in (each.rgb, each.weights, each.transmittance)]
+            inputs = [t for each in renderings for t in (each.radiance, each.weights, each.transmittance)]
             gradients = torch.autograd.grad(value, [*inputs, *scene.parameters()], allow_unused=True)
             finite = all(bool(gradient.isfinite().all()) for gradient in gradients if gradient is not None)
             _require(finite, f"a loss has finite gradients{case}")
@@ -367,8 +367,8 @@ def _check_loss(loss: Loss) -> None:
 def _check_model(model: Renderer) -> None:
     renderings = model(example_rays())
     _require(len(renderings) >= 1, "forward returns a rendering for each level")
-    _require(renderings[-1].rgb.shape == (NUM_RAYS, 3), "rgb is [R, 3]")
-    renderings[-1].rgb.sum().backward()
+    _require(renderings[-1].radiance.shape == (NUM_RAYS, 3), "radiance is [R, 3]")
+    renderings[-1].radiance.sum().backward()
     _require_gradients(model.scene.fields)
 
 

@@ -30,10 +30,10 @@ from torch import Tensor
 
 from nerfro.cameras import Cameras
 from nerfro.draws import Draws
-from nerfro.errors import accept_old_fields, accept_old_methods, warn_of_old_name
+from nerfro.errors import accept_old_fields, accept_old_methods, renamed_classes, warn_of_old_name
 from nerfro.rays import Rays
 
-__all__ = ["WORLD_ORIGIN", "Batch", "Exits", "Path", "Radiance", "Rays", "Rendering", "Samples"]
+__all__ = ["WORLD_ORIGIN", "Batch", "Exits", "FieldValues", "Path", "Rays", "Rendering", "Samples"]
 
 WORLD_ORIGIN = np.zeros(3)
 
@@ -347,11 +347,14 @@ accept_old_fields(Samples, {"measure": "contracted_edges"})
 
 
 @dataclass(frozen=True)
-class Radiance:
-    """Result of a field: volume density (per world unit, not negative) and linear radiance."""
+class FieldValues:
+    """Result of a field: density (per world unit, not negative) and radiance in the colour space of the model."""
 
     density: Float[Tensor, "P N"]
-    rgb: Float[Tensor, "P N 3"]
+    radiance: Float[Tensor, "P N 3"]
+
+
+accept_old_fields(FieldValues, {"rgb": "radiance"})
 
 
 @dataclass(frozen=True)
@@ -359,21 +362,21 @@ class Rendering:
     """One sampling level of rendered rays (paper, Eqn. 5).
 
     Attributes:
-        rgb: radiance of each ray in the colour space of the scene, including the background; the sum over all
+        radiance: radiance of each ray in the colour space of the scene, including the background; the sum over all
             polylines of the ray.
         weights: contribution of each sample to its polyline.
         transmittance: transmittance at the end of each polyline, T_{N+1}.
-        boundary_rgb: background radiance in the exit direction, C'(d_N), after absorption by the medium.
+        background_radiance: background radiance in the exit direction, C'(d_N), after absorption by the medium.
         samples: samples of the level.
         path: path of the samples.
-        gain: brightness of the photograph relative to the scene, already applied to `rgb` and `boundary_rgb`; None for
-            no gain.
+        gain: brightness of the photograph relative to the scene, already applied to `radiance` and
+            `background_radiance`; None for no gain.
     """
 
-    rgb: Float[Tensor, "R 3"]
+    radiance: Float[Tensor, "R 3"]
     weights: Float[Tensor, "P N"]
     transmittance: Float[Tensor, "P"]
-    boundary_rgb: Float[Tensor, "P 3"]
+    background_radiance: Float[Tensor, "P 3"]
     samples: Samples
     path: Path
     gain: Float[Tensor, "P 3"] | None = None
@@ -381,7 +384,8 @@ class Rendering:
     def exposed(self, gain: Float[Tensor, "R 3"]) -> Rendering:
         """Multiply linear radiance by the gain of the photograph of each ray."""
         of_path = self.path.broadcast_to_polylines(gain)
-        return replace(self, rgb=self.rgb * gain, boundary_rgb=self.boundary_rgb * of_path, gain=of_path)
+        radiance, background_radiance = self.radiance * gain, self.background_radiance * of_path
+        return replace(self, radiance=radiance, background_radiance=background_radiance, gain=of_path)
 
     @property
     def boundary_fraction(self) -> Float[Tensor, "P 3"]:
@@ -409,6 +413,9 @@ class Rendering:
     def exit_directions(self) -> Float[Tensor, "R 3"]:
         """Unit exit direction of the main polyline of each ray."""
         return self.path.main_polyline(self.path.exit_directions)
+
+
+accept_old_fields(Rendering, {"rgb": "radiance", "boundary_rgb": "background_radiance"})
 
 
 @dataclass(frozen=True)
@@ -478,3 +485,6 @@ def mean_per_pixel(
     total = values.new_zeros(num_pixels, *values.shape[1:]).index_add(0, ray_pixel, values)
     num_rays = values.new_zeros(num_pixels).index_add(0, ray_pixel, torch.ones_like(ray_pixel, dtype=values.dtype))
     return total / num_rays.view(-1, *[1] * (values.ndim - 1))
+
+
+__getattr__ = renamed_classes(__name__, Radiance=FieldValues)

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from nerfro.allowed import Count, Positive
 from nerfro.fields.base import Field
 from nerfro.registry import register
-from nerfro.types import Radiance, Samples
+from nerfro.types import FieldValues, Samples
 
 
 @register("field", "blobs")
@@ -33,10 +33,10 @@ class Blobs(Field):
     def bounds(self) -> Float[Tensor, "2 3"]:
         return self.extent * self.centres.new_tensor([[-1.0] * 3, [1.0] * 3])
 
-    def forward(self, samples: Samples) -> Radiance:
+    def forward(self, samples: Samples) -> FieldValues:
         offsets = (samples.positions[..., None, :] - self.centres) / self.log_sizes.exp()[:, None]
         densities = torch.exp(self.log_densities - 0.5 * offsets.square().sum(-1))  # [P, N, blobs], per world unit
         density = densities.sum(-1)
         colour = (densities @ self.colours.sigmoid()) / density.clamp(min=1e-6)[..., None]
         inside = (samples.positions.abs() <= self.extent).all(-1)
-        return Radiance(density * inside, colour)
+        return FieldValues(density * inside, colour)

@@ -35,4 +35,7 @@ class Haze(RefractiveModel):
     ) -> list[Rendering]:
         clear = torch.exp(-self.log_density.exp() * path.main_polyline(path.far - path.near))[:, None]
         renderings = super().render_path(path, draws, teaches_background)
-        return [dataclasses.replace(r, rgb=clear * r.rgb + (1 - clear) * self.colour.sigmoid()) for r in renderings]
+        return [
+            dataclasses.replace(r, radiance=clear * r.radiance + (1 - clear) * self.colour.sigmoid())
+            for r in renderings
+        ]

@@ -33,7 +33,7 @@ class ExtraSteps(Phase):
         with torch.no_grad():
             batch = run.batches.for_rank(0, 1).batch(_OTHER_PIXELS + number)  # the same pixels in all processes
         path = renderer.trace(renderer.scene.camera(batch.rays, batch.ray_view), batch.path)
-        radiance = batch.per_pixel(renderer.render_path(path, batch.draws)[-1].rgb)
+        radiance = batch.per_pixel(renderer.render_path(path, batch.draws)[-1].radiance)
         error = renderer.scene.colour_space.to_srgb(radiance) - batch.rgb
         run.descend(error.square().mean(), run.parameters(self.learn))
         return True

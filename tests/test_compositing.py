@@ -12,14 +12,14 @@ from nerfro.samplers.paths.straight import straight_path
 from nerfro.samplers.points.stepfun import volume_weights
 from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import NUM_RAYS, example_path, example_rays, example_samples
-from nerfro.types import Path, Radiance, Samples
+from nerfro.types import FieldValues, Path, Samples
 from tests.closed_forms import beam
 
 
-def smooth_radiance(samples: Samples) -> Radiance:
+def smooth_radiance(samples: Samples) -> FieldValues:
     """Density and colour as smooth functions of position and direction."""
     density = 3 * torch.exp(-samples.positions.square().sum(-1))
-    return Radiance(density, torch.sigmoid(samples.positions + samples.directions))
+    return FieldValues(density, torch.sigmoid(samples.positions + samples.directions))
 
 
 @pytest.mark.parametrize("density", [0.0, 1e-8, 1e8])
@@ -48,34 +48,34 @@ def test_dense_ball_of_glass_absorbs_along_its_chords() -> None:
 
 def test_compositing_equals_a_slow_loop() -> None:
     samples, boundary = example_samples(), torch.rand(NUM_RAYS, 3)
-    radiance = smooth_radiance(samples)
-    rendering = composite(samples, radiance, boundary, example_path())
+    values = smooth_radiance(samples)
+    rendering = composite(samples, values, boundary, example_path())
     for ray in range(NUM_RAYS):
         colour, transmittance = torch.zeros(3), 1.0
         for i in range(samples.s.shape[1]):
-            alpha = 1 - math.exp(-float(radiance.density[ray, i] * samples.deltas[ray, i]))
-            colour += transmittance * alpha * radiance.rgb[ray, i]
+            alpha = 1 - math.exp(-float(values.density[ray, i] * samples.deltas[ray, i]))
+            colour += transmittance * alpha * values.radiance[ray, i]
             transmittance *= 1 - alpha
         colour += transmittance * boundary[ray]
-        torch.testing.assert_close(rendering.rgb[ray], colour, atol=1e-5, rtol=0)
+        torch.testing.assert_close(rendering.radiance[ray], colour, atol=1e-5, rtol=0)
         assert rendering.transmittance[ray] == pytest.approx(transmittance, abs=1e-5)
 
 
 def test_opaque_wall_hides_the_boundary_and_gives_its_depth() -> None:
     samples = example_samples()
     density = torch.where(torch.arange(16) == 5, 1e6, 0.0).expand_as(samples.s)
-    rgb = torch.full_like(samples.positions, 0.25)
-    rendering = composite(samples, Radiance(density, rgb), torch.ones(NUM_RAYS, 3), example_path())
-    torch.testing.assert_close(rendering.rgb, torch.full((NUM_RAYS, 3), 0.25))
+    radiance = torch.full_like(samples.positions, 0.25)
+    rendering = composite(samples, FieldValues(density, radiance), torch.ones(NUM_RAYS, 3), example_path())
+    torch.testing.assert_close(rendering.radiance, torch.full((NUM_RAYS, 3), 0.25))
     assert (rendering.depth >= samples.edges[:, 5]).all()
     assert (rendering.depth <= samples.edges[:, 6]).all()
 
 
 def test_half_precision_radiance_is_summed_in_single_precision() -> None:
     samples = example_samples()
-    radiance = smooth_radiance(samples)
-    half = Radiance(radiance.density.bfloat16(), radiance.rgb.bfloat16())
-    assert composite(samples, half, torch.zeros(NUM_RAYS, 3).bfloat16(), example_path()).rgb.dtype == torch.float32
+    values = smooth_radiance(samples)
+    half = FieldValues(values.density.bfloat16(), values.radiance.bfloat16())
+    assert composite(samples, half, torch.zeros(NUM_RAYS, 3).bfloat16(), example_path()).radiance.dtype == torch.float32
 
 
 def test_rendering_converges_with_the_number_of_samples() -> None:

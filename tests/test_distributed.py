@@ -67,7 +67,7 @@ class Watching(Loss):
         os.write(1, f"rank {dist.get_rank()} at step {batch.draws.step}\\n".encode())
         if os.environ.get("KILLED") == f"rank {dist.get_rank()} at step {batch.draws.step}":
             os.kill(os.getpid(), signal.SIGKILL)
-        return renderings[-1].rgb.sum() * 0
+        return renderings[-1].radiance.sum() * 0
 '''
 
 

@@ -26,7 +26,7 @@ from nerfro.training.config import build_model
 from nerfro.training.module import TrainingModule
 from nerfro.training.optimizer import OptimizerConfig
 from nerfro.training.run_folder import load_checkpoint, restore
-from nerfro.types import Radiance, Samples
+from nerfro.types import FieldValues, Samples
 from tests.ball_photographs import save
 from tests.conftest import QUIET, Runner, refused
 from tests.exact_silhouettes import cameras_around
@@ -108,8 +108,8 @@ class Slanted(Field):
         super().__init__()
         self.scale = torch.nn.Parameter(torch.tensor(0.1))
 
-    def forward(self, samples: Samples) -> Radiance:
-        return Radiance(torch.ones_like(samples.s), 0.5 + self.scale * samples.positions)
+    def forward(self, samples: Samples) -> FieldValues:
+        return FieldValues(torch.ones_like(samples.s), 0.5 + self.scale * samples.positions)
 
 
 def make_model(make_field: Callable[[], Field] = Slanted, **fields: Any) -> Renderer:
@@ -139,7 +139,7 @@ def test_each_stage_trains_its_own_parameters() -> None:
         model.stage.fill_(stage)
         model.sharpen(0)
         model.zero_grad(set_to_none=True)
-        model(example_rays())[-1].rgb.sum().backward()
+        model(example_rays())[-1].radiance.sum().backward()
         parts = {"scene": model.scene.fields, "index": model.scene.medium, "interior": model.interior}
         trained[stage] = {name for name, part in parts.items() if any(p.grad is not None for p in part.parameters())}
     assert trained == {SCENE: {"scene"}, INDEX: {"index"}, INTERIOR: {"interior"}}

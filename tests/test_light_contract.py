@@ -24,7 +24,7 @@ from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import NUM_RAYS, example_batch, example_components, example_draws, example_path, example_rays
 from nerfro.training.module import TrainingModule
 from nerfro.training.optimizer import GroupConfig, OptimizerConfig
-from nerfro.types import Exits, Path, Radiance
+from nerfro.types import Exits, FieldValues, Path
 from tests.paper import Hierarchical
 
 
@@ -44,7 +44,7 @@ def rendered(path: Path) -> Tensor:
     for parameter in model.scene.fields.parameters():
         torch.nn.init.normal_(parameter, std=0.3)
     with torch.no_grad():
-        return model.render_path(path)[-1].rgb
+        return model.render_path(path)[-1].radiance
 
 
 def test_ray_is_the_sum_of_its_polylines_weighted_by_throughput() -> None:
@@ -59,7 +59,7 @@ def test_opacity_and_depth_belong_to_rays() -> None:
     samples = Stratified(8)(path, None)
     density = torch.zeros_like(samples.s)
     density[1::2] = 50.0  # the straight polylines are blocked at once, the bent ones pass
-    rendering = composite(samples, Radiance(density, samples.positions), torch.zeros(2 * NUM_RAYS, 3), path)
+    rendering = composite(samples, FieldValues(density, samples.positions), torch.zeros(2 * NUM_RAYS, 3), path)
     torch.testing.assert_close(rendering.opacity, torch.full((NUM_RAYS,), 0.25))
     first = 0.5 * (samples.edges[1::2, 0] + samples.edges[1::2, 1])
     torch.testing.assert_close(rendering.depth, first, rtol=1e-3, atol=0)

@@ -109,7 +109,7 @@ def test_parity_of_the_rendering(
     level: int, name: str, recorded: dict[str, Tensor], renderings: list[Rendering]
 ) -> None:
     rendering = renderings[level]
-    assert_close(rendering.rgb, recorded[f"{name}_rgb"], 1e-3)
+    assert_close(rendering.radiance, recorded[f"{name}_rgb"], 1e-3)
     assert_close(rendering.transmittance, recorded[f"{name}_transmittance"][:, 0], 1e-3)
     assert_close(rendering.opacity, recorded[f"{name}_opacity"], 1e-3)
 

@@ -37,6 +37,7 @@ from nerfro.testing import (
     example_batch,
     example_draws,
     example_rays,
+    example_rendering,
     example_samples,
     example_views,
 )
@@ -47,6 +48,7 @@ from nerfro.training.ray_batches import RayBatches
 from nerfro.viewing import PLUGIN_EXPORTS
 from nerfro.viewing.exports import Export, find_export
 from nerfro.viewing.trained_scene import TrainedScene
+from nerfro.viewing.volume import Volume
 from tests.conftest import Finished, Runner, refused
 from tests.processes import printed_by, python
 
@@ -221,7 +223,12 @@ def test_medium_of_varying_index_keeps_its_contract(members: dict[str, object]) 
         ("surface", Surface, ball(lambda d: 0.5 * d), "exact within `grid.band` voxels"),
         ("loss", Loss, {"forward": lambda *_: None}, "forward returned None, not Tensor"),
         ("loss", Loss, loss(lambda r, _: r.opacity), r"a loss is a scalar, and forward returned shape \[24\]"),
-        ("loss", Loss, loss(lambda r, b: (r.rgb - b.rgb).mean()), "pixels with two rays raised RuntimeError: The size"),
+        (
+            "loss",
+            Loss,
+            loss(lambda r, b: (r.radiance - b.rgb).mean()),
+            "pixels with two rays raised RuntimeError: The size",
+        ),
         ("loss", Loss, loss(lambda r, _: (r.weights.sum(-1) - r.opacity).mean()), "rays that split, .* RuntimeError"),
         ("loss", Loss, loss(lambda r, _: r.opacity.log().mean()), "a loss is finite for empty pixels"),
         ("loss", Loss, loss(lambda r, _: r.transmittance.log().mean()), "a loss is finite for opaque pixels"),
@@ -279,6 +286,22 @@ def test_old_names_work_with_a_warning() -> None:
         samples = replace(samples, measure=samples.edges)
     with pytest.warns(UserWarning, match="Samples.measure is called contracted_edges"):
         assert samples.measure is samples.contracted_edges is samples.edges
+    with pytest.warns(UserWarning, match="types.Radiance is called nerfro.types.FieldValues"):
+        radiance_class = types.Radiance
+    with pytest.warns(UserWarning, match="FieldValues.rgb is called radiance"):
+        values = radiance_class(samples.s, rgb=samples.positions)
+    with pytest.warns(UserWarning, match="FieldValues.rgb is called radiance"):
+        assert values.rgb is values.radiance is samples.positions
+    rendering = example_rendering()
+    with pytest.warns(UserWarning, match="Rendering.rgb is called radiance"):
+        assert torch.equal(replace(rendering, rgb=2 * rendering.radiance).radiance, 2 * rendering.radiance)
+    with pytest.warns(UserWarning, match="Rendering.rgb is called radiance"):
+        assert rendering.rgb is rendering.radiance
+    with pytest.warns(UserWarning, match="Rendering.boundary_rgb is called background_radiance"):
+        assert rendering.boundary_rgb is rendering.background_radiance
+    volume = Volume(values.density[:, :, None], values.radiance[:, :, None], torch.zeros(2, 3))
+    with pytest.warns(UserWarning, match="Volume.rgb is called radiance"):
+        assert volume.rgb is volume.radiance
     with pytest.warns(UserWarning, match="TrainingRun"):
         assert phase_base.Run is TrainingRun
     with pytest.warns(UserWarning, match="after_step is called update"):

@@ -13,7 +13,10 @@ from nerfro.types import Exits
 
 
 class Boundary(nn.Module, ABC):
-    """Background radiance, C'(d) (paper, Eqn. 5): linear radiance that arrives from outside of the volume."""
+    """Background radiance, C'(d) (paper, Eqn. 5): radiance that arrives from outside of the volume.
+
+    It is in the colour space of the model: linear, or sRGB with `model.colour=srgb`.
+    """
 
     @abstractmethod
     def forward(self, exits: Exits) -> Float[Tensor, "*batch 3"]:
@@ -23,7 +26,7 @@ class Boundary(nn.Module, ABC):
             exits: last segments of paths. A background at infinity depends only on the directions.
 
         Returns:
-            Linear radiance of each exit, not negative and without upper bound.
+            Radiance of each exit, not negative and without upper bound.
         """
 
     @property

@@ -281,9 +281,9 @@ class Room(Boundary):
         rays = Rays(exits.positions, exits.directions, exits.radii * ones, 0 * ones, self.radius * ones)
         path = straight_path(rays)
         samples = self.sampler(path, None, draws)
-        radiance = self.field(samples)
-        rendered = composite(samples, radiance, radiance.rgb[:, -1], path)
-        return rendered.rgb, rendered.depth
+        values = self.field(samples)
+        rendered = composite(samples, values, values.radiance[:, -1], path)
+        return rendered.radiance, rendered.depth
 
 
 def _learn(boundary: Boundary, pixels: Pixels, steps: int, batch: int, progress: Callable[[float], None]) -> None:

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerfro.cameras import Cameras
-from nerfro.types import Radiance, Samples
+from nerfro.types import FieldValues, Samples
 
 
 class Field(nn.Module, ABC):
@@ -37,10 +37,10 @@ class Field(nn.Module, ABC):
         """Evaluate density and colour at points, seen in unit directions, in single precision."""
         zeros = torch.zeros(len(positions), 2, device=positions.device)
         found = self(Samples(positions[:, None], directions[:, None], zeros[:, :1], zeros, zeros[:, 0]))
-        return found.density[:, 0].float(), found.rgb[:, 0].float()
+        return found.density[:, 0].float(), found.radiance[:, 0].float()
 
     @abstractmethod
-    def forward(self, samples: Samples) -> Radiance:
+    def forward(self, samples: Samples) -> FieldValues:
         """Evaluate density (per world unit) and colour at samples.
 
         Args:

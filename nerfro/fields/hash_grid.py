@@ -21,7 +21,7 @@ from nerfro.fields.selection import evaluate_selected, inside_box
 from nerfro.geometry.contraction import contract, contracted_box, contraction_scale
 from nerfro.kernels.available import fast_bfloat16
 from nerfro.registry import register
-from nerfro.types import Radiance, Samples
+from nerfro.types import FieldValues, Samples
 
 # Number of features that the density network passes to the colour network.
 _GEOMETRY_FEATURES = 16
@@ -97,7 +97,7 @@ class HashGridField(Field):
     def bounds(self) -> Float[Tensor, "2 3"] | None:
         return torch.stack([self.box_min, self.box_max]) if self.radius is None else None
 
-    def forward(self, samples: Samples) -> Radiance:
+    def forward(self, samples: Samples) -> FieldValues:
         if self.radius is None:
             return evaluate_selected(self.decode, samples, inside_box(samples.positions, self.box_min, self.box_max))
         return evaluate_selected(self._decode_world, samples)

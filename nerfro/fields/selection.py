@@ -7,10 +7,10 @@ from collections.abc import Callable
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerfro.types import Radiance, Samples
+from nerfro.types import FieldValues, Samples
 
 Decoder = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
-"""Maps positions and unit directions [points, 3] to density [points] and colour [points, 3]."""
+"""Maps positions and unit directions [points, 3] to density [points] and radiance [points, 3]."""
 
 
 def evaluate_selected(decoder: Decoder, samples: Samples, selected: Bool[Tensor, "P N"] | None = None) -> Radiance:
@@ -33,8 +33,8 @@ def evaluate_selected(decoder: Decoder, samples: Samples, selected: Bool[Tensor,
     density, rgb = decoder(positions.index_select(0, index), directions.index_select(0, index))
     # Out of place, so that gradients flow from the full tensors back to the selected samples.
     all_density = density.new_zeros(selected.numel()).index_copy(0, index, density)
-    all_rgb = rgb.new_zeros(selected.numel(), 3).index_copy(0, index, rgb)
-    return Radiance(all_density.view(selected.shape), all_rgb.view(*selected.shape, 3))
+    all_radiance = radiance.new_zeros(selected.numel(), 3).index_copy(0, index, radiance)
+    return FieldValues(all_density.view(selected.shape), all_radiance.view(*selected.shape, 3))
 
 
 def inside_box(

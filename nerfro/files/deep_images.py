@@ -37,14 +37,14 @@ def read_radiance(path: Path) -> Float[np.ndarray, "H W 3"]:
     pixels, names = _read(path)
     if names[:3] != ("R", "G", "B"):
         raise OSError(f"it has the channels {', '.join(names)}, but R, G and B are needed")
-    rgb = pixels[..., :3].astype(np.float32)
+    radiance = pixels[..., :3].astype(np.float32)
     if path.suffix.lower() != ".hdr":
-        return rgb
+        return radiance
     # A mantissa m of 8 bits stands for the interval from m to m + 1 (Ward, Real Pixels, Graphics Gems II, 1991).
     # OpenImageIO returns its lower end, which is 0.25 % too dark on average, and this code returns its middle.
-    brightest = rgb.max(-1, keepdims=True)
+    brightest = radiance.max(-1, keepdims=True)
     half_step = np.ldexp(np.float32(1), np.frexp(brightest)[1] - 9)
-    return np.where(brightest > 0, rgb + half_step, 0)
+    return np.where(brightest > 0, radiance + half_step, 0)
 
 
 def write_radiance(path: Path, values: Float[np.ndarray, "H W C"]) -> None:

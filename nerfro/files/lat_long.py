@@ -31,10 +31,10 @@ def directions(height: int) -> Float[Tensor, "H 2*H 3"]:
     return torch.stack([polar.sin() * azimuth.cos(), polar.sin() * azimuth.sin(), polar.cos()], dim=-1)
 
 
-def sample(rgb: Float[Tensor, "H W 3"], where: Float[Tensor, "points 3"], width: int) -> Float[Tensor, "points 3"]:
+def sample(radiance: Float[Tensor, "H W 3"], where: Float[Tensor, "points 3"], width: int) -> Float[Tensor, "points 3"]:
     """Look up directions bilinearly in a lat-long image, averaged to at most `width` columns against aliasing."""
-    image = rgb.permute(2, 0, 1)[None]
-    if rgb.shape[1] > width:
+    image = radiance.permute(2, 0, 1)[None]
+    if radiance.shape[1] > width:
         image = torch.nn.functional.interpolate(image, size=(width // 2, width), mode="area")
     # An additional column on each side closes the seam.
     image = torch.cat([image[..., -1:], image, image[..., :1]], dim=-1)
@@ -56,17 +56,17 @@ def load_lat_long(path: Path | str) -> Float[Tensor, "H 2*H 3"]:
     suffix = _format(path)
     with reading(path, "the sky ", advice="write or copy it again", missing="correct boundary.image"):
         if suffix in (".hdr", ".exr"):
-            rgb = read_radiance(path)
+            radiance = read_radiance(path)
         else:
             with open_image(path) as (image, bits):
                 levels = read_16bit(path) / 65535 if bits > 8 else np.array(image.convert("RGB")) / 255
-            rgb = to_linear(levels[..., :3] if levels.shape[-1] > 2 else levels[..., :1].repeat(3, -1))
-    height, width = rgb.shape[:2]
+            radiance = to_linear(levels[..., :3] if levels.shape[-1] > 2 else levels[..., :1].repeat(3, -1))
+    height, width = radiance.shape[:2]
     if width != 2 * height:
         raise NerfroError(f"the sky {path} has {width}x{height} pixels; give an image that is twice as wide as high")
-    if not (np.isfinite(rgb).all() and (rgb >= 0).all()):
+    if not (np.isfinite(radiance).all() and (radiance >= 0).all()):
         raise NerfroError(f"the sky {path} has radiance that is negative or not finite; write or copy it again")
-    return torch.from_numpy(np.ascontiguousarray(rgb)).float()
+    return torch.from_numpy(np.ascontiguousarray(radiance)).float()
 
 
 def save_lat_long(path: Path | str, radiance: Float[Tensor, "H 2*H 3"]) -> None:

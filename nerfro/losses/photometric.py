@@ -30,6 +30,6 @@ class Photometric(Loss):
     def forward(self, renderings: list[Rendering], batch: Batch, scene: Scene) -> Float[Tensor, ""]:
         value = batch.rgb.new_zeros(())
         for rendering, factor in zip(renderings, [self.coarse] * (len(renderings) - 1) + [1.0], strict=True):
-            radiance = batch.per_pixel(rendering.rgb)
+            radiance = batch.per_pixel(rendering.radiance)
             value = value + factor * mse_loss(*scene.colour_space.prediction_and_target(radiance, batch.rgb))
         return value

@@ -40,9 +40,9 @@ class RefractiveModel(Renderer):
     ) -> list[Rendering]:
         samples = self.point_sampler(path, None, draws)
         directions = None if self.boundary_direction == "exit" else samples.directions[:, -1]
-        boundary_rgb = self.background(path, teaches_background, directions)
-        renderings = [composite(samples, self.scene.fields[0](samples), boundary_rgb, path)]
+        background_radiance = self.background(path, teaches_background, directions)
+        renderings = [composite(samples, self.scene.fields[0](samples), background_radiance, path)]
         for field in self.scene.fields[1:]:
             samples = self.point_sampler(path, renderings[-1], draws)
-            renderings.append(composite(samples, field(samples), boundary_rgb, path))
+            renderings.append(composite(samples, field(samples), background_radiance, path))
         return renderings

@@ -218,18 +218,18 @@ class Renderer(nn.Module, ABC):
         meets = self._may_meet(rays, path)
         if meets.all():
             rendering = self.render_path(path)[-1]
-            return rendering.rgb, rendering.depth, rendering.opacity
+            return rendering.radiance, rendering.depth, rendering.opacity
         # Most rays of an image miss the object.
-        rgb, depth = torch.empty_like(rays.directions), path.main_polyline(path.far).clone()
+        radiance, depth = torch.empty_like(rays.directions), path.main_polyline(path.far).clone()
         opacity = torch.zeros_like(depth)
         passing, rows = (~meets).nonzero()[:, 0], meets.nonzero()[:, 0]
-        rgb[passing] = self.scene.boundary(Exits.unbent(rays[passing])).to(rgb)
+        radiance[passing] = self.scene.boundary(Exits.unbent(rays[passing])).to(radiance)
         if len(rows):
             rendering = self.render_path(path.select_rays(rows))[-1]
-            rgb[rows], depth[rows], opacity[rows] = (
-                part.to(rgb) for part in (rendering.rgb, rendering.depth, rendering.opacity)
+            radiance[rows], depth[rows], opacity[rows] = (
+                part.to(radiance) for part in (rendering.radiance, rendering.depth, rendering.opacity)
             )
-        return rgb, depth, opacity
+        return radiance, depth, opacity
 
     def _may_meet(self, rays: Rays, path: Path) -> Bool[Tensor, "R"]:
         """Find the rays that may meet a field; the others are straight and show the background."""

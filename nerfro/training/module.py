@@ -133,7 +133,7 @@ class TrainingModule(LightningModule):
             # Processes wait for each other's gradients of all parameters, also of those that a batch does not use.
             learned = [parameter.sum().to(total) for parameter in self.parameters() if parameter.requires_grad]
             total = total + 0 * torch.stack(learned).sum()
-        shown = colour_space.to_display(batch.per_pixel(renderings[-1].rgb.detach()))
+        shown = colour_space.to_display(batch.per_pixel(renderings[-1].radiance.detach()))
         error = (shown - batch.rgb).square().mean()
         self.log("train/psnr", -10 * torch.log10(error))
         self.log("loss/total", total)

@@ -151,9 +151,10 @@ def bake_volume(volume: Volume, colour_space: ColourSpace) -> Baked:
     cell = float((sides / (torch.tensor(volume.density.shape) - 1)).min())
     min_density, span = MIN_OPTICAL_DEPTH / cell, math.log(_MAX_OPTICAL_DEPTH / MIN_OPTICAL_DEPTH)
     levels = (volume.density.clamp(min=min_density) / min_density).log().div(span).clamp(max=1)
-    rgb = (to_srgb(volume.rgb) if colour_space is ColourSpace.SRGB else volume.rgb).clamp(min=0)
-    max_radiance = max(float(rgb.max()), 1e-6)
-    content = torch.cat([(rgb / max_radiance).sqrt(), levels[..., None]], -1).mul(255).round().byte()
+    radiance = to_srgb(volume.radiance) if colour_space is ColourSpace.SRGB else volume.radiance
+    radiance = radiance.clamp(min=0)
+    max_radiance = max(float(radiance.max()), 1e-6)
+    content = torch.cat([(radiance / max_radiance).sqrt(), levels[..., None]], -1).mul(255).round().byte()
     slices = content.permute(2, 1, 0, 3).numpy()
     occupied = _occupied_bricks(slices[..., 3])
     return Baked(

@@ -14,15 +14,15 @@ from nerfro.media.analytic import Vacuum
 from nerfro.media.solid import Solid
 from nerfro.rendering import ColourSpace, Renderer, Scene
 from nerfro.samplers.paths.straight import Straight
-from nerfro.types import Radiance, Samples
+from nerfro.types import FieldValues, Samples
 from nerfro.variants import variant
 
 
 class EmptyField(Field):
     """Radiance field of density zero."""
 
-    def forward(self, samples: Samples) -> Radiance:
-        return Radiance(torch.zeros_like(samples.s), torch.zeros_like(samples.positions))
+    def forward(self, samples: Samples) -> FieldValues:
+        return FieldValues(torch.zeros_like(samples.s), torch.zeros_like(samples.positions))
 
 
 def with_changed_scene(renderer: Renderer, **changes: nn.Module) -> Renderer:

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.allowed import Range, check
+from nerfro.errors import accept_old_fields
 from nerfro.geometry.contraction import contraction_scale, expand
 from nerfro.progress import track
 from nerfro.viewing.trained_scene import TrainedScene
@@ -25,15 +26,18 @@ class Volume:
 
     Attributes:
         density: density per world unit, or per unit of contracted length.
-        rgb: linear radiance, averaged over the directions along the three axes; 0 in empty space.
+        radiance: linear radiance, averaged over the directions along the three axes; 0 in empty space.
         box: corners, world units.
         radius: radius around the centre of the box beyond which space is contracted; None without contraction.
     """
 
     density: Float[Tensor, "X Y Z"]
-    rgb: Float[Tensor, "X Y Z 3"]
+    radiance: Float[Tensor, "X Y Z 3"]
     box: Float[Tensor, "2 3"]
     radius: float | None = None
+
+
+accept_old_fields(Volume, {"rgb": "radiance"})
 
 
 @torch.inference_mode()
@@ -72,11 +76,12 @@ def sample_field(
     density = density / scale
     cell = float((sides / (counts - 1)).max())
     visible = (density * cell > MIN_OPTICAL_DEPTH).nonzero()[:, 0]
-    rgb = torch.zeros(len(positions), 3)
+    radiance = torch.zeros(len(positions), 3)
     directions = torch.cat([torch.eye(3), -torch.eye(3)])
     for rows in visible.split(POINTS_AT_ONCE):
         points = positions[rows].to(device)
         colours = [field.at_points(points, direction.to(points).expand_as(points))[1].cpu() for direction in directions]
-        rgb[rows] = torch.stack(colours).mean(0)
+        radiance[rows] = torch.stack(colours).mean(0)
     shape = [int(n) for n in counts]
-    return Volume(density.view(shape), scene.renderer.scene.colour_space.to_linear(rgb).view(*shape, 3), box, radius)
+    radiance = scene.renderer.scene.colour_space.to_linear(radiance)
+    return Volume(density.view(shape), radiance.view(*shape, 3), box, radius)

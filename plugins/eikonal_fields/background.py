@@ -13,7 +13,7 @@ from nerfro.boundaries.base import Boundary
 from nerfro.fields.base import Field
 from nerfro.fields.selection import inside_box
 from nerfro.geometry.interpolation import smooth, trilinear
-from nerfro.types import Exits, Radiance, Samples
+from nerfro.types import Exits, FieldValues, Samples
 
 # Directions are looked up on the unit sphere in a grid over this cube.
 _SKY_SIDE = 1.1
@@ -25,9 +25,9 @@ class BackgroundGrids:
     """Radiance outside a box, and the background, on grids that are differentiable in position and direction.
 
     Attributes:
-        radiance: rgb and density at the vertices over `box`.
+        radiance: radiance and density at the vertices over `box`.
         box: corners, world units.
-        sky: rgb of the boundary in the direction of each vertex of a cube around the origin.
+        sky: radiance of the background in the direction of each vertex of a cube around the origin.
     """
 
     radiance: Float[Tensor, "X Y Z 4"]
@@ -70,10 +70,10 @@ class BackgroundGrids:
         size = 2 * math.ceil(3 * sigma) + 1
         return BackgroundGrids(smooth(self.radiance, size, sigma), self.box, smooth(self.sky, size, sigma))
 
-    def radiance_at(self, samples: Samples) -> Radiance:
+    def radiance_at(self, samples: Samples) -> FieldValues:
         """Look up density and colour at samples."""
         values = trilinear(self.radiance, self.box, samples.positions)
-        return Radiance(values[..., 3], values[..., :3])
+        return FieldValues(values[..., 3], values[..., :3])
 
     def sky_towards(self, directions: Float[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
         """Look up the colour of the background in unit directions."""
@@ -93,5 +93,5 @@ def _mean_radiance(field: Field, positions: Float[Tensor, "points 3"]) -> Float[
     for axis in axes:
         directions = axis.expand(len(positions), 1, 3)
         found = field(Samples(positions[:, None], directions, s, torch.cat([s, s], 1), s[:, 0]))
-        total += torch.cat([found.rgb[:, 0], found.density], -1).float() / len(axes)
+        total += torch.cat([found.radiance[:, 0], found.density], -1).float() / len(axes)
     return total

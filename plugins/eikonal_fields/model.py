@@ -18,11 +18,11 @@ from nerfro.fields.selection import inside_box
 from nerfro.registry import register
 from nerfro.rendering import Components, Renderer, composite
 from nerfro.samplers.paths.straight import straight_path
-from nerfro.types import Path, Radiance, Rays, Rendering, Samples
+from nerfro.types import FieldValues, Path, Rays, Rendering, Samples
 
 from .background import BackgroundGrids
 
-Ask = Callable[[Samples], Radiance]
+Ask = Callable[[Samples], FieldValues]
 
 
 class TrainingStage(IntEnum):
@@ -144,19 +144,19 @@ class EikonalFields(Renderer):
         outside = ~inside_box(samples.positions.detach(), *self.scene.medium.box)
         if stage == TrainingStage.INDEX and self.training:
             assert self._blurred is not None  # made at the start of the step
-            radiance = radiance_where(self._blurred.radiance_at, samples, outside)
-            return [composite(samples, radiance, self._blurred.sky_towards(path.exit_directions), path)]
+            values = radiance_where(self._blurred.radiance_at, samples, outside)
+            return [composite(samples, values, self._blurred.sky_towards(path.exit_directions), path)]
         with torch.no_grad():
-            radiance = radiance_where(field, samples, outside)
+            values = radiance_where(field, samples, outside)
             sky = self.background(path)
         if stage == TrainingStage.INTERIOR:
             inner = radiance_where(self.interior, samples, ~outside)
-            radiance = Radiance(radiance.density + inner.density, radiance.rgb + inner.rgb)
-        return [composite(samples, radiance, sky, path)]
+            values = FieldValues(values.density + inner.density, values.radiance + inner.radiance)
+        return [composite(samples, values, sky, path)]
 
 
-def radiance_where(field: Field | Ask, samples: Samples, selected: Bool[Tensor, "P N"]) -> Radiance:
-    """Evaluate a field only at the selected samples; density and colour are zero elsewhere."""
+def radiance_where(field: Field | Ask, samples: Samples, selected: Bool[Tensor, "P N"]) -> FieldValues:
+    """Evaluate a field only at the selected samples; density and radiance are zero elsewhere."""
     ray, i = selected.nonzero(as_tuple=True)
     chosen = Samples(
         samples.positions[ray, i][:, None],
@@ -167,8 +167,8 @@ def radiance_where(field: Field | Ask, samples: Samples, selected: Bool[Tensor, 
     )
     found = field(chosen)
     density: Float[Tensor, "P N"] = torch.zeros_like(samples.s)
-    rgb: Float[Tensor, "P N 3"] = torch.zeros_like(samples.positions)
-    return Radiance(
+    radiance: Float[Tensor, "P N 3"] = torch.zeros_like(samples.positions)
+    return FieldValues(
         density.index_put((ray, i), found.density[:, 0].to(density)),
-        rgb.index_put((ray, i), found.rgb[:, 0].to(rgb)),
+        radiance.index_put((ray, i), found.radiance[:, 0].to(radiance)),
     )

@@ -17,7 +17,7 @@ from nerfro.draws import Draws
 from nerfro.fields.selection import inside_box
 from nerfro.registry import register
 from nerfro.rendering import Components, Renderer, composite
-from nerfro.types import Path, Radiance, Rendering, Samples
+from nerfro.types import FieldValues, Path, Rendering, Samples
 
 from .encoding import DIRECTION_DEGREE, integrated_positional_encoding, positional_encoding
 from .mlp import RadianceMLP, in_blocks
@@ -52,12 +52,12 @@ class MipNerfField(FieldInBox):
         num_position, num_direction = 6 * position_degree, 3 * (1 + 2 * DIRECTION_DEGREE)
         self.mlp = RadianceMLP(num_position, num_direction, width, depth, skip, view_width)
 
-    def forward(self, samples: Samples) -> Radiance:
-        density, rgb = in_blocks(self._decode_block, *frustum_gaussians(samples), samples.directions)
+    def forward(self, samples: Samples) -> FieldValues:
+        density, radiance = in_blocks(self._decode_block, *frustum_gaussians(samples), samples.directions)
         if not self.everywhere:
             inside = inside_box(samples.positions, *self.box)
-            density, rgb = density * inside, rgb * inside[..., None]
-        return Radiance(density, rgb)
+            density, radiance = density * inside, radiance * inside[..., None]
+        return FieldValues(density, radiance)
 
     def _decode_block(
         self,
@@ -67,8 +67,8 @@ class MipNerfField(FieldInBox):
     ) -> tuple[Float[Tensor, " points"], Float[Tensor, "points 3"]]:
         position = integrated_positional_encoding(mean / self.unit, variance / self.unit**2, self.position_degree)
         direction = positional_encoding(directions, DIRECTION_DEGREE)
-        density, rgb = self.mlp(position, direction)
-        return density / self.unit, rgb
+        density, radiance = self.mlp(position, direction)
+        return density / self.unit, radiance
 
 
 def frustum_gaussians(samples: Samples) -> tuple[Float[Tensor, "P N 3"], Float[Tensor, "P N 3"]]:
@@ -105,10 +105,10 @@ class MipNerfModel(Renderer):
     def render_path(
         self, path: Path, draws: Draws | None = None, teaches_background: Bool[Tensor, "R"] | None = None
     ) -> list[Rendering]:
-        boundary_rgb = self.background(path, teaches_background)
+        background_radiance = self.background(path, teaches_background)
         (field,) = self.scene.fields
         renderings: list[Rendering] = []
         for _ in range(self.point_sampler.num_levels):
             samples = self.point_sampler(path, renderings[-1] if renderings else None, draws)
-            renderings.append(composite(samples, field(samples), boundary_rgb, path))
+            renderings.append(composite(samples, field(samples), background_radiance, path))
         return renderings

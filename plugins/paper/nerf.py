@@ -14,7 +14,7 @@ from nerfro.allowed import AnyNumber, Depth, Positive, Range, Width, corners_of_
 from nerfro.fields.base import Field
 from nerfro.fields.selection import evaluate_selected, inside_box
 from nerfro.registry import register
-from nerfro.types import Radiance, Samples
+from nerfro.types import FieldValues, Samples
 
 from .encoding import DIRECTION_DEGREE, positional_encoding
 from .mlp import RadianceMLP, in_blocks
@@ -71,9 +71,9 @@ class NerfField(FieldInBox):
         num_position, num_direction = 3 * (1 + 2 * position_degree), 3 * (1 + 2 * DIRECTION_DEGREE)
         self.mlp = RadianceMLP(num_position, num_direction, width, depth, skip, view_width)
 
-    def forward(self, samples: Samples) -> Radiance:
+    def forward(self, samples: Samples) -> FieldValues:
         if self.everywhere:
-            return Radiance(*self.decode(samples.positions, samples.directions))
+            return FieldValues(*self.decode(samples.positions, samples.directions))
         return evaluate_selected(self.decode, samples, inside_box(samples.positions, *self.box))
 
     def decode(
@@ -87,5 +87,5 @@ class NerfField(FieldInBox):
     ) -> tuple[Float[Tensor, " points"], Float[Tensor, "points 3"]]:
         position = positional_encoding(positions / self.unit, self.position_degree)
         direction = positional_encoding(directions, DIRECTION_DEGREE)
-        density, rgb = self.mlp(position, direction)
-        return density / self.unit, rgb
+        density, radiance = self.mlp(position, direction)
+        return density / self.unit, radiance

@@ -15,7 +15,8 @@ from nerfro.viewing.volume import RESOLUTION, sample_field
 def write_volume(scene: TrainedScene, out: Path, config: DictConfig) -> str:
     """Write density, linear radiance and the corners of the grid as .npz; `config` is an `ExportConfig`."""
     volume = sample_field(scene, config.resolution or RESOLUTION)
-    save_arrays(out, {name: getattr(volume, name).numpy() for name in ("density", "rgb", "box")})
+    arrays = {"density": volume.density, "rgb": volume.radiance, "box": volume.box}
+    save_arrays(out, {name: values.numpy() for name, values in arrays.items()})
     return f"the inside: {'x'.join(map(str, volume.density.shape))} vertices with density and linear rgb"
 
 

@@ -35,9 +35,9 @@ def test_losses_use_exposed_renderings() -> None:
     gain = torch.rand(NUM_RAYS, 3) + 0.5
     (rendering,) = model(batch.rays)
     exposed = rendering.exposed(gain)
-    torch.testing.assert_close(exposed.rgb, gain * rendering.rgb)
-    torch.testing.assert_close(exposed.boundary_rgb, gain * rendering.boundary_rgb)
-    expected = mse_loss(model.scene.colour_space.to_srgb(gain * rendering.rgb), batch.rgb)
+    torch.testing.assert_close(exposed.radiance, gain * rendering.radiance)
+    torch.testing.assert_close(exposed.background_radiance, gain * rendering.background_radiance)
+    expected = mse_loss(model.scene.colour_space.to_srgb(gain * rendering.radiance), batch.rgb)
     torch.testing.assert_close(Photometric()([exposed], batch, model.scene), expected)
 
 

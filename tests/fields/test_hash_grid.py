@@ -39,23 +39,23 @@ def test_selection_does_not_change_the_values_of_samples() -> None:
         asked.append(positions.shape[0])
         return positions.square().sum(-1), directions.abs()
 
-    radiance = evaluate_selected(decoder, samples, selected)
-    density, rgb = decoder(samples.positions, samples.directions)
+    values = evaluate_selected(decoder, samples, selected)
+    density, colour = decoder(samples.positions, samples.directions)
     assert asked[0] == int(selected.sum())
-    assert torch.equal(radiance.density, torch.where(selected, density, 0))
-    assert torch.equal(radiance.rgb, torch.where(selected[..., None], rgb, 0))
+    assert torch.equal(values.density, torch.where(selected, density, 0))
+    assert torch.equal(values.radiance, torch.where(selected[..., None], colour, 0))
 
 
 def test_empty_selection_has_gradients() -> None:
     field = make_field()
-    radiance = field(make_samples(scale=0.0))  # all in the middle
-    assert (radiance.density > 0).all()
+    values = field(make_samples(scale=0.0))  # all in the middle
+    assert (values.density > 0).all()
     outside = make_samples()
     outside = Samples(outside.positions + 100, outside.directions, outside.s, outside.edges, outside.radii)
-    radiance = field(outside)
-    assert not radiance.density.any()
-    assert not radiance.rgb.any()
-    (radiance.density.sum() + radiance.rgb.sum()).backward()
+    values = field(outside)
+    assert not values.density.any()
+    assert not values.radiance.any()
+    (values.density.sum() + values.radiance.sum()).backward()
     assert all(p.grad is not None and not p.grad.any() for p in field.parameters())
 
 
@@ -63,8 +63,8 @@ def test_only_samples_inside_the_box_are_evaluated() -> None:
     field, samples = make_field(box_min=[-1, -0.5, 0], box_max=[1, 0.5, 1.5]), make_samples()
     inside = ((samples.positions >= field.box_min) & (samples.positions <= field.box_max)).all(-1)
     assert 0 < inside.sum() < inside.numel()
-    radiance = field(samples)
-    assert torch.equal(radiance.density > 0, inside)
+    values = field(samples)
+    assert torch.equal(values.density > 0, inside)
     assert torch.equal(inside_box(torch.full((2, 3), float("nan")), field.box_min, field.box_max), torch.zeros(2) > 0)
 
 
@@ -96,11 +96,11 @@ def test_gradients_of_positions_and_directions_match_autograd() -> None:
     field.colour_mlp[-1].weight.data *= 0.3  # no colour so dark that its gradient is held back
     edges = torch.tensor([[0.0, 1.0]]).expand(80, 2)
     samples = Samples(*(values[:, None] for values in inputs), edges[:, :1], edges, edges[:, 0])
-    radiance = field(samples)
-    ours = torch.autograd.grad(radiance.density.sum() + (radiance.rgb * upstream).sum(), inputs)
+    values = field(samples)
+    ours = torch.autograd.grad(values.density.sum() + (values.radiance * upstream).sum(), inputs)
     in_double = [values.detach().double().requires_grad_() for values in inputs]
-    density, rgb = decoded_in_double(field, *in_double)
-    expected = torch.autograd.grad(density.sum() + (rgb * upstream).sum(), in_double)
+    density, colour = decoded_in_double(field, *in_double)
+    expected = torch.autograd.grad(density.sum() + (colour * upstream).sum(), in_double)
     inside = inside_box(inputs[0], field.box_min, field.box_max)
     assert 10 < inside.sum() < 70
     for found, reference in zip(ours, expected, strict=True):
@@ -116,19 +116,19 @@ def test_shortcut_keeps_gradients_of_a_dead_colour_network() -> None:
         with torch.no_grad():  # all units below zero in the first layer, wherever it is asked
             field.colour_mlp[0].weight[:] = 0
             field.colour_mlp[0].weight[:, 16] = -1  # the first harmonic is the same in all directions
-        rgb = field(make_samples(scale=1.0)).rgb
-        rgb.square().sum().backward()
+        radiance = field(make_samples(scale=1.0)).radiance
+        radiance.square().sum().backward()
         assert (field.table.grad.abs().sum() > 0) == shortcut
-        assert bool(rgb.std(dim=(0, 1)).gt(1e-3).all()) == shortcut  # one grey everywhere without it
+        assert bool(radiance.std(dim=(0, 1)).gt(1e-3).all()) == shortcut  # one grey everywhere without it
 
 
 def test_field_runs_under_autocast_with_encodings_in_single_precision() -> None:
     field = make_field()
     with torch.autocast("cpu", torch.bfloat16):
         assert field.encode(torch.zeros(5, 3)).dtype == torch.float32
-        radiance = field(make_samples())
-    assert radiance.density.dtype == torch.float32
-    radiance.density.sum().backward()
+        values = field(make_samples())
+    assert values.density.dtype == torch.float32
+    values.density.sum().backward()
     assert field.table.grad is not None
     assert field.table.grad.dtype == torch.float32
 
@@ -149,10 +149,10 @@ def test_field_of_all_space_is_evaluated_at_contracted_positions() -> None:
     offset = positions - centre
     within = offset.norm(dim=-1) < 0.8
     assert 0 < within.sum() < len(within)
-    radiance = everywhere(samples)
-    density, rgb = everywhere.decode(contract(positions, centre, 0.8), samples.directions.flatten(0, 1))
-    torch.testing.assert_close(radiance.rgb.flatten(0, 1), rgb)
-    found = radiance.density.flatten()
+    values = everywhere(samples)
+    density, colour = everywhere.decode(contract(positions, centre, 0.8), samples.directions.flatten(0, 1))
+    torch.testing.assert_close(values.radiance.flatten(0, 1), colour)
+    found = values.density.flatten()
     torch.testing.assert_close(found[within], density[within])
     torch.testing.assert_close(found[~within], (density * (0.8 / offset.norm(dim=-1)) ** 2)[~within])
     assert (found > 0).all()

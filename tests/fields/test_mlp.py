@@ -90,9 +90,9 @@ def test_field_with_a_box_equals_one_without_inside_and_is_empty_outside(make: t
     samples = Stratified(32, cast="cones")(example_path(8), None)
     kept = ((samples.positions > inside.box[0]) & (samples.positions < inside.box[1])).all(-1)
     assert 0 < kept.sum() < kept.numel()
-    expected, radiance = everywhere(samples), inside(samples)
-    torch.testing.assert_close(radiance.density, expected.density * kept)
-    torch.testing.assert_close(radiance.rgb, expected.rgb * kept[..., None])
+    expected, values = everywhere(samples), inside(samples)
+    torch.testing.assert_close(values.density, expected.density * kept)
+    torch.testing.assert_close(values.radiance, expected.radiance * kept[..., None])
     assert everywhere.bounds is None
     assert inside.bounds is inside.box
 
@@ -113,10 +113,10 @@ def test_compiled_networks_equal_plain_ones_and_keep_weight_names() -> None:
     torch._dynamo.register_backend(counting, name="counting")
     compile_networks(compiled, "counting")
     samples = example_samples()
-    expected, radiance = plain(samples), compiled(samples)
+    expected, values = plain(samples), compiled(samples)
     assert calls
-    torch.testing.assert_close(radiance.rgb, expected.rgb)
-    torch.testing.assert_close(radiance.density, expected.density)
+    torch.testing.assert_close(values.radiance, expected.radiance)
+    torch.testing.assert_close(values.density, expected.density)
     assert compiled.state_dict().keys() == plain.state_dict().keys()
 
 

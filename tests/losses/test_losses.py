@@ -40,8 +40,8 @@ def gradient_norms(model: Renderer, value: Tensor) -> dict[str, float]:
 
 def test_photometric_loss_is_the_mean_over_rays_and_channels_of_both_levels(model: Renderer) -> None:
     batch = example_batch()
-    coarse = replace(example_rendering(), rgb=batch.rgb + 0.1)
-    fine = replace(coarse, rgb=batch.rgb - 0.3)
+    coarse = replace(example_rendering(), radiance=batch.rgb + 0.1)
+    fine = replace(coarse, radiance=batch.rgb - 0.3)
     torch.testing.assert_close(Photometric()([coarse, fine], batch, model.scene), torch.tensor(0.09 + 0.01))
     torch.testing.assert_close(Photometric(coarse=0.1)([coarse, fine], batch, model.scene), torch.tensor(0.09 + 0.001))
 
@@ -60,7 +60,7 @@ def test_boundary_regularizer_matches_a_manual_computation(model: Renderer) -> N
     for ray in range(NUM_RAYS):
         if transmittance[ray] > 0.5:
             count += 1
-            passed = transmittance[ray] * rendering.boundary_rgb[ray]
+            passed = transmittance[ray] * rendering.background_radiance[ray]
             total += sum(abs(float(passed[c] - batch.rgb[ray, c])) for c in range(3))
     value = BoundaryRegularizer()([rendering, rendering], batch, model.scene)
     assert value.item() == pytest.approx(total / (count + 1), rel=1e-5)
@@ -71,7 +71,7 @@ def test_boundary_regularizer_can_be_restricted_to_refracted_rays(model: Rendere
     rendering = replace(example_rendering(), transmittance=torch.ones(NUM_RAYS))
     refracted = rendering.path.refracted
     assert 0 < refracted.sum() < NUM_RAYS
-    error = (rendering.boundary_rgb - batch.rgb).abs().sum(-1)[refracted]
+    error = (rendering.background_radiance - batch.rgb).abs().sum(-1)[refracted]
     value = BoundaryRegularizer(refracted_only=True)([rendering], batch, model.scene)
     torch.testing.assert_close(value, error.sum() / (len(error) + 1))
 
@@ -148,8 +148,8 @@ MODEL = RefractiveModel(example_components())
 def rendering(colour: Tensor, background: Tensor, passed: Tensor) -> Rendering:
     path = example_path(8)
     samples = point_samples(path, path.near[:, None])
-    rgb = (1 - passed)[:, None] * colour + passed[:, None] * background
-    return Rendering(rgb, (1 - passed)[:, None], passed, background, samples, path)
+    radiance = (1 - passed)[:, None] * colour + passed[:, None] * background
+    return Rendering(radiance, (1 - passed)[:, None], passed, background, samples, path)
 
 
 def batch() -> Batch:
@@ -174,14 +174,14 @@ def test_values_of_a_pixel_are_the_mean_over_its_rays_in_any_order() -> None:
 
 def test_losses_compare_pixels_and_not_their_rays() -> None:
     given, rendered = batch(), rendering(torch.rand(8, 3), torch.rand(8, 3), torch.rand(8))
-    expected = (to_srgb(given.per_pixel(rendered.rgb)) - given.rgb).square().mean()
+    expected = (to_srgb(given.per_pixel(rendered.radiance)) - given.rgb).square().mean()
     torch.testing.assert_close(Photometric()([rendered], given, MODEL.scene), expected)
 
 
 def test_boundary_regularizer_uses_the_background_of_pixels() -> None:
     given, passed = batch(), torch.tensor([0.9, 0.9, 0.2, 0.2, 0.9, 0.2, 0.9, 0.2])  # of the last pixel little
     rendered = rendering(torch.rand(8, 3), torch.rand(8, 3), passed)
-    background = to_srgb(given.per_pixel(passed[:, None] * rendered.boundary_rgb))
+    background = to_srgb(given.per_pixel(passed[:, None] * rendered.background_radiance))
     expected = (background - given.rgb).abs().sum(-1)[:2].sum() / (2 + 1)
     torch.testing.assert_close(BoundaryRegularizer()([rendered], given, MODEL.scene), expected)
 
@@ -210,7 +210,7 @@ def test_background_learns_from_selected_rays_and_the_medium_from_all(absorbs: b
     def gradients(held: Tensor) -> list[Tensor]:
         """By the sky and by what bends and tints the rays; by the rays in a sum of two renderings."""
         weights = torch.linspace(0.5, 1.5, 8)[:, None]
-        seen = model.render_path(path, None, held)[-1].rgb
+        seen = model.render_path(path, None, held)[-1].radiance
         learned = [sky.texels, directions, *([absorption] if absorbs else [])]
         return list(torch.autograd.grad((weights * seen.square()).sum(), learned))
 

@@ -14,7 +14,7 @@ from nerfro.media.shapes import Ball
 from nerfro.rendering import Scene, composite
 from nerfro.samplers.paths.straight import Straight
 from nerfro.testing import example_batch, example_path
-from nerfro.types import Path, Radiance, Rays, Rendering, Samples
+from nerfro.types import FieldValues, Path, Rays, Rendering, Samples
 
 SCENE = Mock(spec=Scene)
 
@@ -31,8 +31,8 @@ def learned_opacity(seen: torch.Tensor, loss: Loss, start: float = 1.0, num_step
     batch = replace(example_batch(8), rgb=seen.expand(8, 3))
     for _ in range(num_steps):
         density = raw.exp().expand(8, 8)
-        rendering = composite(samples, Radiance(density, torch.ones(8, 8, 3)), torch.ones(8, 3), path)
-        error = (rendering.rgb - 1).square().mean()
+        rendering = composite(samples, FieldValues(density, torch.ones(8, 8, 3)), torch.ones(8, 3), path)
+        error = (rendering.radiance - 1).square().mean()
         total = error + loss.weight * loss([rendering], batch, SCENE)
         optimizer.zero_grad()
         total.backward()
@@ -66,7 +66,7 @@ def white_fog(path: Path, density: torch.Tensor) -> Rendering:
     """Fog of one density for each of 8 intervals between 0 and 8, white before white."""
     edges = torch.linspace(0, 8, 9).expand(8, -1)
     samples = Samples.along(path, 0.5 * (edges[:, 1:] + edges[:, :-1]), edges)
-    return composite(samples, Radiance(density.expand(8, 8), torch.ones(8, 8, 3)), torch.ones(8, 3), path)
+    return composite(samples, FieldValues(density.expand(8, 8), torch.ones(8, 8, 3)), torch.ones(8, 3), path)
 
 
 CONTENT = NearCamera((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
@@ -85,7 +85,7 @@ def test_near_camera_loss_removes_only_near_fog() -> None:
     optimizer = torch.optim.Adam([raw], lr=0.1)
     for _ in range(200):
         rendering = white_fog(path, raw.exp())
-        loss = (1 - rendering.rgb).square().mean() + 0.1 * CONTENT([rendering], BATCH, SCENE)
+        loss = (1 - rendering.radiance).square().mean() + 0.1 * CONTENT([rendering], BATCH, SCENE)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

@@ -13,7 +13,7 @@ from nerfro.rendering import composite
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.points.stratified import point_samples
 from nerfro.testing import example_components, example_rays
-from nerfro.types import Path, Radiance, Rays
+from nerfro.types import FieldValues, Path, Rays
 from tests.closed_forms import beam, random_rays
 from tests.conftest import refused
 from tests.paper import Eikonal
@@ -45,10 +45,10 @@ def test_content_inside_is_attenuated_by_the_glass_before_it() -> None:
     torch.testing.assert_close(path.transmitted(s)[0], expected)
     samples = point_samples(path, s)
     density = torch.tensor([[0.0, 0, 1e6, 0, 0]], dtype=torch.float64)
-    seen = composite(samples, Radiance(density, torch.ones(1, 5, 3)), torch.ones(1, 3), path)
-    torch.testing.assert_close(seen.rgb, expected[None, 2], rtol=1e-6, atol=0)
-    empty = composite(samples, Radiance(0 * density, torch.ones(1, 5, 3)), torch.ones(1, 3), path)
-    torch.testing.assert_close(empty.rgb, expected[None, -1], rtol=1e-6, atol=0)
+    seen = composite(samples, FieldValues(density, torch.ones(1, 5, 3)), torch.ones(1, 3), path)
+    torch.testing.assert_close(seen.radiance, expected[None, 2], rtol=1e-6, atol=0)
+    empty = composite(samples, FieldValues(0 * density, torch.ones(1, 5, 3)), torch.ones(1, 3), path)
+    torch.testing.assert_close(empty.radiance, expected[None, -1], rtol=1e-6, atol=0)
 
 
 def test_reflection_at_the_outside_of_a_ball_is_not_tinted() -> None:
@@ -93,7 +93,7 @@ def test_absorption_has_gradients_without_new_paths() -> None:
     with torch.no_grad():
         path = model.trace(example_rays())
     renderings = model.render_path(model.trace(example_rays(), path))
-    (gradient,) = torch.autograd.grad(renderings[-1].rgb.sum(), parameter)
+    (gradient,) = torch.autograd.grad(renderings[-1].radiance.sum(), parameter)
     assert (gradient != 0).all()
     names = [f"{absorption}.{colour}" for colour in ("red", "green", "blue")]
     assert model.scene.measurements() == dict.fromkeys(names, pytest.approx(0.02 / model.scene.medium.radius))

@@ -37,10 +37,10 @@ def test_boundary_is_evaluated_at_the_exit_or_at_the_last_coarse_sample(parts: C
     rays, parts = example_rays(), replace(parts, boundary=Compass())
     path = parts.path_sampler(rays, parts.medium)
     leaving = RefractiveModel(parts, "exit").eval()(rays)
-    torch.testing.assert_close(leaving[-1].boundary_rgb, 0.5 + 0.5 * path.exit_directions)
+    torch.testing.assert_close(leaving[-1].background_radiance, 0.5 + 0.5 * path.exit_directions)
     early = RefractiveModel(parts, "last_coarse").eval()(rays)
     for rendering in early:
-        torch.testing.assert_close(rendering.boundary_rgb, 0.5 + 0.5 * early[0].samples.directions[:, -1])
+        torch.testing.assert_close(rendering.background_radiance, 0.5 + 0.5 * early[0].samples.directions[:, -1])
 
 
 @pytest.mark.parametrize("training", [True, False])
@@ -64,7 +64,7 @@ def test_chunk_size_bounds_the_number_of_rays_rendered_at_once(
     )
     rendered = model.render(example_rays())
     assert sizes == [7, 7, 7, 3]
-    torch.testing.assert_close(rendered.radiance, whole[-1].rgb)
+    torch.testing.assert_close(rendered.radiance, whole[-1].radiance)
     none = model.render(example_rays()[:0])
     for name, values in vars(none).items():
         assert values.shape == (0, *getattr(rendered, name).shape[1:])

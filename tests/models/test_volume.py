@@ -58,7 +58,7 @@ def rendered(
     path: Path, sampler: DensityGridSampler, field: HashGridField, boundary: Boundary, draws: Draws | None = None
 ) -> torch.Tensor:
     samples = sampler(path, None, draws)
-    return composite(samples, field(samples), boundary(path.exits()), path).rgb
+    return composite(samples, field(samples), boundary(path.exits()), path).radiance
 
 
 def scores(space: dict, boundary: Boundary, num_steps: int = 150) -> list[float]:

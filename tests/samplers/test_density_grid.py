@@ -9,7 +9,7 @@ from nerfro.fields.base import Field
 from nerfro.geometry.contraction import contracted_length, contraction_scale
 from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.testing import example_draws, example_path
-from nerfro.types import Path, Radiance, Samples
+from nerfro.types import FieldValues, Path, Samples
 
 RADIUS = 0.4
 
@@ -17,9 +17,9 @@ RADIUS = 0.4
 class DenseBall(Field):
     """Density 50 inside a ball around the origin, nothing outside."""
 
-    def forward(self, samples: Samples) -> Radiance:
+    def forward(self, samples: Samples) -> FieldValues:
         inside = samples.positions.norm(dim=-1) < RADIUS
-        return Radiance(50.0 * inside, torch.zeros_like(samples.positions))
+        return FieldValues(50.0 * inside, torch.zeros_like(samples.positions))
 
 
 ALL_OF_SPACE = {"radius": 0.7, "near": 0.3, "max_bin_alpha": 0.4}
@@ -110,8 +110,8 @@ def test_updated_grid_holds_the_density_of_the_field() -> None:
 class Fog(Field):
     """Density 1 everywhere."""
 
-    def forward(self, samples: Samples) -> Radiance:
-        return Radiance(torch.ones_like(samples.s), torch.zeros_like(samples.positions))
+    def forward(self, samples: Samples) -> FieldValues:
+        return FieldValues(torch.ones_like(samples.s), torch.zeros_like(samples.positions))
 
 
 @pytest.mark.parametrize(("resolution", "fraction"), [(2, 1 / 16), (4, 1e-4)])

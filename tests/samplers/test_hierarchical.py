@@ -11,15 +11,15 @@ from nerfro.rendering import composite
 from nerfro.samplers.paths.straight import straight_path
 from nerfro.samplers.points.stepfun import midpoints
 from nerfro.testing import example_draws, example_path, example_rays
-from nerfro.types import Path, Radiance, Rendering
+from nerfro.types import FieldValues, Path, Rendering
 from tests.paper import Hierarchical
 
 
 def render(path: Path, sampler: Hierarchical, weights: Tensor) -> Rendering:
     """A coarse rendering whose weights are the given ones."""
     samples = sampler(path, None)
-    radiance = Radiance(torch.ones_like(samples.s), torch.zeros_like(samples.positions))
-    rendering = composite(samples, radiance, torch.zeros(len(path.s), 3), path)
+    values = FieldValues(torch.ones_like(samples.s), torch.zeros_like(samples.positions))
+    rendering = composite(samples, values, torch.zeros(len(path.s), 3), path)
     return replace(rendering, weights=weights.expand_as(samples.s))
 
 

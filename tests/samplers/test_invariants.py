@@ -14,7 +14,7 @@ from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.paths.straight import Straight
 from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import example_rays
-from nerfro.types import Path, Radiance, Rendering
+from nerfro.types import FieldValues, Path, Rendering
 from tests.closed_forms import (
     FunctionMedium,
     Squared,
@@ -121,8 +121,8 @@ def _levels(points: PointSampler, path: Path) -> list[Rendering]:
     for _ in range(points.num_levels):
         samples = points(path, renderings[-1] if renderings else None)
         density = 3 * torch.exp(-samples.positions.square().sum(-1))
-        radiance = Radiance(density, torch.sigmoid(samples.positions))
-        renderings.append(composite(samples, radiance, torch.zeros(len(path.s), 3), path))
+        values = FieldValues(density, torch.sigmoid(samples.positions))
+        renderings.append(composite(samples, values, torch.zeros(len(path.s), 3), path))
     return renderings
 
 

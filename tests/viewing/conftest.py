@@ -18,7 +18,7 @@ from nerfro.registry import discover
 from nerfro.rendering import Components
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.points.stratified import Stratified
-from nerfro.types import Radiance, Samples
+from nerfro.types import FieldValues, Samples
 from nerfro.viewing.server import PageServer
 from nerfro.viewing.trained_scene import TrainedScene
 from tests.cameras_at import cameras_at
@@ -29,10 +29,10 @@ RADIUS, INSIDE_RADIUS, INSIDE_CENTRE, IOR = 0.8, 0.3, (0.1, 0.0, 0.05), 1.3
 class SolidBall(Field):
     """Nearly opaque, of a colour that depends on the place alone."""
 
-    def forward(self, samples: Samples) -> Radiance:
+    def forward(self, samples: Samples) -> FieldValues:
         offset = samples.positions - torch.tensor(INSIDE_CENTRE)
         inside = torch.linalg.vector_norm(offset, dim=-1) < INSIDE_RADIUS
-        return Radiance(500.0 * inside, colour(samples.positions))
+        return FieldValues(500.0 * inside, colour(samples.positions))
 
 
 def colour(positions: torch.Tensor) -> torch.Tensor:

@@ -27,7 +27,7 @@ from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.subdivision import Subdivision
 from nerfro.testing import example_draws
-from nerfro.types import Radiance, Samples
+from nerfro.types import FieldValues, Samples
 from nerfro.variants import variant
 from nerfro.viewing.changes import with_changed_scene
 from nerfro.viewing.page import make_page
@@ -127,16 +127,16 @@ def test_vessel_agrees_with_nerfro(scene: TrainedScene, tmp_path: Path) -> None:
 class Surroundings(Field):
     """Two soft coloured clouds: one beside the glass, and a large one far behind it."""
 
-    def forward(self, samples: Samples) -> Radiance:
+    def forward(self, samples: Samples) -> FieldValues:
         density = torch.zeros_like(samples.s)
-        rgb = torch.zeros_like(samples.positions)
+        radiance = torch.zeros_like(samples.positions)
         clouds = (([0.9, 1.1, 0.2], 0.4, 6.0, [0.8, 0.2, 0.1]), ([-9.0, -1.0, 2.0], 4.0, 0.5, [0.1, 0.3, 0.9]))
         for centre, width, thickest, cloud in clouds:
             offset = samples.positions - torch.tensor(centre)
             of_cloud = thickest * torch.exp(-offset.square().sum(-1) / width**2)
             density += of_cloud
-            rgb += of_cloud[..., None] * torch.tensor(cloud)
-        return Radiance(density, rgb / density[..., None].clamp(min=1e-9))
+            radiance += of_cloud[..., None] * torch.tensor(cloud)
+        return FieldValues(density, radiance / density[..., None].clamp(min=1e-9))
 
 
 @needs_chromium

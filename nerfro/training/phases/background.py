@@ -148,7 +148,7 @@ def _observe_through_object(run: TrainingRun, pixels: Int[Tensor, "Q"]) -> Obser
     rendering = renderer.render_path(path)[-1]
     fraction, exits = path.main_polyline(rendering.boundary_fraction), main_exits(path)
     rgb = batches.photographed(pixels)
-    difference = _photographed(run, rgb, view) - rendering.rgb
+    difference = _photographed(run, rgb, view) - rendering.radiance
     radiance = scene.boundary(Exits(exits)) + difference / fraction.clamp(min=_BACKGROUND)
     widths = widths / batches.cameras.fx[view]
     observed = Observed(exits, radiance, rgb >= 1, fraction.square().mean(-1), widths)
