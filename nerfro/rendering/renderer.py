@@ -222,8 +222,8 @@ class Renderer(nn.Module, ABC):
         # Most rays of an image miss the object.
         radiance, depth = torch.empty_like(rays.directions), path.main_polyline(path.far).clone()
         opacity = torch.zeros_like(depth)
-        passing, rows = (~meets).nonzero()[:, 0], meets.nonzero()[:, 0]
-        radiance[passing] = self.scene.boundary(Exits.unbent(rays[passing])).to(radiance)
+        misses, rows = (~meets).nonzero()[:, 0], meets.nonzero()[:, 0]
+        radiance[misses] = self.scene.boundary(Exits.unbent(rays[misses])).to(radiance)
         if len(rows):
             rendering = self.render_path(path.select_rays(rows))[-1]
             radiance[rows], depth[rows], opacity[rows] = (

@@ -111,10 +111,12 @@ def _filtered_normals(
     guide = unit(patch)[column[order[np.diff(row[order], prepend=-1) != 0]]]
 
     middle = vertices[mesh.faces].mean(1)
-    apart = ((middle[row] - middle[column]) ** 2).sum(1)
-    differing = ((guide[row] - guide[column]) ** 2).sum(1)
-    near = area[column] * np.exp(-apart / (2 * apart[apart > 0].mean()) - differing / (2 * _ANGULAR_WIDTH**2))
-    averaging, direction = sparse.csr_matrix((near, (row, column)), touching.shape), unit(normals)
+    squared_distance = ((middle[row] - middle[column]) ** 2).sum(1)
+    squared_difference = ((guide[row] - guide[column]) ** 2).sum(1)
+    variance = squared_distance[squared_distance > 0].mean()
+    weights = np.exp(-squared_distance / (2 * variance) - squared_difference / (2 * _ANGULAR_WIDTH**2))
+    weights = area[column] * weights
+    averaging, direction = sparse.csr_matrix((weights, (row, column)), touching.shape), unit(normals)
     for _ in range(_ROUNDS):
         direction = unit(averaging @ direction)
     return direction, area

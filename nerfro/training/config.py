@@ -249,8 +249,8 @@ def check_run(config: DictConfig) -> None:
         )
     for name, node in config.callbacks.items():
         configure(find("callbacks", str(name)), node or {})
-    for kind in ("loss", "phase"):
-        build_each(kind, config[kind], known=False)
+    for plugin_type in ("loss", "phase"):
+        build_each(plugin_type, config[plugin_type], known=False)
     OmegaConf.to_object(config.optimizer)  # checks groups of parameters
     for node in (config.data, config.camera, config.sampler.points, config.field, config.boundary, config.model):
         check_node(node)
@@ -323,28 +323,30 @@ def build_data(config: DictConfig) -> DataSource:
     return WithValidationViews(source, number) if number else source
 
 
-def build_each(kind: str, nodes: DictConfig, known: bool = True) -> dict[str, Any]:
+def build_each(plugin_type: str, nodes: DictConfig, known: bool = True) -> dict[str, Any]:
     """Build the plugins of a type of which a run may have several, from the nodes `TYPE.<registered name>`.
 
     Args:
-        kind: plugin type.
+        plugin_type: type of the plugins, such as `loss`.
         nodes: configuration nodes of all plugins.
         known: whether interpolations in the nodes can be resolved; otherwise such settings keep their defaults.
 
     Raises:
         NerfroError: there is no loss, or a node does not fit its plugin.
     """
-    if kind == "loss" and not nodes:
+    if plugin_type == "loss" and not nodes:
         raise NerfroError("there is no loss to train with; add one, such as +loss.photometric.weight=1")
     built = {}
     for name in map(str, nodes):
         node = {} if nodes[name] is None else nodes[name]
         if not isinstance(node, Mapping):
-            setting = "weight" if kind == "loss" else "SETTING"
-            raise NerfroError(f"{kind}.{name}={node} is not a set of settings; write {kind}.{name}.{setting}={node}")
+            setting = "weight" if plugin_type == "loss" else "SETTING"
+            raise NerfroError(
+                f"{plugin_type}.{name}={node} is not a set of settings; write {plugin_type}.{name}.{setting}={node}"
+            )
         if not known:
             node = {field: node[field] for field in node if not OmegaConf.is_interpolation(node, field)}
-        built[name] = create(find(kind, name), node)
+        built[name] = create(find(plugin_type, name), node)
     return built
 
 

@@ -210,12 +210,12 @@ def _depths_contracted(path, grid, segments, width, depths):
     segment, turned_segment, turned_side, cosine, sine, by_cosine, by_sine = 0, -1, 0, 0.0, 0.0, 0.0, 0.0
     x0, y0, z0, within, a = 0.0, 0.0, 0.0, 0.0, 0.0
     half = 2.0 * radius
-    known = -1
+    cached_segment = -1
     for index in range(len(depths)):
         place = (index + 0.5) * width
         segment = _segment(cumulative, segment, place)
-        if segment != known:  # the closest approach relative to the centre
-            known, a = segment, impact[segment]
+        if segment != cached_segment:  # the closest approach relative to the centre
+            cached_segment, a = segment, impact[segment]
             within = np.sqrt(max(radius * radius - a * a, 0.0))
             x0 = positions[segment, 0] + (closest[segment] - s[segment]) * directions[segment, 0] - centre[0]
             y0 = positions[segment, 1] + (closest[segment] - s[segment]) * directions[segment, 1] - centre[1]
@@ -241,11 +241,14 @@ def _depths_contracted(path, grid, segments, width, depths):
 
 
 @compiled
-def _stopped(depth):
-    """Compute 1 - exp(-depth) in single precision, for small depths by a series, which most bins need."""
-    if depth < _THIN:
-        return depth * (1.0 - depth * (1.0 / 2.0 - depth * (1.0 / 6.0 - depth / 24.0)))
-    return 1.0 - np.exp(-depth)
+def _alpha(optical_depth):
+    """Compute the opacity of an interval, 1 - exp(-optical_depth), in single precision.
+
+    Most bins have small optical depths, for which a series is used.
+    """
+    if optical_depth < _THIN:
+        return optical_depth * (1.0 - optical_depth * (1.0 / 2.0 - optical_depth * (1.0 / 6.0 - optical_depth / 24.0)))
+    return 1.0 - np.exp(-optical_depth)
 
 
 @compiled
@@ -269,7 +272,7 @@ def _bin_weights(weights, settings):
     total, transmittance = 0.0, 1.0
     for index in range(len(weights)):
         optical_depth = weights[index]
-        alpha = min(_stopped(optical_depth), settings.max_bin_alpha)
+        alpha = min(_alpha(optical_depth), settings.max_bin_alpha)
         weights[index] = transmittance * alpha
         transmittance *= 1.0 - alpha
         total += weights[index]
@@ -376,8 +379,8 @@ def draw(paths, box, density, random, num_samples, settings):
     num_rays, num_vertices, cells = s.shape[0], s.shape[1], density.shape[0]
     edges = np.empty((num_rays, num_samples + 1), np.float32)
     at = np.empty((num_rays, num_samples), np.float32)
-    points = np.empty((num_rays, num_samples, 3), np.float32)
-    headings = np.empty((num_rays, num_samples, 3), np.float32)
+    sample_positions = np.empty((num_rays, num_samples, 3), np.float32)
+    sample_directions = np.empty((num_rays, num_samples, 3), np.float32)
     occupied = np.empty((num_rays, num_samples), np.bool_)
     lengths = np.empty((num_rays, num_samples), np.float32)
     contracted_edges = np.empty((num_rays, num_samples + 1), np.float32)
@@ -393,7 +396,8 @@ def draw(paths, box, density, random, num_samples, settings):
         for ray in range(block * _BLOCK, min((block + 1) * _BLOCK, num_rays)):
             path = positions[ray], directions[ray], s[ray]
             drawn = Drawn(
-                edges[ray], at[ray], points[ray], headings[ray], occupied[ray], lengths[ray], contracted_edges[ray]
+                edges[ray], at[ray], sample_positions[ray], sample_directions[ray],
+                occupied[ray], lengths[ray], contracted_edges[ray],
             )  # fmt: skip
             first, width = _predict(path, grid, settings, segments, weights)
             if width == 0.0:  # most rays of an image miss the object
@@ -404,4 +408,4 @@ def draw(paths, box, density, random, num_samples, settings):
             else:
                 _random_quantiles(u, num_intervals[ray], ray_index[ray], key)
             _put_samples(path, grid, segments, (first, width, weights), u, settings.empty, drawn)
-    return edges, at, points, headings, occupied, lengths, contracted_edges
+    return edges, at, sample_positions, sample_directions, occupied, lengths, contracted_edges
