@@ -108,8 +108,8 @@ class HashGridField(Field):
         """Evaluate density per world unit and colour at positions in world space that is contracted."""
         assert self.radius is not None
         places = contract(positions, self.centre, self.radius)
-        density, rgb = self.decode(places, directions)
-        return self._world_density(density, positions, places), rgb
+        density, colour = self.decode(places, directions)
+        return self._world_density(density, positions, places), colour
 
     def decode(
         self, positions: Float[Tensor, "points 3"], directions: Float[Tensor, "points 3"]

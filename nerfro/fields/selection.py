@@ -13,8 +13,8 @@ Decoder = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 """Maps positions and unit directions [points, 3] to density [points] and radiance [points, 3]."""
 
 
-def evaluate_selected(decoder: Decoder, samples: Samples, selected: Bool[Tensor, "P N"] | None = None) -> Radiance:
-    """Evaluate a decoder at selected samples that may be occupied; elsewhere, density and colour are zero.
+def evaluate_selected(decoder: Decoder, samples: Samples, selected: Bool[Tensor, "P N"] | None = None) -> FieldValues:
+    """Evaluate a decoder at selected samples that may be occupied; elsewhere, density and radiance are zero.
 
     On a GPU, counting the selected samples costs one synchronization with the host.
 
@@ -27,10 +27,10 @@ def evaluate_selected(decoder: Decoder, samples: Samples, selected: Bool[Tensor,
     if samples.occupied is not None:
         selected = samples.occupied if selected is None else selected & samples.occupied
     if selected is None:
-        density, rgb = decoder(positions, directions)
-        return Radiance(density.view(samples.s.shape), rgb.view(samples.positions.shape))
+        density, radiance = decoder(positions, directions)
+        return FieldValues(density.view(samples.s.shape), radiance.view(samples.positions.shape))
     index = selected.flatten().nonzero().squeeze(1)
-    density, rgb = decoder(positions.index_select(0, index), directions.index_select(0, index))
+    density, radiance = decoder(positions.index_select(0, index), directions.index_select(0, index))
     # Out of place, so that gradients flow from the full tensors back to the selected samples.
     all_density = density.new_zeros(selected.numel()).index_copy(0, index, density)
     all_radiance = radiance.new_zeros(selected.numel(), 3).index_copy(0, index, radiance)

@@ -39,8 +39,8 @@ class BoundaryRegularizer(Loss):
         path = fine.path
         counted = batch.per_pixel(path.sum_polylines(fine.transmittance.detach())) > _MIN_TRANSMITTANCE
         if self.refracted_only:
-            counted = counted & (batch.per_pixel(path.main_polyline(path.refracted).to(fine.rgb)) > 0.5)
-        background = path.sum_polylines(fine.transmittance[:, None] * fine.boundary_rgb.detach())
+            counted = counted & (batch.per_pixel(path.main_polyline(path.refracted).to(fine.radiance)) > 0.5)
+        background = path.sum_polylines(fine.transmittance[:, None] * fine.background_radiance.detach())
         predicted, target = scene.colour_space.prediction_and_target(batch.per_pixel(background), batch.rgb)
         error = (predicted - target).abs().sum(-1)
         # Gradients are averaged over processes, so each process multiplies its sum by the number of processes.

@@ -75,7 +75,7 @@ def test_only_occupied_samples_are_evaluated(radius: float | None) -> None:
     whole, part = field(samples), field(replace(samples, occupied=occupied))
     assert (whole.density > 0).all()
     torch.testing.assert_close(part.density, torch.where(occupied, whole.density, 0))
-    torch.testing.assert_close(part.rgb, torch.where(occupied[..., None], whole.rgb, 0))
+    torch.testing.assert_close(part.radiance, torch.where(occupied[..., None], whole.radiance, 0))
 
 
 def decoded_in_double(
