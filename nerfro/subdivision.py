@@ -128,7 +128,7 @@ def subdivide(
 def pixel_rays(
     cameras: Cameras, pixels: Int[Tensor, "R"], place: Float[Tensor, "R 2"] | Float[Tensor, "2"] | None = None
 ) -> Rays:
-    """Make rays through a position (x, y) in [0, 1) of pixels, by default the centres."""
+    """Make rays through a position (x, y) of pixels, see `Cameras.rays`, by default the centres."""
     width, height = cameras.width, cameras.height
     return cameras.rays(cameras.view_of(pixels), pixels // width % height, pixels % width, place)
 

@@ -17,8 +17,8 @@ class Distortion(Loss):
     """Penalize weights of the finest level that are spread along a path, as in fog (mip-NeRF 360, Eqn. 15).
 
     Arc length is measured in units of the length of the path, far - near, so that the loss does not depend on the scale
-    of the scene. If space is contracted, contracted length is measured in units of the total contracted length, and
-    the final transmittance counts as a weight at infinity, because the loss would otherwise favour transparency.
+    of the scene. If space is contracted, contracted length is measured in units of its value at the last edge of the
+    samples, where the final transmittance counts as a weight, because the loss would otherwise favour transparency.
     """
 
     weight = 1e-2

@@ -29,8 +29,9 @@ class ReconstructConfig:
         outlines: boxes or polygons around the object in some photographs, as for `python -m nerfro.mask`.
         out: output folder.
         trial_steps: number of steps of the training that tries each hypothesis about the object on validation
-            photographs (straight rays, solid body, vessel); 0 skips the comparison and trains with bent rays, of a
-            vessel or of several bodies if the scene file describes them.
+            photographs (straight rays, solid body, vessel); 0 skips the comparison and trains with bent rays: of
+            the vessel or the bodies that the medium of the scene file describes, otherwise of a solid body (of water,
+            if its index is unknown).
         pixels: maximum length of the longer side of the photographs in training; `data.downscale` has precedence.
         calibrate: further options of `python -m nerfro.calibrate`, separated by spaces.
         mask: further options of `python -m nerfro.mask`: `view=true` opens a page for drawing outlines, and

@@ -18,17 +18,13 @@ from nerfro.pipeline.hypotheses import Hypothesis, hypotheses
 from nerfro.pipeline.options import common_options
 from nerfro.pipeline.stage import Stage, is_older, move_aside
 from nerfro.registry import plugin_module
-from nerfro.rendering.scene_file import OLD_SCENE, SCENE, read_scene_file
+from nerfro.rendering.scene_file import OLD_SCENE, SCENE, SceneFile, read_scene_file
 from nerfro.silhouettes.overlaps import SHEET
 from nerfro.training.run_folder import CONFIG_FILE
 
 # Smallest gain of bent rays over straight rays in short trainings, in dB. On a simulated empty glass, a gain of 0.33 dB
 # in the trial became a gain of 0.75 dB after four minutes (docs/lab/simulated_glassware.md).
 _MIN_GAIN = 0.25
-_NEVERTHELESS = (
-    "to use bent rays nevertheless, add trial_steps=0 for a solid body, or train='+experiment=glass_room "
-    "medium=vessel' for a fitted vessel"
-)
 _MIN_PHOTOGRAPHS = 3
 _MASKS = ("masks/*", "masks/*/*", "mask_*", "*/mask_*")  # where loaders search for masks
 
@@ -101,12 +97,21 @@ def train(config: DictConfig, overrides: list[str], scene: Path, out: Path) -> N
             print(f"\nhypothesis: {hypothesis.name}")
             short = hypothesis.trial_options(config.trial_steps)
             _run_training([*hypothesis.options, *not_given(common, short), *short], inputs, trial)
-        options = _best_hypothesis(candidates, trials).options
+        options = _best_hypothesis(candidates, trials, _advice(content)).options
         inputs += [trial / "metrics.json" for trial in trials]
     _run_training([*options, *common], inputs, out / "run")
 
 
-def _best_hypothesis(tried: Sequence[Hypothesis], runs: Sequence[Path]) -> Hypothesis:
+def _advice(scene: SceneFile) -> str:
+    """Say how to train with bent rays although straight rays were chosen."""
+    solid = "to use bent rays nevertheless, add trial_steps=0"
+    if not scene.vessel:
+        return solid
+    experiment = "glass_room" if scene.surroundings == "near" else "glass"
+    return f"{solid} for a solid body, or train='+experiment={experiment} medium=vessel' for the fitted vessel"
+
+
+def _best_hypothesis(tried: Sequence[Hypothesis], runs: Sequence[Path], advice: str) -> Hypothesis:
     """Print the scores of the trials, and return the hypothesis with the best mean of image and object.
 
     Bent rays have to be better than straight rays by `_MIN_GAIN`, because scores of five views vary.
@@ -114,10 +119,11 @@ def _best_hypothesis(tried: Sequence[Hypothesis], runs: Sequence[Path]) -> Hypot
     Args:
         tried: the hypotheses, straight rays first.
         runs: run folder of the trial of each hypothesis; empty if there are only straight rays.
+        advice: how to train with bent rays if straight rays are chosen, for the message.
     """
     if not runs:
         print(f"\ntraining continues with: {tried[0].name}")
-        print(f"no body explains the pixels of the object better; {_NEVERTHELESS}")
+        print(f"no body explains the pixels of the object better; {advice}")
         return tried[0]
     scores = []
     print("\nPSNR of short trainings on validation photographs, in dB:")
@@ -137,7 +143,7 @@ def _best_hypothesis(tried: Sequence[Hypothesis], runs: Sequence[Path]) -> Hypot
     if best is tried[0]:
         doubts = [hypothesis.doubt for hypothesis in tried if hypothesis.doubt]
         reason = doubts[0] if doubts else "the surface or the index is not accurate enough, or the object is opaque"
-        print(f"the mean of bent rays is not higher by {_MIN_GAIN} dB: {reason}; {_NEVERTHELESS}")
+        print(f"the mean of bent rays is not higher by {_MIN_GAIN} dB: {reason}; {advice}")
     return best
 
 
@@ -148,7 +154,7 @@ def _run_training(options: list[str], inputs: list[Path], run: Path) -> None:
     stage = Stage("train", options, run / "metrics.json", run / "images", inputs)
     if started.is_file() and not stage.is_done:
         if is_older(started, inputs):
-            print(f"\ntrain: the surface is newer than {run}, which is kept as {move_aside(run)}")
+            print(f"\ntrain: the surface or a trial is newer than {run}, which is kept as {move_aside(run)}")
         else:
             stage = replace(stage, options=[*options, "ckpt_path=last"])
     stage.run()
