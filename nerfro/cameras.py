@@ -151,7 +151,7 @@ class Cameras:
 
         Args:
             view, row, column: indices of each pixel, on the device of the cameras.
-            place: position (x, y) of the ray from the left and top edge of each pixel, in pixels; by default the centre.
+            place: position (x, y) of the ray from the left and top edge of each pixel, in pixels; None for the centre.
 
         Returns:
             Rays in world space with unit directions.

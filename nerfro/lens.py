@@ -15,6 +15,7 @@ _NEWTON_STEPS = 8
 _LAST_STEP = 1e-5
 # Angles from the optical axis at which `fold_radius` searches, and the largest one in degrees.
 _NUM_ANGLES, _MAX_ANGLE = 1024, 89.9
+_FAR = 1e6  # radius at unit depth in place of infinity
 
 
 def coefficients(
@@ -68,10 +69,10 @@ def distort(
 def distort_without_fold(
     points: Float[Tensor, "V points 2"], lens: Float[Tensor, "V 9"]
 ) -> Float[Tensor, "V points 2"]:
-    """Distort points at any angle from the optical axis; no point outside of the image lands in the image.
+    """Distort points at any angle from the optical axis, so that points outside of the image stay outside.
 
     Beyond some radius, polynomials move points inwards again, which no lens does. From this radius on, the displacement
-    by the lens is constant.
+    by the lens is constant. The radius is that of the radial terms, because tangential terms are small.
 
     Args:
         points: points of the ideal image plane of each view, see `distort`.
@@ -81,7 +82,8 @@ def distort_without_fold(
         Distorted points.
     """
     radius = torch.linalg.vector_norm(points, dim=-1, keepdim=True)
-    inner = points * (fold_radius(lens)[:, None, None] / radius.clamp(min=1e-12)).clamp(max=1)
+    fold = fold_radius(lens)[:, None, None]
+    inner = points * torch.where(radius > fold, fold.clamp(max=_FAR) / radius.clamp(min=1e-12), 1.0)
     distorted, _ = distort(inner.flatten(0, 1), lens.repeat_interleave(points.shape[1], 0))
     return distorted.view_as(points) + (points - inner)
 

@@ -95,7 +95,7 @@ def test_commands_lead_from_photographs_to_scores(
     train_here(
         "+experiment=glass_room",
         *printed_command("train on it", printed),
-        *("trainer.max_steps=40", "trainer.max_time=null", "trainer.accelerator=cpu", "logger=none"),
+        *("trainer.max_steps=60", "trainer.max_time=null", "trainer.accelerator=cpu", "logger=none"),
         *("data.downscale=10", "batches.size=512", "evaluation.subdivision.side=1"),
         *("field.num_levels=6", "field.log2_table_size=13"),
         f"hydra.run.dir={run_folder}",

@@ -166,7 +166,8 @@ class LazyImages:
             return other.read(path) if path in others else self.read(path)
 
         dtype = np.promote_types(self.dtype, other.dtype)
-        return replace(self, files=[*self.files, *other.files], read=read, dtype=dtype)
+        recipe = self.recipe if self.recipe == other.recipe else ""
+        return replace(self, files=[*self.files, *other.files], read=read, dtype=dtype, recipe=recipe)
 
     def cut(self, window: Window) -> LazyImages:
         """Restrict every image to a window."""

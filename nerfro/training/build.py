@@ -26,7 +26,7 @@ from nerfro.rendering.scene_file import with_scene
 from nerfro.samplers.paths.thin_walls import warn_of_thin_walls
 from nerfro.training.config import TrainConfig, build_data, build_each, build_model, check_run, resolve_trainer_options
 from nerfro.training.data_module import RayDataModule, traced
-from nerfro.training.effects import require_effect
+from nerfro.training.effects import settings_without_effect
 from nerfro.training.memory import require_memory
 from nerfro.training.module import TrainingModule
 from nerfro.training.ray_batches import RayBatches
@@ -63,7 +63,8 @@ def build(experiment: str | None = None, overrides: Sequence[str] = ()) -> tuple
         raise NerfroError(in_one_line(error)) from error
     check_configuration(config, TrainConfig, CONF_DIR)
     check_run(config)
-    require_effect(config, given)
+    for line in settings_without_effect(config, given):
+        warn(line)
     resolve_trainer_options(config)
     if config.callbacks:
         warn("nerfro.build ignores callbacks; give them to your own Trainer: lightning.Trainer(callbacks=[...])")
@@ -73,16 +74,15 @@ def build(experiment: str | None = None, overrides: Sequence[str] = ()) -> tuple
 
 
 def check_command(config: DictConfig) -> None:
-    """Check the configuration of `nerfro.train`: `check_run`, and `require_effect` of the command line.
-
-    A program that runs commands gives the same settings to several trainings, so that some may have no effect.
+    """Check the configuration of `nerfro.train`, and warn of settings of the command line that have no effect.
 
     Raises:
-        NerfroError: the configuration cannot train, or a setting has no effect.
+        NerfroError: the configuration cannot train.
     """
     check_run(config)
     if prints_hints():
-        require_effect(config, HydraConfig.get().overrides.task)
+        for line in settings_without_effect(config, HydraConfig.get().overrides.task):
+            warn(line)
 
 
 def build_training(config: DictConfig, source: DataSource, training: Views) -> tuple[TrainingModule, RayDataModule]:

@@ -1,35 +1,42 @@
-"""Settings of a training that have no effect beside other settings."""
+"""Settings of a training that have no effect in combination with the other settings."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from typing import Any, get_args, get_type_hints
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
 from nerfro.allowed import OnlyWith
-from nerfro.errors import NerfroError
 from nerfro.registry import SEVERAL, Plugin, find, plugin_of
 
 
-def require_effect(config: DictConfig, overrides: Iterable[str]) -> None:
-    """Refuse given settings that have no effect beside the other settings, see `allowed.OnlyWith`.
+def settings_without_effect(config: DictConfig, overrides: Iterable[str]) -> list[str]:
+    """Describe given settings that have no effect in combination with the other settings, see `allowed.OnlyWith`.
 
-    Settings that are off (null, 0 or false) or have the default value are accepted.
+    Such settings are not refused, because the same settings may be given to several trainings, as in a sweep. Settings
+    that are off (null, 0 or false) or have the default value are left out.
 
     Args:
         config: configuration of a run, see `TrainConfig`.
         overrides: settings of the command line.
 
-    Raises:
-        NerfroError: a setting has no effect.
+    Returns:
+        A line about each setting without effect.
     """
-    for override in OverridesParser.create().parse_overrides(list(overrides)):
-        if not override.is_delete():
-            for name in _leaves(tuple(override.get_key_element().lstrip("+").split(".")), override.value()):
-                _require_effect_of(config, name)
+    found = []
+    parser = OverridesParser.create()
+    for text in overrides:
+        with suppress(HydraException):  # a path that was inserted for a scene, and that Hydra cannot parse
+            override = parser.parse_override(text)
+            if not override.is_delete():
+                for name in _leaves(tuple(override.get_key_element().lstrip("+").split(".")), override.value()):
+                    found += _reasons(config, name)
+    return found
 
 
 def _leaves(name: tuple[str, ...], value: object) -> Iterator[tuple[str, ...]]:
@@ -41,23 +48,24 @@ def _leaves(name: tuple[str, ...], value: object) -> Iterator[tuple[str, ...]]:
         yield from _leaves((*name, str(key)), each)
 
 
-def _require_effect_of(config: DictConfig, full_name: tuple[str, ...]) -> None:
+def _reasons(config: DictConfig, full_name: tuple[str, ...]) -> list[str]:
+    """Say why a setting has no effect; the result is empty if the setting has an effect."""
     *place, name = full_name
     node: Any = config
     for key in place:
         node = node[key] if isinstance(node, DictConfig) and key in node else None
     if not isinstance(node, DictConfig) or name not in node or not node[name]:
-        return
+        return []
     hints, defaults = _described(node, place)
     if node[name] == defaults.get(name):
-        return
-    for condition in get_args(hints.get(name)):
-        if isinstance(condition, OnlyWith):
-            _require(condition, config, node, place, name)
+        return []
+    conditions = [condition for condition in get_args(hints.get(name)) if isinstance(condition, OnlyWith)]
+    reasons = (_reason(condition, config, node, place, name) for condition in conditions)
+    return [reason for reason in reasons if reason is not None]
 
 
-def _require(condition: OnlyWith, config: DictConfig, node: DictConfig, place: list[str], name: str) -> None:
-    """Refuse a setting of a node if a condition does not hold."""
+def _reason(condition: OnlyWith, config: DictConfig, node: DictConfig, place: list[str], name: str) -> str | None:
+    """Say why a condition of a setting does not hold; None if it holds."""
     other = ".".join([*place, condition.setting]) if condition.setting in node else condition.setting
     value = OmegaConf.select(config, other)
     if isinstance(value, DictConfig):
@@ -66,11 +74,10 @@ def _require(condition: OnlyWith, config: DictConfig, node: DictConfig, place: l
     else:
         shown = "null" if value is None else str(value)
         holds = value in condition.values if condition.values else bool(value)
-    if not holds:
-        advice = f"{other}={' or '.join(condition.values)}" if condition.values else f"another {other}"
-        raise NerfroError(
-            f"{'.'.join([*place, name])}={node[name]} has no effect with {other}={shown}; remove it, or choose {advice}"
-        )
+    if holds:
+        return None
+    advice = f"choose {other}={' or '.join(condition.values)}" if condition.values else f"change {other}"
+    return f"{'.'.join([*place, name])}={node[name]} has no effect with {other}={shown}; remove it, or {advice}"
 
 
 def _fits(condition: OnlyWith, plugin: Plugin) -> bool:
@@ -84,7 +91,7 @@ def _described(node: DictConfig, place: list[str]) -> tuple[Mapping[str, Any], M
     schema = OmegaConf.get_type(node)
     if len(place) == 2 and place[0] in SEVERAL:
         plugin = find(*place)
-    elif "_target_" in node and place != ["trainer"]:
+    elif "_target_" in node and place[0] not in ("logger", "trainer"):  # whose classes are those of Lightning
         plugin = plugin_of(node)
     elif dataclasses.is_dataclass(schema):
         return get_type_hints(schema, include_extras=True), OmegaConf.structured(schema)

@@ -14,6 +14,7 @@ from nerfro.cameras import Cameras
 from nerfro.errors import NerfroError
 from nerfro.files.cache import file_hash
 from nerfro.paths import resolve_path
+from nerfro.registry import plugin_of
 from nerfro.training.settings import first_difference, flat
 
 # Entry of a checkpoint.
@@ -35,7 +36,12 @@ def inputs_of(config: DictConfig, cameras: Cameras | None) -> dict[str, Any]:
 
 
 def file_hashes(config: DictConfig) -> dict[str, str]:
-    """Return a hash of each file that a setting of the medium names, by the name of the setting."""
+    """Return a hash of each file that a setting of the medium names, by the name of the setting.
+
+    There is none if rays are straight, because such a training does not use the medium.
+    """
+    if not plugin_of(config.sampler.path).cls.needs_medium:  # type: ignore[attr-defined]
+        return {}
     found = {}
     for name, value in flat(config.medium, "medium").items():
         places = value if isinstance(value, list) else [value]
@@ -78,13 +84,15 @@ def require_same_inputs(checkpoint: Mapping[str, Any], path: Path, config: DictC
 
 
 def _tensors(cameras: Cameras) -> dict[str, torch.Tensor]:
-    return {name: getattr(cameras, name).cpu() for name in _OF_CAMERAS}
+    tensors = {name: getattr(cameras, name).cpu() for name in _OF_CAMERAS}
+    lens = cameras.distortion
+    return tensors | {"distortion": torch.zeros(len(cameras), 9) if lens is None else lens.cpu()}
 
 
 def _equal(recorded: Mapping[str, Any], present: Mapping[str, torch.Tensor]) -> bool:
     return recorded.keys() == present.keys() and all(
         torch.is_tensor(old)
         and old.shape == new.shape
-        and bool(((old.double() - new).abs() <= _TOLERANCE * new.abs().max()).all())
+        and bool(((old.double() - new).abs() <= _TOLERANCE * new.abs().max().clamp(min=_TOLERANCE)).all())
         for old, new in ((recorded[name], present[name]) for name in present)
     )

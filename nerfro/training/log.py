@@ -51,7 +51,9 @@ def keep_rows(logger: CSVLogger, num_steps: int) -> None:
     if file.is_file():
         with reading(file, advice="remove it"), file.open(newline="", encoding="utf-8") as stream:
             # The row of training step n, counted from 0, and that of the scores after n steps have the same number.
-            rows = [row for row in csv.DictReader(stream) if int(row["step"]) < num_steps + (not row.get("loss/total"))]
+            # The last row of a killed run may be cut off.
+            whole = (row for row in csv.DictReader(stream) if (row["step"] or "").isdecimal())
+            rows = [row for row in whole if int(row["step"]) < num_steps + (not row.get("loss/total"))]
         logger.experiment.metrics += [{name: value for name, value in row.items() if value} for row in rows]
         logger.save()
 

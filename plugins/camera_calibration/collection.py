@@ -154,5 +154,6 @@ def _as_stored(file: Path, image: Image.Image, bits: int) -> Image.Image:
     stored = Image.fromarray(np.uint8(np.rint(255 * to_unit(colours))))
     exif, given = Image.Exif(), Image.Image.getexif(image)
     exif.update({tag: given[tag] for tag in _KEPT_TAGS if tag in given})
+    exif.get_ifd(ExifTags.IFD.Exif).update(given.get_ifd(ExifTags.IFD.Exif))  # the focal length, among others
     stored.info["exif"] = exif.tobytes()
     return stored

@@ -103,7 +103,10 @@ def align_to_outlines(
     distance = float((error - error.median()).abs().median())
     if distance > _MAX_DISTANCE:
         camera.restore(initial, torch.ones(len(cameras), dtype=torch.bool), lens=True)
-        print(f"outlines: the surface is {distance:.2f} pixels off its reduced masks, so the cameras are not aligned")
+        print(
+            f"outlines: the surface is {distance:.2f} pixels off its masks (of at most {_MAX_PIXELS} pixels), so the "
+            "cameras are not aligned"
+        )
         return None
     matrix, vector = normal_equations(slopes, error, weights, view, len(cameras), damping=0.0)
     information = _without_width(matrix, vector)[0] / (_CORRELATED * variance)

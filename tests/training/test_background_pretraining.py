@@ -84,10 +84,13 @@ def test_fits_of_few_pixels_use_the_pixels_of_larger_fits(
         state = phase.begin(run)
         monkeypatch.setattr("nerfro.training.phases.background._MAX_FITTED_PIXELS", limit)
         assert all(phase.step(run, number, state) for number in range(2))
-        of_limit[limit] = torch.cat(used).sort().values, state["weights"].sum()
+        sky = module.renderer.scene.boundary(Exits(views.cameras.image_rays(0).directions)).detach()
+        of_limit[limit] = torch.cat(used).sort().values, state["weights"].sum(), to_srgb(sky)
         used.clear()
-    assert torch.equal(of_limit[64][0], of_limit[10**6][0])
-    torch.testing.assert_close(of_limit[64][1], of_limit[10**6][1])
+    (pixels, weight, sky), (pixels_of_all, weight_of_all, sky_of_all) = of_limit[64], of_limit[10**6]
+    assert torch.equal(pixels, pixels_of_all)
+    torch.testing.assert_close(weight, weight_of_all)
+    assert (sky - sky_of_all).abs().mean() < 0.1 * (sky_of_all - sky_of_all.mean(0)).abs().mean()
 
 
 def test_rays_that_split_into_colours_do_not_show_the_background(
