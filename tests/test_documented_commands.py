@@ -26,6 +26,7 @@ from nerfro.overrides import is_scene_file
 from nerfro.paths import CONF_DIR, PACKAGE_DIR
 from nerfro.registry import KINDS, discover, plugins
 from nerfro.synthetic import SCENES
+from nerfro.training.effects import settings_without_effect
 from nerfro.viewing import PLUGIN_EXPORTS
 from nerfro.viewing.exports import find_export
 
@@ -108,6 +109,8 @@ def require_valid(command: str, options: list[str]) -> None:
         OmegaConf.update(config, setting.key_or_group, setting.value(), force_add=setting.is_add())
     check_names(config)
     check_settings(config, schema)
+    if command == "train":
+        assert settings_without_effect(config, options) == []
     if command == "export" and not OmegaConf.is_missing(config, "what"):
         find_export(config.what, Path(config.out))
 
