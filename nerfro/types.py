@@ -315,7 +315,7 @@ class Samples:
         s: arc lengths from the camera.
         edges: bounds of the intervals in arc length.
         radii: pixel cone radius at unit distance.
-        occupied: samples at which the field may be dense, and is evaluated; None for all.
+        occupied: samples at which the field may be dense; others need not be evaluated. None for all.
         lengths: world lengths by which densities are multiplied, if space is contracted within the intervals; None for
             the lengths of the intervals.
         contracted_edges: bounds of the intervals in contracted length; None without contraction.

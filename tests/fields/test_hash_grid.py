@@ -69,8 +69,8 @@ def test_only_samples_inside_the_box_are_evaluated() -> None:
 
 
 @pytest.mark.parametrize("radius", [None, 3.0])
-def test_only_occupied_samples_are_evaluated(radius: float | None) -> None:
-    field, samples = make_field(box_min=[-2, -2, -2], box_max=[2, 2, 2], radius=radius), make_samples()
+def test_only_occupied_samples_are_evaluated_in_images(radius: float | None) -> None:
+    field, samples = make_field(box_min=[-2, -2, -2], box_max=[2, 2, 2], radius=radius).eval(), make_samples()
     occupied = torch.rand(6, 9, generator=torch.Generator().manual_seed(5)) < 0.4
     whole, part = field(samples), field(replace(samples, occupied=occupied))
     assert (whole.density > 0).all()
