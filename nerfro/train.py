@@ -29,15 +29,7 @@ from nerfro.training.build import build_training, check_before_training, check_c
 from nerfro.training.callbacks import StopOnSignal, Throughput, steps_by_phase
 from nerfro.training.config import TrainConfig, build_data, resolve_trainer_options
 from nerfro.training.mesh_match import require_match
-from nerfro.training.run_folder import (
-    LAST_CHECKPOINT,
-    begin,
-    lock_run,
-    next_steps,
-    remove_scores,
-    require_same_run,
-    resume_advice,
-)
+from nerfro.training.run_folder import LAST_CHECKPOINT, begin, lock_run, next_steps, require_same_run, resume_advice
 from nerfro.training.sweeps import run_cell
 from nerfro.training.trainer import finish_logs, fit, make_trainer, prepare_process, print_profile
 from nerfro.training.viewer import Viewer
@@ -77,9 +69,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetr
     # These batches are not kept, because the data module moves the pixels to the training device.
     memory = check_before_training(renderer, datamodule.batches_of(trainer), device)
     if trainer.is_global_zero:
-        begin(folder, config, renderer)
-        if not 0 <= trainer.max_steps <= num_steps:
-            remove_scores(folder)
+        begin(folder, config, renderer, has_steps=not 0 <= trainer.max_steps <= num_steps)
         print(memory, flush=True)
     if config.compile is not None:
         compile_networks(renderer, config.compile)

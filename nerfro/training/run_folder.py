@@ -84,18 +84,17 @@ def in_sweep() -> bool:
     return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
 
 
-def begin(folder: Path, config: DictConfig, renderer: Renderer) -> None:
-    """Check the disk space, write the records of a run, and print a summary."""
+def begin(folder: Path, config: DictConfig, renderer: Renderer, has_steps: bool) -> None:
+    """Check the disk space, write the records of a run, and print a summary.
+
+    If the run has further training steps (`has_steps`), the scores of its last checkpoint are removed.
+    """
     require_room(folder, needed_bytes(renderer), "hydra.run.dir")
+    for scores in (*folder.glob("metrics.*"), *folder.glob("evaluate_*/metrics.*")) if has_steps else ():
+        scores.unlink()
     record(folder, config)
     found = f"{content.describe(config.content)}{backdrop.describe(config)}"
     print(f"nerfro: {config.name} on {config.data.root} -> {folder}\n{found}", end="", flush=True)
-
-
-def remove_scores(folder: Path) -> None:
-    """Remove the scores of the checkpoint from which a run resumes, because they are not those of further steps."""
-    for scores in (*folder.glob("metrics.*"), *folder.glob("evaluate_*/metrics.*")):
-        scores.unlink()
 
 
 def next_steps(folder: Path, split: str | None) -> str:
