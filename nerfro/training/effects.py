@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from typing import Any, get_args, get_type_hints
 
@@ -13,6 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from nerfro.allowed import OnlyWith
 from nerfro.registry import SEVERAL, Plugin, find, plugin_of
+from nerfro.training.settings import flat
 
 
 def settings_without_effect(config: DictConfig, overrides: Iterable[str]) -> list[str]:
@@ -34,23 +35,14 @@ def settings_without_effect(config: DictConfig, overrides: Iterable[str]) -> lis
         with suppress(HydraException):  # a path that was inserted for a scene, and that Hydra cannot parse
             override = parser.parse_override(text)
             if not override.is_delete():
-                for name in _leaves(tuple(override.get_key_element().lstrip("+").split(".")), override.value()):
-                    found += _reasons(config, name)
+                for full_name in flat(override.value(), override.get_key_element().lstrip("+")):
+                    found += _reasons(config, full_name)
     return found
 
 
-def _leaves(name: tuple[str, ...], value: object) -> Iterator[tuple[str, ...]]:
-    """Yield the full names of the settings in a value, which may be a mapping."""
-    if not isinstance(value, Mapping):
-        yield name
-        return
-    for key, each in value.items():
-        yield from _leaves((*name, str(key)), each)
-
-
-def _reasons(config: DictConfig, full_name: tuple[str, ...]) -> list[str]:
+def _reasons(config: DictConfig, full_name: str) -> list[str]:
     """Say why a setting has no effect; the result is empty if the setting has an effect."""
-    *place, name = full_name
+    *place, name = full_name.split(".")
     node: Any = config
     for key in place:
         node = node[key] if isinstance(node, DictConfig) and key in node else None

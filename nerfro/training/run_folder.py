@@ -216,7 +216,7 @@ def restore(checkpoint: dict, config: DictConfig) -> Renderer:
     prefix = "renderer."
     weights = {n.removeprefix(prefix): w for n, w in checkpoint["state_dict"].items() if n.startswith(prefix)}
     renderer = build_model(config)
-    changed = changed_file(checkpoint, config) if renderer.path_sampler.needs_medium else None
+    changed = changed_file(checkpoint, config)
     if changed is not None:
         warn(f"the content of the file {changed} has changed since the training, so rays now meet another surface")
     try:
