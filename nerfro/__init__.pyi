@@ -7,8 +7,11 @@ from .data.blender import BlenderData
 from .evaluation.collection import metrics
 from .fields.hash_grid import HashGridField
 from .losses.photometric import Photometric
-from .media.sdf_grid import SdfGrid
-from .media.shapes import Ball
+from .media.bodies import Bodies, Body, GridSettings
+from .media.body_settings import make_bodies
+from .media.material import Material
+from .media.surface import MeshSurface
+from .media.surfaces.ball import BallSurface
 from .models.refractive import RefractiveModel
 from .rendering.renderer import Components
 from .samplers.paths.bend import bend, polylines
@@ -25,21 +28,25 @@ from .viewing.trained_scene import TrainedScene
 
 __version__: str
 __all__ = [
-    "Ball",
+    "BallSurface",
     "BlenderData",
+    "Bodies",
+    "Body",
     "Cameras",
     "Components",
     "ConstantBoundary",
     "EnvironmentMap",
+    "GridSettings",
     "GroupConfig",
     "HashGridField",
+    "Material",
+    "MeshSurface",
     "OptimizerConfig",
     "Photometric",
     "RayBatches",
     "RayDataModule",
     "Rays",
     "RefractiveModel",
-    "SdfGrid",
     "Snell",
     "Straight",
     "Stratified",
@@ -49,6 +56,7 @@ __all__ = [
     "bend",
     "build",
     "load",
+    "make_bodies",
     "metrics",
     "polylines",
 ]

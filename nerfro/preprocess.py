@@ -28,7 +28,7 @@ from nerfro.data.base import Views
 from nerfro.data.masks import EVIDENCE, REVOLUTION, masked_views, method_of, with_other_splits
 from nerfro.files.folder_lock import lock_folder
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.media.sdf_grid import SdfGrid
+from nerfro.media.bodies import Bodies
 from nerfro.registry.registration import plugin_module
 from nerfro.rendering.scene_file import SceneFile, with_scene
 from nerfro.silhouettes.overlaps import choose_wrong_masks, report_overlaps
@@ -76,7 +76,7 @@ def _preprocess(config: DictConfig, request: Request) -> None:
             found = find_medium(request, observations, medium)
     vessel, unsupported = dict[str, object](), list[str]()
     if config.vessel:
-        solid = cast(SdfGrid, found.medium)  # see Request.check
+        solid = cast(Bodies, found.medium)  # see Request.check
         vessel, fitted = plugin_module("vessels.fit").find_vessel(solid, location, mesh, observations)
         unsupported = unsupported_bodies(observations, solid, found.is_doubtful, fitted)
     estimated = settings | {"mesh": location} | found.index_settings

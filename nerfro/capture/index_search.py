@@ -35,7 +35,8 @@ from nerfro.core.progress import fraction_bar
 from nerfro.core.robust import geman_mcclure, geman_mcclure_weight
 from nerfro.files.atomic import write_atomically
 from nerfro.media.base import Medium
-from nerfro.media.solid import Solid, body_names
+from nerfro.media.bodies import Bodies
+from nerfro.media.body_settings import expanded
 from nerfro.rendering.scene_file import Provenance
 from nerfro.samplers.paths.snell import Snell
 
@@ -101,7 +102,7 @@ class Estimate:
 
 
 def find_indices(
-    medium: Solid, through: Pixels, surroundings: Surroundings, progress: Callable[[float], None] = lambda done: None
+    medium: Bodies, through: Pixels, surroundings: Surroundings, progress: Callable[[float], None] = lambda done: None
 ) -> Estimate:
     """Search the indices of one or two bodies from coarse to fine grids.
 
@@ -117,8 +118,8 @@ def find_indices(
     num_bodies = len(medium.iors)
     if num_bodies not in _PLANS:
         raise NerfroError(
-            f"the medium has {num_bodies} bodies, and at most two indices are searched for; set medium.ior= and "
-            "medium.inner_iors=, or ior or material of each of bodies="
+            f"the medium has {num_bodies} bodies, and at most two indices are searched for; set medium.ior=, or ior "
+            "or material of each of bodies="
         )
     plan = _PLANS[num_bodies]
     if isinstance(surroundings.boundary, Room):
@@ -240,7 +241,7 @@ class _Search:
     """Errors of candidate indices at pixels of the object; `progress` is called with the number of traced rays."""
 
     def __init__(
-        self, medium: Solid, through: Pixels, surroundings: Surroundings, progress: Callable[[int], None]
+        self, medium: Bodies, through: Pixels, surroundings: Surroundings, progress: Callable[[int], None]
     ) -> None:
         self._achromatic, self._surroundings = medium.achromatic(), surroundings
         self._progress, self._num_traced = progress, 0
@@ -359,7 +360,7 @@ def initial_medium(request: Request, location: str, settings: dict[str, object])
     """
     config, settings = request.config.medium, settings | {"mesh": location}
     if request.searches_index:
-        names = [*(config.get("bodies") or body_names(1 + len(config.get("inner_meshes", []))))]
+        names = [*expanded({name: config.get(name) for name in ("mesh", "bodies")} | settings)]
         settings |= index_settings(config, names, [1.5] * len(names))
     return build_medium(request, settings)
 
@@ -374,14 +375,15 @@ def find_medium(request: Request, observations: Observations, medium: Medium) ->
     """
     if not request.searches_index:
         return FoundMedium(medium)
-    if not isinstance(medium, Solid):
+    bodies = medium.bodies
+    if bodies is None:
         raise NerfroError("the index of this type of medium cannot be searched for; set medium.ior=, or medium=object")
-    found = _search_index(observations, medium, request.folder)
-    searched = medium.with_indices(torch.from_numpy(found.values))
-    return FoundMedium(searched, found, index_settings(request.config.medium, medium.names, found.values))
+    estimate = _search_index(observations, bodies, request.folder)
+    searched = bodies.with_indices(torch.from_numpy(estimate.values))
+    return FoundMedium(searched, estimate, index_settings(request.config.medium, bodies.names, estimate.values))
 
 
-def _search_index(observations: Observations, medium: Solid, folder: Path) -> Estimate:
+def _search_index(observations: Observations, medium: Bodies, folder: Path) -> Estimate:
     """Search the indices of the bodies of a medium, print the result, and write index.json.
 
     Args:
@@ -391,14 +393,14 @@ def _search_index(observations: Observations, medium: Solid, folder: Path) -> Es
     """
     through, surroundings = observations.through, observations.surroundings
     with fraction_bar("search") as progress:
-        found = find_indices(medium, through, surroundings, progress)
-    for name, value, error in zip(found.names, found.values, found.standard_errors, strict=True):
+        estimate = find_indices(medium, through, surroundings, progress)
+    for name, value, error in zip(estimate.names, estimate.values, estimate.standard_errors, strict=True):
         # At an end of the search range, all samples of the views have the same minimum.
         spread = f" +- {error:.2g} (standard error by resampling of the views)" if 0 < error < np.inf else ""
         print(f"{name}: {value:.5g}{spread}")
-    for doubt in found.doubts:
-        warn(f"the photographs do not determine the {' and '.join(found.names)}: {doubt}")
-    values = [round(value, 5) for value in found.values.tolist()]
-    figures = {"ior": values, "standard_error": found.written_errors, "doubts": found.doubts}
+    for doubt in estimate.doubts:
+        warn(f"the photographs do not determine the {' and '.join(estimate.names)}: {doubt}")
+    values = [round(value, 5) for value in estimate.values.tolist()]
+    figures = {"ior": values, "standard_error": estimate.written_errors, "doubts": estimate.doubts}
     write_atomically(folder / INDEX, json.dumps(figures, indent=1) + "\n")
-    return found
+    return estimate

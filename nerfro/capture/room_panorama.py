@@ -16,7 +16,7 @@ from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.capture.surroundings import Room
 from nerfro.core.rays import Rays
 from nerfro.core.types import Exits
-from nerfro.media.sdf_grid import SdfGrid
+from nerfro.media.bodies import Bodies
 from nerfro.samplers.paths.snell import Snell
 
 _SIDE = 192  # texels per side of a cube face, half a degree each
@@ -63,7 +63,7 @@ class RoomPanorama(Boundary):
 
 
 @torch.no_grad()
-def panorama_of(room: Room, medium: SdfGrid, middle: Float[Tensor, "3"]) -> RoomPanorama:
+def panorama_of(room: Room, medium: Bodies, middle: Float[Tensor, "3"]) -> RoomPanorama:
     """Render a panorama of near surroundings from the surface of an object outwards."""
     radius = float((medium.box[1] - medium.box[0]).norm())
     radiance, distances = [], []

@@ -69,7 +69,7 @@ class Plugin:
     Attributes:
         kind: plugin type and configuration group, such as `sampler/path`.
         name: name of the option in the group, such as `eikonal`.
-        cls: the class.
+        cls: the class, or a function that returns an instance.
         config: dataclass of the configurable parameters, with `_target_`.
         hints: annotations of the configurable parameters with allowed values, see `nerfro.registry.allowed`.
         parts: other constructor parameters; the caller of `build` passes the values.
@@ -111,12 +111,12 @@ CHECKS: dict[str, Callable[[str, type], None]] = {}
 _discovered: set[str] = set()
 
 
-def register(kind: str, name: str) -> Callable[[type[Part]], type[Part]]:
-    """Register a class as option `name` of a plugin type; used as a decorator.
+def register(kind: str, name: str) -> Callable[[Part], Part]:
+    """Register a class, or a function that returns an instance, as option `name` of a plugin type.
 
-    The signature of the constructor becomes the configuration. Parameters annotated with int, float, bool, str, their
-    optional, list and dict forms or `Literal` are configuration. The caller of `build` passes all other parameters.
-    Values outside the annotated ranges are refused (`nerfro.registry.allowed`).
+    The signature of the constructor or function becomes the configuration. Parameters annotated with int, float, bool,
+    str, their optional, list and dict forms or `Literal` are configuration. The caller of `build` passes all other
+    parameters. Values outside the annotated ranges are refused (`nerfro.registry.allowed`).
 
     Args:
         kind: plugin type, one of `KINDS`.
@@ -127,8 +127,8 @@ def register(kind: str, name: str) -> Callable[[type[Part]], type[Part]]:
     """
     _require_kind(kind)
 
-    def wrap(cls: type[Part]) -> type[Part]:
-        add(kind, name, cls)
+    def wrap(cls: Part) -> Part:
+        add(kind, name, cls)  # type: ignore[arg-type]
         return checked(f"{kind}={name}")(cls)
 
     return wrap
@@ -418,11 +418,15 @@ def _make_plugin(kind: str, name: str, cls: type) -> Plugin:
 
 
 def _parameters(cls: type) -> list[tuple[inspect.Parameter, Any, Any]]:
-    """Return the parameters of a constructor with the types, without and with `Annotated`.
+    """Return the parameters of a constructor or function with the types, without and with `Annotated`.
 
     A constructor with `**options` also has the parameters of the base class constructor.
     """
     found: dict[str, tuple[inspect.Parameter, Any, Any]] = {}
+    if not isinstance(cls, type):
+        hints, annotations = (typing.get_type_hints(cls, include_extras=extras) for extras in (False, True))
+        parameters = inspect.signature(cls).parameters.values()
+        return [(parameter, hints.get(parameter.name), annotations.get(parameter.name)) for parameter in parameters]
     for base in inspect.getmro(cls):
         # Classes without their own constructor have no configuration; the signature of nn.Module is generic. The class
         # is compared by name, because this module must not import torch.

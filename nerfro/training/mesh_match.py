@@ -19,7 +19,6 @@ from nerfro.geometry.lines import nearest_point
 from nerfro.geometry.mesh import TriangleMesh, num_decimals
 from nerfro.geometry.orientation import area_vectors
 from nerfro.media.base import Medium
-from nerfro.media.sdf_grid import SdfGrid
 from nerfro.silhouettes.silhouettes import PixelBlocks
 
 _NUM_VIEWS, _MAX_PIXELS = 8, 32
@@ -54,9 +53,9 @@ def require_match(medium: Medium, views: Views) -> None:
     """
     indices, _ = medium(views.cameras.camera_to_world[:, :, 3].to(medium.box))
     inside = bool((indices != 1).all())
-    comparison = None
-    if isinstance(medium, SdfGrid) and medium.meshes and views.masks is not None:
-        comparison = _Comparison.of(medium.outline, views, medium.origin)
+    comparison, outline = None, medium.outline
+    if outline is not None and views.masks is not None:
+        comparison = _Comparison.of(outline, views, medium.origin)
     agreement = 1.0 if comparison is None else comparison.agreement(_SAME)
     if not inside and agreement >= _DOUBTFUL:
         return
