@@ -4,11 +4,11 @@ import warnings
 
 import pytest
 
-from nerfro.core.subdivision import Subdivision
 from nerfro.evaluation.render_view import render_view
 from nerfro.kernels.constants import constant
-from nerfro.media.sdf_grid import SdfGrid
+from nerfro.media.bodies import Bodies
 from nerfro.registry.registration import build
+from nerfro.samplers.subdivision import Subdivision
 from nerfro.training.config import build_model
 from nerfro.training.module import TrainingModule
 from nerfro.training.ray_batches import RayBatches
@@ -71,7 +71,7 @@ def test_training_and_rendering_stay_on_the_gpu(
         renderer.point_sampler.update(list(renderer.scene.fields), batch.draws)
         assert {wait for wait in gpu.waits if not wait.startswith(TRACING)} == waits
         rendered = render_view(renderer, cameras, 0, Subdivision())
-        if isinstance(renderer.scene.medium, SdfGrid):
+        if isinstance(renderer.scene.medium, Bodies):
             assert bake_surface(renderer).voxels
     assert isinstance(loss, OnGpu)
     assert isinstance(rendered.radiance, OnGpu)

@@ -47,8 +47,8 @@ class VesselLengths:
         if not 0 < self.foot < heights.get("level", top) <= top * (1 + 1e-12):
             settings = " and ".join(f"medium.{name}={value:g}" for name, value in heights.items())
             raise NerfroError(
-                f"{settings} is not allowed: heights are measured from the vessel's lowest point, the foot is below the "
-                f"level, and the vessel is {top:.4g} high, in world units or the unit of medium.height="
+                f"{settings} is not allowed: heights are measured from the vessel's lowest point, the foot is below "
+                f"the level, and the vessel is {top:.4g} high, in world units or the unit of medium.height="
             )
 
 
@@ -255,6 +255,8 @@ def make_vessel(
     named = {name: values for name, values in (("wall", glass), ("liquid", liquid)) if values is not None}
     settings = {"wall": BodySettings(ior=ior), "liquid": BodySettings(ior=liquid_ior)}
     settings |= expanded({"bodies": named}) if named else {}
+    if any(body.mesh is not None or body.surface is not None for body in settings.values()):
+        raise NerfroError("medium.glass and medium.liquid describe materials; remove their mesh and surface")
     learn = learned_quantities(False, learn_absorption)
     materials = {name: make_material(name, body, learn) for name, body in settings.items()}
     is_empty = settings["liquid"].ior == 1 and not settings["liquid"].absorption

@@ -26,20 +26,21 @@ import trimesh
 from omegaconf import OmegaConf
 from PIL import Image
 
+from nerfro.data.formats import refref
 from nerfro.data.image_files import read_levels, read_mask
 from nerfro.evaluation.results import EvaluationResult, RunMetrics, ViewScores, read_metrics_json, write_metrics_json
 from nerfro.files import lat_long
 from nerfro.files.foreign_config import read_foreign_config
 from nerfro.files.reading import load_array
 from nerfro.geometry.mesh import load_mesh
+from nerfro.masks.mask_files import read_outlines
 from nerfro.rendering.scene_file import with_scene
 from nerfro.samplers.paths.traced_file import read_rays
 from nerfro.training.load import scene_of
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
 from nerfro.training.settings import Role, settings
-from tests.data.formats import FORMATS, refref
+from tests.data.formats import FORMATS
 from tests.fuzz.world import World
-from tests.masks.object_masks import read_outlines
 
 _number = itertools.count()
 
@@ -53,7 +54,7 @@ _LEFT_ALONE = ("trainer.devices", "trainer.num_nodes", "trainer.strategy", "trai
                "trainer.profiler", "compile", "logger", "name")  # fmt: skip
 GROUPS = ["field=nerf", "field=mip_nerf", "boundary=constant", "boundary=skybox", "boundary=near_field",
           "sampler/points=stratified", "sampler/points=hierarchical", "sampler/path=straight", "sampler/path=eikonal",
-          "medium=voxel_grid", "medium=ball", "medium=vacuum", "camera=given", "data=opencv", "data=llff",
+          "medium=voxel_grid", "medium=vacuum", "camera=given", "data=opencv", "data=llff",
           "data=colmap", "data=nerfstudio", "data=idr", "data=refref", "model=mip_nerf",
           "+experiment=mipnerf", "+experiment=nerf", "+experiment=ablation_noH", "+scene=glass",
           "+loss/distortion=distortion"]  # fmt: skip
@@ -116,7 +117,7 @@ def options_of_other_commands(world: World, draw: random.Random) -> str | None:
     np.savez(world.root / "rays.npz", **rays_through_ball())
     commands = {
         "trace": ["medium.mesh", "medium.ior", "medium.resolution", "medium.box_max", "medium.shell_voxels",
-                  "medium.inner_iors", "sampler.path.max_events",
+                  "medium.bodies", "sampler.path.max_events",
                   "sampler.path.interface", "near", "far", "rays", "plot", "out", "overwrite"],
         "evaluate": ["split", "root", "chunk_size", "subdivision.side", "subdivision.divergence", "masks", "alpha",
                      "device", "predictions", "references", "overwrite"],
