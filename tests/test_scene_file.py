@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from nerfro.media.bodies import BodySettings
+from nerfro.media.body_settings import BodySettings
 from nerfro.rendering.scene_file import Provenance, SceneFile, read_scene_file, with_scene
 from tests.conftest import refused
 

@@ -77,7 +77,7 @@ class Plugin:
 
     kind: str
     name: str
-    cls: type
+    cls: Any
     config: type
     hints: Mapping[str, Any]
     parts: frozenset[str]
@@ -128,13 +128,13 @@ def register(kind: str, name: str) -> Callable[[Part], Part]:
     _require_kind(kind)
 
     def wrap(cls: Part) -> Part:
-        add(kind, name, cls)  # type: ignore[arg-type]
+        add(kind, name, cls)
         return checked(f"{kind}={name}")(cls)
 
     return wrap
 
 
-def add(kind: str, name: str, cls: type) -> None:
+def add(kind: str, name: str, cls: Any) -> None:
     """Register a class of another package under a name; see `register`."""
     _require_kind(kind)
     taken = _plugins.get((kind, name))
@@ -262,7 +262,7 @@ def create(plugin: Plugin, node: DictConfig | Mapping[str, object], **parts: obj
     return made
 
 
-def _settings(cls: type) -> tuple[str, ...]:
+def _settings(cls: Any) -> tuple[str, ...]:
     """Names of configurable class attributes, such as the weight of a loss."""
     return getattr(cls, "SETTINGS", ())
 
@@ -376,7 +376,7 @@ def _import_plugin(module: str, where: str) -> None:
         raise NerfroError(f"plugin {where} cannot be imported: {type(error).__name__}: {error}") from error
 
 
-def _make_plugin(kind: str, name: str, cls: type) -> Plugin:
+def _make_plugin(kind: str, name: str, cls: Any) -> Plugin:
     fields: list[tuple[str, Any, Any]] = []
     parts: set[str] = set()
     allowing: dict[str, Any] = {}
@@ -401,7 +401,7 @@ def _make_plugin(kind: str, name: str, cls: type) -> Plugin:
     return Plugin(kind, name, cls, config, allowing, frozenset(parts))
 
 
-def _parameters(cls: type) -> list[tuple[inspect.Parameter, Any, Any]]:
+def _parameters(cls: Any) -> list[tuple[inspect.Parameter, Any, Any]]:
     """Return the parameters of a constructor or function with the types, without and with `Annotated`.
 
     A constructor with `**options` also has the parameters of the base class constructor.

@@ -13,8 +13,8 @@ import torch
 import trimesh
 from torch import Tensor
 
-from nerfro.media.bodies import Bodies, origin_of
-from nerfro.media.body_settings import make_bodies
+from nerfro.media.bodies import Bodies
+from nerfro.media.body_settings import make_bodies, origin_of
 from nerfro.registry.registration import discover
 from nerfro.samplers.paths.snell import Snell
 from tests.closed_forms import angle, make_rays
