@@ -29,7 +29,6 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from nerfro.allowed import Names, Range, check, checked
 from nerfro.errors import NerfroError
-from nerfro.old_names import MOVED_CLASSES
 from nerfro.paths import PLUGINS_DIR, PLUGINS_PACKAGE
 
 KINDS = (
@@ -242,8 +241,7 @@ def plugin_of(node: DictConfig) -> Plugin:
         NerfroError: the class is not registered.
     """
     target = str(node.get("_target_"))
-    place = MOVED_CLASSES.get(target, target)
-    plugin = next((plugin for plugin in _plugins.values() if plugin.target == place), None)
+    plugin = next((plugin for plugin in _plugins.values() if plugin.target == target), None)
     if plugin is None:
         raise NerfroError(
             f"'{target}' is not registered; `python -m nerfro.plugins` lists the registered classes; "

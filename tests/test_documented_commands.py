@@ -20,9 +20,8 @@ from omegaconf import DictConfig, OmegaConf
 from nerfro.allowed import check_names, check_settings
 from nerfro.cli import _added, _quoted
 from nerfro.errors import NerfroError
-from nerfro.old_names import full_key, renamed_override
 from nerfro.options import Described, describe_command, usage
-from nerfro.overrides import is_scene_file
+from nerfro.overrides import full_key, is_scene_file
 from nerfro.paths import CONF_DIR, PACKAGE_DIR
 from nerfro.registry import KINDS, discover, plugins
 from nerfro.synthetic import SCENES
@@ -92,8 +91,7 @@ def require_valid(command: str, options: list[str]) -> None:
     """Raise an error unless a command accepts the options. Hydra composes only the choices of groups, to save time."""
     schema, verbatim = entry_points()[command]
     options = [option for option in options if not is_scene_file(option)]
-    given, options = [full_key(option) for option in options], [renamed_override(option) for option in options]
-    assert [option.lstrip("+") for option in options] == [option.lstrip("+") for option in given], "an old name"
+    options = [full_key(option) for option in options]
     # Of a sweep the first value; no patterns, and no options of Hydra, whose launchers may not be installed.
     options = [re.sub(r"^([^=]+=[^,[{]+),[^]}]*$", r"\1", option) for option in options if "(" not in option]
     options = [_quoted(option, verbatim) for option in options if not option.lstrip("+").startswith("hydra")]

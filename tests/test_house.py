@@ -160,7 +160,7 @@ MAX_LINES, MAX_ARGUMENTS = 60, 8
 FOREIGN = {
     "bar", "config", "content", "ctx", "hydra_config", "job", "log_gain", "logger", "loss", "main", "node", "numba",
     "options", "pairing", "parameter", "parent", "parser", "pycolmap", "reader", "sampled", "session", "spec", "sys",
-    "tensor", "trained", "trainer", "hydra", "RenamingFiles",
+    "tensor", "trained", "trainer", "hydra", "BoundedFiles",
 }  # fmt: skip
 
 

@@ -11,7 +11,6 @@ from omegaconf.errors import OmegaConfBaseException
 
 from nerfro.errors import NerfroError
 from nerfro.files.reading import read_text
-from nerfro.old_names import renamed_config
 from nerfro.trust import require_bounded_yaml
 
 
@@ -31,7 +30,7 @@ def foreign_config(text: str, origin: Path) -> DictConfig:
     interpolation = re.search(r".*\$\{.*", OmegaConf.to_yaml(config))
     if interpolation:
         raise NerfroError(f"{origin} contains an interpolation ({interpolation[0].strip()}); write the value instead")
-    return renamed_config(config, origin)
+    return config
 
 
 def read_foreign_config(path: Path) -> DictConfig:

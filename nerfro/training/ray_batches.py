@@ -19,7 +19,7 @@ from nerfro.data.base import Views
 from nerfro.data.pixel_store import PixelStore
 from nerfro.distributed import share_of
 from nerfro.draws import Draws
-from nerfro.errors import NerfroError, warn, warn_of_old_name
+from nerfro.errors import NerfroError, warn
 from nerfro.subdivision import PixelRays, Subdivision, Trace, TraceExits, contrast, subdivide
 from nerfro.types import Batch
 
@@ -120,11 +120,6 @@ class RayBatches:
         shared = copy.copy(self)
         shared._share = share_of(self.batch_size, rank, size)
         return shared
-
-    def share(self, rank: int, size: int) -> RayBatches:
-        """Old name of `for_rank`."""
-        warn_of_old_name("RayBatches.share", "RayBatches.for_rank")
-        return self.for_rank(rank, size)
 
     def smaller(self, most: int) -> RayBatches:
         """Return the sequence with at most `most` pixels per step."""

@@ -10,7 +10,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.allowed import Range, check
-from nerfro.errors import accept_old_fields
 from nerfro.geometry.contraction import contraction_scale, expand
 from nerfro.progress import track
 from nerfro.viewing.trained_scene import TrainedScene
@@ -35,9 +34,6 @@ class Volume:
     radiance: Float[Tensor, "X Y Z 3"]
     box: Float[Tensor, "2 3"]
     radius: float | None = None
-
-
-accept_old_fields(Volume, {"rgb": "radiance"})
 
 
 @torch.inference_mode()

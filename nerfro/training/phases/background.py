@@ -11,7 +11,7 @@ from torch import Tensor
 
 from nerfro.allowed import Count, Natural, OnlyWith, Share
 from nerfro.boundaries.envmap import EnvironmentMap, Observed
-from nerfro.errors import renamed_classes, warn
+from nerfro.errors import warn
 from nerfro.fields.base import Field
 from nerfro.geometry.interpolation import misses
 from nerfro.rays import Rays
@@ -189,6 +189,3 @@ def occupied_box(renderer: Renderer) -> Float[Tensor, "2 3"] | None:
         boxes.append(renderer.scene.medium.content_box.to(renderer.scene.device))
     low, high = torch.stack(boxes, 1)
     return torch.stack([low.amin(0), high.amax(0)])
-
-
-__getattr__ = renamed_classes(__name__, Background=BackgroundSteps)
