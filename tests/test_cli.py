@@ -12,19 +12,19 @@ from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import OverrideParseException
 
-from nerfro.cli import _flags_first
-from nerfro.composition import BoundedFiles
-from nerfro.errors import NerfroError, warn
-from nerfro.failures import errors_in_one_line, in_one_line
-from nerfro.overrides import full_key
-from nerfro.paths import CONF_DIR, resolve_path, user_path
-from nerfro.trust import GuardedConfigLoader
+from nerfro.cli.composition import BoundedFiles
+from nerfro.cli.entry import _flags_first
+from nerfro.cli.failures import errors_in_one_line, in_one_line
+from nerfro.cli.overrides import full_key
+from nerfro.core.errors import NerfroError, warn
+from nerfro.core.paths import CONF_DIR, resolve_path, user_path
+from nerfro.core.trust import GuardedConfigLoader
 from tests.conftest import composed, refused
 
 
 @pytest.mark.parametrize("num_lines", [1, 10_000])  # less and more than a pipe's buffer
 def test_closed_output_pipe_is_no_error(num_lines: int) -> None:
-    program = f"import nerfro.failures\nwith nerfro.failures.errors_in_one_line():\n    print('line\\n' * {num_lines})"
+    program = f"import nerfro.cli.failures\nwith nerfro.cli.failures.errors_in_one_line():\n    print('line\\n' * {num_lines})"
     reader, writer = os.pipe()
     os.close(reader)
     done = subprocess.run(

@@ -18,13 +18,13 @@ from PIL import Image
 from torch import nn
 
 from nerfro import types
+from nerfro.core.paths import PLUGINS_DIR
 from nerfro.data.base import DataSource, Views
 from nerfro.data.blender import BlenderData
 from nerfro.losses.base import Loss
 from nerfro.media.base import Medium
 from nerfro.media.surface import Surface
-from nerfro.paths import PLUGINS_DIR
-from nerfro.registry import KINDS, discover, find, plugins, register
+from nerfro.registry.registration import KINDS, discover, find, plugins, register
 from nerfro.samplers.base import PathSampler, PointSampler
 from nerfro.testing import (
     ContractError,
@@ -44,7 +44,7 @@ BOUNDARY = '''
 """A boundary."""
 import torch
 from nerfro.boundaries.base import Boundary
-from nerfro.registry import register
+from nerfro.registry.registration import register
 
 
 @register("boundary", "{name}")
@@ -91,7 +91,7 @@ def test_failing_plugin_is_named_with_the_cause(
 
 METRIC = """
 from nerfro.evaluation.image_metrics import ImageMetric
-from nerfro.registry import register
+from nerfro.registry.registration import register
 
 @register("metric", "worst")
 class Worst(ImageMetric):
@@ -461,7 +461,7 @@ packages = ["nerfro_grey"]
 USE_IT = """
 import sys
 import nerfro.plugins, nerfro.train
-from nerfro.registry import find
+from nerfro.registry.registration import find
 from nerfro.testing import check
 sys.argv = ["nerfro.plugins", "boundary=installed_grey"]
 nerfro.plugins.main()

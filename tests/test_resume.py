@@ -14,7 +14,7 @@ from unittest import mock
 import pytest
 import torch
 
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
 from nerfro.evaluation import scoring
 from nerfro.files.images import save_png
 from nerfro.training.run_folder import (

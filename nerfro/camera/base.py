@@ -8,8 +8,8 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from nerfro.camera.exposure import Exposure
-from nerfro.cameras import Cameras
-from nerfro.rays import Rays
+from nerfro.core.cameras import Cameras
+from nerfro.core.rays import Rays
 
 
 class CameraModel(nn.Module, ABC):

@@ -9,9 +9,9 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
+from nerfro.core.trust import require_bounded_yaml
 from nerfro.files.reading import read_text
-from nerfro.trust import require_bounded_yaml
 
 
 def foreign_config(text: str, origin: Path) -> DictConfig:

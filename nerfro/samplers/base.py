@@ -9,11 +9,11 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor, nn
 
-from nerfro.draws import Draws
+from nerfro.core.draws import Draws
+from nerfro.core.types import Path, Rays, Rendering, Samples
 from nerfro.fields.base import Field
 from nerfro.media.base import Medium
 from nerfro.samplers.paths.branching import ONE_PATH
-from nerfro.types import Path, Rays, Rendering, Samples
 
 
 class PathSampler(nn.Module, ABC):
