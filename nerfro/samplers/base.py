@@ -10,14 +10,11 @@ from jaxtyping import Bool
 from torch import Tensor, nn
 
 from nerfro.core.draws import Draws
-from nerfro.core.errors import accept_old_methods
 from nerfro.core.types import Path, Rays, Rendering, Samples
 from nerfro.fields.base import Field
 from nerfro.media.base import Medium
 from nerfro.samplers.paths.branching import ONE_PATH
 from nerfro.samplers.paths.polylines import SnellTrace
-
-_OLD_METHODS = {"refine": "replay", "main": "trace_main"}
 
 
 class PathSampler(nn.Module, ABC):
@@ -35,10 +32,6 @@ class PathSampler(nn.Module, ABC):
     branching = ONE_PATH
     max_events = 16
     wavelengths: Sequence[float] = (610.0, 550.0, 465.0)
-
-    def __init_subclass__(cls) -> None:
-        super().__init_subclass__()
-        accept_old_methods(cls, _OLD_METHODS)
 
     @abstractmethod
     def forward(self, rays: Rays, medium: Medium) -> Path:
@@ -78,9 +71,6 @@ class PathSampler(nn.Module, ABC):
         return False
 
 
-accept_old_methods(PathSampler, _OLD_METHODS)
-
-
 class PointSampler(nn.Module, ABC):
     """Choose arc lengths on a path.
 
@@ -89,10 +79,6 @@ class PointSampler(nn.Module, ABC):
     """
 
     num_levels: int
-
-    def __init_subclass__(cls) -> None:
-        super().__init_subclass__()
-        accept_old_methods(cls, {"after_step": "update"})
 
     @abstractmethod
     def forward(self, path: Path, previous: Rendering | None, draws: Draws | None = None) -> Samples:
