@@ -40,6 +40,7 @@ class Tracer(ABC):
     """Trace rays from surface to surface of bodies at one wavelength.
 
     Attributes:
+        medium: the bodies, with one index for all wavelengths in a call of `trace` or `replay`.
         releases_gil: whether tracing on the CPU releases the global interpreter lock.
     """
 
@@ -79,15 +80,15 @@ class GridTracer(Tracer):
 class TriangleTracer(Tracer):
     """Trace triangles of meshes."""
 
+    def __init__(self, medium: Bodies) -> None:
+        super().__init__(medium)
+        medium.intersector  # noqa: B018 (created once, before the variants of all wavelengths share it)
+
     def trace(self, rays: Rays, max_events: int, branching: Branching) -> SnellTrace:
         return _trace_triangles(rays, self.medium, max_events, branching)
 
     def intersect(self, path: Path) -> Intersect:
         return intersect_triangles(self.medium.triangles, path.triangle)
-
-    def at_wavelengths(self, wavelengths: Sequence[float]) -> Sequence[Tracer]:
-        self.medium.intersector  # noqa: B018 (created once, before the variants share it)
-        return super().at_wavelengths(wavelengths)
 
 
 class ReferenceTracer(Tracer):
@@ -97,11 +98,11 @@ class ReferenceTracer(Tracer):
         return trace_interfaces(rays, self.medium, max_events, branching)
 
 
-class _StraightTracer(Tracer):
+class StraightTracer(Tracer):
     """Leave rays straight in a vacuum."""
 
-    def __init__(self, medium: Medium) -> None:
-        self.medium = medium  # type: ignore[assignment]
+    def __init__(self) -> None:
+        pass
 
     def trace(self, rays: Rays, max_events: int, branching: Branching) -> SnellTrace:
         none = torch.zeros(len(rays), dtype=torch.long, device=rays.near.device)
@@ -109,6 +110,9 @@ class _StraightTracer(Tracer):
 
     def replay(self, path: Path, rays: Rays, branching: Branching) -> Path:
         return replay_straight(path, rays)
+
+    def at_wavelengths(self, wavelengths: Sequence[float]) -> Sequence[Tracer]:
+        return [self]
 
 
 @register("sampler/path", "snell")
@@ -150,7 +154,7 @@ class Snell(PathSampler):
             NerfroError: the medium has no surfaces, or no triangles for `interface=mesh`.
         """
         if medium.is_vacuum:
-            return _StraightTracer(medium)
+            return StraightTracer()
         bodies = medium.bodies
         if bodies is None:
             raise NerfroError(
@@ -172,8 +176,8 @@ class Snell(PathSampler):
 
     @torch.no_grad()
     def trace_main(self, rays: Rays, medium: Medium) -> Path:
-        tracers = self.tracer(medium).at_wavelengths(self.wavelengths)
-        return tracers[0].trace(rays, self.max_events, replace(self.branching, main_only=True)).path
+        tracer = self.tracer(medium).at_wavelengths(self.wavelengths)[0]
+        return tracer.trace(rays, self.max_events, replace(self.branching, main_only=True)).path
 
     def replay(self, path: Path, rays: Rays, medium: Medium) -> Path:
         """Return the path with gradients with respect to rays, indices and distance grids; see `samplers.paths.replay`.
