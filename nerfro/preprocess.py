@@ -56,30 +56,30 @@ def _preprocess(config: DictConfig, request: Request) -> None:
     settings = surface_settings(request, views.cameras, mesh, source.origin)
     medium = initial_medium(request, location, settings)
     observations = Observations(views, mesh, config.room, medium.origin - source.origin)
-    found = find_medium(request, observations, medium)
+    searched = find_medium(request, observations, medium)
     if config.refine:
         given, location = mesh, str(request.folder / MESH)
-        if found.is_doubtful:
+        if searched.is_doubtful:
             warn("surface unchanged: refine=true needs the index, and the photographs do not determine the index")
         else:
-            mesh = refine(observations, mesh, found.medium, silhouettes, request.searches_index, request.folder)
+            mesh = refine(observations, mesh, searched.medium, silhouettes, request.searches_index, request.folder)
         mesh.relative_to(-source.origin).save(request.folder / MESH)
         settings = surface_settings(request, views.cameras, mesh, source.origin)
         if mesh is not given:
             if silhouettes is not None:
                 report_overlaps(outlined, mesh, silhouettes, None, request.folder, list_all=False)
             medium = initial_medium(request, location, settings)
-            if (medium.origin != found.medium.origin).any():
+            if (medium.origin != searched.medium.origin).any():
                 observations = Observations(views, mesh, config.room, medium.origin - source.origin)
-            found = find_medium(request, observations, medium)
+            searched = find_medium(request, observations, medium)
     vessel, unsupported = dict[str, object](), list[str]()
     if config.vessel:
-        solid = found.medium.bodies
+        solid = searched.medium.bodies
         assert solid is not None  # see Request.check
         vessel, fitted = find_vessel(solid, location, mesh, observations)
-        unsupported = unsupported_bodies(observations, solid, found.is_doubtful, fitted)
-    estimated = settings | {"mesh": location} | found.index_settings
-    origin = replace(found.provenance, unsupported=unsupported)
+        unsupported = unsupported_bodies(observations, solid, searched.is_doubtful, fitted)
+    estimated = settings | {"mesh": location} | searched.index_settings
+    origin = replace(searched.provenance, unsupported=unsupported)
     scene = SceneFile(medium=estimated, vessel=vessel, surroundings=observations.distance, provenance=origin)
     write_scene(request, scene, views.cameras, mesh)
 

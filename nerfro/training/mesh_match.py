@@ -96,10 +96,10 @@ class _Comparison(NamedTuple):
     @classmethod
     def of(cls, mesh: TriangleMesh, views: Views, origin: Float[np.ndarray, "3"]) -> _Comparison | None:
         """Reduce the masks of some views; None if all are empty or full, or without Embree."""
-        chosen = views.select(views.spread(_NUM_VIEWS))
-        blocks = PixelBlocks(chosen.cameras, _MAX_PIXELS)
-        assert chosen.masks is not None
-        masks = torch.stack([blocks.mean(mask).flatten() for mask in chosen.masks]) > 0.5
+        compared = views.select(views.spread(_NUM_VIEWS))
+        blocks = PixelBlocks(compared.cameras, _MAX_PIXELS)
+        assert compared.masks is not None
+        masks = torch.stack([blocks.mean(mask).flatten() for mask in compared.masks]) > 0.5
         useful = (masks.any(1) & ~masks.all(1)).nonzero()[:, 0].tolist()
         if not useful:
             return None
@@ -107,7 +107,7 @@ class _Comparison(NamedTuple):
             intersector = MeshIntersector(mesh.triangles)
         except NerfroError:
             return None
-        cameras = blocks.cameras(chosen.cameras).select(useful)
+        cameras = blocks.cameras(compared.cameras).select(useful)
         rays = [cameras.image_rays(view) for view in range(len(cameras))]
         origins, directions = (torch.cat([getattr(ray, name) for ray in rays]) for name in ("origins", "directions"))
         return cls(mesh, -origin, intersector, cameras, origins, directions, masks[useful])

@@ -74,14 +74,15 @@ def without_inside(renderer: Renderer) -> Renderer:
     return with_changed_scene(renderer, fields=nn.ModuleList(EmptyField() for _ in renderer.scene.fields))
 
 
-def _of_bodies(given: Tensor, known: Tensor, name: str) -> Tensor:
+def _of_bodies(values: Tensor, current: Tensor, name: str) -> Tensor:
     """Complete values that are given for each body, or for the first body alone, to values for all bodies."""
-    given = given.to(known)
-    if not len(known):
+    values = values.to(current)
+    if not len(current):
         raise NerfroError(f"{name} cannot be set: the model has no bodies on which rays bend; leave {name} out")
-    if given.shape == known.shape[1:]:
-        given = torch.cat([given[None], known[1:]])
-    allowed, kind = (given > 0, "positive numbers") if name == "ior" else (given >= 0, "numbers that are not negative")
-    if given.shape != known.shape or not (torch.isfinite(given) & allowed).all():
-        raise NerfroError(f"{name}={given.tolist()} is not allowed; give {list(known.shape)} {kind}")
-    return given
+    if values.shape == current.shape[1:]:
+        values = torch.cat([values[None], current[1:]])
+    wanted = "positive numbers" if name == "ior" else "numbers that are not negative"
+    allowed = values > 0 if name == "ior" else values >= 0
+    if values.shape != current.shape or not (torch.isfinite(values) & allowed).all():
+        raise NerfroError(f"{name}={values.tolist()} is not allowed; give {list(current.shape)} {wanted}")
+    return values

@@ -115,10 +115,10 @@ class TrainedScene:
         return RenderedViews(*(torch.stack(images) for images in zip(*rendered, strict=True)))
 
     def _render_view(self, cameras: Cameras, view: int, subdivision: Subdivision) -> tuple[Tensor, ...]:
-        found = render_view(self.renderer, cameras.to(self.renderer.scene.device), view, subdivision)
+        pixels = render_view(self.renderer, cameras.to(self.renderer.scene.device), view, subdivision)
         colour_space = self.renderer.scene.colour_space
-        rgb, radiance = colour_space.to_display(found.radiance), colour_space.to_linear(found.radiance)
-        values = rgb, found.depth, found.opacity, found.normals, found.exit_directions, radiance
+        rgb, radiance = colour_space.to_display(pixels.radiance), colour_space.to_linear(pixels.radiance)
+        values = rgb, pixels.depth, pixels.opacity, pixels.normals, pixels.exit_directions, radiance
         return tuple(value.float().cpu().view(cameras.height, cameras.width, *value.shape[1:]) for value in values)
 
     @property

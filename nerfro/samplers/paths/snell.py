@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Annotated, Any, Literal
 
@@ -200,23 +200,21 @@ class Snell(PathSampler):
         """Trace rays and count events; `branching` replaces the rule of the sampler."""
         tracers = self.tracer(medium).at_wavelengths(self.wavelengths)
         settings = self.max_events, branching or self.branching
-        if len(tracers) == 1:
-            return tracers[0].trace(rays, *settings)
-        return _traced_in_bands(rays, tracers, lambda rays, tracer: tracer.trace(rays, *settings))
+        return tracers[0].trace(rays, *settings) if len(tracers) == 1 else _traced_in_bands(rays, tracers, *settings)
 
 
-def _traced_in_bands(rays: Rays, tracers: Sequence[Tracer], trace: Callable[[Rays, Tracer], SnellTrace]) -> SnellTrace:
+def _traced_in_bands(rays: Rays, tracers: Sequence[Tracer], max_events: int, branching: Branching) -> SnellTrace:
     """Trace rays at each wavelength; rays that miss the object have one polyline with light of all colours.
 
     Args:
         rays: camera rays.
         tracers: tracer at each wavelength: the bands of red, then of green, then of blue.
-        trace: function that traces rays at one wavelength.
+        max_events, branching: see `Tracer.trace`.
     """
-    first = trace(rays, tracers[0])
+    first = tracers[0].trace(rays, max_events, branching)
     bent = first.path.refracted
     rows = first.path.ray[bent].unique_consecutive()
-    traces = [first, *(trace(rays[rows], tracer) for tracer in tracers[1:])]
+    traces = [first, *(tracer.trace(rays[rows], max_events, branching) for tracer in tracers[1:])]
     path = Path.joined([trace.path for trace in traces])
     of_rays = [first.path.ray, *(rows[trace.path.ray] for trace in traces[1:])]
     band = torch.cat([torch.full_like(ray, number) for number, ray in enumerate(of_rays)])
