@@ -115,7 +115,7 @@ def checked(where: str) -> Callable[[Class], Class]:
     """Decorate a class or a function so that its constructor or call checks all arguments against the annotations.
 
     Args:
-        where: start of the error message, such as `medium=ball`.
+        where: start of the error message, such as `medium=vacuum`.
     """
 
     def guarded(function: Any) -> Any:
