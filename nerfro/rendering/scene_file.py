@@ -71,8 +71,8 @@ class SceneFile:
 
     @property
     def short(self) -> dict[str, object] | None:
-        """Settings of the medium for one body that has only mesh and index; None for other bodies."""
-        settings = [_given(body) for body in self.bodies.values()]
+        """Settings of the medium for at most one body that has only mesh and index; None for other bodies."""
+        settings = [_given(body) for body in self.bodies.values()] or [{}]
         return settings[0] if len(settings) == 1 and settings[0].keys() <= {"mesh", "ior"} else None
 
     def settings(self, *, data_type: str | None = None, medium: str | None = None) -> dict[str, object]:
