@@ -112,6 +112,7 @@ def _run_origin(comparison: Comparison, run: EvaluatedRun) -> RunOrigin:
         "spent": _spent(metrics.steps, metrics.train_seconds, metrics.rays_per_second),
         "versions": ", ".join(f"{name} {version}" for name, version in facts["versions"].items() if version),
         "python": facts["python"],
+        "settings of algorithms": "; ".join(facts["algorithms"]) or "none",
     }
     config = OmegaConf.to_yaml(OmegaConf.create(json.loads(json.dumps(run.config))))
     method, test_set = place

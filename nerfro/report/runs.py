@@ -30,6 +30,7 @@ _FACTS: dict[str, Any] = {
     **dict.fromkeys(("commit", "gpu"), (str, type(None))),
     "threads": int,
     "versions": dict,
+    "algorithms": list,
 }
 
 

@@ -26,7 +26,7 @@ from nerfro.files.foreign_config import foreign_config, read_foreign_config
 from nerfro.files.reading import reading
 from nerfro.kernels.available import fast_bfloat16
 from nerfro.paths import PACKAGE_DIR, user_path
-from nerfro.provenance import command_line, versions
+from nerfro.provenance import AlgorithmSettings, command_line, versions
 from nerfro.rendering import Renderer
 from nerfro.training import backdrop, content
 from nerfro.training.config import build_model, check_trained, training_device
@@ -117,7 +117,7 @@ def needed_bytes(renderer: Renderer) -> int:
 
 
 def record(folder: Path, config: DictConfig) -> None:
-    """Write the records of a run: config.yaml (resolved), run.json (command, versions, commit) and git.diff."""
+    """Write the records of a run: config.yaml (resolved), run.json (command, versions, settings of algorithms) and git.diff."""
     write_atomically(folder / CONFIG_FILE, OmegaConf.to_yaml(config, resolve=True))
     commit, diff, device = _git("rev-parse", "HEAD"), _git("diff", "HEAD"), training_device(config)
     facts = {
@@ -131,6 +131,7 @@ def record(folder: Path, config: DictConfig) -> None:
         "gpu": torch.cuda.get_device_name() if device == "cuda" else None,
         "fast_bfloat16": fast_bfloat16(device),
         "versions": versions(),
+        "algorithms": list(AlgorithmSettings.used.values()),
     }
     write_atomically(folder / "run.json", json.dumps(facts, indent=2) + "\n")
     if diff:
