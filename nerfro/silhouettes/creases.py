@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy import sparse
 
+from nerfro.core.provenance import AlgorithmSettings
 from nerfro.geometry.normals import unit
-from nerfro.provenance import AlgorithmSettings
 from nerfro.silhouettes.moving_mesh import MeshGeometry, MovingMesh, solve_symmetric
 from nerfro.silhouettes.rims import Rims
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from scipy.special import log_ndtr
 
-from nerfro.provenance import AlgorithmSettings
+from nerfro.core.provenance import AlgorithmSettings
 from nerfro.silhouettes.rims import Rims
 from nerfro.silhouettes.visual_hull import Silhouettes
 

@@ -13,8 +13,8 @@ from jaxtyping import Float, Int
 from scipy import sparse
 from scipy.spatial import cKDTree
 
+from nerfro.core.provenance import AlgorithmSettings
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.provenance import AlgorithmSettings
 from nerfro.silhouettes.creases import CreaseSettings, Sides, has_creases, sharpened
 from nerfro.silhouettes.moving_mesh import MovingMesh, solve_symmetric
 from nerfro.silhouettes.pixel_sides import PixelSideSettings, by_pixel_sides

@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from nerfro.core.errors import NerfroError, first_of, warn
+from nerfro.core.progress import fraction_bar
+from nerfro.core.provenance import AlgorithmSettings
 from nerfro.data.base import Views
-from nerfro.errors import NerfroError, first_of, warn
 from nerfro.geometry.mesh import TriangleMesh, num_decimals
-from nerfro.progress import fraction_bar
-from nerfro.provenance import AlgorithmSettings
 from nerfro.silhouettes.pose_conventions import overlap
 from nerfro.silhouettes.revolution import RevolutionSettings, Symmetry, fit_revolution
 from nerfro.silhouettes.silhouette_fit import FitSettings, fit_surface

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from nerfro.cameras import Cameras
+from nerfro.core.cameras import Cameras
+from nerfro.core.provenance import AlgorithmSettings
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.provenance import AlgorithmSettings
 
 
 @dataclass(frozen=True)
