@@ -117,7 +117,7 @@ def needed_bytes(renderer: Renderer) -> int:
 
 
 def record(folder: Path, config: DictConfig) -> None:
-    """Write the records of a run: config.yaml (resolved), run.json (command, versions, settings of algorithms) and git.diff."""
+    """Write the records of a run: config.yaml (resolved), run.json (command, versions, algorithms), git.diff."""
     write_atomically(folder / CONFIG_FILE, OmegaConf.to_yaml(config, resolve=True))
     commit, diff, device = _git("rev-parse", "HEAD"), _git("diff", "HEAD"), training_device(config)
     facts = {
