@@ -25,7 +25,7 @@ from nerfro.core.light import to_linear
 from nerfro.core.progress import track
 from nerfro.core.provenance import AlgorithmSettings
 from nerfro.core.rays import Rays
-from nerfro.core.subdivision import pixel_rays
+from nerfro.samplers.subdivision import pixel_rays
 
 
 @dataclass(frozen=True)
