@@ -80,9 +80,9 @@ def fit_gain(
         radiance, target = radiance.double().clone(), target.double().clone()
         logarithm = torch.zeros(3, dtype=torch.float64, device=radiance.device)
         for _ in range(_STEPS):
-            each = logarithm.expand_as(radiance).clone().requires_grad_()
-            shown = encode(each.exp() * radiance)
-            (slope,) = torch.autograd.grad(shown.sum(), each)
+            log_gains = logarithm.expand_as(radiance).clone().requires_grad_()
+            shown = encode(log_gains.exp() * radiance)
+            (slope,) = torch.autograd.grad(shown.sum(), log_gains)
             # Pixels that are saturated in both images carry no information.
             error = torch.where((target >= 1) & (shown > 1), 0.0, shown.detach() - target)
             slope = torch.where((target >= 1) & (shown > 1), 0.0, slope)

@@ -188,9 +188,9 @@ def list_images(folder: Path, suffixes: Sequence[str] = IMAGE_SUFFIXES) -> list[
     files = [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(("mask_", "."))]
     images = [path for path in files if path.suffix.lower() in suffixes]
     if not images:
-        found = sorted({path.suffix.lower() for path in files if path.suffix})
+        others = sorted({path.suffix.lower() for path in files if path.suffix})
         raise NerfroError(
-            f"{folder} holds no image{f', but {first_of(found)} files' if found else ''}; allowed are "
+            f"{folder} holds no image{f', but {first_of(others)} files' if others else ''}; allowed are "
             f"{', '.join(suffixes)}. nerfro.reconstruct also reads HEIC photographs and, with video=FILE, videos"
         )
     return sorted(images)

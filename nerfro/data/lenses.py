@@ -160,31 +160,31 @@ def _numbers(level: Mapping[str, Any], rational: bool, where: str) -> dict[str, 
         rational: whether k4, k5 and k6 belong to the denominator (`FULL_OPENCV`).
         where: subject of the error message.
     """
-    found = {key: level[key] for key in _NUMBERS if level.get(key) is not None}
-    check(f"{where}: ", _NUMBERS, found)
+    numbers = {key: level[key] for key in _NUMBERS if level.get(key) is not None}
+    check(f"{where}: ", _NUMBERS, numbers)
     matrix, dist = level.get("cam_mat"), level.get("dist")
     for key, others in (("cam_mat", ("fl_x", "fl_y", "cx", "cy")), ("dist", _NAMES)):
-        both = [other for other in others if level.get(key) is not None and other in found]
+        both = [other for other in others if level.get(key) is not None and other in numbers]
         if both:
             raise NerfroError(f"{where}: {key} and {both[0]} both state the lens; keep one of them")
     if matrix is not None:
         lens = Lens.of_matrix(parse_matrix(matrix, ((3, 3),), f"{where}: cam_mat"), f"{where}: cam_mat")
-        found |= {"fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy}
-        check(f"{where}: cam_mat: ", _NUMBERS, found)
+        numbers |= {"fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy}
+        check(f"{where}: cam_mat: ", _NUMBERS, numbers)
     if rational:
         renamed = zip(("k4", "k5", "k6"), _COEFFICIENTS[2], strict=True)
-        found |= {new: found.pop(old) for old, new in renamed if old in found}
-    if found.pop("k5", 0) or found.pop("k6", 0):
+        numbers |= {new: numbers.pop(old) for old, new in renamed if old in numbers}
+    if numbers.pop("k5", 0) or numbers.pop("k6", 0):
         raise NerfroError(
             f"{where}: k5 and k6 belong to OpenCV's rational model, in which k4, k5 and k6 form the denominator; set "
             "camera_model to FULL_OPENCV, or remove both"
         )
     if dist is not None:
-        found |= _opencv_distortion(dist, where)
+        numbers |= _opencv_distortion(dist, where)
     for axis in "xy":
-        if f"{axis}_fov" in found:
-            found.setdefault(f"camera_angle_{axis}", math.radians(found[f"{axis}_fov"]))
-    return found
+        if f"{axis}_fov" in numbers:
+            numbers.setdefault(f"camera_angle_{axis}", math.radians(numbers[f"{axis}_fov"]))
+    return numbers
 
 
 def _opencv_distortion(numbers: Any, where: str) -> dict[str, float]:

@@ -91,11 +91,11 @@ def make_room(folder: Path, num_bytes: int) -> None:
 
 def _statuses(paths: Iterable[Path]) -> list[tuple[Path, os.stat_result]]:
     """Query the status of files; files that have just been removed are left out."""
-    found = []
+    statuses = []
     for path in paths:
         with contextlib.suppress(FileNotFoundError):
-            found.append((path, path.stat()))
-    return found
+            statuses.append((path, path.stat()))
+    return statuses
 
 
 def _checksum(arrays: Mapping[str, np.ndarray]) -> str:

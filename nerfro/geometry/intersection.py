@@ -130,5 +130,5 @@ class LayeredIntersector:
     def first_hits(self, x: Float[Tensor, "R 3"], d: Float[Tensor, "R 3"]) -> Int[Tensor, "R L"]:
         """Return the first triangle that each ray hits in each layer, -1 for none."""
         hits = [layer.first_hits(x, d) for layer in self._layers]
-        found = [torch.where(hit >= 0, faces[hit], -1) for hit, faces in zip(hits, self._faces, strict=True)]
-        return torch.stack(found, -1)
+        triangles = [torch.where(hit >= 0, faces[hit], -1) for hit, faces in zip(hits, self._faces, strict=True)]
+        return torch.stack(triangles, -1)

@@ -76,8 +76,8 @@ def _distance_to(
     distance, height = (np.full((resolution,) * 3, value, np.float32) for value in (np.inf, 0.0))
     for first in track("distances", range(0, resolution, PLANES)):
         planes = slice(first, first + PLANES)
-        found = distance[planes], height[planes]
-        _narrow_band((triangles, normals), order, starts[first:], (origin, spacing), first, reach, found)
+        slices = distance[planes], height[planes]
+        _narrow_band((triangles, normals), order, starts[first:], (origin, spacing), first, reach, slices)
     # The surface point nearest to a vertex lies within half a voxel diagonal of a vertex in the band.
     half_diagonal = 0.5 * float(np.linalg.norm(spacing))
     far = distance_to_set(distance <= half_diagonal, spacing) - half_diagonal

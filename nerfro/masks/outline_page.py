@@ -79,17 +79,17 @@ class OutlinePage:
             self.outlines, self._found = outlines, None
         masks, notes = {}, {}
         try:
-            found = self._found = self._found or self.segment(self.outlines)
+            segmentation = self._found = self._found or self.segment(self.outlines)
         except NerfroError as error:
             if request["save"]:
                 raise
             message = str(error)
         else:
-            masks = {view: self._contours(view, mask) for view, mask in found.masks.items()}
-            notes = {view: f"given, overlap {overlap:.3f}" for view, overlap in found.agreement.items()}
-            message = f"{len(found.by_hull)} masks are projections of the {found.shape}"
+            masks = {view: self._contours(view, mask) for view, mask in segmentation.masks.items()}
+            notes = {view: f"given, overlap {overlap:.3f}" for view, overlap in segmentation.agreement.items()}
+            message = f"{len(segmentation.by_hull)} masks are projections of the {segmentation.shape}"
             if request["save"]:
-                message = self.save(self.outlines, found)
+                message = self.save(self.outlines, segmentation)
                 self._server.finish()
         return {"outlines": self.outlines, "masks": masks, "notes": notes, "message": message}
 

@@ -253,8 +253,8 @@ def print_sheets(sheets: list[Sheet], folder: Path) -> list[Path]:
         caption = f"{sheet.title}; {1000 * width:.1f} mm wide: print at 100 % and measure"
         size = 0.45 * margin
         size *= min(1, levels.shape[1] / ImageFont.load_default(size).getlength(caption))
-        place = margin, page.height - margin / 2
-        ImageDraw.Draw(page).text(place, caption, 0, ImageFont.load_default(size), anchor="lm")
+        position = margin, page.height - margin / 2
+        ImageDraw.Draw(page).text(position, caption, 0, ImageFont.load_default(size), anchor="lm")
         pages.append(page.convert("1", dither=Image.Dither.NONE))  # a PDF of grey levels would be lossy
     files = [folder / "board.pdf", *(folder / f"board_{number:02d}.png" for number in range(len(pages)))]
     with atomic_file(files[0]) as stream:

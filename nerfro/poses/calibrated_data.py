@@ -27,8 +27,8 @@ def split_views(names: list[str], every: int) -> dict[str, list[str]]:
     """Split names into training, validation and test: every `every`-th name is for test, as many for validation."""
     splits: dict[str, list[str]] = {split: [] for split in SPLITS}
     for number, name in enumerate(sorted(names)):
-        place = number % every
-        splits["test" if place == 0 else "val" if place == every // 2 and every > 2 else "train"].append(name)
+        rank = number % every
+        splits["test" if rank == 0 else "val" if rank == every // 2 and every > 2 else "train"].append(name)
     return splits
 
 

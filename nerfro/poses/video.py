@@ -45,8 +45,8 @@ def extract_frames(video: Path, folder: Path, count: int) -> list[Path]:
             "or reduce frames="
         )
     edges = np.linspace(0, len(sharpness), count + 1).round().astype(int)
-    chosen = {int(first + sharpness[first:last].argmax()) for first, last in itertools.pairwise(edges)}
-    files = {number: folder / f"frame_{number:05d}.jpg" for number in sorted(chosen)}
+    sharpest = {int(first + sharpness[first:last].argmax()) for first, last in itertools.pairwise(edges)}
+    files = {number: folder / f"frame_{number:05d}.jpg" for number in sorted(sharpest)}
     folder.mkdir(parents=True, exist_ok=True)
     for file in folder.glob("frame_*.jpg"):
         if file not in files.values() or file.stat().st_mtime_ns < video.stat().st_mtime_ns:
@@ -91,8 +91,8 @@ def _frames(video: Path) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
     capture = _open(video)
     try:
         while True:
-            found, frame = capture.read()
-            if not found:
+            succeeded, frame = capture.read()
+            if not succeeded:
                 return
             yield frame
     finally:

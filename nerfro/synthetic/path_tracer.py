@@ -44,18 +44,18 @@ def load_mitsuba(variant: str = "auto") -> ModuleType:
         raise NerfroError(f"unknown Mitsuba variant '{variant}'; choose auto, {', '.join(VARIANTS)}")
     llvm.select_llvm()
     drjit, mitsuba = (optional(name, "synthesize", llvm.PURPOSE) for name in ("drjit", "mitsuba"))
-    chosen, reason = variant, llvm.missing_llvm()
+    selected, reason = variant, llvm.missing_llvm()
     if variant == "auto":
         cuda = drjit.has_backend(drjit.JitBackend.CUDA)
-        chosen = "llvm_ad_rgb" if reason is None else "cuda_ad_rgb" if cuda else "scalar_rgb"
-        if chosen == "scalar_rgb":
+        selected = "llvm_ad_rgb" if reason is None else "cuda_ad_rgb" if cuda else "scalar_rgb"
+        if selected == "scalar_rgb":
             print(f"nerfro: Mitsuba runs about seventy times slower, because {reason}; {llvm.HINT}", file=sys.stderr)
     elif variant == "llvm_ad_rgb" and reason is not None:
         raise NerfroError(f"variant=llvm_ad_rgb cannot run, because {reason}; {llvm.HINT}, or choose variant=auto")
     elif variant == "cuda_ad_rgb" and not drjit.has_backend(drjit.JitBackend.CUDA):
         raise NerfroError("variant=cuda_ad_rgb cannot run, because Dr.Jit finds no CUDA driver; choose variant=auto")
-    mitsuba.set_variant(chosen)
-    register_materials(chosen)
+    mitsuba.set_variant(selected)
+    register_materials(selected)
     return mitsuba
 
 

@@ -44,8 +44,8 @@ def find_ffmpeg() -> str:
     Raises:
         NerfroError: neither is installed.
     """
-    if (found := shutil.which("ffmpeg")) is not None:
-        return found
+    if (path := shutil.which("ffmpeg")) is not None:
+        return path
     purpose, alternative = "a film in .mp4 format needs ffmpeg", ", or install ffmpeg, or set film=[gif] or film=[]"
     try:
         return optional("imageio_ffmpeg", "video", purpose, alternative).get_ffmpeg_exe()

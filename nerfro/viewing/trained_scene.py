@@ -116,10 +116,10 @@ class TrainedScene:
         return RenderedViews(*(torch.stack(images) for images in zip(*rendered, strict=True)))
 
     def _render_view(self, cameras: Cameras, view: int, subdivision: Subdivision) -> tuple[Tensor, ...]:
-        found = render_view(self.renderer, cameras.to(self.renderer.scene.device), view, subdivision)
+        rays = render_view(self.renderer, cameras.to(self.renderer.scene.device), view, subdivision)
         colour_space = self.renderer.scene.colour_space
-        rgb, radiance = colour_space.to_display(found.radiance), colour_space.to_linear(found.radiance)
-        values = rgb, found.depth, found.opacity, found.normals, found.exit_directions, radiance
+        rgb, radiance = colour_space.to_display(rays.radiance), colour_space.to_linear(rays.radiance)
+        values = rgb, rays.depth, rays.opacity, rays.normals, rays.exit_directions, radiance
         return tuple(value.float().cpu().view(cameras.height, cameras.width, *value.shape[1:]) for value in values)
 
     @property

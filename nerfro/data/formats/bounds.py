@@ -46,7 +46,7 @@ def find_bounds(
     centres, forward = poses[:, :, 3], -poses[:, :, 2]
     distances_in_view = [_distances_in_view(points, *camera) for camera in zip(poses, edges, strict=True)]
     quantiles = [_OUTLIER_QUANTILE, 1 - _OUTLIER_QUANTILE]
-    ranges = np.array([np.quantile(each, quantiles) for each in distances_in_view if len(each)])
+    ranges = np.array([np.quantile(distances, quantiles) for distances in distances_in_view if len(distances)])
     if len(ranges):
         return 0.9 * float(ranges[:, 0].min()), 1.1 * float(ranges[:, 1].max())
     to_target = nearest_point(centres, forward) - centres

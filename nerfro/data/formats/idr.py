@@ -68,12 +68,12 @@ class IdrData(PosedImages):
         projections = (self._projection(arrays, i, file) for i in range(len(images)))
         cameras = [decompose(projection, f"{file}: world_mat_{i}") for i, projection in enumerate(projections)]
         poses, lenses = zip(*cameras, strict=True)
-        chosen = self.held_out(range(len(images)), self.test_every, split)
-        frames = [Frame(images[i].name, images[i], masks[i], poses[i]) for i in chosen]
+        indices = self.held_out(range(len(images)), self.test_every, split)
+        frames = [Frame(images[i].name, images[i], masks[i], poses[i]) for i in indices]
         # All views are considered, so that all splits have the same bounds.
         distance = np.linalg.norm(np.stack(poses)[:, :, 3], axis=-1)
         near, far = max(float(distance.min()) - 1, 0.0), float(distance.max()) + 1
-        return FrameSet(frames, [lenses[i] for i in chosen], "opencv", near, far)
+        return FrameSet(frames, [lenses[i] for i in indices], "opencv", near, far)
 
     def _projection(self, arrays: dict[str, np.ndarray], index: int, file: Path) -> Float[np.ndarray, "3 4"]:
         product = np.eye(4)

@@ -74,12 +74,12 @@ class LlffData(PosedImages):
                 f"{folder / self.images} holds {len(files)} images but {folder / 'poses_bounds.npy'} has {len(poses)} "
                 "poses; images and poses are matched in the order of names, so restore the images that were calibrated"
             )
-        poses, chosen = map_poses(poses, transform), list(range(len(files)))
+        poses, indices = map_poses(poses, transform), list(range(len(files)))
         if self.video is None:
-            chosen = self.held_out(chosen, self.test_every, split)
-        frames = [Frame(files[i].name, files[i], find_mask(folder, files[i]), poses[i]) for i in chosen]
+            indices = self.held_out(indices, self.test_every, split)
+        frames = [Frame(files[i].name, files[i], find_mask(folder, files[i]), poses[i]) for i in indices]
         size, where = read_size(frames[0].image)[:2], f"{folder / 'poses_bounds.npy'}"
-        lenses = [Lens(f, f, 0.5 * w, 0.5 * h).resized((w, h), size, where) for h, w, f in sizes[chosen].tolist()]
+        lenses = [Lens(f, f, 0.5 * w, 0.5 * h).resized((w, h), size, where) for h, w, f in sizes[indices].tolist()]
         return FrameSet(frames, lenses, "opengl", 0.9 * float(depths.min()), farthest)
 
 

@@ -117,9 +117,9 @@ class LpipsNetwork(nn.Module):
 
     def _register(self, name: str, weights: dict[str, Tensor], key: str, shape: tuple[int, ...]) -> None:
         if key not in weights or tuple(weights[key].shape) != shape:
-            found = list(weights[key].shape) if key in weights else "none"
+            actual = list(weights[key].shape) if key in weights else "none"
             raise NerfroError(
-                f"LPIPS weights: expected {key} of shape {list(shape)}, found {found}; "
+                f"LPIPS weights: expected {key} of shape {list(shape)}, found {actual}; "
                 "use the published file of AlexNet"
             )
         self.register_buffer(name, weights[key].detach().float().clone(), persistent=False)

@@ -163,8 +163,8 @@ def wood(points: np.ndarray, tone: Vector, seed: int) -> np.ndarray:
     """Return sRGB [..., 3] of planks along x."""
     plank = np.floor(points[..., 1:2] / 0.45).astype(int)
     shift = 9 * hashed(plank, seed)[..., None]
-    place = np.concatenate([points[..., :1] * 1.5 + shift, points[..., 1:2] * 22, 0 * shift], -1)
-    grain = fractal_noise(place, 4, seed)
+    position = np.concatenate([points[..., :1] * 1.5 + shift, points[..., 1:2] * 22, 0 * shift], -1)
+    grain = fractal_noise(position, 4, seed)
     seam = np.abs(points[..., 1] / 0.45 % 1 - 0.5) > 0.485
     colour = np.asarray(tone) * (0.55 + 0.6 * grain + 0.25 * (hashed(plank, seed + 1) - 0.5))[..., None]
     return np.where(seam[..., None], 0.4 * colour, colour)

@@ -78,13 +78,13 @@ def _bookcase(y: np.ndarray, z: np.ndarray) -> np.ndarray:
     shelf = np.floor((z + 1.0) / 0.36).astype(int)
     height = (z + 1.0) / 0.36 - shelf
     number = np.floor((y + 1.4) / 0.075).astype(int)
-    place = (y + 1.4) / 0.075 - number
+    across = (y + 1.4) / 0.075 - number
     key = np.stack([shelf, number], -1)
     top = 0.55 + 0.3 * hashed(key, 1)
     book = chosen(BOOKS, hashed(key, 2)) * (0.75 + 0.25 * hashed(key, 3))[..., None]
-    label = (np.abs(height - 0.4) < 0.07) & (np.abs(place - 0.5) < 0.3)
+    label = (np.abs(height - 0.4) < 0.07) & (np.abs(across - 0.5) < 0.3)
     book = np.where(label[..., None], np.array([0.95, 0.90, 0.72]), book)
-    book = np.where((place < 0.08)[..., None], 0.4 * book, book)
+    book = np.where((across < 0.08)[..., None], 0.4 * book, book)
     colour = np.where((height < top)[..., None], book, np.array([0.24, 0.17, 0.12]))
     return np.where((height > 0.9)[..., None], np.array([0.58, 0.40, 0.24]), colour)
 
