@@ -45,13 +45,6 @@ _NUMBERS = {
     **dict.fromkeys(("cx", "cy", *_NAMES), _NUMBER),
 }
 
-# A focal length in units of the longer side of the image: a field of view from 0.06 to 177.7 degrees.
-_MIN_FOCAL, _MAX_FOCAL = 0.01, 1000
-# Largest ratio of the sides of a pixel, and largest distance of the principal point from the centre in images.
-_MAX_PIXEL_RATIO, _MAX_SHIFT = 4, 5
-# Maximum error in pixels after undistorting and distorting a point again.
-_DISTORTION_TOLERANCE = 0.01
-
 
 @dataclass(frozen=True)
 class Lens:
@@ -235,10 +228,11 @@ def check_lenses(lenses: Iterable[Lens], names: Iterable[str], size: tuple[int, 
     """
     longer, outside = max(size), []
     limits = {
-        "fx": Annotated[float, Range(at_least=_MIN_FOCAL * longer, at_most=_MAX_FOCAL * longer)],
-        "fy / fx": Annotated[float, Range(at_least=1 / _MAX_PIXEL_RATIO, at_most=_MAX_PIXEL_RATIO)],
+        # A field of view from 0.06 to 177.7 degrees.
+        "fx": Annotated[float, Range(at_least=0.01 * longer, at_most=1000 * longer)],
+        "fy / fx": Annotated[float, Range(at_least=1 / 4, at_most=4)],
         **{
-            key: Annotated[float, Range(at_least=-_MAX_SHIFT * side, at_most=(1 + _MAX_SHIFT) * side)]
+            key: Annotated[float, Range(at_least=-5 * side, at_most=6 * side)]
             for key, side in zip(("cx", "cy"), size, strict=True)
         },
     }
@@ -266,7 +260,8 @@ def _check_distortion(lens: Lens, size: tuple[int, int], name: str) -> None:
     distortion = torch.tensor(lens.distortion, dtype=torch.float64).expand(len(points), 9)
     ideal, area = undistort(points, distortion)
     error: Tensor = (distort(ideal, distortion)[0] - points).norm(dim=-1) * lens.fx
-    if not bool(((error < _DISTORTION_TOLERANCE) & (area > 0)).all()):
+    # A point that is undistorted and distorted again moves by at most 0.01 pixels.
+    if not bool(((error < 0.01) & (area > 0)).all()):
         raise NerfroError(
             f"{name}: the lens distortion is not invertible everywhere in the image; "
             "check the coefficients and their order, or undistort the images first"

@@ -15,8 +15,6 @@ from nerfro.geometry.normals import corner_normals
 from nerfro.geometry.occupancy import PLANES, occupancy_fraction, triangles_by_plane
 from nerfro.kernels.compilation import compiled, compiled_parallel
 
-_MIN_DEPTH = 0.01  # of a vertex inside the mesh, voxels
-
 
 def signed_distance_grid(
     mesh: TriangleMesh,
@@ -57,7 +55,7 @@ def signed_distance_grid(
     distance, height = _distance_to(triangles[shown], normals[shown], origin, spacing, resolution, reach)
     inside = occupancy_fraction(mesh, box, resolution, subsamples=1) > 0.5
     # Vertices on a flat mesh can count as inside.
-    require_inside(bool((inside & (distance > _MIN_DEPTH * spacing.min())).any()))
+    require_inside(bool((inside & (distance > 0.01 * spacing.min())).any()))
     if lid is not None:
         inside |= _distance_to(triangles[lid], normals[lid], origin, spacing, resolution, reach)[0] < distance
     return (np.where(inside, -distance, distance) - height).astype(np.float32)

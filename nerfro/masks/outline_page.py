@@ -23,8 +23,6 @@ from nerfro.masks.masking import Segmentation
 from nerfro.viewing.server import PageServer, open_page
 
 _TEMPLATE = Path(__file__).with_name("outlines.html.jinja")
-_MAX_SIDE = 960  # of a photograph on the page, pixels
-_TOLERANCE = 0.5  # largest distance, in pixels, between a mask and its outline on the page
 
 Outlines = dict[str, list]
 
@@ -97,7 +95,7 @@ class OutlinePage:
         photographs = []
         for frame, image, (width, height) in zip(self.frames, self.images, self._sizes, strict=True):
             picture = Image.fromarray(image)
-            picture.thumbnail((_MAX_SIDE, _MAX_SIDE))
+            picture.thumbnail((960, 960))
             uri = data_uri(np.asarray(picture), "JPEG", quality=85)
             photographs.append({"name": frame.name, "width": width, "height": height, "image": uri})
         return photographs
@@ -106,7 +104,9 @@ class OutlinePage:
         """Convert a mask to polygons of (column, row) in pixels of the image file."""
         scale = np.divide(self._sizes[view], mask.shape[::-1])
         rings = [
-            approximate_polygon(ring, _TOLERANCE) for ring in find_contours(np.pad(mask, 1).astype(np.float32), 0.5)
+            # Vertices lie within half a pixel of the mask.
+            approximate_polygon(ring, 0.5)
+            for ring in find_contours(np.pad(mask, 1).astype(np.float32), 0.5)
         ]
         return [((ring[:, ::-1] - 0.5) * scale).round(1).tolist() for ring in rings]
 

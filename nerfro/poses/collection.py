@@ -22,7 +22,6 @@ from nerfro.poses.calibrated_data import REPORT
 from nerfro.poses.photographs import HEIF_SUFFIXES, PHOTOGRAPH_SUFFIXES, one_of_each_pair, require_one_of_each_name
 from nerfro.poses.video import extract_frames
 
-_QUALITY = 95  # of converted photographs
 # EXIF data of 16-bit files that are kept; others describe the file.
 _KEPT_TAGS = (ExifTags.Base.Orientation, ExifTags.Base.Make, ExifTags.Base.Model)
 
@@ -137,7 +136,7 @@ def _place_photograph(file: Path, folder: Path, replaces: bool) -> None:
         if file.suffix.lower() in HEIF_SUFFIXES or orientation_of(image) in range(2, 9):
             upright = ImageOps.exif_transpose(_as_stored(file, image, bits)).convert("RGB")
             with atomic_file(converted) as output:
-                upright.save(output, "JPEG", quality=_QUALITY, exif=upright.getexif())
+                upright.save(output, "JPEG", quality=95, exif=upright.getexif())
             return
     link.symlink_to(file.resolve())
 

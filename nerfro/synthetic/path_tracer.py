@@ -22,7 +22,7 @@ VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb", "scalar_rgb")
 # Hammersley points: at most one point lies in each row and column, which edges may be parallel to.
 SILHOUETTE_PLACES = [((k + 0.5) / 128, (int(f"{k:07b}"[::-1], 2) + 0.5) / 128) for k in range(128)]
 SAMPLES_PER_PASS = 6_000_000  # a wavefront of paths takes about 1 GB of memory per 10 million paths
-_TEXELS_PER_TASK, _EDGE_CONTRAST = 1 << 17, 0.1
+_TEXELS_PER_TASK = 1 << 17
 ROULETTE_DEPTH, MAX_DEPTH = (
     32,
     1024,
@@ -208,7 +208,7 @@ def envmap_texture(sky: Sky, height: int, to_world: np.ndarray) -> np.ndarray:
         right = np.abs(texture - np.roll(texture, -1, 1)).max(-1)
         below = np.pad(np.abs(np.diff(texture, axis=0)).max(-1), ((1, 1), (0, 0)))
         contrast = np.maximum.reduce([right, np.roll(right, 1, 1), below[:-1], below[1:]])
-        edges = np.argwhere(contrast > _EDGE_CONTRAST)
+        edges = np.argwhere(contrast > 0.1)
         tasks = np.array_split(edges, -(-9 * len(edges) // _TEXELS_PER_TASK) or 1)
         texture[edges[:, 0], edges[:, 1]] = np.concatenate(list(pool.map(refined, tasks)))
     return texture

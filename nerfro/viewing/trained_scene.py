@@ -29,8 +29,6 @@ from nerfro.samplers.subdivision import Subdivision
 from nerfro.viewing.changes import with_absorption, with_indices, with_sky, without_glass, without_inside
 from nerfro.viewing.surface import surface_of
 
-_MIN_SKY_HEIGHT = 512
-
 
 class RenderedViews(NamedTuple):
     """Images of V cameras, on the CPU.
@@ -130,7 +128,7 @@ class TrainedScene:
     @property
     def sky_height(self) -> int:
         """Number of rows of a lat-long image as fine as the background, at least 512."""
-        return max(_MIN_SKY_HEIGHT, 2 * self.renderer.scene.boundary.face_resolution)
+        return max(512, 2 * self.renderer.scene.boundary.face_resolution)
 
     def sky_of_height(self, height: int) -> Float[Tensor, "H 2*H 3"]:
         """Evaluate the background as a lat-long image with a given number of rows."""

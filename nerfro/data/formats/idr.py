@@ -20,8 +20,6 @@ from nerfro.data.masks import find_mask
 from nerfro.files.reading import load_arrays, parse_matrix
 from nerfro.registry.registration import register
 
-_MAX_SKEW = 1e-3
-
 
 @register("data", "idr")
 class IdrData(PosedImages):
@@ -104,7 +102,7 @@ def decompose(projection: Float[np.ndarray, "3 4"], where: str) -> tuple[Float[n
     signs = np.diag(np.sign(np.diag(upper)))
     intrinsics, rotation = upper @ signs, signs @ rotation
     intrinsics /= intrinsics[2, 2]
-    lens = Lens.of_matrix(intrinsics, f"the camera matrix of {where}", _MAX_SKEW)
+    lens = Lens.of_matrix(intrinsics, f"the camera matrix of {where}", 1e-3)
     centre = -np.linalg.solve(square, projection[:, 3])
     return np.column_stack([rotation.T, centre]), replace(lens, cx=lens.cx + 0.5, cy=lens.cy + 0.5)
 

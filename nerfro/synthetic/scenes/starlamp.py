@@ -18,7 +18,6 @@ ROOM_LOW, ROOM_HIGH = np.array([-1.7, -1.4, -1.0]), np.array([1.7, 1.4, 1.2])
 BOOKS = np.array(
     [[0.7, 0.2, 0.18], [0.16, 0.33, 0.52], [0.88, 0.7, 0.28], [0.22, 0.46, 0.33], [0.9, 0.86, 0.76], [0.45, 0.26, 0.48]]
 )
-GLASS_SPACING = 0.010
 
 
 def star_prism(points: np.ndarray) -> np.ndarray:
@@ -142,5 +141,5 @@ def build(spacing: float) -> SyntheticScene:
     planet = distance.painted(ball, planet_colours, -extent, extent, spacing)
     extent = np.full(3, 1.1 * RING_RADII[1])
     rings = distance.painted(ring, ring_colours, -extent, extent, min(spacing, 0.006))
-    glass = distance.triangulate(star_prism, (-OUTER, -HALF_DEPTH, -OUTER), (OUTER, HALF_DEPTH, OUTER), GLASS_SPACING)
+    glass = distance.triangulate(star_prism, (-OUTER, -HALF_DEPTH, -OUTER), (OUTER, HALF_DEPTH, OUTER), 0.010)
     return SyntheticScene(ior=1.5, glass=glass, interior=distance.join([planet, rings]), sky=sky)
