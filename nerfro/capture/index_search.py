@@ -158,7 +158,7 @@ def find_indices(
             "medium.inner_iors=, or ior or material of each of bodies="
         )
     plan = settings.plans[num_bodies - 1]
-    if isinstance(surroundings.boundary, Room):
+    if isinstance(surroundings.background, Room):
         plan = plan._replace(coarse_pixels=settings.near_pixels // 4, fine_pixels=settings.near_pixels)
     num_rays, pixels = settings.num_rays(plan, num_bodies), through.some(plan.fine_pixels)
     search = _Search(medium, pixels, surroundings, lambda traced: progress(min(1, traced / num_rays)), settings)
