@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,10 +13,7 @@ from torch import Tensor, nn
 
 from nerfro.core.errors import NerfroError
 from nerfro.core.types import WORLD_ORIGIN, Path
-
-if TYPE_CHECKING:
-    from nerfro.geometry.mesh import TriangleMesh
-    from nerfro.media.bodies import Bodies
+from nerfro.geometry.mesh import TriangleMesh
 
 Scalars = Float[Tensor, "*batch"]
 Vectors = Float[Tensor, "*batch 3"]
@@ -56,8 +53,8 @@ class Medium(nn.Module, ABC):
         """
 
     @property
-    def bodies(self) -> Bodies | None:
-        """The bodies, if the medium consists of bodies with sharp surfaces; None otherwise."""
+    def bodies(self) -> Any:
+        """The `media.bodies.Bodies`, if the medium consists of bodies with sharp surfaces; None otherwise."""
         return None
 
     @property

@@ -68,9 +68,9 @@ def expanded(medium: Mapping[str, Any]) -> dict[str, BodySettings]:
     if not bodies:
         raise NerfroError("bodies={} has no body; write bodies={NAME: {mesh: FILE, ior: 1.5}}")
     settings = {str(name): _settings(str(name), values) for name, values in bodies.items()}
-    for body in settings.values():
-        if body.mesh is None and body.surface is None and mesh is not None:
-            body.mesh = str(mesh)
+    if mesh is not None:
+        own = {name: body for name, body in settings.items() if body.mesh is not None or body.surface is not None}
+        settings = {name: dataclasses.replace(body, mesh=str(mesh)) for name, body in settings.items()} | own
     return dict(sorted(settings.items(), key=lambda item: item[1].priority))
 
 

@@ -128,11 +128,11 @@ def checked(where: str) -> Callable[[Class], Class]:
 
         return call
 
-    def wrap(target: Class) -> Class:
-        if not isinstance(target, type):
-            return guarded(target)
-        target.__init__ = guarded(target.__init__)  # type: ignore[misc]
-        return target
+    def wrap(cls: Class) -> Class:
+        if not isinstance(cls, type):
+            return guarded(cls)
+        cls.__init__ = guarded(cls.__init__)  # type: ignore[misc]
+        return cls
 
     return wrap
 
