@@ -5,6 +5,7 @@ from .cameras import Cameras
 from .data.blender import BlenderData
 from .evaluation.collection import metrics
 from .fields.hash_grid import HashGridField
+from .geometry.space import Box, Contracted
 from .losses.photometric import Photometric
 from .media.sdf_grid import SdfGrid
 from .media.shapes import Ball
@@ -27,9 +28,11 @@ __version__: str
 __all__ = [
     "Ball",
     "BlenderData",
+    "Box",
     "Cameras",
     "Components",
     "ConstantBoundary",
+    "Contracted",
     "EnvironmentMap",
     "GroupConfig",
     "HashGridField",

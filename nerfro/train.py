@@ -41,7 +41,7 @@ def main(config: DictConfig) -> float | None:
     """Train one experiment, evaluate it, and return `optimized_metric`, which sweepers of Hydra optimize."""
     folder = Path(HydraConfig.get().runtime.output_dir)
 
-    def train() -> RunMetrics | None:
+    def train(config: DictConfig) -> RunMetrics | None:
         with lock_run(folder, config) as checkpoint:
             return _train(config, folder, checkpoint)
 
@@ -52,14 +52,14 @@ def main(config: DictConfig) -> float | None:
 def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetrics | None:
     """Train and evaluate; everything that can be refused is refused before training starts."""
     prepare_process(config.seed)
-    resolve_trainer_options(config)
+    config = resolve_trainer_options(config)
     source = build_data(config)
     training, split = source.load("train"), config.evaluation.split
     test = training if split is None else source.load(split).checked()
     test = test.select(range(len(test))[: config.trainer.limit_test_batches])
     subdivision = Subdivision(**config.evaluation.subdivision)
     metrics = prepared_metrics()
-    module, datamodule = build_training(config, source, training)
+    config, module, datamodule = build_training(config, source, training)
     renderer = module.renderer
     num_steps = require_same_run(folder, checkpoint, config, module.parameter_groups(), training.cameras)
     throughput, interruption = Throughput(), StopOnSignal()

@@ -22,6 +22,7 @@ from nerfro.draws import Draws
 from nerfro.errors import NerfroError
 from nerfro.fields.hash_grid import HashGridField
 from nerfro.geometry.mesh import TriangleMesh
+from nerfro.geometry.space import Contracted
 from nerfro.light import to_linear
 from nerfro.progress import fraction_bar
 from nerfro.rays import Rays
@@ -257,14 +258,13 @@ class Room(Boundary):
 
     def __init__(self, bounds: Float[np.ndarray, "2 3"], radius: float) -> None:
         super().__init__()
-        low, high = bounds.tolist()
-        self.radius = radius
+        self.radius, space = radius, Contracted(bounds, radius)
         with torch.random.fork_rng(devices=[]):
             torch.default_generator.manual_seed(0)
             self.field = HashGridField(
-                low, high, radius, finest_resolution=512, log2_table_size=17, direction_bands=1, initial_depth=3.0
+                space, finest_resolution=512, log2_table_size=17, direction_bands=1, initial_depth=3.0
             )
-        self.sampler = DensityGridSampler(box_min=low, box_max=high, radius=radius, update_fraction=0.25, decay=0.6)
+        self.sampler = DensityGridSampler(space, update_fraction=0.25, decay=0.6)
 
     def forward(self, exits: Exits, draws: Draws | None = None) -> Float[Tensor, "P 3"]:
         return self.seen(exits, draws)[0]

@@ -9,10 +9,11 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerfro.cameras import Cameras
+from nerfro.data.component import Component
 from nerfro.types import FieldValues, Samples
 
 
-class Field(nn.Module, ABC):
+class Field(Component, nn.Module, ABC):
     """Density and colour of a volume; subclasses implement `forward`.
 
     Positions and densities are in world units, and directions are unit vectors. Colours are linear radiance, or sRGB

@@ -16,9 +16,11 @@ from nerfro.allowed import checked
 from nerfro.boundaries.base import Boundary, background_radiance
 from nerfro.camera.base import CameraModel
 from nerfro.camera.given import GivenCamera
+from nerfro.data.component import Component
 from nerfro.draws import Draws
 from nerfro.fields.base import Field
 from nerfro.geometry.interpolation import intersect_box
+from nerfro.geometry.space import Space, Unbounded
 from nerfro.media.base import Medium
 from nerfro.rays import Rays
 from nerfro.rendering.colour_space import ColourSpace
@@ -39,6 +41,7 @@ class Components:
         make_field: makes a new radiance field; a model with several sampling levels has a field for each.
         boundary: background radiance, from beyond the volume.
         camera: estimate of the training cameras.
+        space: space that fields and samples cover.
         chunk_size: number of rays rendered at once in evaluation, which limits the memory.
     """
 
@@ -48,6 +51,7 @@ class Components:
     make_field: Callable[[], Field]
     boundary: Boundary
     camera: CameraModel = dataclasses.field(default_factory=GivenCamera)
+    space: Space = dataclasses.field(default_factory=Unbounded)
     chunk_size: int = 8192
 
 
@@ -71,7 +75,7 @@ class RenderedRays:
 
 
 @checked("model")
-class Renderer(nn.Module, ABC):
+class Renderer(Component, nn.Module, ABC):
     """Render rays through a scene. Models derive from this class and implement `render_path`.
 
     Args:
@@ -95,7 +99,7 @@ class Renderer(nn.Module, ABC):
         super().__init__()
         fields = [components.make_field() for _ in range(num_fields)]
         medium, boundary, camera = components.medium, components.boundary, components.camera
-        self.scene = Scene(medium, fields, boundary, camera, ColourSpace(colour))
+        self.scene = Scene(medium, fields, boundary, camera, ColourSpace(colour), components.space)
         self.path_sampler, self.point_sampler = components.path_sampler, components.point_sampler
         self.chunk_size = components.chunk_size
 

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor, nn
 
+from nerfro.data.component import Component
 from nerfro.draws import Draws
 from nerfro.errors import accept_old_methods
 from nerfro.fields.base import Field
@@ -69,7 +70,7 @@ class PathSampler(nn.Module, ABC):
 accept_old_methods(PathSampler, _OLD_METHODS)
 
 
-class PointSampler(nn.Module, ABC):
+class PointSampler(Component, nn.Module, ABC):
     """Choose arc lengths on a path.
 
     Attributes:

@@ -24,8 +24,17 @@ from nerfro.registry import discover
 from nerfro.rendering import Renderer
 from nerfro.rendering.scene_file import with_scene
 from nerfro.samplers.paths.thin_walls import warn_of_thin_walls
-from nerfro.training.config import TrainConfig, build_data, build_each, build_model, check_run, resolve_trainer_options
+from nerfro.training.config import (
+    TrainConfig,
+    build_data,
+    build_each,
+    build_medium,
+    build_model,
+    check_run,
+    resolve_trainer_options,
+)
 from nerfro.training.data_module import RayDataModule, traced
+from nerfro.training.derivation import derived
 from nerfro.training.effects import settings_without_effect
 from nerfro.training.memory import require_memory
 from nerfro.training.module import TrainingModule
@@ -65,12 +74,13 @@ def build(experiment: str | None = None, overrides: Sequence[str] = ()) -> tuple
     check_run(config)
     for line in settings_without_effect(config, given):
         warn(line)
-    resolve_trainer_options(config)
+    config = resolve_trainer_options(config)
     if config.callbacks:
         warn("nerfro.build ignores callbacks; give them to your own Trainer: lightning.Trainer(callbacks=[...])")
     seed_everything(config.seed, verbose=False)
     source = build_data(config)
-    return build_training(config, source, source.load("train"))
+    _, module, data = build_training(config, source, source.load("train"))
+    return module, data
 
 
 def check_command(config: DictConfig) -> None:
@@ -85,7 +95,9 @@ def check_command(config: DictConfig) -> None:
             warn(line)
 
 
-def build_training(config: DictConfig, source: DataSource, training: Views) -> tuple[TrainingModule, RayDataModule]:
+def build_training(
+    config: DictConfig, source: DataSource, training: Views
+) -> tuple[DictConfig, TrainingModule, RayDataModule]:
     """Build the module and the data of a run.
 
     Args:
@@ -93,13 +105,18 @@ def build_training(config: DictConfig, source: DataSource, training: Views) -> t
         source: data set of the run.
         training: its training views.
 
+    Returns:
+        The complete configuration, the module and the data.
+
     Raises:
         NerfroError: medium and data set have different origins.
     """
     validation = source.load("val").checked() if config.evaluation.every > 0 and "val" in source.splits else None
     batches = RayBatches.of(training, config)
-    renderer = build_model(config, training)
-    medium = renderer.scene.medium
+    medium = build_medium(config)
+    config = derived(config, medium, training)
+    renderer = build_model(config, medium)
+    renderer.scene.begin(training.cameras)
     if renderer.path_sampler.needs_medium and (medium.origin != source.origin).any():
         raise NerfroError(
             f"{type(medium).__name__} has its origin at {medium.origin.tolist()}, and the data set at "
@@ -109,7 +126,7 @@ def build_training(config: DictConfig, source: DataSource, training: Views) -> t
         traced(batches, renderer, config), validation, config.evaluation.every, config.trainer.overfit_batches
     )
     schedule = Schedule(build_each("phase", config.phase), training)
-    return TrainingModule.of(renderer, config, [schedule], training.cameras), data
+    return config, TrainingModule.of(renderer, config, [schedule], training.cameras), data
 
 
 def check_before_training(renderer: Renderer, batches: RayBatches, device: torch.device) -> str:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from nerfro.boundaries.base import Boundary
 from nerfro.fields.base import Field
-from nerfro.fields.selection import inside_box
+from nerfro.geometry.space import inside_box
 from nerfro.geometry.interpolation import smooth, trilinear
 from nerfro.types import Exits, FieldValues, Samples
 

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from nerfro.allowed import Depth, Natural, Positive, Width
 from nerfro.errors import NerfroError
-from nerfro.fields.selection import inside_box
+from nerfro.geometry.space import inside_box
 from nerfro.geometry.mesh import load_mesh, local_origin
 from nerfro.media.base import Medium
 from nerfro.paths import resolve_path
