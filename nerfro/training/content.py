@@ -83,13 +83,14 @@ def content_settings(config: DictConfig, medium: Medium, cameras: Cameras) -> di
             "content.box_min and content.box_max belong together; give both, or neither for the object's bounds"
         )
     box = _box(config, medium) if content.box_min is None else np.array([list(content.box_min), list(content.box_max)])
-    settings = _ball(content, box, cameras) if content.space == "all" else {"box": box}
-    if settings["box"] is None:
+    settings: dict[str, Any] = {}
+    if content.space == "all":
+        box, settings["content.radius"], settings["content.near"] = _ball(content, box, cameras)
+    if box is None:
         if content.space == "box":
             _refuse_unknown_box(config)
         return {}
-    low, high = settings.pop("box").tolist()
-    return {f"content.{name}": value for name, value in ({"box_min": low, "box_max": high} | settings).items()}
+    return {"content.box_min": box[0].tolist(), "content.box_max": box[1].tolist(), **settings}
 
 
 def components(config: DictConfig) -> Iterator[tuple[str, type[Component]]]:
@@ -129,7 +130,9 @@ def describe(config: DictConfig) -> str:
     )
 
 
-def _ball(content: DictConfig, box: Float[np.ndarray, "2 3"] | None, cameras: Cameras) -> dict[str, Any]:
+def _ball(
+    content: DictConfig, box: Float[np.ndarray, "2 3"] | None, cameras: Cameras
+) -> tuple[Float[np.ndarray, "2 3"], float, float]:
     """Derive the ball between the cameras: the box around it, its radius and the arc length of the first samples."""
     poses = cameras.camera_to_world.double().cpu().numpy()
     centres, forward = poses[:, :, 3], -poses[:, :, 2]
@@ -143,7 +146,7 @@ def _ball(content: DictConfig, box: Float[np.ndarray, "2 3"] | None, cameras: Ca
         corners = middle + np.array([[-1.0], [1.0]]) * radius
         box = np.array([[float(f"{x:.6g}") for x in corner] for corner in corners])
     near = float(f"{_NEAR_SHARE * distances.min():.4g}") if near is None else near
-    return {"box": box, "radius": radius, "near": near}
+    return box, radius, near
 
 
 def common_target(

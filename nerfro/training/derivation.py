@@ -30,7 +30,8 @@ def derived(config: DictConfig, medium: Medium, training: Views) -> DictConfig:
         NerfroError: the space of the run is unknown, see `content_settings`.
     """
     config = with_values(config, content_settings(config, medium, training.cameras))
-    space, values = space_of(config.content), {}
+    space = space_of(config.content)
+    values: dict[str, Any] = {}
     for name, component in components(config):
         if OmegaConf.select(config, name) is not None:
             settings = component.derive(config, training, space)
