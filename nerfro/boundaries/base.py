@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.func import functional_call
 
+from nerfro.core.types import Exits
 from nerfro.data.component import Component
-from nerfro.types import Exits
 
 
 class Boundary(Component, nn.Module, ABC):

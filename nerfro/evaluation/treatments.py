@@ -14,7 +14,7 @@ from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.results import AS_GIVEN, EXPOSED, EvaluationResult
 from nerfro.evaluation.scoring import ScoringProtocol, score_views
 from nerfro.rendering import Renderer
-from nerfro.subdivision import Subdivision
+from nerfro.samplers.subdivision import Subdivision
 
 
 def score_split(

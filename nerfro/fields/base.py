@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from nerfro.cameras import Cameras
+from nerfro.core.cameras import Cameras
+from nerfro.core.types import FieldValues, Samples
 from nerfro.data.component import Component
-from nerfro.types import FieldValues, Samples
 
 
 class Field(Component, nn.Module, ABC):

@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float
 from omegaconf import DictConfig
 from torch import Tensor, nn
 
-from nerfro.allowed import Depth, Positive, Range, Width
-from nerfro.cameras import Cameras
+from nerfro.core.cameras import Cameras
+from nerfro.core.types import FieldValues, Samples
 from nerfro.data.base import Views
 from nerfro.fields import hash_encoding
 from nerfro.fields import spherical_harmonics as harmonics
@@ -22,8 +22,8 @@ from nerfro.fields.networks import radiance
 from nerfro.fields.selection import evaluate_selected
 from nerfro.geometry.space import Space
 from nerfro.kernels.available import fast_bfloat16
-from nerfro.registry import register
-from nerfro.types import FieldValues, Samples
+from nerfro.registry.allowed import Depth, Positive, Range, Width
+from nerfro.registry.registration import register
 
 # Number of features that the density network passes to the colour network.
 _GEOMETRY_FEATURES = 16

@@ -12,10 +12,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from nerfro.allowed import corners_of_box
-from nerfro.cameras import Cameras
-from nerfro.errors import NerfroError
-from nerfro.types import Path
+from nerfro.core.cameras import Cameras
+from nerfro.core.errors import NerfroError
+from nerfro.core.types import Path
+from nerfro.registry.allowed import corners_of_box
 
 # Stand-in for infinity, in units of the ball's radius, or of the line's distance if the line misses the ball.
 FAR = 1e4

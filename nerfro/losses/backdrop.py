@@ -10,14 +10,14 @@ from jaxtyping import Bool, Float
 from omegaconf import DictConfig
 from torch import Tensor
 
+from nerfro.core.errors import NerfroError
+from nerfro.core.types import Batch, Rendering
 from nerfro.data.base import Views
 from nerfro.data.lazy_images import LazyImages
-from nerfro.errors import NerfroError
 from nerfro.geometry.space import Space
 from nerfro.losses.base import Loss
-from nerfro.registry import register
+from nerfro.registry.registration import register
 from nerfro.rendering import Scene
-from nerfro.types import Batch, Rendering
 
 # Tolerance of one level of 255, plus rounding errors.
 _NEAR = 1.5 / 255

@@ -10,8 +10,8 @@ from torch import nn
 from nerfro.boundaries.base import Boundary
 from nerfro.camera.base import CameraModel
 from nerfro.camera.given import GivenCamera
-from nerfro.cameras import Cameras
-from nerfro.errors import NerfroError
+from nerfro.core.cameras import Cameras
+from nerfro.core.errors import NerfroError
 from nerfro.fields.base import Field
 from nerfro.geometry.space import Space, Unbounded
 from nerfro.media.base import Medium

@@ -14,7 +14,15 @@ import torch
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from nerfro.allowed import (
+from nerfro.core.errors import NerfroError
+from nerfro.core.paths import resolve_path, scene_name
+from nerfro.data.base import DataSource
+from nerfro.data.validation_views import WithValidationViews
+from nerfro.evaluation.results import Region
+from nerfro.media.analytic import Vacuum
+from nerfro.media.base import Medium
+from nerfro.media.bodies import origin_of
+from nerfro.registry.allowed import (
     Count,
     Names,
     Natural,
@@ -28,18 +36,10 @@ from nerfro.allowed import (
     check_settings,
     corners_of_box,
 )
-from nerfro.data.base import DataSource
-from nerfro.data.validation_views import WithValidationViews
-from nerfro.errors import NerfroError
-from nerfro.evaluation.results import Region
-from nerfro.media.analytic import Vacuum
-from nerfro.media.base import Medium
-from nerfro.media.bodies import origin_of
-from nerfro.paths import resolve_path, scene_name
-from nerfro.registry import build, check_node, configure, create, find, plugins, require_lightning
+from nerfro.registry.registration import build, check_node, configure, create, find, plugins, require_lightning
 from nerfro.rendering import Components, Renderer
-from nerfro.subdivision import Subdivision
-from nerfro.synthetic import SCENES
+from nerfro.samplers.subdivision import Subdivision
+from nerfro.synthetic.options import SCENES
 from nerfro.training.content import ContentConfig, require_box, space_of
 from nerfro.training.optimizer import OptimizerConfig
 from nerfro.training.settings import with_values

@@ -7,10 +7,10 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf
 
+from nerfro.core.light import to_linear
 from nerfro.data.base import Views
-from nerfro.light import to_linear
 from nerfro.media.base import Medium
-from nerfro.registry import find
+from nerfro.registry.registration import find
 from nerfro.training.content import components, content_settings, space_of
 from nerfro.training.settings import with_values
 

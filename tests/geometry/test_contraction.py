@@ -4,7 +4,6 @@ import math
 
 import pytest
 import torch
-
 from nerfro.geometry.contraction import (
     FAR,
     contract,

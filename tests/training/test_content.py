@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 import torch
+from nerfro.training.angular_resolution import derive_angular_resolution
 from omegaconf import DictConfig, OmegaConf
 
-from nerfro.cameras import Cameras
+from nerfro.core.cameras import Cameras
 from nerfro.media.analytic import Vacuum
-from nerfro.registry import discover, find
-from nerfro.training.angular_resolution import derive_angular_resolution
+from nerfro.registry.registration import discover, find
 from nerfro.training.config import TrainConfig
 from nerfro.training.content import common_target, derive_content, describe
 from tests.exact_silhouettes import cameras_around

@@ -1,0 +1,88 @@
+"""The field of NeRF: an MLP on positional encodings of points."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from jaxtyping import Float
+from omegaconf import DictConfig
+from torch import Tensor
+
+from nerfro.core.types import FieldValues, Samples
+from nerfro.data.base import Views
+from nerfro.fields.base import Field
+from nerfro.fields.selection import evaluate_selected
+from nerfro.geometry.space import Space, Unbounded
+from nerfro.paper.encoding import DIRECTION_DEGREE, positional_encoding
+from nerfro.paper.mlp import RadianceMLP, in_blocks
+from nerfro.registry.allowed import Depth, Positive, Range, Width
+from nerfro.registry.registration import register
+
+# Distance from near to far in the scenes of NeRF, for whose world unit its encoding of positions is made.
+_RANGE_OF_RAYS = 4.0
+
+
+class EncodedField(Field):
+    """A field that encodes positions in world coordinates.
+
+    Args:
+        unit: length of the encoded positions and of the density, world units. The authors use 1. In a configuration,
+            None takes a quarter of the distance from near to far, so that the world unit is irrelevant.
+        space: space that the field covers; None for all of space.
+    """
+
+    def __init__(self, unit: float | None = 1.0, space: Space | None = None) -> None:
+        super().__init__()
+        self.unit = 1.0 if unit is None else unit
+        self.space = Unbounded() if space is None else space
+
+    @classmethod
+    def derive(cls, settings: DictConfig, views: Views, space: Space) -> dict[str, Any]:
+        return {"unit": (views.cameras.far - views.cameras.near) / _RANGE_OF_RAYS}
+
+    @property
+    def bounds(self) -> Float[Tensor, "2 3"] | None:
+        return self.space.bounds
+
+
+@register("field", "nerf")
+class NerfField(EncodedField):
+    """8x256 MLP on positional encodings of position and local direction (paper, section 2; NeRF, section 5).
+
+    Args:
+        width, depth, skip, view_width: shape of the MLP, see `RadianceMLP`.
+        position_degree: number of octaves of the encoding of positions.
+        unit, space: see `EncodedField`. The field is empty outside a box, and samples there are not evaluated.
+    """
+
+    def __init__(
+        self,
+        width: Width = 256,
+        depth: Depth = 8,
+        skip: int = 5,
+        view_width: Width = 128,
+        position_degree: Annotated[int, Range(at_least=0, at_most=64)] = 10,
+        unit: Positive | None = 1.0,
+        space: Space | None = None,
+    ) -> None:
+        super().__init__(unit, space)
+        self.position_degree = position_degree
+        num_position, num_direction = 3 * (1 + 2 * position_degree), 3 * (1 + 2 * DIRECTION_DEGREE)
+        self.mlp = RadianceMLP(num_position, num_direction, width, depth, skip, view_width)
+
+    def forward(self, samples: Samples) -> FieldValues:
+        return evaluate_selected(self.decode, samples, self.space.inside(samples.positions))
+
+    def decode(
+        self, positions: Float[Tensor, "*batch 3"], directions: Float[Tensor, "*batch 3"]
+    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
+        """Evaluate density and colour at positions for unit directions."""
+        return in_blocks(self._decode_block, positions, directions)
+
+    def _decode_block(
+        self, positions: Float[Tensor, "points 3"], directions: Float[Tensor, "points 3"]
+    ) -> tuple[Float[Tensor, " points"], Float[Tensor, "points 3"]]:
+        position = positional_encoding(positions / self.unit, self.position_degree)
+        direction = positional_encoding(directions, DIRECTION_DEGREE)
+        density, radiance = self.mlp(position, direction)
+        return density / self.unit, radiance
