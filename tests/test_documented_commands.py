@@ -18,17 +18,15 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
 from nerfro.cli.entry import _added, _quoted
-from nerfro.cli.old_names import full_key, renamed_override
 from nerfro.cli.options import Described, describe_command, usage
-from nerfro.cli.overrides import is_scene_file
+from nerfro.cli.overrides import full_key, is_scene_file
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import CONF_DIR, PACKAGE_DIR
 from nerfro.registry.allowed import check_names, check_settings
 from nerfro.registry.registration import KINDS, discover, plugins
-from nerfro.synthetic.options import SCENES
+from nerfro.synthetic.scenes import SCENES
 from nerfro.training.effects import settings_without_effect
-from nerfro.viewing import PLUGIN_EXPORTS
-from nerfro.viewing.exports import find_export
+from nerfro.viewing.exports import EXPORTS, find_export
 
 CHECKOUT = PACKAGE_DIR.parent
 PAGES = {
@@ -92,8 +90,7 @@ def require_valid(command: str, options: list[str]) -> None:
     """Raise an error unless a command accepts the options. Hydra composes only the choices of groups, to save time."""
     schema, verbatim = entry_points()[command]
     options = [option for option in options if not is_scene_file(option)]
-    given, options = [full_key(option) for option in options], [renamed_override(option) for option in options]
-    assert [option.lstrip("+") for option in options] == [option.lstrip("+") for option in given], "an old name"
+    options = [full_key(option) for option in options]
     # Of a sweep the first value; no patterns, and no options of Hydra, whose launchers may not be installed.
     options = [re.sub(r"^([^=]+=[^,[{]+),[^]}]*$", r"\1", option) for option in options if "(" not in option]
     options = [_quoted(option, verbatim) for option in options if not option.lstrip("+").startswith("hydra")]
@@ -144,7 +141,7 @@ def test_job_files_are_scripts() -> None:
 
 
 def test_help_lists_plugins() -> None:
-    names: dict[str, list[str]] = {"export": list(PLUGIN_EXPORTS), "synthesize": list(SCENES)}
+    names: dict[str, list[str]] = {"export": list(EXPORTS), "synthesize": list(SCENES)}
     names["train"] = [plugin.name for plugin in plugins()]
     names["trace"] = [plugin.name for kind in ("medium", "surface", "sampler/path") for plugin in plugins(kind)]
     for command, added in names.items():

@@ -14,6 +14,8 @@ from nerfro.evaluation.render_view import render_view
 from nerfro.media.analytic import Vacuum
 from nerfro.media.shapes import Ball
 from nerfro.models.refractive import RefractiveModel
+from nerfro.paper.hierarchical import Hierarchical
+from nerfro.paper.nerf import NerfField
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.paths.straight import Straight
 from nerfro.samplers.subdivision import Subdivision, contrast, divergence, neighbour_rays, part_rays, pixel_rays
@@ -21,7 +23,6 @@ from nerfro.testing import example_batch, example_components
 from nerfro.training.ray_batches import RayBatches
 from tests.cameras_at import cameras_at, random_poses
 from tests.closed_forms import RoundedBox
-from tests.paper import Hierarchical, NerfField
 
 NUM_VIEWS, HEIGHT, WIDTH = 3, 8, 10
 SIDE, FOCAL = 33, 60.0

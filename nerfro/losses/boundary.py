@@ -6,7 +6,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.core.distributed import rank_and_size, sum_over_processes
-from nerfro.core.errors import renamed_classes
 from nerfro.core.types import Batch, Rendering
 from nerfro.losses.base import Loss
 from nerfro.registry.registration import register
@@ -45,6 +44,3 @@ class BoundaryRegularizer(Loss):
         error = (predicted - target).abs().sum(-1)
         # Gradients are averaged over processes, so each process multiplies its sum by the number of processes.
         return (error * counted).sum() * rank_and_size()[1] / (sum_over_processes(counted.sum()) + 1)
-
-
-__getattr__ = renamed_classes(__name__, BoundaryRegulariser=BoundaryRegularizer)

@@ -27,7 +27,6 @@ from hydra.utils import instantiate
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from nerfro.cli.old_names import MOVED_CLASSES
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import PLUGINS_DIR, PLUGINS_PACKAGE
 from nerfro.registry.allowed import Names, Range, check, checked
@@ -41,9 +40,9 @@ SEVERAL = ("loss", "phase", "callbacks")  # a run may have several plugins of th
 
 # Modules and packages with built-in plugins; `discover` imports all of them.
 _BUILT_IN = (
-    "camera", "media", "samplers.paths", "samplers.points", "fields", "boundaries", "losses", "models", "data",
-    "evaluation.image_metrics",
-    "training.phases",
+    "camera", "camera.refined", "media", "media.surfaces", "samplers.paths", "samplers.points", "fields", "boundaries",
+    "losses", "models", "paper", "data", "data.formats", "evaluation.image_metrics", "evaluation.perceptual",
+    "training.phases", "viewing.page", "exports",
 )  # fmt: skip
 ENTRY_POINTS = "nerfro.plugins"
 
@@ -242,8 +241,7 @@ def plugin_of(node: DictConfig) -> Plugin:
         NerfroError: the class is not registered.
     """
     target = str(node.get("_target_"))
-    place = MOVED_CLASSES.get(target, target)
-    plugin = next((plugin for plugin in _plugins.values() if plugin.target == place), None)
+    plugin = next((plugin for plugin in _plugins.values() if plugin.target == target), None)
     if plugin is None:
         raise NerfroError(
             f"'{target}' is not registered; `python -m nerfro.plugins` lists the registered classes; "
@@ -328,22 +326,6 @@ def discover(plugins_dir: Path = PLUGINS_DIR) -> None:
         _discovered.add("built-in")
     for folder in plugin_folders(plugins_dir):
         _import_folder(folder)
-
-
-def plugin_module(name: str) -> types.ModuleType:
-    """Import a module of a local plugin by its place in `plugins/`, such as `synthetic_scenes.synthesis`.
-
-    Raises:
-        NerfroError: the plugin is not installed.
-    """
-    discover()
-    plugin, full_name = name.partition(".")[0], f"{PLUGINS_PACKAGE}.{name}"
-    try:
-        return importlib.import_module(full_name)
-    except ModuleNotFoundError as error:
-        if error.name is None or not f"{full_name}.".startswith(f"{error.name}."):
-            raise
-        raise NerfroError(f"{PLUGINS_DIR} lacks the plugin {plugin}; install nerfro again") from error
 
 
 def plugin_folders(plugins_dir: Path = PLUGINS_DIR) -> list[Path]:

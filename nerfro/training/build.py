@@ -14,9 +14,8 @@ from omegaconf import DictConfig
 
 from nerfro.cli.entry import check_configuration
 from nerfro.cli.failures import in_one_line
-from nerfro.cli.old_names import renamed_override
 from nerfro.cli.options import describe_command
-from nerfro.cli.overrides import prints_hints
+from nerfro.cli.overrides import full_key, prints_hints
 from nerfro.core.errors import NerfroError, warn
 from nerfro.core.paths import CONF_DIR
 from nerfro.data.base import DataSource, Views
@@ -63,7 +62,7 @@ def build(experiment: str | None = None, overrides: Sequence[str] = ()) -> tuple
     discover()
     ConfigStore.instance().store(name="train_schema", node=TrainConfig, provider="nerfro")
     chosen = [] if experiment is None else [f"+experiment={experiment}"]
-    given = with_scene([*chosen, *map(renamed_override, overrides)], ["data", "medium"])
+    given = with_scene([*chosen, *map(full_key, overrides)], ["data", "medium"])
     try:
         with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
             config = compose("train", given)

@@ -15,7 +15,7 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from nerfro.core.errors import NerfroError
-from nerfro.core.paths import resolve_path, scene_name
+from nerfro.core.paths import CONF_DIR, resolve_path, scene_name
 from nerfro.data.base import DataSource
 from nerfro.data.validation_views import WithValidationViews
 from nerfro.evaluation.results import Region
@@ -39,7 +39,6 @@ from nerfro.registry.allowed import (
 from nerfro.registry.registration import build, check_node, configure, create, find, plugins, require_lightning
 from nerfro.rendering import Components, Renderer
 from nerfro.samplers.subdivision import Subdivision
-from nerfro.synthetic.options import SCENES
 from nerfro.training.content import ContentConfig, require_box, space_of
 from nerfro.training.optimizer import OptimizerConfig
 from nerfro.training.settings import with_values
@@ -312,7 +311,7 @@ def build_data(config: DictConfig) -> DataSource:
         NerfroError: there is no data; for a synthetic scene the message names the command that renders the scene.
     """
     scene, root = scene_name(config.data.root), resolve_path(config.data.root)
-    if scene in SCENES and not root.exists():
+    if not root.exists() and (CONF_DIR / "scene" / f"{scene}.yaml").is_file():
         small = "resolution=128 spp=256 test_spp=1024 views.val=10 views.test=20"
         raise NerfroError(
             f"{root} holds no data yet; run python -m nerfro.synthesize scene={scene} out={root} {small} first"

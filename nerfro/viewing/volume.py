@@ -10,7 +10,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.core.errors import accept_old_fields
 from nerfro.core.progress import track
 from nerfro.geometry.space import Box, Space
 from nerfro.registry.allowed import Range, check
@@ -34,9 +33,6 @@ class Volume:
     density: Float[Tensor, "X Y Z"]
     radiance: Float[Tensor, "X Y Z 3"]
     space: Space
-
-
-accept_old_fields(Volume, {"rgb": "radiance"})
 
 
 @torch.inference_mode()

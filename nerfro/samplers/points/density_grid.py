@@ -31,12 +31,12 @@ _MIN_SAMPLES, _HEAVY = 8, 0.5
 class DensityGridSampler(PointSampler):
     """Draw samples in proportion to the rendering weights that a grid of the field's density predicts.
 
-    The grid covers the box of the space. In contracted space, samples cover all of space, from `Space.near` to practical
-    infinity, and even samples are even in contracted length. Each cell keeps the largest density that was found in it, with exponential
+    The grid covers the box of the space. Each cell keeps the largest density that was found in it, with exponential
     decay, and a fraction of the cells is updated from the finest field at regular steps of training. This is the
     occupancy grid of Instant-NGP (Mueller et al. 2022, appendix C), but it keeps densities, so that samples can be
     drawn from them along a bent path. The predicted weights include transmittance, so that few samples lie behind
-    opaque cells. A fraction of the samples is spread evenly, so that no region is left out.
+    opaque cells. A fraction of the samples is spread evenly, so that no region is left out. In contracted space, samples
+    reach from `Space.near` to practical infinity, and evenly means evenly in contracted length.
 
     Args:
         space: space of the samples; it has a box.

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from nerfro.boundaries.envmap import EnvironmentMap, Observed
-from nerfro.core.errors import renamed_classes, warn
+from nerfro.core.errors import warn
 from nerfro.core.rays import Rays
 from nerfro.core.types import Exits
 from nerfro.fields.base import Field
@@ -189,6 +189,3 @@ def occupied_box(renderer: Renderer) -> Float[Tensor, "2 3"] | None:
         boxes.append(renderer.scene.medium.content_box.to(renderer.scene.device))
     low, high = torch.stack(boxes, 1)
     return torch.stack([low.amin(0), high.amax(0)])
-
-
-__getattr__ = renamed_classes(__name__, Background=BackgroundSteps)
