@@ -57,8 +57,6 @@ MESH = "embedded:torus/mesh.ply"
         ("boundary", "envmap", {"resolutions": [4, 0]}, r"resolutions=\[4, 0\] is not allowed; take at least 1"),
         ("data", "opencv", {"root": ".", "eval_crop": 0.0}, "eval_crop=0.0 is not allowed"),
         ("data", "opencv", {"root": ".", "eval_crop": 1.2}, "eval_crop=1.2 is not allowed"),
-        ("field", "hash_grid", {"box_min": [0.0] * 3, "box_max": [1.0, 0.0, 1.0]}, "min below max"),
-        ("field", "hash_grid", {"box_min": [0.0, 0.0]}, "three numbers"),
         ("loss", "backdrop", {"colour": [1.0]}, "three numbers in"),
         ("loss", "backdrop", {"colour": [255.0] * 3}, "three numbers in"),
         ("loss", "photometric", {"ramp": -1}, "ramp=-1 is not allowed; take at least 0"),

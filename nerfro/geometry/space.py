@@ -203,6 +203,10 @@ class Unbounded(Space):
     def box(self) -> Float[Tensor, "2 3"]:
         raise NerfroError("a space without bounds has no box; give a Box or a Contracted space")
 
+    @property
+    def side(self) -> float:  # type: ignore[override]
+        return float(self.box.amax())
+
 
 class Contracted(Space):
     """All of space, contracted outside a ball to the shell between the ball and twice its radius.

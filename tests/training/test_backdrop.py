@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from nerfro.training.backdrop import find_backdrop
 from omegaconf import OmegaConf
 
+from nerfro.losses.backdrop import find_backdrop
 from tests.conftest import QUIET, Runner, repaint
 
 GREY = 102 / 255

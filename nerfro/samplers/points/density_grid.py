@@ -35,8 +35,8 @@ class DensityGridSampler(PointSampler):
     decay, and a fraction of the cells is updated from the finest field at regular steps of training. This is the
     occupancy grid of Instant-NGP (Mueller et al. 2022, appendix C), but it keeps densities, so that samples can be
     drawn from them along a bent path. The predicted weights include transmittance, so that few samples lie behind
-    opaque cells. A fraction of the samples is spread evenly, so that no region is left out. In contracted space, samples
-    reach from `Space.near` to practical infinity, and evenly means evenly in contracted length.
+    opaque cells. A fraction of the samples is spread evenly, so that no region is left out. In contracted space,
+    samples reach from `Space.near` to practical infinity, and evenly means evenly in contracted length.
 
     Args:
         space: space of the samples; it has a box.
