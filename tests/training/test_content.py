@@ -35,7 +35,7 @@ def of_all_space(**content: object) -> DictConfig:
 
 
 def finest_cells(radius: float) -> int:
-    views, space = replace(example_views(), cameras=around(7)), Contracted(MIDDLE + [[-1], [1]], radius)
+    views, space = replace(example_views(), cameras=around(7)), Contracted(np.stack([MIDDLE - 1, MIDDLE + 1]), radius)
     return HashGridField.derive(OmegaConf.create(), views, space)["finest_resolution"]
 
 
