@@ -3,7 +3,7 @@
 A plugin begins with one import, such as `from nerfro.parts import Loss, register`; see docs/guides/plugins.md.
 """
 
-from nerfro.boundaries.base import Boundary
+from nerfro.backgrounds.base import Background
 from nerfro.camera.base import CameraModel
 from nerfro.core.cameras import Cameras
 from nerfro.core.draws import Draws
@@ -31,7 +31,7 @@ from nerfro.viewing.exports import EXPORTS, Export
 from nerfro.viewing.trained_scene import TrainedScene
 
 __all__ = [
-    "EXPORTS", "Batch", "Boundary", "Box", "CameraModel", "Cameras", "Components", "Contracted", "Count", "DataSource",
+    "EXPORTS", "Batch", "Background", "Box", "CameraModel", "Cameras", "Components", "Contracted", "Count", "DataSource",
     "Distance", "Draws", "Exits", "Export", "Field", "FieldValues", "Grid", "ImageMetric", "Loss", "Medium", "Natural",
     "NerfroError", "NotNegative", "Path", "PathSampler", "Phase", "PointSampler", "Positive", "Range", "Rays",
     "RefractiveModel", "Renderer", "Rendering", "Samples", "Scalars", "Scene", "Space", "Stratified", "Surface",

@@ -42,9 +42,9 @@ class TotalVariation(Loss):
     def forward(self, renderings: list[Rendering], batch: Batch, scene: Scene) -> Float[Tensor, ""]:
         index = torch.arange(_NUM_PAIRS, device=batch.rgb.device)
         numbers = batch.draws.uniform(index, 3, "total variation")
-        angle = _NUM_DETAILS * scene.boundary.detail if self.angle is None else self.angle
+        angle = _NUM_DETAILS * scene.background.detail if self.angle is None else self.angle
         first, second = direction_pairs(numbers, math.radians(angle))
-        rgb = scene.colour_space.to_srgb(scene.boundary(Exits(torch.cat([first, second]))))
+        rgb = scene.colour_space.to_srgb(scene.background(Exits(torch.cat([first, second]))))
         return (rgb[_NUM_PAIRS:] - rgb[:_NUM_PAIRS]).abs().mean()
 
 

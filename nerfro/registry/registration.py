@@ -32,7 +32,7 @@ from nerfro.core.paths import PLUGINS_DIR, PLUGINS_PACKAGE
 from nerfro.registry.allowed import Names, Range, check, checked
 
 KINDS = (
-    "model", "camera", "medium", "surface", "sampler/path", "sampler/points", "field", "boundary", "loss", "phase",
+    "model", "camera", "medium", "surface", "sampler/path", "sampler/points", "field", "background", "loss", "phase",
     "data", "callbacks", "metric",
 )  # fmt: skip
 
@@ -40,7 +40,7 @@ SEVERAL = ("loss", "phase", "callbacks")  # a run may have several plugins of th
 
 # Modules and packages with built-in plugins; `discover` imports all of them.
 _BUILT_IN = (
-    "camera", "camera.refined", "media", "media.surfaces", "samplers.paths", "samplers.points", "fields", "boundaries",
+    "camera", "camera.refined", "media", "media.surfaces", "samplers.paths", "samplers.points", "fields", "backgrounds",
     "losses", "models", "paper", "data", "data.formats", "evaluation.image_metrics", "evaluation.perceptual",
     "training.phases", "viewing.page", "exports",
 )  # fmt: skip

@@ -95,7 +95,7 @@ def content_settings(config: DictConfig, medium: Medium, cameras: Cameras) -> di
 
 def components(config: DictConfig) -> Iterator[tuple[str, type[Component]]]:
     """Yield the full name and the class of each `Component` of a run."""
-    for name in ("model", "field", "sampler.points", "boundary"):
+    for name in ("model", "field", "sampler.points", "background"):
         yield name, plugin_of(OmegaConf.select(config, name)).cls
     for name in map(str, config.loss):
         yield f"loss.{name}", find("loss", name).cls

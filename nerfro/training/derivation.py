@@ -56,5 +56,5 @@ def _with_backdrop(config: DictConfig) -> DictConfig:
         return config
     colour = torch.tensor(list(loss.colour))
     radiance = colour if config.model.get("colour") == "srgb" else to_linear(colour)
-    constant = {"_target_": find("boundary", "constant").target, "rgb": radiance.tolist()}
-    return with_values(config, {"boundary": constant})
+    constant = {"_target_": find("background", "constant").target, "rgb": radiance.tolist()}
+    return with_values(config, {"background": constant})

@@ -113,7 +113,7 @@ class EikonalFields(Renderer):
             (field,) = scene.fields
             self._sharp = BackgroundGrids.fit(
                 field,  # type: ignore[arg-type]
-                scene.boundary,
+                scene.background,
                 scene.space.box,
                 scene.medium.box,
                 self.resolution,

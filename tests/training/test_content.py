@@ -7,7 +7,7 @@ import pytest
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from nerfro.boundaries.envmap import EnvironmentMap
+from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.core.cameras import Cameras
 from nerfro.fields.hash_grid import HashGridField
 from nerfro.geometry.space import Contracted, Unbounded
@@ -92,10 +92,10 @@ def test_finest_texel_follows_the_pixel(
 ) -> None:
     views = replace(example_views(), cameras=cameras_around(3, side, focal=1.4))
     config = OmegaConf.create({
-        "boundary": {"resolutions": given, "fitted_resolutions": None},
+        "background": {"resolutions": given, "fitted_resolutions": None},
         "phase": {"background": {"steps": 10 if fits else 0}},
     })  # fmt: skip
-    settings = {**config.boundary} | EnvironmentMap.derive(config, views, Unbounded())
+    settings = {**config.background} | EnvironmentMap.derive(config, views, Unbounded())
     resolutions, fitted = settings["resolutions"], settings["fitted_resolutions"]
     assert max(resolutions) == descent
     assert max([*resolutions, *(fitted or ())]) == finest

@@ -1,4 +1,4 @@
-"""Boundary regularizer of the paper."""
+"""Background regularizer of the paper."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from nerfro.rendering import Scene
 _MIN_TRANSMITTANCE = 0.5
 
 
-@register("loss", "boundary")
-class BoundaryRegularizer(Loss):
+@register("loss", "background")
+class BackgroundRegularizer(Loss):
     """Penalize |T C'(d) - C| where the final transmittance T is above 1/2 (paper, Eqn. 8).
 
     The background should explain such pixels without the field, so the loss removes fog in front of the surface. Only
