@@ -27,8 +27,6 @@ def metrics(*names: str) -> torchmetrics.MetricCollection:
     for name in names:
         find("metric", name)
     found = build_metrics()
-    for name in names or found:
-        found[name].prepare()
     for name in names:
         if found[name].missing is not None:
             raise NerfroError(f"metric={name} is not available: {found[name].missing}")

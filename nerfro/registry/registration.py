@@ -21,8 +21,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Optional, TypeVar, Union, get_args, get_origin
 
+from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
+from hydra.core.plugins import Plugins
 from hydra.errors import InstantiationException
+from hydra.plugins.search_path_plugin import SearchPathPlugin
 from hydra.utils import instantiate
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
@@ -323,9 +326,19 @@ def discover(plugins_dir: Path = PLUGINS_DIR) -> None:
             _import_all(f"nerfro.{package}")
         for entry_point in importlib.metadata.entry_points(group=ENTRY_POINTS):
             _import_plugin(entry_point.value, f"'{entry_point.name}' of an installed package ({entry_point.value})")
+        Plugins.instance().register(PluginConfigurations)
         _discovered.add("built-in")
     for folder in plugin_folders(plugins_dir):
         _import_folder(folder)
+
+
+class PluginConfigurations(SearchPathPlugin):
+    """Let Hydra search for options, such as experiments, in the folder `conf/` of each local plugin, too."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        for folder in plugin_folders():
+            for configurations in sorted(folder.glob("*/conf")):
+                search_path.append("nerfro", f"file://{configurations}")
 
 
 def plugin_folders(plugins_dir: Path = PLUGINS_DIR) -> list[Path]:
