@@ -50,10 +50,9 @@ def test_distorted_reconstruction_of_a_room_trains(write, train_here, tmp_path):
     )  # fmt: skip
     rows = json.loads((run / "metrics.json").read_text())["views"]
     assert len(rows) == 2
-    config = OmegaConf.load(run / "config.yaml")
-    middle = [0.5 * (low + high) for low, high in zip(config.field.box_min, config.field.box_max, strict=True)]
-    assert middle == pytest.approx([0, 0, 0], abs=1e-4)  # of the mesh
-    assert config.field.radius == config.sampler.points.radius > 0.5
+    space = load(run).renderer.scene.space
+    assert space.centre.tolist() == pytest.approx([0, 0, 0], abs=1e-4)  # of the mesh
+    assert space.radius > 0.5
 
 
 @pytest.mark.parametrize(
