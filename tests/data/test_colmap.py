@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from omegaconf import OmegaConf
 
 from nerfro.core.errors import NerfroError
 from nerfro.data.base import Views
 from nerfro.data.formats import colmap_model
 from nerfro.data.formats.colmap_model import CAMERA_MODELS
+from nerfro.training.load import load as load_run
 from tests.conftest import SMALL, refused
 
 from .formats import BROWN, FORMATS, OPENCV, TRAIN, write_colmap
@@ -50,7 +50,7 @@ def test_distorted_reconstruction_of_a_room_trains(write, train_here, tmp_path):
     )  # fmt: skip
     rows = json.loads((run / "metrics.json").read_text())["views"]
     assert len(rows) == 2
-    space = load(run).renderer.scene.space
+    space = load_run(run).renderer.scene.space
     assert space.centre.tolist() == pytest.approx([0, 0, 0], abs=1e-4)  # of the mesh
     assert space.radius > 0.5
 
