@@ -15,10 +15,10 @@ from nerfro.core.types import Exits, FieldValues, Path
 from nerfro.files import lat_long
 from nerfro.losses.background import BackgroundRegularizer
 from nerfro.losses.base import Loss
+from nerfro.losses.distortion import Distortion
 from nerfro.losses.photometric import Photometric
 from nerfro.models.refractive import RefractiveModel
 from nerfro.paper.hierarchical import Hierarchical
-from nerfro.registry.registration import find
 from nerfro.rendering import composite
 from nerfro.samplers.paths.straight import straight_path
 from nerfro.samplers.points.density_grid import DensityGridSampler
@@ -84,7 +84,7 @@ def test_random_numbers_are_drawn_for_each_ray(sampler: Stratified | Hierarchica
     assert torch.equal(samples.s[::2], sampler(same, None, example_draws()).s), "and splitting changes nobody's"
 
 
-@pytest.mark.parametrize("loss", [Photometric(), BackgroundRegularizer(), find("loss", "distortion").cls()])
+@pytest.mark.parametrize("loss", [Photometric(), BackgroundRegularizer(), Distortion()])
 def test_losses_accept_rays_that_split(loss: Loss) -> None:
     model, batch = RefractiveModel(example_components()).eval(), example_batch()
     with torch.no_grad():

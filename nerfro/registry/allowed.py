@@ -1,6 +1,6 @@
 """Allowed values of parameters and settings, declared by annotations such as `Annotated[int, Range(at_least=1)]`.
 
-Numbers must be finite, except with the annotation `AnyNumber`. Choices of text in configuration dataclasses have the
+Numbers must be finite. Choices of text in configuration dataclasses have the
 form `Annotated[str, Literal["a", "b"]]`, because OmegaConf does not support `Literal`.
 """
 
@@ -95,7 +95,6 @@ class OnlyWith:
 
 _FURTHEST = 10**7  # world units, as in georeferenced data
 
-AnyNumber = Annotated[float, None]  # including infinity and NaN
 Count = Annotated[int, Range(at_least=1)]
 NumRays = Annotated[int, Range(at_least=1, at_most=2**22)]  # computed in one chunk
 Side = Annotated[int, Range(at_least=1, at_most=32)]  # number of rays along each side of a pixel

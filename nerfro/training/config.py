@@ -36,7 +36,16 @@ from nerfro.registry.allowed import (
     check_settings,
     corners_of_box,
 )
-from nerfro.registry.registration import build, check_node, configure, create, find, plugins, require_lightning
+from nerfro.registry.registration import (
+    build,
+    check_node,
+    configure,
+    create,
+    find,
+    plugin_of,
+    plugins,
+    require_lightning,
+)
 from nerfro.rendering import Components, Renderer
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.training.content import ContentConfig, require_box, space_of
@@ -249,7 +258,7 @@ def check_run(config: DictConfig) -> None:
     for name, node in config.callbacks.items():
         configure(find("callbacks", str(name)), node or {})
     for plugin_type in ("loss", "phase"):
-        build_each(plugin_type, config[plugin_type], known=False)
+        build_each(plugin_type, config[plugin_type])
     OmegaConf.to_object(config.optimizer)  # checks groups of parameters
     for node in (config.data, config.camera, config.sampler.points, config.field, config.background, config.model):
         check_node(node)
@@ -321,13 +330,12 @@ def build_data(config: DictConfig) -> DataSource:
     return WithValidationViews(source, number) if number else source
 
 
-def build_each(plugin_type: str, nodes: DictConfig, known: bool = True) -> dict[str, Any]:
+def build_each(plugin_type: str, nodes: DictConfig) -> dict[str, Any]:
     """Build the plugins of a type of which a run may have several, from the nodes `TYPE.<registered name>`.
 
     Args:
         plugin_type: type of the plugins, such as `loss`.
         nodes: configuration nodes of all plugins.
-        known: whether interpolations in the nodes can be resolved; otherwise such settings keep their defaults.
 
     Raises:
         NerfroError: there is no loss, or a node does not fit its plugin.
@@ -342,15 +350,13 @@ def build_each(plugin_type: str, nodes: DictConfig, known: bool = True) -> dict[
             raise NerfroError(
                 f"{plugin_type}.{name}={node} is not a set of settings; write {plugin_type}.{name}.{setting}={node}"
             )
-        if not known:
-            node = {field: node[field] for field in node if not OmegaConf.is_interpolation(node, field)}
         built[name] = create(find(plugin_type, name), node)
     return built
 
 
 def build_medium(config: DictConfig) -> Medium:
     """Build the medium of a run, which is empty if the path sampler needs none."""
-    needs_medium = check_node(config.sampler.path).needs_medium  # type: ignore[attr-defined]
+    needs_medium = plugin_of(config.sampler.path).cls.needs_medium  # type: ignore[attr-defined]
     medium: Medium = build(config.medium) if needs_medium else Vacuum()
     return medium
 

@@ -58,7 +58,8 @@ def space_of(content: DictConfig | ContentConfig) -> Space:
         return Unbounded(box)
     if content.space == "box":
         return Box(box)
-    assert content.radius is not None
+    if content.radius is None:
+        raise NerfroError("content.space=all needs content.radius, the radius of the ball around the content")
     return Contracted(box, content.radius, content.near or 0.0)
 
 
