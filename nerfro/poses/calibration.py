@@ -156,11 +156,11 @@ def calibrate(
         deviation = float(np.median(np.concatenate(list(errors.values())))) / 1.18
         limit = max(settings.min_outlier_error, settings.outlier_deviations * deviation)
         outliers = {name: _outliers(kept[name], error, limit) for name, error in errors.items()}
-        if number == settings.max_estimates or not any(removed.any() for removed in outliers.values()):
+        if number == settings.max_estimates or not any(outlying.any() for outlying in outliers.values()):
             break
-        for name, removed in outliers.items():
-            num_outliers[name] += int(removed.sum())
-        current = {name: kept[name].select(~removed) for name, removed in outliers.items()}
+        for name, outlying in outliers.items():
+            num_outliers[name] += int(outlying.sum())
+        current = {name: kept[name].select(~outlying) for name, outlying in outliers.items()}
     poses = {}
     for name, (rotation, translation) in located.items():
         camera_axes = opencv().Rodrigues(rotation)[0].T
