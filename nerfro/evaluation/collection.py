@@ -27,8 +27,6 @@ def metrics(*names: str) -> torchmetrics.MetricCollection:
     for name in names:
         find("metric", name)
     built = build_metrics()
-    for name in names or built:
-        built[name].prepare()
     for name in names:
         if built[name].missing is not None:
             raise NerfroError(f"metric={name} is not available: {built[name].missing}")
