@@ -8,15 +8,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from omegaconf import DictConfig
-
 from nerfro.files.atomic import write_atomically
 from nerfro.viewing import PLUGIN_EXPORTS
-from nerfro.viewing.exports import Export
+from nerfro.viewing.exports import Export, ExportConfig
 from nerfro.viewing.trained_scene import TrainedScene
 
 
-def write_centres(scene: TrainedScene, out: Path, config: DictConfig) -> str:
+def write_centres(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
     """Write the centres of the training cameras, in world units, and return a description of the file."""
     centres = scene.cameras("train").camera_to_world[:, :, 3].tolist()
     write_atomically(out, "x,y,z\n" + "".join(",".join(map(str, centre)) + "\n" for centre in centres))
