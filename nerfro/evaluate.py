@@ -7,9 +7,10 @@ Examples:
 
 from __future__ import annotations
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
+from nerfro.cli.calls import options_in
 from nerfro.cli.entry import entry_point
 from nerfro.evaluation.request import EvaluateConfig
 from nerfro.pipeline.evaluate import evaluate
@@ -18,7 +19,7 @@ from nerfro.pipeline.evaluate import evaluate
 @entry_point("evaluate", EvaluateConfig)
 def main(config: DictConfig) -> None:
     """Score the test views of a checkpoint, or a folder of images."""
-    evaluate(options=OmegaConf.to_object(config))
+    evaluate(options=options_in(config, EvaluateConfig))
 
 
 if __name__ == "__main__":

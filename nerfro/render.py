@@ -7,9 +7,10 @@ Examples:
 
 from __future__ import annotations
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
+from nerfro.cli.calls import options_in
 from nerfro.cli.entry import entry_point
 from nerfro.core.paths import CONF_DIR
 from nerfro.pipeline.render import render
@@ -19,7 +20,7 @@ from nerfro.viewing.render_request import RenderConfig
 @entry_point("render", RenderConfig, CONF_DIR / "render")
 def main(config: DictConfig) -> None:
     """Check the request, load the scene, render the missing frames, and encode films."""
-    render(options=OmegaConf.to_object(config))
+    render(options=options_in(config, RenderConfig))
 
 
 if __name__ == "__main__":

@@ -7,9 +7,10 @@ Examples:
 
 from __future__ import annotations
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
+from nerfro.cli.calls import options_in
 from nerfro.cli.entry import entry_point
 from nerfro.report.summary import SummaryConfig, summarize
 
@@ -17,7 +18,7 @@ from nerfro.report.summary import SummaryConfig, summarize
 @entry_point("summary", SummaryConfig)
 def main(config: DictConfig) -> None:
     """Read and compare runs, and print and write the result."""
-    summarize(OmegaConf.to_object(config))
+    summarize(options_in(config, SummaryConfig))
 
 
 if __name__ == "__main__":

@@ -9,11 +9,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor, nn
 
-from nerfro.core.draws import Draws
-from nerfro.core.types import Path, Rendering
-from nerfro.models.refractive import RefractiveModel
-from nerfro.registry.allowed import Positive
-from nerfro.registry.registration import register
+from nerfro.parts import Draws, Path, Positive, RefractiveModel, Rendering, register
 
 
 @register("model", "haze")

@@ -6,9 +6,7 @@ from typing import Any
 
 import torch
 
-from nerfro.registry.allowed import Count
-from nerfro.registry.registration import register
-from nerfro.training.phases.base import Phase, TrainingRun
+from nerfro.parts import Count, Phase, TrainingRun, register
 
 _OTHER_PIXELS = 10**6  # numbers of batches that training steps do not use
 

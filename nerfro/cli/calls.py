@@ -65,13 +65,20 @@ def options_of(
         raise NerfroError(in_one_line(error)) from error
 
 
+def options_in(config: DictConfig, schema: type[Options]) -> Options:
+    """Return the checked configuration of a command as a dataclass."""
+    options = OmegaConf.to_object(config)
+    assert isinstance(options, schema)
+    return options
+
+
 def parsed(overrides: Sequence[str]) -> dict[str, Any]:
     """Parse overrides such as `lens=radial` to settings."""
     overrides_of_hydra = OverridesParser.create().parse_overrides(list(overrides))
     return {override.get_key_element(): override.value() for override in overrides_of_hydra}
 
 
-def changed_settings(options: object) -> dict[str, object]:
+def changed_settings(options: object) -> dict[str, Any]:
     """Return the settings of a dataclass with other values than the defaults, for example to print a command line."""
     defaults = dataclasses.asdict(type(options)())  # type: ignore[call-overload]
     values = dataclasses.asdict(options)  # type: ignore[call-overload]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from nerfro.files.lat_long import save_lat_long
-from nerfro.viewing.exports import Export, ExportConfig
+from nerfro.viewing.exports import EXPORTS, Export, ExportConfig
 from nerfro.viewing.trained_scene import TrainedScene
 
 
@@ -16,4 +16,4 @@ def write_sky(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
     return f"the sky: {sky.shape[1]}x{sky.shape[0]} pixels, lat-long, z up"
 
 
-EXPORT = Export((".hdr", ".exr", ".png"), write_sky, unused=("half_depth",))
+EXPORTS["sky"] = Export((".hdr", ".exr", ".png"), write_sky, unused=("half_depth",))

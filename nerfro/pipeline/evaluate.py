@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from pathlib import Path
+from typing import cast
 
 from nerfro.cli.calls import changed_settings, options_of
 from nerfro.core.errors import NerfroError
@@ -42,7 +43,7 @@ def evaluate(
     require_one_task(options)
     if options.checkpoint is not None:
         return _evaluate_checkpoint(options, checkpoint_of(options.checkpoint))
-    return _evaluate_folder(options, user_path(options.predictions), user_path(options.references))
+    return _evaluate_folder(options, user_path(str(options.predictions)), user_path(str(options.references)))
 
 
 def _evaluate_checkpoint(options: EvaluateConfig, path: Path) -> RunMetrics:
@@ -75,6 +76,7 @@ def _evaluate_checkpoint(options: EvaluateConfig, path: Path) -> RunMetrics:
 
 
 def _evaluate_folder(options: EvaluateConfig, predictions: Path, references: Path) -> RunMetrics:
+    alpha = cast(Alpha, options.alpha)
     masks = None if options.masks is None else user_path(options.masks)
     run_config = predictions.parent / CONFIG_FILE
     if options.root is not None and not run_config.is_file():
@@ -82,12 +84,12 @@ def _evaluate_folder(options: EvaluateConfig, predictions: Path, references: Pat
     read_names = functools.partial(_names_in_run, run_config, options.root)
     pairs = match_folders(predictions, references, masks, options.mask_labels, read_names)
     for pair in pairs:  # damaged or mismatched images are reported before the scoring starts
-        pair.load(options.alpha)
+        pair.load(alpha)
     device = find_device(options.device)
     with own_folder(options, predictions / "scores") as folder:
         metrics = prepared_metrics()
         record(folder, options)
-        scores = RunMetrics(score_folders(pairs, options.alpha, metrics, folder, device))
+        scores = RunMetrics(score_folders(pairs, alpha, metrics, folder, device))
         write_scores(scores, f"{predictions} against {references}", folder)
     print(f"images and tables: {folder}")
     return scores

@@ -101,8 +101,9 @@ def _calibrate(config: DictConfig, capture: Capture, out: Path) -> Capture:
 
 def _segment(config: DictConfig, capture: Capture) -> Capture:
     """Make the missing masks."""
-    outlines = {} if config.outlines is None else {"outlines": OmegaConf.to_container(config)["outlines"]}
-    options, sheet = [*as_overrides(outlines), *shlex.split(config.mask)], resolve_path(capture.root) / "masks.png"
+    outlines = OmegaConf.to_container(config.outlines) if OmegaConf.is_config(config.outlines) else config.outlines
+    options = [*as_overrides({"outlines": outlines} if outlines else {}), *shlex.split(config.mask)]
+    sheet = resolve_path(capture.root) / "masks.png"
     stage = Stage("mask", [*capture.overrides, *options], sheet, sheet)
     return stage.run(lambda: segment(capture, options), lambda: capture)
 

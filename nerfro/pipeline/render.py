@@ -44,7 +44,7 @@ def render(
 def _render(options: RenderConfig, folder: Path) -> list[Path]:
     scene = prepared(options, load(options.checkpoint, options.device, options.root))
     shots = find_shots(options, scene)
-    inputs = [checkpoint_of(options.checkpoint), *([options.sky] if options.sky else [])]
+    inputs: list[str | Path] = [checkpoint_of(options.checkpoint), *([options.sky] if options.sky else [])]
     request = (options.what, scene.subdivision, *map(file_hash, inputs))
     films = [folder / f"film.{form}" for form in options.film if shots.film and options.format == "png"]
     if folder / "film.mp4" in films:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal, Optional
+from typing import Annotated, Any, Literal, Optional, cast
 
 import rich
 
 from nerfro.core.paths import user_path
-from nerfro.evaluation.results import FULL
+from nerfro.evaluation.results import FULL, Region
 from nerfro.evaluation.tables import Table, to_rich, write_table
 from nerfro.files.atomic import refuse_existing, write_atomically
 from nerfro.files.folder_lock import lock_folder
@@ -40,11 +40,11 @@ class SummaryConfig:
 
 def summarize(options: SummaryConfig) -> None:
     """Read and compare runs, and print and write the result."""
-    metrics = find_metrics(options.metrics)
+    metrics, region = find_metrics(options.metrics), cast(Region, options.region)
     patterns = options.runs if isinstance(options.runs, list) else [options.runs]
     runs, unfinished = find_runs([str(pattern) for pattern in patterns])
     comparisons = compare(runs, options.methods, options.scenes)
-    tables = {c.budget.file_name: to_table(c, metrics, options.region) for c in comparisons}
+    tables = {c.budget.file_name: to_table(c, metrics, region) for c in comparisons}
 
     folder = "outputs/summary" if options.out is None and options.report else options.out
     if folder is None:
@@ -60,7 +60,7 @@ def summarize(options: SummaryConfig) -> None:
             write_table(table, out / name)
         print(f"tables: {out}")
         if options.report:
-            selection = Selection(options.views, next(iter(metrics)), options.region)
+            selection = Selection(options.views, next(iter(metrics)), region)
             page = report_page(list(zip(comparisons, tables.values(), strict=True)), unfinished, selection)
             write_atomically(out / "report.html", page)
             print(f"report: {out / 'report.html'}, {len(page) / 2**20:.1f} MiB")

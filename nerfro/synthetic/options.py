@@ -1,4 +1,4 @@
-"""Names of synthetic scenes, and options of `nerfro.synthesize`; `nerfro/synthetic/` renders the scenes."""
+"""Options of `nerfro.synthesize`."""
 
 from __future__ import annotations
 
@@ -8,9 +8,7 @@ from typing import Annotated, Optional
 from omegaconf import MISSING
 
 from nerfro.registry.allowed import Count, Names, Natural, NotNegative, Positive, Range
-
-SCENES: dict[str, str] = {}
-"""Module of each scene, by name; plugins add scenes. `build(spacing)` of the module returns the `SyntheticScene`."""
+from nerfro.synthetic.scenes import SCENES
 
 SceneName = Annotated[str, Names(lambda: SCENES)]
 

@@ -17,11 +17,11 @@ from nerfro.core.cameras import Cameras, Window, central_window
 from nerfro.core.distributed import share_of
 from nerfro.core.draws import Draws
 from nerfro.core.errors import NerfroError, warn, warn_of_old_name
-from nerfro.core.subdivision import PixelRays, Subdivision, Trace, TraceExits, contrast, subdivide
 from nerfro.core.types import Batch
 from nerfro.data.base import Views
 from nerfro.data.pixel_store import PixelStore
 from nerfro.registry.allowed import Count, Natural, Range, checked
+from nerfro.samplers.subdivision import PixelRays, Subdivision, Trace, TraceExits, contrast, subdivide
 
 Batching = Literal["single_image", "all_images"]
 

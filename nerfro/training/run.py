@@ -11,13 +11,13 @@ from omegaconf import DictConfig
 
 from nerfro.cli.calls import Composition
 from nerfro.core.distributed import leave
-from nerfro.core.subdivision import Subdivision
 from nerfro.evaluation.metrics import prepared_metrics
 from nerfro.evaluation.results import RunMetrics
 from nerfro.evaluation.tables import write_scores
 from nerfro.evaluation.treatments import score_split
 from nerfro.fields.networks import compile_networks
 from nerfro.rendering.scene_file import SceneFile
+from nerfro.samplers.subdivision import Subdivision
 from nerfro.training.build import Training, check_before_training, composed_training, warn_without_effect
 from nerfro.training.callbacks import StopOnSignal, Throughput, steps_by_phase
 from nerfro.training.mesh_match import require_match

@@ -16,10 +16,10 @@ from tqdm import tqdm
 
 from nerfro.camera.exposure import fit_gain
 from nerfro.core.cameras import Cameras
-from nerfro.core.subdivision import PixelRays, Subdivision, contrast, subdivide
 from nerfro.core.types import Batch, mean_per_pixel
 from nerfro.data.base import Views
 from nerfro.rendering import Renderer
+from nerfro.samplers.subdivision import PixelRays, Subdivision, contrast, subdivide
 from nerfro.training.module import TrainingModule
 
 # Number of validation pixels, and largest number of their views.

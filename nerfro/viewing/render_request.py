@@ -20,10 +20,10 @@ from nerfro.core.cameras import Cameras
 from nerfro.core.errors import NerfroError
 from nerfro.core.lens import distort, fold_radius
 from nerfro.core.paths import user_path
-from nerfro.core.subdivision import SubdivisionChanges
 from nerfro.core.variants import variant
 from nerfro.data.lenses import Lens, check_lenses
 from nerfro.registry.allowed import Count, Positive, Range, refuse_unused
+from nerfro.samplers.subdivision import SubdivisionChanges
 from nerfro.viewing.camera_files import read_cameras
 from nerfro.viewing.camera_paths import PATHS, CaptureGeometry, OrbitPosition, path_cameras
 from nerfro.viewing.trained_scene import TrainedScene
@@ -135,7 +135,7 @@ def _free_cameras(options: RenderConfig, scene: TrainedScene) -> Shots:
         start = OrbitPosition(options.azimuth, options.elevation, options.distance or geometry.distance)
         cameras = path_cameras(geometry, options.path, start, options.frames)
     else:
-        cameras = read_cameras(user_path(options.path), geometry, scene.source.origin)
+        cameras = read_cameras(user_path(str(options.path)), geometry, scene.source.origin)
     return Shots(cameras, _numbered("frame", len(cameras), 4), len(cameras) > 1)
 
 

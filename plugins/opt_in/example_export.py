@@ -8,10 +8,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from nerfro.files.atomic import write_atomically
-from nerfro.viewing import PLUGIN_EXPORTS
-from nerfro.viewing.exports import Export, ExportConfig
-from nerfro.viewing.trained_scene import TrainedScene
+from nerfro.parts import EXPORTS, Export, ExportConfig, TrainedScene, write_atomically
 
 
 def write_centres(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
@@ -21,5 +18,4 @@ def write_centres(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
     return f"the centres of {len(centres)} cameras"
 
 
-PLUGIN_EXPORTS["cameras"] = __name__  # `what=cameras`; the command looks for EXPORT in this module
-EXPORT = Export((".csv",), write_centres)
+EXPORTS["cameras"] = Export((".csv",), write_centres)
