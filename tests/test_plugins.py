@@ -5,7 +5,6 @@ import csv
 import json
 import os
 import shutil
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -538,7 +537,8 @@ packages = ["nerfro_grey"]
 # The commands' own mains, in one process: to begin one takes most of the time.
 USE_IT = """
 import sys
-import nerfro.plugins, nerfro.train
+import nerfro.plugins
+from nerfro.train import main
 from nerfro.registry.registration import find
 from nerfro.testing import check
 sys.argv = ["nerfro.plugins", "boundary=installed_grey"]
@@ -546,7 +546,7 @@ nerfro.plugins.main()
 check(find("boundary", "installed_grey"))
 print("kept its contract")
 sys.argv = "nerfro.train boundary=installed_grey boundary.grey=0.25 --cfg job -p boundary".split()
-nerfro.train.main()
+main()
 """
 
 

@@ -9,6 +9,7 @@ from typing import cast
 from nerfro.cli.calls import changed_settings, options_of
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import user_path
+from nerfro.data.image_files import Alpha
 from nerfro.evaluation.error_sheets import write_error_sheet
 from nerfro.evaluation.folders import match_folders
 from nerfro.evaluation.metrics import prepared_metrics

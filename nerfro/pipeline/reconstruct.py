@@ -207,12 +207,13 @@ def _run_training(scene: SceneFile, options: Sequence[str], inputs: Sequence[Pat
         else:
             options = [*options, "ckpt_path=last"]
             stage = replace(stage, options=[*stage.options, "ckpt_path=last"])
+    return stage.run(lambda: train_scene(scene, options), lambda: Run(folder, read_metrics_json(result)))
 
-    def train() -> Run:
-        with composed_training(None, options, scene) as composition:
-            return run_training(composition)
 
-    return stage.run(train, lambda: Run(folder, read_metrics_json(result)))
+def train_scene(scene: SceneFile, overrides: Sequence[str]) -> Run:
+    """Train like `nerfro.train`, without warnings of settings that have no effect in some of the trainings."""
+    with composed_training(None, overrides, scene) as composition:
+        return run_training(composition)
 
 
 def _report(run: Run, out: Path) -> None:
