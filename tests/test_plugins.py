@@ -6,7 +6,6 @@ import json
 import os
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,51 +16,37 @@ from omegaconf import DictConfig
 from PIL import Image
 from torch import nn
 
-from nerfro import camera
 from nerfro.core import types
 from nerfro.core.paths import PLUGINS_DIR
 from nerfro.data.base import DataSource, Views
 from nerfro.data.blender import BlenderData
-from nerfro.losses import boundary
 from nerfro.losses.base import Loss
 from nerfro.media.base import Medium
-from nerfro.media.shapes import Ball
 from nerfro.media.surface import Surface
 from nerfro.registry.registration import KINDS, discover, find, plugins, register
 from nerfro.samplers.base import PathSampler, PointSampler
-from nerfro.samplers.paths.snell import Snell
 from nerfro.testing import (
     ContractError,
     check,
     check_export,
-    example_batch,
-    example_draws,
-    example_rays,
-    example_rendering,
-    example_samples,
-    example_views,
 )
-from nerfro.training.phases import background
-from nerfro.training.phases import base as phase_base
 from nerfro.training.phases.base import Phase, TrainingRun
-from nerfro.training.ray_batches import RayBatches
 from nerfro.viewing.exports import EXPORTS, Export, find_export
 from nerfro.viewing.trained_scene import TrainedScene
-from nerfro.viewing.volume import Volume
 from tests.conftest import Finished, Runner, refused
 from tests.processes import printed_by, python
 
 discover()
 
-BOUNDARY = '''
-"""A boundary."""
+BACKGROUND = '''
+"""A background."""
 import torch
-from nerfro.boundaries.base import Boundary
+from nerfro.backgrounds.base import Background
 from nerfro.registry.registration import register
 
 
-@register("boundary", "{name}")
-class OneGrey(Boundary):
+@register("background", "{name}")
+class OneGrey(Background):
     """The same grey in every direction."""
 
     def __init__(self, grey: float = 0.5) -> None:
@@ -259,71 +244,6 @@ def test_check_names_the_violated_contract(kind: str, base: type, members: dict[
         check(find(kind, "broken"))
 
 
-def test_old_names_work_with_a_warning() -> None:
-    batch = example_batch()
-    with pytest.warns(UserWarning, match=r"Batch\.pixel is called Batch\.ray_pixel"):
-        assert batch.pixel is batch.ray_pixel
-    with pytest.warns(UserWarning, match=r"Batch\.pixel_number"):
-        assert batch.index is batch.pixel_number
-    with pytest.warns(UserWarning, match="CameraModel"):
-        assert camera.base.Camera is camera.base.CameraModel
-    path = Snell()(example_rays(), Ball())
-    with pytest.warns(UserWarning, match="Path.surface is called Path.surface_body, which counts from 1"):
-        assert torch.equal(path.surface + 1, path.surface_body)
-    with pytest.warns(UserWarning, match="Path.exit_positions is called Path.end_positions"):
-        assert torch.equal(path.exit_positions, path.end_positions)
-    with pytest.warns(UserWarning, match="Path.per_ray is called sum_polylines"):
-        assert torch.equal(path.per_ray(values=path.far), path.sum_polylines(path.far))
-    with pytest.warns(UserWarning, match="Path.of_ray is called broadcast_to_polylines"):
-        assert torch.equal(path.of_ray(path.far), path.broadcast_to_polylines(path.far))
-    with pytest.warns(UserWarning, match="Path.of_rays is called select_rays"):
-        assert torch.equal(path.of_rays(path.ray[1:]).s, path.select_rays(path.ray[1:]).s)
-    with pytest.warns(UserWarning, match="Path.first_of_ray is called main_polyline"):
-        assert torch.equal(path.first_of_ray(path.far), path.main_polyline(path.far))
-    samples = example_samples()
-    with pytest.warns(UserWarning, match="Samples.measure is called contracted_edges"):
-        samples = replace(samples, measure=samples.edges)
-    with pytest.warns(UserWarning, match="Samples.measure is called contracted_edges"):
-        assert samples.measure is samples.contracted_edges is samples.edges
-    with pytest.warns(UserWarning, match="types.Radiance is called nerfro.core.types.FieldValues"):
-        radiance_class = types.Radiance
-    with pytest.warns(UserWarning, match="FieldValues.rgb is called radiance"):
-        values = radiance_class(samples.s, rgb=samples.positions)
-    with pytest.warns(UserWarning, match="FieldValues.rgb is called radiance"):
-        assert values.rgb is values.radiance is samples.positions
-    rendering = example_rendering()
-    with pytest.warns(UserWarning, match="Rendering.rgb is called radiance"):
-        assert torch.equal(replace(rendering, rgb=2 * rendering.radiance).radiance, 2 * rendering.radiance)
-    with pytest.warns(UserWarning, match="Rendering.rgb is called radiance"):
-        assert rendering.rgb is rendering.radiance
-    with pytest.warns(UserWarning, match="Rendering.boundary_rgb is called background_radiance"):
-        assert rendering.boundary_rgb is rendering.background_radiance
-    volume = Volume(values.density[:, :, None], values.radiance[:, :, None], torch.zeros(2, 3))
-    with pytest.warns(UserWarning, match="Volume.rgb is called radiance"):
-        assert volume.rgb is volume.radiance
-    with pytest.warns(UserWarning, match="TrainingRun"):
-        assert phase_base.Run is TrainingRun
-    with pytest.warns(UserWarning, match="after_step is called update"):
-        old = type("Old", (PointSampler,), {"after_step": lambda sampler, fields, draws: 7, "forward": None})
-    assert old().update([], example_draws()) == 7
-    with pytest.warns(UserWarning, match="Bent.refine is called replay"):
-        bent = type("Bent", (PathSampler,), {"refine": lambda sampler, path, rays, medium: 7, "forward": None})
-    assert bent().replay(None, None, None) == 7
-    with pytest.warns(UserWarning, match="Snell.refine is called replay"):
-        again = Snell().refine(path, example_rays(), Ball())
-    assert torch.equal(again.positions, path.positions)
-    with pytest.warns(UserWarning, match="BoundaryRegularizer"):
-        assert boundary.BoundaryRegulariser is boundary.BoundaryRegularizer
-    with pytest.warns(UserWarning, match="BackgroundSteps"):
-        assert background.Background is background.BackgroundSteps
-    batches = RayBatches(example_views(), 4)
-    with pytest.warns(UserWarning, match="for_rank"):
-        assert torch.equal(batches.share(1, 2).batch(0).rgb, batches.for_rank(1, 2).batch(0).rgb)
-    # For both releases: nothing is replaced.
-    both = {"refine": lambda sampler, *given: sampler.replay(*given), "replay": lambda *given: 7, "forward": None}
-    assert type("Both", (PathSampler,), both)().refine(None, None, None) == 7
-
-
 def test_views_refuse_a_list_of_images() -> None:
     # Without the constructor, whose annotations are checked in tests alone.
     views = SimpleNamespace(images=[torch.zeros(16, 16, 3)], masks=None, usable=None)
@@ -331,16 +251,16 @@ def test_views_refuse_a_list_of_images() -> None:
 
 
 def test_plugin_with_a_taken_name_names_both_modules_and_its_file(write_plugin: Callable[[str, str], Path]) -> None:
-    folder = write_plugin("clash", BOUNDARY.format(name="constant"))
-    message = refused("boundary=constant is registered twice", discover, folder)
-    for word in (str(folder / "clash.py"), "nerfro.boundaries.constant", "nerfro_plugins.clash"):
+    folder = write_plugin("clash", BACKGROUND.format(name="constant"))
+    message = refused("background=constant is registered twice", discover, folder)
+    for word in (str(folder / "clash.py"), "nerfro.backgrounds.constant", "nerfro_plugins.clash"):
         assert word in message
 
 
 def test_two_files_of_one_name_are_refused(tmp_path: Path) -> None:
     for folder in ("one", "two"):
         (tmp_path / folder).mkdir()
-        (tmp_path / folder / "same.py").write_text(BOUNDARY.format(name=f"grey_{folder}"))
+        (tmp_path / folder / "same.py").write_text(BACKGROUND.format(name=f"grey_{folder}"))
     discover(tmp_path / "one")
     refused(r"two plugin files are called same: .*one.* and .*two", discover, tmp_path / "two")
 
@@ -355,13 +275,13 @@ def test_plugins_of_the_current_directory_are_registered_unless_the_environment_
     variable: str | None, found: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "plugins").mkdir()
-    (tmp_path / "plugins" / "grey_here.py").write_text(BOUNDARY.format(name="grey_here"))
+    (tmp_path / "plugins" / "grey_here.py").write_text(BACKGROUND.format(name="grey_here"))
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("NERFRO_PLUGINS", raising=False)
     if variable is not None:
         monkeypatch.setenv("NERFRO_PLUGINS", variable)
     discover()
-    assert ("grey_here" in {plugin.name for plugin in plugins("boundary")}) is found
+    assert ("grey_here" in {plugin.name for plugin in plugins("background")}) is found
 
 
 # Overrides that use each template.
@@ -372,7 +292,7 @@ TEMPLATES = {
         "medium.resolution=32",
         "bodies={ring: {surface: {name: torus}, ior: 1.5}}",
     ],
-    "example_boundary": ["boundary=gradient_sky"],
+    "example_background": ["background=gradient_sky"],
     "example_camera": ["camera=shifted"],
     "example_data": ["data=numpy_views"],
     "example_field": ["field=blobs"],
@@ -529,7 +449,7 @@ build-backend = "hatchling.build"
 name = "nerfro-grey"
 version = "1.0"
 [project.entry-points."nerfro.plugins"]
-grey = "nerfro_grey.boundary"
+grey = "nerfro_grey.background"
 [tool.hatch.build.targets.wheel]
 packages = ["nerfro_grey"]
 """
@@ -541,9 +461,9 @@ import nerfro.plugins
 from nerfro.train import main
 from nerfro.registry.registration import find
 from nerfro.testing import check
-sys.argv = ["nerfro.plugins", "boundary=installed_grey"]
+sys.argv = ["nerfro.plugins", "background=installed_grey"]
 nerfro.plugins.main()
-check(find("boundary", "installed_grey"))
+check(find("background", "installed_grey"))
 print("kept its contract")
 sys.argv = "nerfro.train boundary=installed_grey boundary.grey=0.25 --cfg job -p boundary".split()
 main()
@@ -556,7 +476,7 @@ def test_installed_package_is_found_listed_and_checked(tmp_path: Path) -> None:
     (project / "nerfro_grey").mkdir(parents=True)
     (project / "pyproject.toml").write_text(PYPROJECT)
     (project / "nerfro_grey" / "__init__.py").touch()
-    (project / "nerfro_grey" / "boundary.py").write_text(BOUNDARY.format(name="installed_grey"))
+    (project / "nerfro_grey" / "background.py").write_text(BACKGROUND.format(name="installed_grey"))
     install(project, site)
     found = os.pathsep.join([str(site), os.environ.get("PYTHONPATH", "")])
     used = printed_by("-c", USE_IT, folder=tmp_path, PYTHONPATH=found)
@@ -565,11 +485,11 @@ def test_installed_package_is_found_listed_and_checked(tmp_path: Path) -> None:
     assert kept
     assert "grey: 0.25" in job
     # One that cannot be imported stops the run and is named.
-    (site / "nerfro_grey" / "boundary.py").write_text("import no_such_package\n")
+    (site / "nerfro_grey" / "background.py").write_text("import no_such_package\n")
     broken = python("-m", "nerfro.plugins", folder=tmp_path, PYTHONPATH=found)
     assert broken.returncode == 1
     assert broken.stderr.strip() == (
-        "nerfro: error: plugin 'grey' of an installed package (nerfro_grey.boundary) cannot be imported: "
+        "nerfro: error: plugin 'grey' of an installed package (nerfro_grey.background) cannot be imported: "
         "ModuleNotFoundError: No module named 'no_such_package'"
     )
 

@@ -24,8 +24,8 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from nerfro.cli.composition import composed_with
 from nerfro.cli.entry import added, check_configuration
 from nerfro.cli.failures import in_one_line
-from nerfro.cli.old_names import renamed_override
 from nerfro.cli.options import describe_command
+from nerfro.cli.overrides import full_key
 from nerfro.core.errors import NerfroError, nearest_of
 from nerfro.core.paths import CONF_DIR
 from nerfro.registry.allowed import check_settings
@@ -147,7 +147,7 @@ def composed(
 
     discover()
     ConfigStore.instance().store(name=f"{command}_schema", node=schema, provider="nerfro")
-    arguments = expand([*map(renamed_override, overrides)], [field.name for field in dataclasses.fields(schema)])
+    arguments = expand([*map(full_key, overrides)], [field.name for field in dataclasses.fields(schema)])
     arguments = [*map(added, arguments)] if command == "train" else arguments
     try:
         with composed_with(check_all), initialize_config_dir(str(CONF_DIR), version_base="1.3"):

@@ -30,7 +30,6 @@ from torch import Tensor
 
 from nerfro.core.cameras import Cameras
 from nerfro.core.draws import Draws
-from nerfro.core.errors import accept_old_fields, accept_old_methods, renamed_classes, warn_of_old_name
 from nerfro.core.rays import Rays
 
 __all__ = ["WORLD_ORIGIN", "Batch", "Exits", "FieldValues", "Path", "Rays", "Rendering", "Samples"]
@@ -194,21 +193,9 @@ class Path:
         return self.s[:, -1]
 
     @property
-    def surface(self) -> Int[Tensor, "P S"]:
-        """Old form of `surface_body`, numbered from 0; -1 for none."""
-        warn_of_old_name("Path.surface", "Path.surface_body, which counts from 1")
-        return self.surface_body - 1
-
-    @property
     def end_positions(self) -> Float[Tensor, "P 3"]:
         """End of each polyline, behind the last event."""
         return self.positions[:, -1]
-
-    @property
-    def exit_positions(self) -> Float[Tensor, "P 3"]:
-        """Old name of `end_positions`."""
-        warn_of_old_name("Path.exit_positions", "Path.end_positions")
-        return self.end_positions
 
     @property
     def exit_directions(self) -> Float[Tensor, "P 3"]:
@@ -265,16 +252,6 @@ class Path:
         vertex = torch.searchsorted(self.s.detach().contiguous(), s.detach().contiguous(), side="left") - 1
         return vertex.clamp(min=0)
 
-
-accept_old_methods(
-    Path,
-    {
-        "per_ray": "sum_polylines",
-        "of_ray": "broadcast_to_polylines",
-        "of_rays": "select_rays",
-        "first_of_ray": "main_polyline",
-    },
-)
 
 # Fields of `Path` with a column for each vertex, and fields without rows.
 _OF_VERTICES = frozenset({"positions", "directions", "s", "body", "surface_body", "across", "triangle"})
@@ -343,18 +320,12 @@ class Samples:
         return self.lengths if self.lengths is not None else self.edges[:, 1:] - self.edges[:, :-1]
 
 
-accept_old_fields(Samples, {"measure": "contracted_edges"})
-
-
 @dataclass(frozen=True)
 class FieldValues:
     """Result of a field: density (per world unit, not negative) and radiance in the colour space of the model."""
 
     density: Float[Tensor, "P N"]
     radiance: Float[Tensor, "P N 3"]
-
-
-accept_old_fields(FieldValues, {"rgb": "radiance"})
 
 
 @dataclass(frozen=True)
@@ -388,7 +359,7 @@ class Rendering:
         return replace(self, radiance=radiance, background_radiance=background_radiance, gain=of_path)
 
     @property
-    def boundary_fraction(self) -> Float[Tensor, "P 3"]:
+    def background_fraction(self) -> Float[Tensor, "P 3"]:
         """Fraction of the background radiance that reaches the camera along each polyline."""
         fraction = self.transmittance[:, None] * self.path.throughput
         return fraction * self.path.transmitted(self.path.far[:, None])[:, 0] if self.path.absorbs else fraction
@@ -413,9 +384,6 @@ class Rendering:
     def exit_directions(self) -> Float[Tensor, "R 3"]:
         """Unit exit direction of the main polyline of each ray."""
         return self.path.main_polyline(self.path.exit_directions)
-
-
-accept_old_fields(Rendering, {"rgb": "radiance", "boundary_rgb": "background_radiance"})
 
 
 @dataclass(frozen=True)
@@ -449,18 +417,6 @@ class Batch:
     path: Path | None = None
 
     @property
-    def pixel(self) -> Int[Tensor, "R"]:
-        """Old name of `ray_pixel`."""
-        warn_of_old_name("Batch.pixel", "Batch.ray_pixel")
-        return self.ray_pixel
-
-    @property
-    def index(self) -> Int[Tensor, "Q"]:
-        """Old name of `pixel_number`."""
-        warn_of_old_name("Batch.index", "Batch.pixel_number")
-        return self.pixel_number
-
-    @property
     def ray_view(self) -> Int[Tensor, "R"]:
         """Number of the training view of each ray."""
         return self.view[self.ray_pixel]
@@ -485,6 +441,3 @@ def mean_per_pixel(
     total = values.new_zeros(num_pixels, *values.shape[1:]).index_add(0, ray_pixel, values)
     num_rays = values.new_zeros(num_pixels).index_add(0, ray_pixel, torch.ones_like(ray_pixel, dtype=values.dtype))
     return total / num_rays.view(-1, *[1] * (values.ndim - 1))
-
-
-__getattr__ = renamed_classes(__name__, Radiance=FieldValues)

@@ -10,13 +10,10 @@ from jaxtyping import Bool
 from torch import Tensor, nn
 
 from nerfro.core.draws import Draws
-from nerfro.core.errors import accept_old_methods
 from nerfro.core.types import Path, Rays, Rendering, Samples
 from nerfro.fields.base import Field
 from nerfro.media.base import Medium
 from nerfro.samplers.paths.branching import ONE_PATH
-
-_OLD_METHODS = {"refine": "replay", "main": "trace_main"}
 
 
 class PathSampler(nn.Module, ABC):
@@ -29,10 +26,6 @@ class PathSampler(nn.Module, ABC):
 
     needs_medium = True
     branching = ONE_PATH
-
-    def __init_subclass__(cls) -> None:
-        super().__init_subclass__()
-        accept_old_methods(cls, _OLD_METHODS)
 
     @abstractmethod
     def forward(self, rays: Rays, medium: Medium) -> Path:
@@ -66,9 +59,6 @@ class PathSampler(nn.Module, ABC):
         return False
 
 
-accept_old_methods(PathSampler, _OLD_METHODS)
-
-
 class PointSampler(nn.Module, ABC):
     """Choose arc lengths on a path.
 
@@ -77,10 +67,6 @@ class PointSampler(nn.Module, ABC):
     """
 
     num_levels: int
-
-    def __init_subclass__(cls) -> None:
-        super().__init_subclass__()
-        accept_old_methods(cls, {"after_step": "update"})
 
     @abstractmethod
     def forward(self, path: Path, previous: Rendering | None, draws: Draws | None = None) -> Samples:

@@ -16,7 +16,7 @@ from torch import Tensor
 from nerfro.core.cameras import Cameras, Window, central_window
 from nerfro.core.distributed import share_of
 from nerfro.core.draws import Draws
-from nerfro.core.errors import NerfroError, warn, warn_of_old_name
+from nerfro.core.errors import NerfroError, warn
 from nerfro.core.types import Batch
 from nerfro.data.base import Views
 from nerfro.data.pixel_store import PixelStore
@@ -120,11 +120,6 @@ class RayBatches:
         shared = copy.copy(self)
         shared._share = share_of(self.batch_size, rank, size)
         return shared
-
-    def share(self, rank: int, size: int) -> RayBatches:
-        """Old name of `for_rank`."""
-        warn_of_old_name("RayBatches.share", "RayBatches.for_rank")
-        return self.for_rank(rank, size)
 
     def smaller(self, most: int) -> RayBatches:
         """Return the sequence with at most `most` pixels per step."""

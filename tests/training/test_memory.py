@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from nerfro.boundaries.base import Boundary
-from nerfro.boundaries.constant import ConstantBoundary
-from nerfro.boundaries.envmap import EnvironmentMap
+from nerfro.backgrounds.base import Background
+from nerfro.backgrounds.constant import ConstantBackground
+from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.core.errors import NerfroError
 from nerfro.kernels import available
 from nerfro.kernels.available import available_bytes, require_bytes
@@ -26,11 +26,11 @@ from tests.conftest import refused
 from tests.pretended_gpu import GPU, OnGpu, PretendedGpu
 
 
-def model_of(width: int, boundary: Boundary | None = None) -> Renderer:
+def model_of(width: int, background: Background | None = None) -> Renderer:
     def field() -> NerfField:
         return NerfField(width=width, depth=8, skip=4, view_width=8)
 
-    parts = Vacuum(), Straight(), Stratified(8), field, boundary or ConstantBoundary()
+    parts = Vacuum(), Straight(), Stratified(8), field, background or ConstantBackground()
     return RefractiveModel(Components(*parts, chunk_size=256))
 
 
