@@ -97,7 +97,7 @@ def test_code_of_the_chain_executes(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     *chain, together = python_blocks("docs/tutorials/python_chain.md")
     small = {
         '"data/glass", data="opencv"': '"ball", data="blender", settings={"near": 0.5}',
-        '"medium.ior=1.5"': '"medium.ior=1.5", "medium.resolution=32", "resolution=24"',
+        '"medium.ior=1.5"': '"medium.ior=1.45", "medium.resolution=32", "resolution=24"',
         'split="val"': 'split="train"',
         '["trainer.max_time=4m"]': repr([*RECONSTRUCTION_TRAINING, "trainer.max_steps=2", "phase.background.steps=9"]),
     }
@@ -107,7 +107,7 @@ def test_code_of_the_chain_executes(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         code = code.replace(text, other)
     namespace: dict[str, Any] = {}
     exec(code, namespace)
-    assert namespace["scene"].bodies["object"].ior == 1.5
+    assert namespace["scene"].bodies["object"].ior == 1.45
     assert namespace["run"].scores.steps == 2
     assert namespace["scores"].result.views == namespace["run"].scores.result.views
     assert all(file.stat().st_size > 0 for file in [*namespace["frames"], namespace["page"]])
