@@ -16,7 +16,6 @@ import nerfro
 import nerfro.media.material
 from nerfro.__main__ import commands
 from nerfro.core.paths import PACKAGE_DIR
-from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.media.material import MATERIALS
 from nerfro.registry.registration import discover, find
 from nerfro.testing import check
@@ -92,8 +91,6 @@ def test_code_of_the_chain_executes(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     """On small photographs of a ball with poses, as each command on its own."""
     save_with_masks(tmp_path / "ball")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("nerfro.training.run.prepared_metrics", ImageMetrics)
-    monkeypatch.setattr("nerfro.pipeline.evaluate.prepared_metrics", ImageMetrics)
     *chain, together = python_blocks("docs/tutorials/python_chain.md")
     small = {
         '"data/glass", data="opencv"': '"ball", data="blender", settings={"near": 0.5}',
