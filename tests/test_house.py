@@ -5,6 +5,7 @@ import inspect
 import math
 import re
 import sys
+from collections import ChainMap
 from collections.abc import Iterator
 from dataclasses import FrozenInstanceError, fields
 from itertools import pairwise
@@ -243,9 +244,11 @@ def test_settings_of_algorithms_are_frozen_and_documented() -> None:
 
     discover()
     assert "HullSettings" in AlgorithmSettings.classes
+    modules = [vars(sys.modules[settings.__module__]) for settings in AlgorithmSettings.classes.values()]
+    names_of_settings = dict(ChainMap(*modules), inf=math.inf)
     for settings in AlgorithmSettings.classes.values():
         names = re.findall(r"^    (\w[\w, ]*):", inspect.getdoc(settings), re.M)
         assert {field.name for field in fields(settings)} == {*", ".join(names).split(", ")}, settings
         with pytest.raises(FrozenInstanceError):
             setattr(settings(), names[0].split(", ")[0], None)
-        assert eval(repr(settings()), vars(sys.modules[settings.__module__]) | {"inf": math.inf}) == settings()
+        assert eval(repr(settings()), names_of_settings) == settings()
