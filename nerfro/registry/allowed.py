@@ -195,22 +195,22 @@ def check(where: str, hints: Mapping[str, Any], values: Mapping[str, Any]) -> No
             raise NerfroError(f"{where}{name}={value!r} is not allowed; {reason}")
 
 
-def refuse_unused(config: DictConfig, schema: type, names: Iterable[str], reason: str) -> None:
+def refuse_unused(options: object, names: Iterable[str], reason: str) -> None:
     """Refuse settings that are neither off (null, 0, false or empty) nor at their defaults, but have no effect.
 
     Args:
-        config: the configuration.
-        schema: dataclass with the defaults.
+        options: a dataclass of options, or a configuration of its type.
         names: names of the settings without effect.
         reason: end of the sentence "NAME=VALUE has no effect".
 
     Raises:
         NerfroError: a setting has such a value.
     """
-    defaults = OmegaConf.structured(schema)
+    settings = options if isinstance(options, DictConfig) else OmegaConf.structured(options)
+    defaults = OmegaConf.structured(OmegaConf.get_type(settings))
     for name in names:
-        if config[name] and config[name] != defaults[name]:
-            raise NerfroError(f"{name}={config[name]} has no effect {reason}; remove it")
+        if settings[name] and settings[name] != defaults[name]:
+            raise NerfroError(f"{name}={settings[name]} has no effect {reason}; remove it")
 
 
 def corners_of_box(
