@@ -10,8 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from nerfro.core.paths import CONF_DIR
 from nerfro.registry.registration import build, discover
-from nerfro.training.build import build_training
-from nerfro.training.config import build_data
+from nerfro.training.build import Training
 from tests.conftest import QUIET, Runner, composed, write_tiny_scene
 
 discover()
@@ -94,7 +93,7 @@ def test_training_is_independent_of_the_world_unit(experiment: str, train_here: 
 @pytest.mark.parametrize("experiment", ABLATIONS)
 def test_ablation_composes_and_builds(experiment: str) -> None:
     config = composed(f"+experiment={experiment}", *SMALL, *shrunk(composed(f"+experiment={experiment}")))
-    build_training(config, source := build_data(config), source.load("train"))
+    Training.start(config)
     assert config.name == experiment
 
 

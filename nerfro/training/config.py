@@ -21,7 +21,7 @@ from nerfro.data.validation_views import WithValidationViews
 from nerfro.evaluation.results import Region
 from nerfro.media.analytic import Vacuum
 from nerfro.media.base import Medium
-from nerfro.media.bodies import origin_of
+from nerfro.media.body_settings import origin_of
 from nerfro.registry.allowed import (
     Count,
     Names,

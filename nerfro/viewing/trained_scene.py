@@ -24,12 +24,9 @@ from nerfro.files import lat_long
 from nerfro.files.images import data_uri, to_8bit
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.rendering import Renderer
-from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.viewing.changes import with_absorption, with_indices, with_sky, without_glass, without_inside
 from nerfro.viewing.surface import surface_of
-
-_MIN_SKY_HEIGHT = 512
 
 
 class RenderedViews(NamedTuple):
@@ -114,10 +111,10 @@ class TrainedScene:
         return RenderedViews(*(torch.stack(images) for images in zip(*rendered, strict=True)))
 
     def _render_view(self, cameras: Cameras, view: int, subdivision: Subdivision) -> tuple[Tensor, ...]:
-        found = render_view(self.renderer, cameras.to(self.renderer.scene.device), view, subdivision)
+        rays = render_view(self.renderer, cameras.to(self.renderer.scene.device), view, subdivision)
         colour_space = self.renderer.scene.colour_space
-        rgb, radiance = colour_space.to_display(found.radiance), colour_space.to_linear(found.radiance)
-        values = rgb, found.depth, found.opacity, found.normals, found.exit_directions, radiance
+        rgb, radiance = colour_space.to_display(rays.radiance), colour_space.to_linear(rays.radiance)
+        values = rgb, rays.depth, rays.opacity, rays.normals, rays.exit_directions, radiance
         return tuple(value.float().cpu().view(cameras.height, cameras.width, *value.shape[1:]) for value in values)
 
     @property
@@ -128,7 +125,7 @@ class TrainedScene:
     @property
     def sky_height(self) -> int:
         """Number of rows of a lat-long image as fine as the background, at least 512."""
-        return max(_MIN_SKY_HEIGHT, 2 * self.renderer.scene.background.face_resolution)
+        return max(512, 2 * self.renderer.scene.background.face_resolution)
 
     def sky_of_height(self, height: int) -> Float[Tensor, "H 2*H 3"]:
         """Evaluate the background as a lat-long image with a given number of rows."""
@@ -145,8 +142,7 @@ class TrainedScene:
     @property
     def surface(self) -> list[TriangleMesh]:
         """Surfaces on which rays bend, of each body in ascending order of priority; world units."""
-        sampler = self.renderer.path_sampler
-        return surface_of(self.renderer.scene.medium, isinstance(sampler, Snell) and sampler.interface == "mesh")
+        return surface_of(self.renderer.scene.medium, self.renderer.path_sampler.traces_triangles)
 
     @property
     def field(self) -> Field:
