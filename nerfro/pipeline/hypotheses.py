@@ -40,7 +40,7 @@ class Hypothesis:
         return [
             f"trainer.max_steps={round(self.speed * steps)}",
             "trainer.max_time=null",
-            f"batches.num_validation_views={5}",
+            "batches.num_validation_views=5",
             "evaluation.split=val",
             "evaluation.every=0",
             "logger=none",
