@@ -25,7 +25,8 @@ from nerfro.data.blender import BlenderData
 from nerfro.files import lat_long
 from nerfro.geometry.contraction import contract
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
-from nerfro.media.sdf_grid import SdfGrid
+from nerfro.media.bodies import Bodies
+from nerfro.media.body_settings import make_bodies
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.samplers.points.stratified import Stratified
@@ -44,7 +45,7 @@ def main() -> None:
     parser.add_argument("--downscale", type=float, default=1, help="factor of the photographs of the index search")
     options = parser.parse_args()
     folder = options.folder
-    medium = SdfGrid(str(MESH), 1.5, resolution=64)
+    medium = make_bodies(str(MESH), 1.5, resolution=64)
     with torch.no_grad():
         draw_exits(medium, folder / "concept_background.png")
         draw_samples(medium, folder / "concept_sampling.png")
@@ -58,7 +59,7 @@ def canvas(width: float, height: float) -> Figure:
     return figure
 
 
-def row_of_view(medium: SdfGrid, row: int) -> RayPath:
+def row_of_view(medium: Bodies, row: int) -> RayPath:
     """Trace the rays of a row of the embedded test view."""
     cameras = BlenderData().load("test").cameras
     columns = torch.arange(cameras.width)
@@ -66,7 +67,7 @@ def row_of_view(medium: SdfGrid, row: int) -> RayPath:
     return Snell()(rays, medium)
 
 
-def draw_exits(medium: SdfGrid, file: Path) -> None:
+def draw_exits(medium: Bodies, file: Path) -> None:
     """Show three rows of pixels, and the directions in which their rays leave the scene."""
     figure = canvas(11, 3.7)
     photograph, sky = figure.subplots(1, 2, width_ratios=(1, 2))
@@ -87,7 +88,7 @@ def draw_exits(medium: SdfGrid, file: Path) -> None:
     figure.savefig(file, dpi=90)
 
 
-def draw_samples(medium: SdfGrid, file: Path) -> None:
+def draw_samples(medium: Bodies, file: Path) -> None:
     """Compare samples of the density grid with even samples on a bent path through a torus of known density."""
     sampler = DensityGridSampler(num_samples=32, box_min=BOX[0], box_max=BOX[1], uniform=0.2)
     cells = sampler.resolution
@@ -116,7 +117,7 @@ def density(x: torch.Tensor) -> torch.Tensor:
     return 30 * (ring.square() + x[..., 2].square() < 0.15**2)
 
 
-def draw_contraction(medium: SdfGrid, file: Path) -> None:
+def draw_contraction(medium: Bodies, file: Path) -> None:
     """Show a square grid and bent rays before and after contraction."""
     figure = canvas(9, 4.5)
     world, contracted = figure.subplots(1, 2)
@@ -153,7 +154,7 @@ def draw_index_search(data: BlenderData, file: Path) -> None:
         for name, scale in (("true surface", 1.0), ("surface larger by 3 %", 1.03)):
             scaled = Path(folder) / f"{scale}.ply"
             TriangleMesh(scale * mesh.vertices, mesh.faces).save(scaled)
-            found = find_indices(SdfGrid(str(scaled), 1.5, cache=False), through, surroundings)
+            found = find_indices(make_bodies(str(scaled), 1.5, cache=False), through, surroundings)
             label = f"{name}: {found.values[0]:.3f} ± {found.standard_errors[0]:.3f}"
             axes.plot(*found.coarse.T, "o-", markersize=3, linewidth=1, label=label)
     axes.set(xlabel="candidate index", ylabel="mean robust error")

@@ -6,7 +6,7 @@ import pytest
 
 from nerfro.evaluation.render_view import render_view
 from nerfro.kernels.constants import constant
-from nerfro.media.sdf_grid import SdfGrid
+from nerfro.media.bodies import Bodies
 from nerfro.registry.registration import build
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.training.config import build_model
@@ -23,7 +23,7 @@ STEP = 100_000
 # Rays are traced on the CPU, and travel there and back.
 TRACING = ("kernels/arrays.py", "samplers/paths/compiled.py", "paper/compiled.py", "paper/eikonal.py")
 TRACING += ("samplers/paths/snell.py", "samplers/paths/polylines.py", "samplers/paths/wavefront.py")
-TRACING += ("geometry/intersection.py", "media/sdf_grid.py")
+TRACING += ("geometry/intersection.py", "media/bodies.py")
 
 ADAPTIVE = ["sampler.path.integrator=adaptive", "sampler.path.max_steps=60", "sampler.points.draw=arc_length"]
 
@@ -71,7 +71,7 @@ def test_training_and_rendering_stay_on_the_gpu(
         renderer.point_sampler.update(list(renderer.scene.fields), batch.draws)
         assert {wait for wait in gpu.waits if not wait.startswith(TRACING)} == waits
         rendered = render_view(renderer, cameras, 0, Subdivision())
-        if isinstance(renderer.scene.medium, SdfGrid):
+        if isinstance(renderer.scene.medium, Bodies):
             assert bake_surface(renderer).voxels
     assert isinstance(loss, OnGpu)
     assert isinstance(rendered.radiance, OnGpu)

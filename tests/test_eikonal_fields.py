@@ -18,7 +18,6 @@ from nerfro.fields.base import Field
 from nerfro.files import lat_long
 from nerfro.files.images import save_png
 from nerfro.media.base import Medium
-from nerfro.media.shapes import Ball
 from nerfro.paper.eikonal import Eikonal
 from nerfro.paper.nerf import NerfField
 from nerfro.registry.registration import discover, find
@@ -30,6 +29,7 @@ from nerfro.training.module import TrainingModule
 from nerfro.training.optimizer import OptimizerConfig
 from nerfro.training.run_folder import load_checkpoint, restore
 from tests.ball_photographs import save
+from tests.closed_forms import Ball
 from tests.conftest import QUIET, Runner, refused
 from tests.exact_silhouettes import cameras_around
 

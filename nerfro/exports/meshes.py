@@ -12,7 +12,6 @@ from torch.nn import functional
 from nerfro.geometry.bodies import bodies_of
 from nerfro.geometry.interpolation import trilinear
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.media.solid import Solid
 from nerfro.viewing.surface import level_set
 from nerfro.viewing.trained_scene import TrainedScene
 from nerfro.viewing.volume import POINTS_AT_ONCE, RESOLUTION, sample_field
@@ -20,7 +19,7 @@ from nerfro.viewing.volume import POINTS_AT_ONCE, RESOLUTION, sample_field
 
 def glass_meshes(scene: TrainedScene) -> list[trimesh.Trimesh]:
     """Triangulate the surface of each body, with vertex normals; returns an empty list without bodies."""
-    if not isinstance(scene.renderer.scene.medium, Solid):
+    if scene.renderer.scene.medium.bodies is None:
         return []
     return [_with_vertex_normals(mesh) for mesh in scene.surface]
 

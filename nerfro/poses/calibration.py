@@ -114,7 +114,7 @@ class Calibration:
         return [*lines, lens + ("" if deviation is None else f"; standard deviation of fx {deviation:.2f}")]
 
 
-def calibrate(
+def calibrate_by_tags(
     detections: dict[str, TagDetections],
     size: tuple[int, int],
     model: LensModel,

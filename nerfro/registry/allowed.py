@@ -111,24 +111,28 @@ Coordinate = Annotated[float, Range(at_least=-_FURTHEST, at_most=_FURTHEST)]  # 
 Distance = Annotated[float, Range(at_least=0, at_most=_FURTHEST)]  # world units
 
 
-def checked(where: str) -> Callable[[type[Class]], type[Class]]:
-    """Decorate a class with a constructor that checks all arguments against the annotations.
+def checked(where: str) -> Callable[[Class], Class]:
+    """Decorate a class or a function so that its constructor or call checks all arguments against the annotations.
 
     Args:
-        where: start of the error message, such as `medium=ball`.
+        where: start of the error message, such as `medium=vacuum`.
     """
 
-    def wrap(cls: type[Class]) -> type[Class]:
-        constructor = cls.__init__  # type: ignore[misc]
-        signature, hints = inspect.signature(constructor), get_type_hints(constructor, include_extras=True)
+    def guarded(function: Any) -> Any:
+        signature, hints = inspect.signature(function), get_type_hints(function, include_extras=True)
 
-        @functools.wraps(constructor)
-        def init(self: Any, *arguments: Any, **named: Any) -> None:
-            check(f"{where}: ", hints, signature.bind(self, *arguments, **named).arguments)
-            constructor(self, *arguments, **named)
+        @functools.wraps(function)
+        def call(*arguments: Any, **named: Any) -> Any:
+            check(f"{where}: ", hints, signature.bind(*arguments, **named).arguments)
+            return function(*arguments, **named)
 
-        cls.__init__ = init  # type: ignore[misc,method-assign]
-        return cls
+        return call
+
+    def wrap(target: Class) -> Class:
+        if not isinstance(target, type):
+            return guarded(target)
+        target.__init__ = guarded(target.__init__)  # type: ignore[misc]
+        return target
 
     return wrap
 
@@ -195,22 +199,22 @@ def check(where: str, hints: Mapping[str, Any], values: Mapping[str, Any]) -> No
             raise NerfroError(f"{where}{name}={value!r} is not allowed; {reason}")
 
 
-def refuse_unused(config: DictConfig, schema: type, names: Iterable[str], reason: str) -> None:
+def refuse_unused(options: object, names: Iterable[str], reason: str) -> None:
     """Refuse settings that are neither off (null, 0, false or empty) nor at their defaults, but have no effect.
 
     Args:
-        config: the configuration.
-        schema: dataclass with the defaults.
+        options: a dataclass of options, or a configuration of its type.
         names: names of the settings without effect.
         reason: end of the sentence "NAME=VALUE has no effect".
 
     Raises:
         NerfroError: a setting has such a value.
     """
-    defaults = OmegaConf.structured(schema)
+    settings = options if isinstance(options, DictConfig) else OmegaConf.structured(options)
+    defaults = OmegaConf.structured(OmegaConf.get_type(settings))
     for name in names:
-        if config[name] and config[name] != defaults[name]:
-            raise NerfroError(f"{name}={config[name]} has no effect {reason}; remove it")
+        if settings[name] and settings[name] != defaults[name]:
+            raise NerfroError(f"{name}={settings[name]} has no effect {reason}; remove it")
 
 
 def corners_of_box(

@@ -72,13 +72,14 @@ class Scene(nn.Module):
             `cameras.exposure`, and further parameters of cameras.
         """
         parts = {"fields": self.fields, "background": self.background}
-        found = {f"{part}.{name}": own for part, module in parts.items() for name, own in module.named_parameters()}
-        return found | self.medium.parameters_by_name() | self.camera.parameters_by_name()
+        own = {f"{part}.{name}": value for part, module in parts.items() for name, value in module.named_parameters()}
+        return own | self.medium.parameters_by_name() | self.camera.parameters_by_name()
 
     def path_parameters(self) -> list[nn.Parameter]:
         """Return the parameters on which paths depend: of the cameras, and of the index and surfaces of the medium."""
-        found = self.medium.parameters_by_name() | self.camera.parameters_by_name()
-        return [own for name, own in found.items() if not name.endswith((".material.absorption", "cameras.exposure"))]
+        parameters = self.medium.parameters_by_name() | self.camera.parameters_by_name()
+        fixed = ".material.absorption", "cameras.exposure"
+        return [value for name, value in parameters.items() if not name.endswith(fixed)]
 
     def measurements(self) -> dict[str, float]:
         """Return learned physical quantities, such as refractive indices, by name, for the log."""

@@ -20,7 +20,7 @@ from nerfro.data.base import DataSource, Views
 from nerfro.data.validation_views import WithValidationViews
 from nerfro.evaluation.results import Region
 from nerfro.media.analytic import Vacuum
-from nerfro.media.bodies import origin_of
+from nerfro.media.body_settings import origin_of
 from nerfro.registry.allowed import (
     Count,
     Names,

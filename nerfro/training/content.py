@@ -14,9 +14,8 @@ from nerfro.core.cameras import Cameras
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import resolve_path
 from nerfro.geometry.mesh import local_origin, num_decimals
-from nerfro.media.analytic import Vacuum
 from nerfro.media.base import Medium
-from nerfro.media.bodies import surfaces_of
+from nerfro.media.body_settings import surfaces_of
 from nerfro.media.surface import make_surface
 from nerfro.registry.allowed import Count, NotNegative, OnlyWith, Positive
 from nerfro.registry.registration import build
@@ -159,7 +158,7 @@ def _depth(cameras: Cameras) -> float:
 
 def _box(config: DictConfig, medium: Medium) -> Float[np.ndarray, "2 3"] | None:
     """Return the bounds of the object from the medium or its surfaces; None without both."""
-    if not isinstance(medium, Vacuum):
+    if not medium.is_vacuum:
         return _rounded(medium.content_box.double().numpy())
     surfaces = surfaces_of(config.medium)
     if surfaces and all(resolve_path(surface.get("file", ".")).exists() for surface in surfaces):

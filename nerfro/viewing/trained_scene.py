@@ -24,7 +24,6 @@ from nerfro.files import lat_long
 from nerfro.files.images import data_uri, to_8bit
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.rendering import Renderer
-from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.viewing.changes import with_absorption, with_indices, with_sky, without_glass, without_inside
 from nerfro.viewing.surface import surface_of
@@ -145,8 +144,7 @@ class TrainedScene:
     @property
     def surface(self) -> list[TriangleMesh]:
         """Surfaces on which rays bend, of each body in ascending order of priority; world units."""
-        sampler = self.renderer.path_sampler
-        return surface_of(self.renderer.scene.medium, isinstance(sampler, Snell) and sampler.interface == "mesh")
+        return surface_of(self.renderer.scene.medium, self.renderer.path_sampler.traces_triangles)
 
     @property
     def field(self) -> Field:

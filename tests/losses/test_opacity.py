@@ -11,10 +11,10 @@ from nerfro.losses.backdrop import Backdrop
 from nerfro.losses.base import Loss
 from nerfro.losses.near_camera import NearCamera
 from nerfro.losses.opaque import Opaque
-from nerfro.media.shapes import Ball
 from nerfro.rendering import Scene, composite
 from nerfro.samplers.paths.straight import Straight
 from nerfro.testing import example_batch, example_path
+from tests.closed_forms import Ball
 
 SCENE = Mock(spec=Scene)
 

@@ -9,11 +9,11 @@ from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.core.draws import Draws
 from nerfro.core.types import Path
 from nerfro.fields.hash_grid import HashGridField
-from nerfro.media.shapes import Ball
 from nerfro.rendering import composite
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.points.density_grid import DensityGridSampler
 from tests.cameras_at import cameras_at
+from tests.closed_forms import Ball
 
 WALL = 3.0  # half side of the room
 TOY, SIZE = torch.tensor([0.3, 1.2, 0.2]), 0.3

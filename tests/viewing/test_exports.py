@@ -20,7 +20,7 @@ from PIL import Image
 
 from nerfro.core.errors import NerfroError
 from nerfro.core.light import to_linear, to_srgb
-from nerfro.media.sdf_grid import SdfGrid
+from nerfro.media.body_settings import make_bodies
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.viewing.changes import with_changed_scene
 from nerfro.viewing.exports import ExportConfig, export_of, find_export
@@ -72,7 +72,7 @@ def two_bodies(scene: TrainedScene, tmp_path: Path) -> TrainedScene:
         shape.apply_translation([x, 0, 0])
         shape.export(tmp_path / f"{name}.ply")
         bodies[name]["mesh"] = str(tmp_path / f"{name}.ply")
-    medium = SdfGrid(bodies=bodies, resolution=32, cache=False)
+    medium = make_bodies(bodies=bodies, resolution=32, cache=False)
     return replace(scene, renderer=with_changed_scene(scene.renderer, medium=medium))
 
 

@@ -111,7 +111,7 @@ float clearanceAt(vec3 x) {
   return free;
 }
 
-// Returns the number of the body that decides at a point, from 1; 0 in air (media/solid.py).
+// Returns the number of the body that decides at a point, from 1; 0 in air (media/bodies.py).
 int decidingBody(int inside) {
   int number = 0;
   for (int body = 0; body < numBodies; ++body) {
