@@ -190,17 +190,17 @@ class EnvironmentMap(Background):
         for n, (values, of_level), earlier in levels:
             wide = observed.widths > _MAX_TEXELS * 0.5 * math.pi / n
             weights = observed.weights.masked_fill(wide, 0)[:, None].expand(-1, 3)
-            place, level = (face, coordinates), cube_map.CubeLevels((n,))
+            positions, level = (face, coordinates), cube_map.CubeLevels((n,))
             with torch.enable_grad():
                 change = torch.zeros_like(values, requires_grad=True)
-                changed = self._looked_up(*place, change, of_level, level)
+                changed = self._looked_up(*positions, change, of_level, level)
             sums, counts = (
                 torch.autograd.grad(changed, change, gradient, retain_graph=True)[0]
                 for gradient in (weights * residual, weights)
             )
             change = sums / (counts + earlier[:, None] + 1)
             values += change
-            residual -= self._looked_up(*place, change, of_level, level)
+            residual -= self._looked_up(*positions, change, of_level, level)
             total.append(counts[:, 0])
         return torch.cat(total)
 

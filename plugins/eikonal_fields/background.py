@@ -92,6 +92,6 @@ def _mean_radiance(field: Field, positions: Float[Tensor, "points 3"]) -> Float[
     s = positions.new_zeros(len(positions), 1)
     for axis in axes:
         directions = axis.expand(len(positions), 1, 3)
-        found = field(Samples(positions[:, None], directions, s, torch.cat([s, s], 1), s[:, 0]))
-        total += torch.cat([found.radiance[:, 0], found.density], -1).float() / len(axes)
+        values = field(Samples(positions[:, None], directions, s, torch.cat([s, s], 1), s[:, 0]))
+        total += torch.cat([values.radiance[:, 0], values.density], -1).float() / len(axes)
     return total

@@ -154,17 +154,17 @@ class EikonalFields(Renderer):
 def radiance_where(field: Field | Ask, samples: Samples, selected: Bool[Tensor, "P N"]) -> FieldValues:
     """Evaluate a field only at the selected samples; density and radiance are zero elsewhere."""
     ray, i = selected.nonzero(as_tuple=True)
-    chosen = Samples(
+    queried = Samples(
         samples.positions[ray, i][:, None],
         samples.directions[ray, i][:, None],
         samples.s[ray, i][:, None],
         torch.stack([samples.edges[ray, i], samples.edges[ray, i + 1]], -1),
         samples.radii[ray],
     )
-    found = field(chosen)
+    values = field(queried)
     density: Float[Tensor, "P N"] = torch.zeros_like(samples.s)
     radiance: Float[Tensor, "P N 3"] = torch.zeros_like(samples.positions)
     return FieldValues(
-        density.index_put((ray, i), found.density[:, 0].to(density)),
-        radiance.index_put((ray, i), found.radiance[:, 0].to(radiance)),
+        density.index_put((ray, i), values.density[:, 0].to(density)),
+        radiance.index_put((ray, i), values.radiance[:, 0].to(radiance)),
     )
