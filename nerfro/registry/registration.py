@@ -414,8 +414,8 @@ def _parameters(cls: Any) -> list[tuple[inspect.Parameter, Any, Any]]:
     found: dict[str, tuple[inspect.Parameter, Any, Any]] = {}
     if not isinstance(cls, type):
         hints, annotations = (typing.get_type_hints(cls, include_extras=extras) for extras in (False, True))
-        parameters = inspect.signature(cls).parameters.values()
-        return [(parameter, hints.get(parameter.name), annotations.get(parameter.name)) for parameter in parameters]
+        signature = inspect.signature(cls)
+        return [(own, hints.get(name), annotations.get(name)) for name, own in signature.parameters.items()]
     for base in inspect.getmro(cls):
         # Classes without their own constructor have no configuration; the signature of nn.Module is generic. The class
         # is compared by name, because this module must not import torch.
