@@ -196,20 +196,14 @@ def build(node: object, **parts: object) -> Any:
 
 
 def check_node(node: object) -> type:
-    """Check the configuration node of a plugin, except for unresolved interpolations, and return the plugin class.
+    """Check the configuration node of a plugin, and return the plugin class.
 
     Raises:
         NerfroError: as `build`.
     """
     node = _settings_of(node)
     plugin = plugin_of(node)
-    keys = [str(key) for key in node]
-    if not any(OmegaConf.is_interpolation(node, key) for key in keys):
-        configure(plugin, node)
-    else:
-        unknown = [key for key in keys if OmegaConf.is_interpolation(node, key) or OmegaConf.is_missing(node, key)]
-        known = {key: node[key] for key in keys if key not in unknown}
-        check(f"{plugin.kind}={plugin.name}: ", plugin.hints, known)
+    configure(plugin, node)
     return plugin.cls
 
 
