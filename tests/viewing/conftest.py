@@ -1,5 +1,6 @@
 """A scene in closed form: a coloured ball inside a ball of glass, under a smooth sky."""
 
+import functools
 import math
 from collections.abc import Iterator
 from importlib import import_module
@@ -13,6 +14,9 @@ from nerfro.core.types import FieldValues, Samples
 from nerfro.data.base import DataSource, Views
 from nerfro.fields.base import Field
 from nerfro.files import lat_long
+from nerfro.media.bodies import Bodies, Body
+from nerfro.media.material import Material
+from nerfro.media.surfaces.ball import BallSurface
 from nerfro.models.refractive import RefractiveModel
 from nerfro.registry.registration import discover
 from nerfro.rendering import Components
@@ -21,7 +25,6 @@ from nerfro.samplers.points.stratified import Stratified
 from nerfro.viewing.server import PageServer
 from nerfro.viewing.trained_scene import TrainedScene
 from tests.cameras_at import cameras_at
-from tests.closed_forms import Ball
 
 RADIUS, INSIDE_RADIUS, INSIDE_CENTRE, IOR = 0.8, 0.3, (0.1, 0.0, 0.05), 1.3
 
@@ -58,11 +61,16 @@ class Photographs(DataSource):
         return Views(cameras, torch.zeros(len(places), size, size, 3), None, [f"r_{i}" for i in range(len(places))])
 
 
+@functools.cache
+def glass() -> Bodies:
+    return Bodies([Body("object", BallSurface(RADIUS), Material(IOR))])
+
+
 def make_scene() -> TrainedScene:
     sky = EnvironmentMap([64])
     sky.set_lat_long(sky_of(lat_long.directions(128)))
     parts = Components(
-        medium=Ball(RADIUS, IOR),
+        medium=glass(),
         path_sampler=Snell(),
         point_sampler=Stratified(num_samples=256),
         make_field=SolidBall,
