@@ -23,8 +23,8 @@ from nerfro.core.paths import ASSETS_DIR
 from nerfro.core.types import Path as RayPath
 from nerfro.data.blender import BlenderData
 from nerfro.files import lat_long
-from nerfro.geometry.contraction import contract
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
+from nerfro.geometry.space import Box, Contracted
 from nerfro.media.bodies import Bodies
 from nerfro.media.body_settings import make_bodies
 from nerfro.samplers.paths.snell import Snell
@@ -90,13 +90,13 @@ def draw_exits(medium: Bodies, file: Path) -> None:
 
 def draw_samples(medium: Bodies, file: Path) -> None:
     """Compare samples of the density grid with even samples on a bent path through a torus of known density."""
-    sampler = DensityGridSampler(num_samples=32, box_min=BOX[0], box_max=BOX[1], uniform=0.2)
+    sampler = DensityGridSampler(Box(BOX), num_samples=32, uniform=0.2)
     cells = sampler.resolution
     centres = (torch.arange(cells) + 0.5) / cells * 1.6 - 0.8
     sampler.density.copy_(density(torch.stack(torch.meshgrid(centres, centres, centres, indexing="ij"), -1)))
     path = row_of_view(medium, 64)[torch.tensor([56])]
     drawn = {
-        "even samples": Stratified(num_samples=32, box_min=BOX[0], box_max=BOX[1])(path, None),
+        "even samples": Stratified(num_samples=32, space=Box(BOX))(path, None),
         "density grid": sampler(path, None),
     }
     near, far = float(drawn["even samples"].edges[0, 0]), float(drawn["even samples"].edges[0, -1])
@@ -121,18 +121,19 @@ def draw_contraction(medium: Bodies, file: Path) -> None:
     """Show a square grid and bent rays before and after contraction."""
     figure = canvas(9, 4.5)
     world, contracted = figure.subplots(1, 2)
-    ticks, fine, centre, radius = np.arange(-16, 16.1, 0.5), torch.linspace(-16, 16, 2001), torch.zeros(3), 1.0
+    ticks, fine, radius = np.arange(-16, 16.1, 0.5), torch.linspace(-16, 16, 2001), 1.0
+    space = Contracted([[-radius] * 3, [radius] * 3], radius)
     for tick in ticks:
         fixed = torch.full_like(fine, float(tick))
         for x, y in ((fine, fixed), (fixed, fine)):
             line = torch.stack([x, y, torch.zeros_like(x)], -1)
-            for axes, points in ((world, line), (contracted, contract(line, centre, radius))):
+            for axes, points in ((world, line), (contracted, space.contract(line))):
                 axes.plot(points[:, 0], points[:, 1], color="0.75", linewidth=0.5)
     path = row_of_view(medium, 64)[torch.arange(30, 100, 10)]
     s = torch.cat([torch.linspace(0, 20, 800), torch.logspace(math.log10(20), 4, 200)]).expand(len(path.s), -1)
     points = path.at(s)[0]
     points = points * torch.tensor([1.0, 1.0, 0.0])
-    for axes, shown in ((world, points), (contracted, contract(points, centre, radius))):
+    for axes, shown in ((world, points), (contracted, space.contract(points))):
         axes.plot(shown[..., 0].T, shown[..., 1].T, color="tab:red", linewidth=0.9)
         axes.add_patch(Circle((0, 0), radius, fill=False, color="tab:blue"))
         axes.set_aspect("equal")

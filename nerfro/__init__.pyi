@@ -8,6 +8,7 @@ from .data.blender import BlenderData
 from .data.capture import Capture
 from .evaluation.collection import metrics
 from .fields.hash_grid import HashGridField
+from .geometry.space import Box, Contracted
 from .losses.photometric import Photometric
 from .masks.segment import segment
 from .media.bodies import Bodies, Body, GridSettings
@@ -42,10 +43,12 @@ __all__ = [
     "BlenderData",
     "Bodies",
     "Body",
+    "Box",
     "Cameras",
     "Capture",
     "Components",
     "ConstantBackground",
+    "Contracted",
     "EnvironmentMap",
     "GridSettings",
     "GroupConfig",

@@ -9,7 +9,8 @@ from nerfro.kernels.constants import constant
 from nerfro.media.bodies import Bodies
 from nerfro.registry.registration import build
 from nerfro.samplers.subdivision import Subdivision
-from nerfro.training.config import build_model
+from nerfro.training.config import build_medium, build_model
+from nerfro.training.derivation import derived
 from nerfro.training.module import TrainingModule
 from nerfro.training.ray_batches import RayBatches
 from nerfro.viewing.baking import bake_surface
@@ -55,7 +56,9 @@ def test_training_and_rendering_stay_on_the_gpu(
     monkeypatch.setattr(TrainingModule, "global_step", STEP)
     overrides = [f"+experiment={experiment[0]}", *experiment[1:], *SMALL, "data.downscale=16"]
     config = composed(*overrides, *shrunk(composed(*overrides)))
-    renderer, views = build_model(config), build(config.data).load("train")
+    views = build(config.data).load("train")
+    config = derived(config, build_medium(config), views)
+    renderer = build_model(config)
     module = TrainingModule.of(renderer, config)
     # What is computed and kept while the model is on the CPU must move with it.
     renderer.render(views.cameras.image_rays(0))

@@ -17,6 +17,7 @@ from nerfro.data.base import Views
 from nerfro.fields.base import Field
 from nerfro.files import lat_long
 from nerfro.files.images import save_png
+from nerfro.geometry.space import Box
 from nerfro.media.base import Medium
 from nerfro.paper.eikonal import Eikonal
 from nerfro.paper.nerf import NerfField
@@ -120,8 +121,9 @@ def make_model(make_field: Callable[[], Field] = Slanted, **fields: Any) -> Rend
         point_sampler=Stratified(64),
         make_field=make_field,
         background=ConstantBackground([0.2, 0.3, 0.4]),
+        space=Box([[-5.0] * 3, [5.0] * 3]),
     )
-    return EikonalFields(parts, **{"resolution": 16, "box_min": [-5.0] * 3, "box_max": [5.0] * 3, **fields})
+    return EikonalFields(parts, **{"resolution": 16, **fields})
 
 
 def test_stages_split_the_budget() -> None:

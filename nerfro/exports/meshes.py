@@ -52,8 +52,8 @@ def inside_mesh(scene: TrainedScene, resolution: int | None, half_depth: float |
     # The padding closes surfaces at the faces of the box. A logarithm of the density is closer to linear across a
     # surface than the density.
     values = functional.pad(volume.density, (1,) * 6).clamp(min=1e-3 * level).log()
-    spacing = (volume.box[1] - volume.box[0]) / (torch.tensor(volume.density.shape) - 1)
-    box = volume.box + torch.stack([-spacing, spacing])
+    spacing = (volume.space.box[1] - volume.space.box[0]) / (torch.tensor(volume.density.shape) - 1)
+    box = volume.space.box + torch.stack([-spacing, spacing])
     if not values.max() > math.log(level):
         return None
     mesh = largest_components(level_set(values, box, math.log(level)))

@@ -1,6 +1,6 @@
 """Allowed values of parameters and settings, declared by annotations such as `Annotated[int, Range(at_least=1)]`.
 
-Numbers must be finite, except with the annotation `AnyNumber`. Choices of text in configuration dataclasses have the
+Numbers must be finite. Choices of text in configuration dataclasses have the
 form `Annotated[str, Literal["a", "b"]]`, because OmegaConf does not support `Literal`.
 """
 
@@ -95,7 +95,6 @@ class OnlyWith:
 
 _FURTHEST = 10**7  # world units, as in georeferenced data
 
-AnyNumber = Annotated[float, None]  # including infinity and NaN
 Count = Annotated[int, Range(at_least=1)]
 NumRays = Annotated[int, Range(at_least=1, at_most=2**22)]  # computed in one chunk
 Side = Annotated[int, Range(at_least=1, at_most=32)]  # number of rays along each side of a pixel
@@ -217,20 +216,18 @@ def refuse_unused(options: object, names: Iterable[str], reason: str) -> None:
             raise NerfroError(f"{name}={settings[name]} has no effect {reason}; remove it")
 
 
-def corners_of_box(
-    box_min: Sequence[float], box_max: Sequence[float], bounded: bool = True
-) -> Float[np.ndarray, "2 3"]:
+def corners_of_box(box_min: Sequence[float], box_max: Sequence[float]) -> Float[np.ndarray, "2 3"]:
     """Return the corners of a box as an array.
 
     Args:
         box_min, box_max: lower and upper corner, world units.
-        bounded: refuse corners farther than 10^7 units from the origin.
 
     Raises:
-        NerfroError: a corner does not have three numbers, or the lower corner is not below the upper one.
+        NerfroError: a corner does not have three numbers or is farther than 10^7 units from the origin, or the lower
+            corner is not below the upper one.
     """
     box = np.array([box_min, box_max], np.float64) if len(box_min) == len(box_max) == 3 else np.zeros((2, 3))
-    if not (box[1] > box[0]).all() or (bounded and not (np.abs(box) <= _FURTHEST).all()):
+    if not (box[1] > box[0]).all() or not (np.abs(box) <= _FURTHEST).all():
         raise NerfroError(
             f"box_min={list(box_min)}, box_max={list(box_max)} is not a box; give three numbers each, min below max, "
             f"and none beyond {_FURTHEST}"

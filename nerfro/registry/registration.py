@@ -196,20 +196,14 @@ def build(node: object, **parts: object) -> Any:
 
 
 def check_node(node: object) -> type:
-    """Check the configuration node of a plugin, except for unresolved interpolations, and return the plugin class.
+    """Check the configuration node of a plugin, and return the plugin class.
 
     Raises:
         NerfroError: as `build`.
     """
     node = _settings_of(node)
     plugin = plugin_of(node)
-    keys = [str(key) for key in node]
-    if not any(OmegaConf.is_interpolation(node, key) for key in keys):
-        configure(plugin, node)
-    else:
-        unknown = [key for key in keys if OmegaConf.is_interpolation(node, key) or OmegaConf.is_missing(node, key)]
-        known = {key: node[key] for key in keys if key not in unknown}
-        check(f"{plugin.kind}={plugin.name}: ", plugin.hints, known)
+    configure(plugin, node)
     return plugin.cls
 
 
@@ -420,8 +414,8 @@ def _parameters(cls: Any) -> list[tuple[inspect.Parameter, Any, Any]]:
     found: dict[str, tuple[inspect.Parameter, Any, Any]] = {}
     if not isinstance(cls, type):
         hints, annotations = (typing.get_type_hints(cls, include_extras=extras) for extras in (False, True))
-        parameters = inspect.signature(cls).parameters.values()
-        return [(parameter, hints.get(parameter.name), annotations.get(parameter.name)) for parameter in parameters]
+        signature = inspect.signature(cls)
+        return [(own, hints.get(name), annotations.get(name)) for name, own in signature.parameters.items()]
     for base in inspect.getmro(cls):
         # Classes without their own constructor have no configuration; the signature of nn.Module is generic. The class
         # is compared by name, because this module must not import torch.

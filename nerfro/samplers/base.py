@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from nerfro.core.draws import Draws
 from nerfro.core.types import Path, Rays, Rendering, Samples
+from nerfro.data.component import Component
 from nerfro.fields.base import Field
 from nerfro.media.base import Medium
 from nerfro.samplers.paths.branching import ONE_PATH
@@ -71,7 +72,7 @@ class PathSampler(nn.Module, ABC):
         return False
 
 
-class PointSampler(nn.Module, ABC):
+class PointSampler(Component, nn.Module, ABC):
     """Choose arc lengths on a path.
 
     Attributes:

@@ -33,6 +33,7 @@ from nerfro.data.base import DataSource, Views
 from nerfro.evaluation.image_metrics import ImageMetric
 from nerfro.fields.base import Field
 from nerfro.fields.hash_grid import HashGridField
+from nerfro.geometry.space import Box
 from nerfro.losses.base import Loss
 from nerfro.media.base import Medium
 from nerfro.media.bodies import Bodies, Body, GridSettings
@@ -75,7 +76,8 @@ def check(plugin: Plugin, fields: Mapping[str, object] | None = None) -> None:
     _require(issubclass(made, base), f"a {plugin.kind} derives from {base.__module__}.{base.__name__}")
     missing = sorted(getattr(made, "__abstractmethods__", ()))
     _require(not missing, f"{plugin.cls.__name__} lacks {', '.join(missing)}")
-    built = build({"_target_": plugin.target, **(fields or {})}, components=example_components())
+    node = {"_target_": plugin.target, **(fields or {})}
+    built = build(node, components=example_components(), space=example_space())
     with _named(f"{plugin.kind}={plugin.name}"):
         check_contract(built)
 
@@ -90,6 +92,11 @@ def _named(plugin: str) -> Iterator[None]:
     except Exception as error:
         first_line = str(error).strip().partition("\n")[0]
         raise ContractError(f"contract broken: {plugin} raised {type(error).__name__}: {first_line}") from error
+
+
+def example_space() -> Box:
+    """Return a cube of side 2 around the origin."""
+    return Box([[-1.0] * 3, [1.0] * 3])
 
 
 def example_rays(num_rays: int = NUM_RAYS) -> Rays:
@@ -194,8 +201,7 @@ def check_export(name: str) -> None:
         not isinstance(endings, str) and len(endings) > 0 and all(e == e.lower() and e[:1] == "." for e in endings),
         f"suffixes={endings!r} are not a tuple of endings in lower case with a dot, such as ('.csv',)",
     )
-    box = torch.tensor([[-1.0] * 3, [1.0] * 3])
-    scene = TrainedScene(example_run().renderer.eval(), _ExampleData(), content=box)
+    scene = TrainedScene(example_run().renderer.eval(), _ExampleData())
     with tempfile.TemporaryDirectory() as folder:
         out = FilePath(folder, f"scene{endings[0]}")
         config = OmegaConf.structured(ExportConfig(checkpoint="-", what=name, out=str(out)))
@@ -469,9 +475,10 @@ def example_components() -> Components:
         path_sampler=Straight(),
         point_sampler=Stratified(8),
         make_field=lambda: HashGridField(
-            num_levels=2, log2_table_size=8, width=16, initial_depth=1.0, precision="float32"
+            example_space(), num_levels=2, log2_table_size=8, width=16, initial_depth=1.0, precision="float32"
         ),
         background=ConstantBackground(),
+        space=example_space(),
     )
 
 

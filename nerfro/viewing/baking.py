@@ -126,7 +126,7 @@ def bake_volume(volume: Volume, colour_space: ColourSpace) -> Baked:
         volume: samples of the radiance field, with linear radiance.
         colour_space: space in which the model adds up the radiance of a ray.
     """
-    sides = volume.box[1] - volume.box[0]
+    sides = volume.space.box[1] - volume.space.box[0]
     cell = float((sides / (torch.tensor(volume.density.shape) - 1)).min())
     min_density, span = MIN_OPTICAL_DEPTH / cell, math.log(30.0 / MIN_OPTICAL_DEPTH)
     levels = (volume.density.clamp(min=min_density) / min_density).log().div(span).clamp(max=1)
@@ -138,14 +138,14 @@ def bake_volume(volume: Volume, colour_space: ColourSpace) -> Baked:
     occupied = _occupied_bricks(slices[..., 3])
     return Baked(
         {
-            "low": volume.box[0].tolist(),
-            "high": volume.box[1].tolist(),
+            "low": volume.space.box[0].tolist(),
+            "high": volume.space.box[1].tolist(),
             "size": list(volume.density.shape),
             "occupiedSize": list(occupied.shape[::-1]),
             "logDensity": [math.log(min_density), span],
             "maxRadiance": max_radiance,
             "marchStep": 0.7 * cell,
-            "contractionRadius": volume.radius or 0.0,
+            "contractionRadius": volume.space.radius,
         },
         {"colour": slices[..., :3], "density": slices[..., 3:], "occupied": occupied[..., None]},
     )

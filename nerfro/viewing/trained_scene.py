@@ -67,14 +67,12 @@ class TrainedScene:
         source: data set.
         subdivision: rays per pixel; the default is the subdivision of the run's evaluation.
         name: name of the experiment.
-        content: corners of the box outside of which the field is empty, world units; None if the box is unknown.
     """
 
     renderer: Renderer
     source: DataSource
     subdivision: Subdivision = field(default_factory=Subdivision)
     name: str = ""
-    content: Float[Tensor, "2 3"] | None = None
 
     def __repr__(self) -> str:
         return f"TrainedScene({self.name}, {self.renderer.scene})"
@@ -163,12 +161,13 @@ class TrainedScene:
         box = self.renderer.scene.medium.content_box.float().cpu()
         if (box[1] > box[0]).all():
             return box
-        if self.content is None:
+        content = self.renderer.scene.space.content
+        if content is None:
             raise NerfroError(
                 "the position of the object is unknown, because the run has neither glass nor content.box_min; "
                 "train with content.box_min and content.box_max"
             )
-        return self.content
+        return content.cpu()
 
     def with_(
         self,

@@ -12,8 +12,8 @@ from torch import Tensor
 from nerfro.backgrounds.base import Background
 from nerfro.core.types import Exits, FieldValues, Samples
 from nerfro.fields.base import Field
-from nerfro.fields.selection import inside_box
 from nerfro.geometry.interpolation import smooth, trilinear
+from nerfro.geometry.space import inside_box
 
 # Directions are looked up on the unit sphere in a grid over this cube.
 _SKY_SIDE = 1.1

@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import resolve_path
-from nerfro.fields.selection import inside_box
 from nerfro.geometry.mesh import load_mesh, local_origin
+from nerfro.geometry.space import inside_box
 from nerfro.media.base import Medium
 from nerfro.registry.allowed import Depth, Natural, Positive, Width
 from nerfro.registry.registration import register

@@ -24,6 +24,7 @@ from nerfro.evaluation.image_metrics import psnr
 from nerfro.fields.base import Field
 from nerfro.files import lat_long
 from nerfro.files.deep_images import write_radiance
+from nerfro.geometry.space import Contracted
 from nerfro.media.bodies import Bodies
 from nerfro.media.body_settings import make_bodies
 from nerfro.samplers.paths.snell import Snell
@@ -142,13 +143,12 @@ class Surroundings(Field):
 
 @needs_chromium
 def test_contracted_surroundings_are_shown(scene: TrainedScene, tmp_path: Path) -> None:
-    sampler = DensityGridSampler(
-        512, 256, [-2.0] * 3, [2.0] * 3, radius=2.0, near=1.0, resolution=48, update_fraction=0.9
-    )
+    space = Contracted([[-2.0] * 3, [2.0] * 3], 2.0, near=1.0)
+    sampler = DensityGridSampler(space, 512, 256, resolution=48, update_fraction=0.9)
     field = Surroundings()
     for step in range(3):
         sampler.update([field], example_draws(step=step * sampler.update_every))
-    renderer = with_changed_scene(scene.renderer, fields=torch.nn.ModuleList([field]))
+    renderer = with_changed_scene(scene.renderer, fields=torch.nn.ModuleList([field]), space=space)
     everywhere = replace(scene, renderer=variant(renderer, point_sampler=sampler))
     found = ask(
         make_page(everywhere, 96), f"(() => {{ {SHOT} return [0, 1, 2].map((v) => shot(v, 32)); }})()", tmp_path
