@@ -153,7 +153,7 @@ def find_indices(
     """
     settings.use()
     num_bodies = len(medium.iors)
-    if num_bodies > len(settings.plans):
+    if not 0 < num_bodies <= len(settings.plans):
         raise NerfroError(
             f"the medium has {num_bodies} bodies, and at most two indices are searched for; set medium.ior=, or ior "
             "or material of each of bodies="
