@@ -21,7 +21,11 @@ EXTRAS = {
     "ray": ["nerfro", "train", "hydra/launcher=ray", "--cfg", "hydra"],
     "optuna": ["nerfro", "train", "hydra/sweeper=optuna", "--cfg", "hydra"],
     "refref": ["nerfro", "train", "data=refref", "data.root=."],
-    "video": ["python", "-c", "from nerfro.registry import plugin_module as m; m('film_encoding.film').find_ffmpeg()"],
+    "video": [
+        "python",
+        "-c",
+        "from nerfro.registry.registration import plugin_module as m; m('film_encoding.film').find_ffmpeg()",
+    ],
     "capture": ["nerfro", "calibrate", f"images={PHOTOGRAPHS}", "target=apriltag", "out=calibrated"],
 }
 PLUGIN = Path("plugins", "example_sampler.py")

@@ -23,15 +23,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.camera.similarity import motion_between
-from nerfro.cameras import Cameras
+from nerfro.core.cameras import Cameras
+from nerfro.core.paths import resolve_path
 from nerfro.data.blender import BlenderData
 from nerfro.evaluation.results import read_metrics_json
-from nerfro.paths import resolve_path
-from nerfro.registry import discover
+from nerfro.registry.registration import discover
 
 discover()
-pixel_units = import_module("nerfro_plugins.refined_cameras.pixel_units")
-rotation_matrices = import_module("nerfro_plugins.refined_cameras.refined").rotation_matrices
+pixel_units = import_module("nerfro.camera.refined.pixel_units")
+rotation_matrices = import_module("nerfro.camera.refined.refined").rotation_matrices
 
 
 def main() -> None:

@@ -12,8 +12,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.camera.similarity import Similarity, motion_between, similarity
+from nerfro.core.errors import NerfroError
 from nerfro.data.transforms import find_splits, read_manifest
-from nerfro.errors import NerfroError
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.geometry.occupancy import occupancy_fraction
 

@@ -18,17 +18,17 @@ from matplotlib.patches import Circle
 
 from nerfro.capture.index_search import find_indices
 from nerfro.capture.surroundings import divide_pixels, learn_surroundings
+from nerfro.core.light import to_srgb
+from nerfro.core.paths import ASSETS_DIR
+from nerfro.core.types import Path as RayPath
 from nerfro.data.blender import BlenderData
 from nerfro.files import lat_long
 from nerfro.geometry.contraction import contract
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
-from nerfro.light import to_srgb
 from nerfro.media.sdf_grid import SdfGrid
-from nerfro.paths import ASSETS_DIR
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.samplers.points.stratified import Stratified
-from nerfro.types import Path as RayPath
 
 MESH = ASSETS_DIR / "torus" / "mesh.ply"
 IMAGES = Path(__file__).resolve().parent.parent / "docs" / "images"

@@ -18,10 +18,10 @@ import torch
 from torch import Tensor
 
 import nerfro
-from nerfro.cameras import Cameras
+from nerfro.core.cameras import Cameras
+from nerfro.core.subdivision import divergence, neighbour_rays, pixel_rays
 from nerfro.evaluation.render_view import render_view
 from nerfro.rendering import Renderer
-from nerfro.subdivision import divergence, neighbour_rays, pixel_rays
 
 CLASSES = ("background beside the glass", "objects inside", "edges", "background through the glass")
 

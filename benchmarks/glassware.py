@@ -28,23 +28,23 @@ from PIL import Image
 from scipy.interpolate import PchipInterpolator
 from skimage.measure import approximate_polygon, find_contours
 
+from nerfro.core.light import to_srgb
+from nerfro.core.progress import track
 from nerfro.evaluation.results import FULL, read_metrics_json
-from nerfro.light import to_srgb
-from nerfro.progress import track
-from nerfro.registry import discover, plugin_module
+from nerfro.registry.registration import discover, plugin_module
 
 discover()
 opencv = plugin_module("camera_calibration.opencv").opencv
 write_film = plugin_module("film_encoding.film").write_film
-dataset = import_module("nerfro_plugins.synthetic_scenes.dataset")
+dataset = import_module("nerfro.synthetic.dataset")
 PlannedImage, write_image = dataset.PlannedImage, dataset.write_image
-path_tracer = import_module("nerfro_plugins.synthetic_scenes.path_tracer")
+path_tracer = import_module("nerfro.synthetic.path_tracer")
 PathTracer, Pinhole = path_tracer.PathTracer, path_tracer.Pinhole
 panel_shape, triangle_shape = path_tracer.panel_shape, path_tracer.triangle_shape
-modelled = import_module("nerfro_plugins.synthetic_scenes.scene")
+modelled = import_module("nerfro.synthetic.scene")
 Panel, Scene = modelled.Panel, modelled.SyntheticScene
-Surface = import_module("nerfro_plugins.synthetic_scenes.surface").SurfaceMesh
-find_scene = import_module("nerfro_plugins.synthetic_scenes.synthesis").find_scene
+Surface = import_module("nerfro.synthetic.surface").SurfaceMesh
+find_scene = import_module("nerfro.synthetic.synthesis").find_scene
 
 dolphin = find_scene("dolphin_capture")
 distance, patterns, photographs = (

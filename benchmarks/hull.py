@@ -12,11 +12,11 @@ from capture import align_to_truth, transformed, volume_overlap
 from jaxtyping import Float
 
 from nerfro.camera.similarity import Similarity
+from nerfro.core.paths import resolve_path
 from nerfro.data.base import Views
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.media.sdf_grid import SdfGrid
-from nerfro.paths import resolve_path
-from nerfro.registry import discover, find
+from nerfro.registry.registration import discover, find
 from nerfro.samplers.paths.snell import Snell
 from nerfro.silhouettes.silhouettes import pixel_stride
 from tests.exact_silhouettes import volume

@@ -27,7 +27,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from nerfro.paths import cache_dir
+from nerfro.core.paths import cache_dir
 
 # The embedded scene, and numbers of training pictures with their width and height.
 ROWS = ("embedded", "200x800x800", "300x1600x1200")

@@ -17,12 +17,12 @@ import numpy as np
 import torch
 
 import nerfro
+from nerfro.core.light import to_srgb
 from nerfro.evaluation.image_metrics import psnr
-from nerfro.light import to_srgb
-from nerfro.registry import discover
+from nerfro.registry.registration import discover
 
 discover()
-load_mitsuba = import_module("nerfro_plugins.synthetic_scenes.path_tracer").load_mitsuba
+load_mitsuba = import_module("nerfro.synthetic.path_tracer").load_mitsuba
 
 
 def main() -> None:

@@ -34,13 +34,13 @@ from matplotlib.ticker import LogLocator, NullLocator
 from training import SCENE, Training, write_images
 
 import nerfro
+from nerfro.core.subdivision import Subdivision
+from nerfro.core.types import Batch
 from nerfro.evaluation.render_view import render_view
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
-from nerfro.registry import build
-from nerfro.subdivision import Subdivision
+from nerfro.registry.registration import build
 from nerfro.training.module import TrainingModule
 from nerfro.training.validation import ValidationPixels
-from nerfro.types import Batch
 
 AXES = {
     "pixels": [128, 64, 256, 512, 1024, 1600],

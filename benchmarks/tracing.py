@@ -22,11 +22,11 @@ import trimesh
 from rounded_cube import trace_rounded_cube
 from torch import Tensor
 
-from nerfro.cameras import Cameras
+from nerfro.core.cameras import Cameras
+from nerfro.core.types import Rays
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball
 from nerfro.samplers.paths.snell import Snell
-from nerfro.types import Rays
 from tests.closed_forms import RoundedBox, angle, ball_exits, make_rays
 from tests.paper import Eikonal, VoxelGrid
 

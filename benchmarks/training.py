@@ -37,18 +37,18 @@ from torch.profiler import ProfilerActivity, profile, record_function
 from torch.utils.flop_counter import FlopCounterMode
 
 import nerfro
+from nerfro.core.paths import ASSETS_DIR
+from nerfro.core.rays import Rays
+from nerfro.core.subdivision import Subdivision
+from nerfro.core.types import Batch
 from nerfro.evaluation.render_view import render_view
 from nerfro.evaluation.results import read_metrics_json
 from nerfro.fields.hash_grid import HashGridField
 from nerfro.kernels.allocator import keep_freed_memory
 from nerfro.kernels.available import fast_bfloat16
-from nerfro.paths import ASSETS_DIR
-from nerfro.rays import Rays
-from nerfro.subdivision import Subdivision
 from nerfro.training.data_module import RayDataModule
 from nerfro.training.ray_batches import RayBatches
 from nerfro.training.trainer import lightning_precision
-from nerfro.types import Batch
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENE = ASSETS_DIR / "torus"

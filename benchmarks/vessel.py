@@ -14,9 +14,9 @@ import numpy as np
 import torch
 import trimesh
 
+from nerfro.core.rays import Rays
 from nerfro.media.sdf_grid import SdfGrid
-from nerfro.rays import Rays
-from nerfro.registry import plugin_module
+from nerfro.registry.registration import plugin_module
 from nerfro.samplers.paths.snell import Snell
 from tests.closed_forms import angle, make_rays
 

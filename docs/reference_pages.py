@@ -18,9 +18,9 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig
 
 from nerfro.__main__ import commands
-from nerfro.options import google_docstring, plugin_options, schema_options, yaml_comments
-from nerfro.paths import CONF_DIR
-from nerfro.registry import KINDS, Plugin, discover, plugins
+from nerfro.cli.options import google_docstring, plugin_options, schema_options, yaml_comments
+from nerfro.core.paths import CONF_DIR
+from nerfro.registry.registration import KINDS, Plugin, discover, plugins
 from nerfro.training import lightning_callbacks  # noqa: F401 - registers callbacks
 from nerfro.training.config import TrainConfig
 

@@ -30,7 +30,7 @@ def __getattr__(name: str) -> Any:
     if name == "__version__":
         return _version()
     if name == "Scene":
-        from nerfro.errors import warn_of_old_name
+        from nerfro.core.errors import warn_of_old_name
 
         warn_of_old_name("nerfro.Scene", "nerfro.TrainedScene")
         name = "TrainedScene"
@@ -38,11 +38,11 @@ def __getattr__(name: str) -> Any:
 
 
 def _plugin(name: str) -> type:
-    from nerfro.registry import discover, find
+    from nerfro.registry.registration import discover, find
 
     discover()
     kind, plugin = _PLUGINS[name]
-    replacement = f"nerfro.registry.find({kind!r}, {plugin!r}).cls"
+    replacement = f"nerfro.registry.registration.find({kind!r}, {plugin!r}).cls"
     warnings.warn(f"nerfro.{name} is a plugin; take {replacement}; the next release removes the name", stacklevel=3)
     return find(kind, plugin).cls
 

@@ -1,7 +1,8 @@
 # Public names of nerfro, which `lazy_loader` imports on first access.
 from .boundaries.constant import ConstantBoundary
 from .boundaries.envmap import EnvironmentMap
-from .cameras import Cameras
+from .core.cameras import Cameras
+from .core.rays import Rays
 from .data.blender import BlenderData
 from .evaluation.collection import metrics
 from .fields.hash_grid import HashGridField
@@ -9,7 +10,6 @@ from .losses.photometric import Photometric
 from .media.sdf_grid import SdfGrid
 from .media.shapes import Ball
 from .models.refractive import RefractiveModel
-from .rays import Rays
 from .rendering.renderer import Components
 from .samplers.paths.bend import bend, polylines
 from .samplers.paths.snell import Snell

@@ -6,11 +6,11 @@ import ast
 import runpy
 import sys
 
-from nerfro.cli import print_version
-from nerfro.completion import completions, shell_code
-from nerfro.errors import NerfroError, nearest_of
-from nerfro.failures import errors_in_one_line
-from nerfro.paths import PACKAGE_DIR
+from nerfro.cli.completion import completions, shell_code
+from nerfro.cli.entry import print_version
+from nerfro.cli.failures import errors_in_one_line
+from nerfro.core.errors import NerfroError, nearest_of
+from nerfro.core.paths import PACKAGE_DIR
 
 
 def main() -> None:

@@ -12,11 +12,11 @@ from typing import Annotated, Literal, Optional
 
 from omegaconf import DictConfig
 
-import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
-from nerfro.allowed import Count, Natural, Positive, Range
-from nerfro.cli import entry_point
+import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
+from nerfro.cli.entry import entry_point
 from nerfro.data.frames import Every
-from nerfro.registry import plugin_module
+from nerfro.registry.allowed import Count, Natural, Positive, Range
+from nerfro.registry.registration import plugin_module
 
 Squares = Annotated[int, Range(at_least=1, at_most=100)]  # along a side of a board
 

@@ -14,10 +14,10 @@ import sys
 from datetime import datetime
 from pathlib import Path
 
-import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
+import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
+from nerfro.cli.failures import errors_in_one_line
+from nerfro.core.trust import command_of_module
 from nerfro.evaluation.results import read_metrics_json
-from nerfro.failures import errors_in_one_line
-from nerfro.trust import command_of_module
 from nerfro.viewing.server import open_page
 
 _OPTIONS = (

@@ -12,9 +12,10 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
-from nerfro.cli import entry_point
-from nerfro.errors import NerfroError
+import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
+from nerfro.cli.entry import entry_point
+from nerfro.core.errors import NerfroError
+from nerfro.core.paths import user_path
 from nerfro.evaluation.error_sheets import write_error_sheet
 from nerfro.evaluation.folders import match_folders
 from nerfro.evaluation.metrics import prepared_metrics
@@ -25,7 +26,6 @@ from nerfro.evaluation.tables import write_scores
 from nerfro.evaluation.treatments import score_split
 from nerfro.files.foreign_config import read_foreign_config
 from nerfro.files.images import load_png
-from nerfro.paths import user_path
 from nerfro.training.callbacks import Throughput, steps_by_phase
 from nerfro.training.config import build_data, check_trained
 from nerfro.training.load import checkpoint_of, scene_of

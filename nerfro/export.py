@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from omegaconf import DictConfig
 
-import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
-from nerfro.allowed import refuse_unused
-from nerfro.cli import entry_point
+import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
+from nerfro.cli.entry import entry_point
+from nerfro.core.paths import user_path
 from nerfro.files.atomic import refuse_existing
-from nerfro.paths import user_path
+from nerfro.registry.allowed import refuse_unused
 from nerfro.training.load import load
 from nerfro.viewing.exports import ExportConfig, find_export
 

@@ -13,11 +13,11 @@ from typing import Annotated, Any, Optional
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import MISSING, DictConfig
 
-import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
-from nerfro.allowed import Range
-from nerfro.cli import entry_point
-from nerfro.overrides import is_given, of_groups, print_next
-from nerfro.registry import plugin_module
+import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
+from nerfro.cli.entry import entry_point
+from nerfro.cli.overrides import is_given, of_groups, print_next
+from nerfro.registry.allowed import Range
+from nerfro.registry.registration import plugin_module
 from nerfro.rendering.scene_file import with_scene
 
 

@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import sys
 
-import nerfro.startup
+import nerfro.cli.startup
 import nerfro.training.lightning_callbacks  # noqa: F401 - registers callbacks
-from nerfro.failures import errors_in_one_line
+from nerfro.cli.failures import errors_in_one_line
+from nerfro.cli.options import plugin_options
 from nerfro.media.material import MATERIALS
-from nerfro.options import plugin_options
-from nerfro.registry import Plugin, discover, find, plugins
+from nerfro.registry.registration import Plugin, discover, find, plugins
 
 
 def main() -> None:

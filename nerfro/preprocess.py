@@ -16,20 +16,20 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
+import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
 from nerfro.capture.index_search import find_medium, initial_medium
 from nerfro.capture.object_errors import unsupported_bodies
 from nerfro.capture.preprocess_options import MESH, PreprocessConfig, Request, surface_settings, write_scene
 from nerfro.capture.refinement import refine
 from nerfro.capture.surroundings import Observations
-from nerfro.cli import entry_point
+from nerfro.cli.entry import entry_point
+from nerfro.core.errors import warn
 from nerfro.data.base import Views
 from nerfro.data.masks import EVIDENCE, REVOLUTION, masked_views, method_of, with_other_splits
-from nerfro.errors import warn
 from nerfro.files.folder_lock import lock_folder
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.media.sdf_grid import SdfGrid
-from nerfro.registry import plugin_module
+from nerfro.registry.registration import plugin_module
 from nerfro.rendering.scene_file import SceneFile, with_scene
 from nerfro.silhouettes.overlaps import choose_wrong_masks, report_overlaps
 from nerfro.silhouettes.pose_conventions import require_consistent_poses

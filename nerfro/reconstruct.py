@@ -12,12 +12,12 @@ from __future__ import annotations
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
-from nerfro.cli import entry_point
+import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
+from nerfro.cli.entry import entry_point
+from nerfro.cli.overrides import is_given, of_groups
+from nerfro.core.paths import resolve_path, user_path
 from nerfro.data.lazy_images import decoded_once
 from nerfro.files.folder_lock import lock_folder
-from nerfro.overrides import is_given, of_groups
-from nerfro.paths import resolve_path, user_path
 from nerfro.pipeline.options import ReconstructConfig, have_poses
 from nerfro.pipeline.stage import terminated_in_one_line
 from nerfro.pipeline.stages import calibrate, preprocess, report, segment, train

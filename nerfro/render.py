@@ -11,13 +11,13 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
-from nerfro.cli import entry_point
+import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
+from nerfro.cli.entry import entry_point
+from nerfro.core.paths import CONF_DIR, user_path
 from nerfro.files.cache import file_hash
 from nerfro.files.folder_lock import lock_folder
 from nerfro.kernels.allocator import keep_freed_memory
-from nerfro.paths import CONF_DIR, user_path
-from nerfro.registry import plugin_module
+from nerfro.registry.registration import plugin_module
 from nerfro.training.load import checkpoint_of, load
 from nerfro.viewing.frames import render_frames
 from nerfro.viewing.layers import LAYERS

@@ -14,14 +14,14 @@ from typing import Annotated, Any, Literal, Optional
 import rich
 from omegaconf import DictConfig, ListConfig
 
-import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
-from nerfro.allowed import Natural
-from nerfro.cli import entry_point
+import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
+from nerfro.cli.entry import entry_point
+from nerfro.core.paths import user_path
 from nerfro.evaluation.results import FULL
 from nerfro.evaluation.tables import Table, to_rich, write_table
 from nerfro.files.atomic import refuse_existing, write_atomically
 from nerfro.files.folder_lock import lock_folder
-from nerfro.paths import user_path
+from nerfro.registry.allowed import Natural
 from nerfro.report.comparison import compare, find_metrics, to_table
 from nerfro.report.page import report_page
 from nerfro.report.runs import find_runs

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from omegaconf import DictConfig
 
-import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
-from nerfro.cli import entry_point
-from nerfro.paths import CONF_DIR
-from nerfro.synthetic import SynthesizeConfig, synthesize
+import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
+from nerfro.cli.entry import entry_point
+from nerfro.core.paths import CONF_DIR
+from nerfro.synthetic.options import SynthesizeConfig, synthesize
 
 
 @entry_point("synthesize", SynthesizeConfig, CONF_DIR / "synthesize")  # conf/scene would turn `scene=` into a group

@@ -11,14 +11,14 @@ import rich
 import torch
 from omegaconf import DictConfig
 
-import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
-from nerfro.cli import entry_point
-from nerfro.errors import NerfroError
+import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
+from nerfro.cli.entry import entry_point
+from nerfro.core.errors import NerfroError
+from nerfro.core.paths import user_path
 from nerfro.evaluation.path_plot import draw_paths
 from nerfro.files.atomic import refuse_existing
 from nerfro.files.cache import save_arrays
-from nerfro.paths import user_path
-from nerfro.registry import build
+from nerfro.registry.registration import build
 from nerfro.rendering.scene_file import with_scene
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.paths.thin_walls import warn_of_thin_walls

@@ -13,18 +13,18 @@ from pathlib import Path
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
-from nerfro.cli import entry_point
-from nerfro.distributed import leave
+import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
+from nerfro.cli.entry import entry_point
+from nerfro.cli.failures import EXIT_INTERRUPTED
+from nerfro.cli.overrides import prints_hints
+from nerfro.core.distributed import leave
+from nerfro.core.subdivision import Subdivision
 from nerfro.evaluation.metrics import prepared_metrics
 from nerfro.evaluation.results import RunMetrics, optimized
 from nerfro.evaluation.tables import write_scores
 from nerfro.evaluation.treatments import score_split
-from nerfro.failures import EXIT_INTERRUPTED
 from nerfro.fields.networks import compile_networks
-from nerfro.overrides import prints_hints
 from nerfro.rendering.scene_file import with_scene
-from nerfro.subdivision import Subdivision
 from nerfro.training.build import build_training, check_before_training, check_command
 from nerfro.training.callbacks import StopOnSignal, Throughput, steps_by_phase
 from nerfro.training.config import TrainConfig, build_data, resolve_trainer_options

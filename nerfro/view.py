@@ -15,9 +15,9 @@ from typing import Annotated, Optional
 
 from omegaconf import MISSING, DictConfig
 
-import nerfro.startup  # noqa: F401 - before the other imports, which take seconds
-from nerfro.allowed import Range
-from nerfro.cli import entry_point
+import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
+from nerfro.cli.entry import entry_point
+from nerfro.registry.allowed import Range
 from nerfro.training.load import load
 from nerfro.viewing.page import make_page
 from nerfro.viewing.server import PageServer, open_page

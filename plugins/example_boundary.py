@@ -7,9 +7,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerfro.boundaries.base import Boundary
-from nerfro.errors import NerfroError
-from nerfro.registry import register
-from nerfro.types import Exits
+from nerfro.core.errors import NerfroError
+from nerfro.core.types import Exits
+from nerfro.registry.registration import register
 
 
 @register("boundary", "gradient_sky")

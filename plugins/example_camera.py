@@ -9,9 +9,9 @@ from jaxtyping import Int
 from torch import Tensor, nn
 
 from nerfro.camera.base import CameraModel
-from nerfro.cameras import Cameras
-from nerfro.rays import Rays
-from nerfro.registry import register
+from nerfro.core.cameras import Cameras
+from nerfro.core.rays import Rays
+from nerfro.registry.registration import register
 
 
 @register("camera", "shifted")

@@ -9,13 +9,13 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from nerfro.allowed import Distance
-from nerfro.cameras import Cameras
+from nerfro.core.cameras import Cameras
+from nerfro.core.errors import NerfroError
+from nerfro.core.paths import resolve_path
 from nerfro.data.base import DataSource, Views
-from nerfro.errors import NerfroError
 from nerfro.files.reading import load_arrays
-from nerfro.paths import resolve_path
-from nerfro.registry import register
+from nerfro.registry.allowed import Distance
+from nerfro.registry.registration import register
 
 
 @register("data", "numpy_views")

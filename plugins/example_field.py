@@ -6,10 +6,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from nerfro.allowed import Count, Positive
+from nerfro.core.types import FieldValues, Samples
 from nerfro.fields.base import Field
-from nerfro.registry import register
-from nerfro.types import FieldValues, Samples
+from nerfro.registry.allowed import Count, Positive
+from nerfro.registry.registration import register
 
 
 @register("field", "blobs")

@@ -6,10 +6,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerfro.core.types import Batch, Rendering
 from nerfro.losses.base import Loss
-from nerfro.registry import register
+from nerfro.registry.registration import register
 from nerfro.rendering import Scene
-from nerfro.types import Batch, Rendering
 
 
 @register("loss", "opacity_entropy")

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import torch
 
-from nerfro.allowed import Positive
 from nerfro.media.base import Medium, Scalars, Vectors
-from nerfro.registry import register
+from nerfro.registry.allowed import Positive
+from nerfro.registry.registration import register
 
 
 @register("medium", "gradient_rod")

@@ -9,11 +9,11 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor, nn
 
-from nerfro.allowed import Positive
-from nerfro.draws import Draws
+from nerfro.core.draws import Draws
+from nerfro.core.types import Path, Rendering
 from nerfro.models.refractive import RefractiveModel
-from nerfro.registry import register
-from nerfro.types import Path, Rendering
+from nerfro.registry.allowed import Positive
+from nerfro.registry.registration import register
 
 
 @register("model", "haze")

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import torch
 
+from nerfro.core.types import Path, Rays
 from nerfro.media.base import Medium
-from nerfro.registry import register
+from nerfro.registry.registration import register
 from nerfro.samplers.base import PathSampler
-from nerfro.types import Path, Rays
 
 
 @register("sampler/path", "mirror_floor")

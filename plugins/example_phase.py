@@ -6,8 +6,8 @@ from typing import Any
 
 import torch
 
-from nerfro.allowed import Count
-from nerfro.registry import register
+from nerfro.registry.allowed import Count
+from nerfro.registry.registration import register
 from nerfro.training.phases.base import Phase, TrainingRun
 
 _OTHER_PIXELS = 10**6  # numbers of batches that training steps do not use

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import torch
 
-from nerfro.allowed import Count
-from nerfro.draws import Draws
-from nerfro.registry import register
+from nerfro.core.draws import Draws
+from nerfro.core.types import Path, Rendering, Samples
+from nerfro.registry.allowed import Count
+from nerfro.registry.registration import register
 from nerfro.samplers.base import PointSampler
 from nerfro.samplers.points.stratified import point_samples
-from nerfro.types import Path, Rendering, Samples
 
 _GROWTH = 4.0  # ratio of the last spacing to the first
 

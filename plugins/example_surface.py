@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from nerfro.allowed import Positive
 from nerfro.media.surface import Grid, Surface
-from nerfro.registry import register
+from nerfro.registry.allowed import Positive
+from nerfro.registry.registration import register
 
 
 @register("surface", "torus")

@@ -11,15 +11,15 @@ import trimesh
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, normalize
 
-from nerfro.cameras import Cameras
+from nerfro.core.cameras import Cameras
+from nerfro.core.light import to_srgb
+from nerfro.core.types import Exits
 from nerfro.data.base import Views
 from nerfro.files.images import save_png
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.light import to_srgb
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.samplers.paths.snell import Snell
 from nerfro.silhouettes.silhouettes import mesh_silhouettes
-from nerfro.types import Exits
 from tests.cameras_at import cameras_at, poses_towards_origin
 from tests.closed_forms import grid_points
 

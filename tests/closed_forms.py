@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from nerfro.core.types import Rays
 from nerfro.media.base import Medium
 from nerfro.media.solid import Solid
-from nerfro.types import Rays
 
 Squared = Callable[[Tensor], tuple[Tensor, Tensor]]
 

@@ -25,8 +25,8 @@ from omegaconf import DictConfig
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from nerfro.errors import NerfroError
-from nerfro.paths import CONF_DIR
+from nerfro.core.errors import NerfroError
+from nerfro.core.paths import CONF_DIR
 
 # Workers of pytest-xdist share the cores; threads that wait for each other by spinning would slow all of them down.
 if "PYTEST_XDIST_WORKER" in os.environ:
@@ -89,12 +89,12 @@ def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def restored_registry(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Forget the plugins that a test discovers."""
-    import nerfro.registry
+    import nerfro.registry.registration
     import nerfro.training.lightning_callbacks  # registers callbacks, which the restoration would else remove
 
-    nerfro.registry.discover()
-    monkeypatch.setattr(nerfro.registry, "_plugins", dict(nerfro.registry._plugins))
-    monkeypatch.setattr(nerfro.registry, "_discovered", set(nerfro.registry._discovered))
+    nerfro.registry.registration.discover()
+    monkeypatch.setattr(nerfro.registry.registration, "_plugins", dict(nerfro.registry.registration._plugins))
+    monkeypatch.setattr(nerfro.registry.registration, "_discovered", set(nerfro.registry.registration._discovered))
     parent = sys.modules["nerfro_plugins"]
     monkeypatch.setattr(parent, "__path__", list(parent.__path__))
     known = set(sys.modules)
@@ -124,7 +124,7 @@ class Bomb:
 
 def composed(*overrides: str) -> DictConfig:
     """The configuration that `nerfro.train` composes of some overrides."""
-    from nerfro.registry import discover
+    from nerfro.registry.registration import discover
     from nerfro.training.config import TrainConfig
 
     discover()
@@ -141,13 +141,13 @@ def _seed() -> None:
 @pytest.fixture(scope="session")
 def mitsuba() -> ModuleType:
     """Mitsuba with its fastest variant; tests are skipped where only the scalar variant works, which takes minutes."""
-    from nerfro.registry import discover
+    from nerfro.registry.registration import discover
 
     discover()
-    llvm = importlib.import_module("nerfro_plugins.synthetic_scenes.llvm")
+    llvm = importlib.import_module("nerfro.synthetic.llvm")
     llvm.select_llvm()  # before Mitsuba is imported, which loads the library at once
     pytest.importorskip("mitsuba")
-    module = importlib.import_module("nerfro_plugins.synthetic_scenes.path_tracer").load_mitsuba()
+    module = importlib.import_module("nerfro.synthetic.path_tracer").load_mitsuba()
     if module.variant() == "scalar_rgb":
         pytest.skip(f"needs Mitsuba with LLVM or CUDA, but {llvm.missing_llvm()}; {llvm.HINT}")
     return module
@@ -371,7 +371,7 @@ WAITING_LOSS = '''
 """Waits."""
 import time
 from nerfro.losses.base import Loss
-from nerfro.registry import register
+from nerfro.registry.registration import register
 
 @register("loss", "waiting")
 class Waiting(Loss):

@@ -6,7 +6,7 @@ import trimesh
 from matplotlib.path import Path as Polygon
 from scipy.spatial import ConvexHull
 
-from nerfro.cameras import Cameras
+from nerfro.core.cameras import Cameras
 from nerfro.data.base import Views
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.silhouettes.silhouettes import mesh_silhouettes

@@ -1,13 +1,13 @@
-"""Classes and functions of the plugin `plugins/paper/`, which have no importable name before `discover`."""
+"""Classes and functions of the plugin `nerfro/paper/`, which have no importable name before `discover`."""
 
 from importlib import import_module
 
-from nerfro.registry import discover
+from nerfro.registry.registration import discover
 from nerfro.rendering import Components
 from tests.closed_forms import Luneburg
 
 discover()
-paper = import_module("nerfro_plugins.paper")
+paper = import_module("nerfro.paper")
 eikonal, integrators, mlp = paper.eikonal, paper.integrators, paper.mlp
 
 Eikonal, march_adaptive, march_uniform = eikonal.Eikonal, eikonal.march_adaptive, eikonal.march_uniform

@@ -13,7 +13,7 @@ import torch
 from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_map
 
-from nerfro.paths import PACKAGE_DIR, PLUGINS_DIR
+from nerfro.core.paths import PACKAGE_DIR, PLUGINS_DIR
 
 GPU = torch.device("cuda", 0)
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from nerfro.light import to_linear, to_srgb
+from nerfro.core.light import to_linear, to_srgb
 from tests.poses.camera_calibration import Sheet
 
 _SAMPLES = 3  # per pixel and side

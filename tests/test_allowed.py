@@ -5,8 +5,8 @@ from typing import Annotated, Literal
 
 import pytest
 
-from nerfro.allowed import AnyNumber, Count, Positive, Range, checked, corners_of_box
-from nerfro.registry import create, discover, find
+from nerfro.registry.allowed import AnyNumber, Count, Positive, Range, checked, corners_of_box
+from nerfro.registry.registration import create, discover, find
 from tests.conftest import refused
 
 

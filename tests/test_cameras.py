@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from nerfro.cameras import Cameras, Window, central_window
+from nerfro.core.cameras import Cameras, Window, central_window
 from nerfro.testing import example_draws
 from tests.cameras_at import cameras_at, random_poses
 

@@ -17,16 +17,16 @@ import torch
 from benchmarks.capture import measure
 from nerfro.data.blender import OpenCVData
 from nerfro.geometry.mesh import load_mesh
-from nerfro.registry import discover
-from nerfro.synthetic import synthesize
+from nerfro.registry.registration import discover
+from nerfro.synthetic.options import synthesize
 from tests.conftest import Runner
 from tests.exact_silhouettes import overlaps_of_convex_body
 from tests.test_synthesize import configured
 
 discover()
-path_tracer = import_module("nerfro_plugins.synthetic_scenes.path_tracer")
-photographs = import_module("nerfro_plugins.synthetic_scenes.scenes.photographs")
-dolphin_capture = import_module("nerfro_plugins.synthetic_scenes.scenes.dolphin_capture")
+path_tracer = import_module("nerfro.synthetic.path_tracer")
+photographs = import_module("nerfro.synthetic.scenes.photographs")
+dolphin_capture = import_module("nerfro.synthetic.scenes.dolphin_capture")
 
 
 def photograph(folder: Path, **options: object) -> Path:

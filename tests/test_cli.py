@@ -13,21 +13,21 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import OverrideParseException
 from omegaconf import OmegaConf
 
-from nerfro.cli import _flags_first
-from nerfro.composition import RenamingFiles
-from nerfro.errors import NerfroError, warn
-from nerfro.failures import errors_in_one_line, in_one_line
+from nerfro.cli.composition import RenamingFiles
+from nerfro.cli.entry import _flags_first
+from nerfro.cli.failures import errors_in_one_line, in_one_line
+from nerfro.cli.old_names import RENAMED, is_old_name, renamed_override
+from nerfro.core.errors import NerfroError, warn
+from nerfro.core.paths import CONF_DIR, resolve_path, user_path
+from nerfro.core.trust import GuardedConfigLoader
 from nerfro.files.foreign_config import foreign_config
-from nerfro.old_names import RENAMED, is_old_name, renamed_override
-from nerfro.paths import CONF_DIR, resolve_path, user_path
-from nerfro.registry import plugins
-from nerfro.trust import GuardedConfigLoader
+from nerfro.registry.registration import plugins
 from tests.conftest import composed, refused
 
 
 @pytest.mark.parametrize("num_lines", [1, 10_000])  # less and more than a pipe's buffer
 def test_closed_output_pipe_is_no_error(num_lines: int) -> None:
-    program = f"import nerfro.failures\nwith nerfro.failures.errors_in_one_line():\n    print('line\\n' * {num_lines})"
+    program = f"import nerfro.cli.failures\nwith nerfro.cli.failures.errors_in_one_line():\n    print('line\\n' * {num_lines})"
     reader, writer = os.pipe()
     os.close(reader)
     done = subprocess.run(
@@ -152,7 +152,7 @@ OLD_NAMES = {
 def test_old_names_in_overrides_are_replaced_with_a_warning(
     old: str, new: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("nerfro.old_names.RENAMED", OLD_NAMES)
+    monkeypatch.setattr("nerfro.cli.old_names.RENAMED", OLD_NAMES)
     assert is_old_name(old) == (old != new)
     assert renamed_override(old) == new
     printed = capsys.readouterr().out
@@ -163,7 +163,7 @@ def test_old_names_in_overrides_are_replaced_with_a_warning(
 def test_old_names_in_files_and_old_runs_are_replaced_with_a_warning(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("nerfro.old_names.RENAMED", OLD_NAMES)
+    monkeypatch.setattr("nerfro.cli.old_names.RENAMED", OLD_NAMES)
     (tmp_path / "experiment").mkdir()
     (tmp_path / "experiment" / "mine.yaml").write_text(
         "# @package _global_\ndefaults:\n  - mirror\n  - /loss@loss.near: near\n  - _self_\nbatches: {hidden: 7}\n"

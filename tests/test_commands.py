@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 
 import nerfro.demo
-from nerfro.completion import completions
-from nerfro.options import Described, recall, remember
-from nerfro.paths import PACKAGE_DIR
+from nerfro.cli.completion import completions
+from nerfro.cli.options import Described, recall, remember
+from nerfro.core.paths import PACKAGE_DIR
 from nerfro.viewing.server import open_page
 from tests.conftest import Runner, refused
 from tests.processes import python
@@ -51,7 +51,7 @@ def test_help_version_and_mistakes_do_not_wait_for_torch(arguments: list[str], p
     remember("train", DESCRIBED)
     done = start("train", *arguments)
     imports = [line.split("|")[-1].strip() for line in done.stderr.splitlines() if line.startswith("import time")]
-    assert "nerfro.startup" in imports
+    assert "nerfro.cli.startup" in imports
     assert not {"torch", "lightning"} & set(imports)
     others = [line for line in done.stderr.splitlines(keepends=True) if not line.startswith("import time")]
     assert "".join([done.stdout, *others]) == printed
@@ -86,7 +86,9 @@ def test_missing_option_is_reported_with_an_example(run_here: Runner, unchecked:
 
 
 def test_ctrl_c_during_the_imports_ends_in_one_line() -> None:
-    program = "import sys, nerfro.startup\nsys.argv = ['x']\nnerfro.startup.begin('plugins')\nraise KeyboardInterrupt"
+    program = (
+        "import sys, nerfro.cli.startup\nsys.argv = ['x']\nnerfro.startup.begin('plugins')\nraise KeyboardInterrupt"
+    )
     done = python("-c", program)
     assert done.stderr == "nerfro: interrupted\n"
     assert done.returncode not in (0, 1)

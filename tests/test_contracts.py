@@ -2,7 +2,7 @@
 
 import pytest
 
-from nerfro.registry import Plugin, discover, plugins
+from nerfro.registry.registration import Plugin, discover, plugins
 from nerfro.testing import check
 
 discover()

@@ -18,12 +18,12 @@ import torch
 from lightning.pytorch import LightningModule, Trainer
 from omegaconf import OmegaConf
 
+from nerfro.core.types import Batch
 from nerfro.training.build import build
 from nerfro.training.callbacks import Checkpoints, SharedTimer, StopOnSignal, Throughput
 from nerfro.training.config import TrainConfig
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
 from nerfro.training.trainer import make_trainer
-from nerfro.types import Batch
 from tests.conftest import Runner, weights_of
 from tests.processes import OFFLINE
 
@@ -51,7 +51,7 @@ import time
 import torch
 import torch.distributed as dist
 from nerfro.losses.base import Loss
-from nerfro.registry import register
+from nerfro.registry.registration import register
 
 @register("loss", "watching")
 class Watching(Loss):

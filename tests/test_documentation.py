@@ -15,9 +15,9 @@ from omegaconf import OmegaConf
 import nerfro
 import nerfro.media.material
 from nerfro.__main__ import commands
+from nerfro.core.paths import PACKAGE_DIR
 from nerfro.media.material import MATERIALS
-from nerfro.paths import PACKAGE_DIR
-from nerfro.registry import discover, find
+from nerfro.registry.registration import discover, find
 from nerfro.testing import check
 from nerfro.viewing import PLUGIN_EXPORTS
 from nerfro.viewing.exports import ExportConfig, find_export

@@ -17,15 +17,15 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
-from nerfro.allowed import check_names, check_settings
-from nerfro.cli import _added, _quoted
-from nerfro.errors import NerfroError
-from nerfro.old_names import full_key, renamed_override
-from nerfro.options import Described, describe_command, usage
-from nerfro.overrides import is_scene_file
-from nerfro.paths import CONF_DIR, PACKAGE_DIR
-from nerfro.registry import KINDS, discover, plugins
-from nerfro.synthetic import SCENES
+from nerfro.cli.entry import _added, _quoted
+from nerfro.cli.old_names import full_key, renamed_override
+from nerfro.cli.options import Described, describe_command, usage
+from nerfro.cli.overrides import is_scene_file
+from nerfro.core.errors import NerfroError
+from nerfro.core.paths import CONF_DIR, PACKAGE_DIR
+from nerfro.registry.allowed import check_names, check_settings
+from nerfro.registry.registration import KINDS, discover, plugins
+from nerfro.synthetic.options import SCENES
 from nerfro.training.effects import settings_without_effect
 from nerfro.viewing import PLUGIN_EXPORTS
 from nerfro.viewing.exports import find_export

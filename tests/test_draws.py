@@ -7,9 +7,9 @@ import pytest
 import torch
 from scipy import stats
 
-from nerfro.draws import Draws
+from nerfro.core.draws import Draws
+from nerfro.core.philox import philox4x32
 from nerfro.kernels.philox import _philox4x32, fill_uniform
-from nerfro.philox import philox4x32
 
 # Counter, key and words of philox4x32-10 in Random123's known answers (kat_vectors).
 KNOWN = [

@@ -12,13 +12,14 @@ from omegaconf import OmegaConf
 from torch import Tensor
 
 from nerfro.boundaries.constant import ConstantBoundary
+from nerfro.core.types import FieldValues, Samples
 from nerfro.data.base import Views
 from nerfro.fields.base import Field
 from nerfro.files import lat_long
 from nerfro.files.images import save_png
 from nerfro.media.base import Medium
 from nerfro.media.shapes import Ball
-from nerfro.registry import discover, find
+from nerfro.registry.registration import discover, find
 from nerfro.rendering import Components, Renderer
 from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import example_rays
@@ -26,7 +27,6 @@ from nerfro.training.config import build_model
 from nerfro.training.module import TrainingModule
 from nerfro.training.optimizer import OptimizerConfig
 from nerfro.training.run_folder import load_checkpoint, restore
-from nerfro.types import FieldValues, Samples
 from tests.ball_photographs import save
 from tests.conftest import QUIET, Runner, refused
 from tests.exact_silhouettes import cameras_around

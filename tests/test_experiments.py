@@ -8,8 +8,8 @@ import jaxtyping
 import pytest
 from omegaconf import DictConfig, OmegaConf
 
-from nerfro.paths import CONF_DIR
-from nerfro.registry import build, discover
+from nerfro.core.paths import CONF_DIR
+from nerfro.registry.registration import build, discover
 from nerfro.training.config import build_model
 from nerfro.training.module import TrainingModule
 from tests.conftest import QUIET, Runner, composed, write_tiny_scene

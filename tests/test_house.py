@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from nerfro.paths import PACKAGE_DIR, PLUGINS_DIR
+from nerfro.core.paths import PACKAGE_DIR, PLUGINS_DIR
 from tests.size import count_by_component, count_code_lines
 
 # From above to below: a package imports what follows it, and itself.

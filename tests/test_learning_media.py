@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from nerfro.registry import discover, find
+from nerfro.registry.registration import discover, find
 from tests.ball_photographs import TRAINING, photographs, save
 from tests.closed_forms import make_rays
 from tests.conftest import Runner, weights_of

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from nerfro.cameras import Cameras
-from nerfro.lens import coefficients, distort, opencv_coefficients, undistort
+from nerfro.core.cameras import Cameras
+from nerfro.core.lens import coefficients, distort, opencv_coefficients, undistort
 from tests.cameras_at import cameras_at, random_poses
 
 LENSES = {

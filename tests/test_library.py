@@ -11,7 +11,7 @@ import trimesh
 from PIL import Image
 
 import nerfro
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
 from nerfro.files.images import load_png
 from tests.closed_forms import ball_exits, beam
 from tests.conftest import UTM, Runner, moved_mesh, refused

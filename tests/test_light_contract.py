@@ -10,13 +10,14 @@ import torch
 from torch import Tensor
 
 from nerfro.boundaries.envmap import EnvironmentMap
+from nerfro.core.light import to_linear, to_srgb
+from nerfro.core.types import Exits, FieldValues, Path
 from nerfro.files import lat_long
-from nerfro.light import to_linear, to_srgb
 from nerfro.losses.base import Loss
 from nerfro.losses.boundary import BoundaryRegularizer
 from nerfro.losses.photometric import Photometric
 from nerfro.models.refractive import RefractiveModel
-from nerfro.registry import find
+from nerfro.registry.registration import find
 from nerfro.rendering import composite
 from nerfro.samplers.paths.straight import straight_path
 from nerfro.samplers.points.density_grid import DensityGridSampler
@@ -24,7 +25,6 @@ from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import NUM_RAYS, example_batch, example_components, example_draws, example_path, example_rays
 from nerfro.training.module import TrainingModule
 from nerfro.training.optimizer import GroupConfig, OptimizerConfig
-from nerfro.types import Exits, FieldValues, Path
 from tests.paper import Hierarchical
 
 

@@ -14,13 +14,13 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from nerfro.cameras import Cameras
+from nerfro.core.cameras import Cameras
+from nerfro.core.types import Batch, Rays, Rendering
 from nerfro.losses.base import Loss
 from nerfro.models.refractive import RefractiveModel
-from nerfro.registry import create, discover, find
+from nerfro.registry.registration import create, discover, find
 from nerfro.rendering import Components
 from nerfro.testing import example_batch
-from nerfro.types import Batch, Rays, Rendering
 from tests.paper import Eikonal, Hierarchical, NerfField, Skybox, VoxelGrid
 
 discover()

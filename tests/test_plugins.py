@@ -19,6 +19,7 @@ from PIL import Image
 from torch import nn
 
 from nerfro import camera, types
+from nerfro.core.paths import PLUGINS_DIR
 from nerfro.data.base import DataSource, Views
 from nerfro.data.blender import BlenderData
 from nerfro.losses import boundary
@@ -26,8 +27,7 @@ from nerfro.losses.base import Loss
 from nerfro.media.base import Medium
 from nerfro.media.shapes import Ball
 from nerfro.media.surface import Surface
-from nerfro.paths import PLUGINS_DIR
-from nerfro.registry import KINDS, discover, find, plugins, register
+from nerfro.registry.registration import KINDS, discover, find, plugins, register
 from nerfro.samplers.base import PathSampler, PointSampler
 from nerfro.samplers.paths.snell import Snell
 from nerfro.testing import (
@@ -58,7 +58,7 @@ BOUNDARY = '''
 """A boundary."""
 import torch
 from nerfro.boundaries.base import Boundary
-from nerfro.registry import register
+from nerfro.registry.registration import register
 
 
 @register("boundary", "{name}")
@@ -105,7 +105,7 @@ def test_failing_plugin_is_named_with_the_cause(
 
 METRIC = """
 from nerfro.evaluation.image_metrics import ImageMetric
-from nerfro.registry import register
+from nerfro.registry.registration import register
 
 @register("metric", "worst")
 class Worst(ImageMetric):
@@ -286,7 +286,7 @@ def test_old_names_work_with_a_warning() -> None:
         samples = replace(samples, measure=samples.edges)
     with pytest.warns(UserWarning, match="Samples.measure is called contracted_edges"):
         assert samples.measure is samples.contracted_edges is samples.edges
-    with pytest.warns(UserWarning, match="types.Radiance is called nerfro.types.FieldValues"):
+    with pytest.warns(UserWarning, match="types.Radiance is called nerfro.core.types.FieldValues"):
         radiance_class = types.Radiance
     with pytest.warns(UserWarning, match="FieldValues.rgb is called radiance"):
         values = radiance_class(samples.s, rgb=samples.positions)
@@ -540,7 +540,7 @@ packages = ["nerfro_grey"]
 USE_IT = """
 import sys
 import nerfro.plugins, nerfro.train
-from nerfro.registry import find
+from nerfro.registry.registration import find
 from nerfro.testing import check
 sys.argv = ["nerfro.plugins", "boundary=installed_grey"]
 nerfro.plugins.main()

@@ -21,13 +21,13 @@ from PIL import ExifTags, Image
 import nerfro.reconstruct
 import nerfro.train
 from nerfro.capture import refinement
+from nerfro.cli.overrides import print_next, without_hints
+from nerfro.core.errors import NerfroError
 from nerfro.data import image_files
 from nerfro.data.masks import find_mask
-from nerfro.errors import NerfroError
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.files.images import save_png
 from nerfro.files.reading import open_image
-from nerfro.overrides import print_next, without_hints
 from nerfro.pipeline import stage
 from nerfro.pipeline.hypotheses import Hypothesis
 from nerfro.pipeline.stage import terminated_in_one_line

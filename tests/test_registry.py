@@ -7,10 +7,10 @@ import pytest
 from omegaconf import OmegaConf
 from torch import nn
 
-import nerfro.registry
+import nerfro.registry.registration
 import nerfro.training.lightning_callbacks
-from nerfro.errors import NerfroError
-from nerfro.registry import build, configure, discover, find, plugin_module, register
+from nerfro.core.errors import NerfroError
+from nerfro.registry.registration import build, configure, discover, find, plugin_module, register
 from nerfro.training.config import build_each
 from tests.conftest import Runner, refused
 
@@ -20,7 +20,7 @@ discover()
 @pytest.fixture(autouse=True)
 def _registry_as_before(monkeypatch: pytest.MonkeyPatch) -> None:
     """Registrations of a test end with it."""
-    monkeypatch.setattr(nerfro.registry, "_plugins", dict(nerfro.registry._plugins))
+    monkeypatch.setattr(nerfro.registry.registration, "_plugins", dict(nerfro.registry.registration._plugins))
 
 
 # What a constructor becomes.
@@ -89,7 +89,7 @@ def test_missing_required_field_is_named() -> None:
     refused(r"data=opencv needs root; add data\.root=\.\.\.", configure, find("data", "opencv"), {})
 
 
-@pytest.mark.parametrize("target", ["os.system", "nerfro_plugins.paper.eikonal.march_uniform", None])
+@pytest.mark.parametrize("target", ["os.system", "nerfro.paper.eikonal.march_uniform", None])
 def test_target_that_is_not_registered_is_not_built(target: str | None, tmp_path: Path) -> None:
     node = {"_target_": target, "command": f"touch {tmp_path / 'ran'}"}
     refused(f"'{target}' is not registered; .*nerfro.plugins", build, node)

@@ -14,7 +14,7 @@ from PIL import Image
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.results import RunMetrics, write_metrics_json
 from nerfro.files.images import load_png, save_png
-from nerfro.registry import discover
+from nerfro.registry.registration import discover
 from nerfro.report.comparison import compare, find_metrics, to_table
 from nerfro.report.page import report_page
 from nerfro.report.runs import find_runs

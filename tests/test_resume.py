@@ -15,10 +15,10 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from nerfro.errors import NerfroError
+from nerfro.cli.old_names import renamed_config
+from nerfro.core.errors import NerfroError
 from nerfro.evaluation import scoring
 from nerfro.files.images import save_png
-from nerfro.old_names import renamed_config
 from nerfro.training.run_folder import (
     LAST_CHECKPOINT,
     find_checkpoint,

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from nerfro.cameras import Cameras
+from nerfro.core.cameras import Cameras
+from nerfro.core.subdivision import Subdivision, contrast, divergence, neighbour_rays, part_rays, pixel_rays
+from nerfro.core.types import Batch
 from nerfro.data.base import Views
 from nerfro.evaluation.render_view import render_view
 from nerfro.media.analytic import Vacuum
@@ -15,10 +17,8 @@ from nerfro.media.shapes import Ball
 from nerfro.models.refractive import RefractiveModel
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.paths.straight import Straight
-from nerfro.subdivision import Subdivision, contrast, divergence, neighbour_rays, part_rays, pixel_rays
 from nerfro.testing import example_batch, example_components
 from nerfro.training.ray_batches import RayBatches
-from nerfro.types import Batch
 from tests.cameras_at import cameras_at, random_poses
 from tests.closed_forms import RoundedBox
 from tests.paper import Hierarchical, NerfField

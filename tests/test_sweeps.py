@@ -14,8 +14,8 @@ import pytest
 from hydra.core.plugins import Plugins
 from omegaconf import OmegaConf
 
-from nerfro.allowed import check_settings
-from nerfro.paths import CONF_DIR, scene_name
+from nerfro.core.paths import CONF_DIR, scene_name
+from nerfro.registry.allowed import check_settings
 from nerfro.training.config import TrainConfig
 from nerfro.training.sweeps import identity_of
 from tests.conftest import Runner, composed

@@ -10,13 +10,13 @@ from PIL import Image
 from torch.nn.functional import max_pool2d
 
 from nerfro.boundaries.envmap import EnvironmentMap
+from nerfro.core.light import to_srgb
+from nerfro.core.paths import ASSETS_DIR, CONF_DIR
+from nerfro.core.types import Exits
 from nerfro.data.blender import BlenderData
 from nerfro.geometry.mesh import load_mesh
-from nerfro.light import to_srgb
-from nerfro.paths import ASSETS_DIR, CONF_DIR
-from nerfro.registry import plugin_module
-from nerfro.synthetic import SynthesizeConfig, synthesize
-from nerfro.types import Exits
+from nerfro.registry.registration import plugin_module
+from nerfro.synthetic.options import SynthesizeConfig, synthesize
 from tests.conftest import refused
 from tests.exact_silhouettes import overlaps_of_convex_body
 

@@ -8,11 +8,11 @@ import pytest
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
 
-from nerfro.errors import NerfroError
-from nerfro.paths import CONF_DIR
-from nerfro.registry import discover
+from nerfro.core.errors import NerfroError
+from nerfro.core.paths import CONF_DIR
+from nerfro.core.trust import GuardedConfigLoader, command_of_module
+from nerfro.registry.registration import discover
 from nerfro.training.config import TrainConfig
-from nerfro.trust import GuardedConfigLoader, command_of_module
 from tests.conftest import Bomb
 from tests.processes import python
 

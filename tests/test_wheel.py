@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from nerfro.paths import PACKAGE_DIR
+from nerfro.core.paths import PACKAGE_DIR
 from tests.processes import printed_by
 
 PROJECT = PACKAGE_DIR.parent

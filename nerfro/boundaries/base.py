@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from nerfro.types import Exits
+from nerfro.core.types import Exits
 
 
 class Boundary(nn.Module, ABC):

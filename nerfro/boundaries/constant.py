@@ -6,11 +6,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.allowed import NotNegative
 from nerfro.boundaries.base import Boundary
-from nerfro.errors import NerfroError
-from nerfro.registry import register
-from nerfro.types import Exits
+from nerfro.core.errors import NerfroError
+from nerfro.core.types import Exits
+from nerfro.registry.allowed import NotNegative
+from nerfro.registry.registration import register
 
 
 @register("boundary", "constant")

@@ -13,13 +13,13 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from nerfro.allowed import Count
 from nerfro.boundaries import cube_map
 from nerfro.boundaries.base import Boundary
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
+from nerfro.core.types import Exits
 from nerfro.files import lat_long
-from nerfro.registry import register
-from nerfro.types import Exits
+from nerfro.registry.allowed import Count
+from nerfro.registry.registration import register
 
 # Softplus of 0 is log 2.
 _GREY = 0.5 / math.log(2)

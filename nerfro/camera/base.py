@@ -8,9 +8,9 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from nerfro.camera.exposure import Exposure
-from nerfro.cameras import Cameras
-from nerfro.errors import renamed_classes
-from nerfro.rays import Rays
+from nerfro.core.cameras import Cameras
+from nerfro.core.errors import renamed_classes
+from nerfro.core.rays import Rays
 
 
 class CameraModel(nn.Module, ABC):

@@ -6,8 +6,8 @@ from jaxtyping import Int
 from torch import Tensor
 
 from nerfro.camera.base import CameraModel
-from nerfro.rays import Rays
-from nerfro.registry import register
+from nerfro.core.rays import Rays
+from nerfro.registry.registration import register
 
 
 @register("camera", "given")

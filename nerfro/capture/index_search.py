@@ -30,13 +30,13 @@ from nerfro.capture.grid_search import (
 )
 from nerfro.capture.preprocess_options import INDEX, Request, build_medium, index_settings
 from nerfro.capture.surroundings import Observations, Pixels, Room, Surroundings, robust_scale
-from nerfro.errors import NerfroError, warn
+from nerfro.core.errors import NerfroError, warn
+from nerfro.core.progress import fraction_bar
+from nerfro.core.robust import geman_mcclure, geman_mcclure_weight
 from nerfro.files.atomic import write_atomically
 from nerfro.media.base import Medium
 from nerfro.media.solid import Solid, body_names
-from nerfro.progress import fraction_bar
 from nerfro.rendering.scene_file import Provenance
-from nerfro.robust import geman_mcclure, geman_mcclure_weight
 from nerfro.samplers.paths.snell import Snell
 
 LOWEST, HIGHEST = 1.0, 2.5  # range of the search

@@ -10,9 +10,9 @@ from jaxtyping import Float
 
 from nerfro.capture.grid_search import bootstrap_weights, mean_errors, standard_error
 from nerfro.capture.surroundings import Observations, robust_scale
+from nerfro.core.robust import geman_mcclure
 from nerfro.media.base import Medium
 from nerfro.media.solid import Solid
-from nerfro.robust import geman_mcclure
 from nerfro.samplers.paths.snell import Snell
 
 # Indices of water and of soda-lime glass, for photographs that do not determine the index.

@@ -13,18 +13,18 @@ from hydra.core.hydra_config import HydraConfig
 from jaxtyping import Float
 from omegaconf import MISSING, DictConfig, OmegaConf
 
-from nerfro.allowed import Count, Natural, NotNegative, Range, corners_of_box, refuse_unused
-from nerfro.cameras import Cameras
+from nerfro.cli.overrides import as_overrides, is_given, print_hint, print_next
+from nerfro.core.cameras import Cameras
+from nerfro.core.errors import NerfroError
+from nerfro.core.paths import EMBEDDED_PREFIX, resolve_path, user_path
 from nerfro.data.base import DataSource
 from nerfro.data.frames import require_root
-from nerfro.errors import NerfroError
 from nerfro.files.atomic import refuse_existing
 from nerfro.geometry.mesh import TriangleMesh, load_mesh, local_origin, num_decimals
 from nerfro.media.base import Medium
 from nerfro.media.bodies import ordered_settings
-from nerfro.overrides import as_overrides, is_given, print_hint, print_next
-from nerfro.paths import EMBEDDED_PREFIX, resolve_path, user_path
-from nerfro.registry import build
+from nerfro.registry.allowed import Count, Natural, NotNegative, Range, corners_of_box, refuse_unused
+from nerfro.registry.registration import build
 from nerfro.rendering.scene_file import SCENE, SceneFile, described, take_bodies
 from nerfro.silhouettes.overlaps import REPORT, SHEET
 from nerfro.silhouettes.revolution import Symmetry

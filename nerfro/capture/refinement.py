@@ -33,20 +33,20 @@ from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.capture.preprocess_options import FIGURES
 from nerfro.capture.room_panorama import RoomPanorama, panorama_of
 from nerfro.capture.surroundings import Observations, Pixels, Room, Surroundings
-from nerfro.errors import NerfroError, warn
+from nerfro.core.errors import NerfroError, warn
+from nerfro.core.progress import fraction_bar
+from nerfro.core.robust import geman_mcclure
+from nerfro.core.types import Exits, Path
 from nerfro.files.atomic import write_atomically
 from nerfro.geometry.interpolation import bspline_basis, smooth
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
-from nerfro.progress import fraction_bar
-from nerfro.robust import geman_mcclure
 from nerfro.samplers.paths.snell import Snell
 from nerfro.silhouettes.pose_conventions import overlap
 from nerfro.silhouettes.rims import RimFinder
 from nerfro.silhouettes.silhouettes import mesh_silhouettes
 from nerfro.silhouettes.visual_hull import Silhouettes
-from nerfro.types import Exits, Path
 
 _MAX_VALIDATION_PIXELS = 20_000
 # Scale of the Geman-McClure loss, linear radiance: residual at which the loss is 1/2 of its maximum and the weight 1/4.

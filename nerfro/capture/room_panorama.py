@@ -14,10 +14,10 @@ from nerfro.boundaries import cube_map
 from nerfro.boundaries.base import Boundary
 from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.capture.surroundings import Room
+from nerfro.core.rays import Rays
+from nerfro.core.types import Exits
 from nerfro.media.sdf_grid import SdfGrid
-from nerfro.rays import Rays
 from nerfro.samplers.paths.snell import Snell
-from nerfro.types import Exits
 
 _SIDE = 192  # texels per side of a cube face, half a degree each
 _CHUNK = 16384  # rays rendered at once

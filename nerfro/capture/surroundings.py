@@ -16,21 +16,21 @@ from torch.nn import functional
 from nerfro.boundaries.base import Boundary
 from nerfro.boundaries.cube_map import project
 from nerfro.boundaries.envmap import EnvironmentMap
-from nerfro.cameras import Cameras
+from nerfro.core.cameras import Cameras
+from nerfro.core.draws import Draws
+from nerfro.core.errors import NerfroError
+from nerfro.core.light import to_linear
+from nerfro.core.progress import fraction_bar
+from nerfro.core.rays import Rays
+from nerfro.core.subdivision import pixel_rays
+from nerfro.core.types import WORLD_ORIGIN, Exits
 from nerfro.data.base import Views
-from nerfro.draws import Draws
-from nerfro.errors import NerfroError
 from nerfro.fields.hash_grid import HashGridField
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.light import to_linear
-from nerfro.progress import fraction_bar
-from nerfro.rays import Rays
 from nerfro.rendering import composite
 from nerfro.samplers.paths.straight import straight_path
 from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.silhouettes.silhouettes import VALIDATION_EVERY, PixelBlocks, mesh_silhouettes
-from nerfro.subdivision import pixel_rays
-from nerfro.types import WORLD_ORIGIN, Exits
 
 # Photographs are downscaled to at most so many pixels per side, in linear radiance.
 _MAX_PIXELS = 200

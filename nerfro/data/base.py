@@ -14,11 +14,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerfro.cameras import Cameras
+from nerfro.core.cameras import Cameras
+from nerfro.core.errors import NerfroError, first_of, warn
+from nerfro.core.progress import track
+from nerfro.core.types import WORLD_ORIGIN
 from nerfro.data.lazy_images import LazyImages
-from nerfro.errors import NerfroError, first_of, warn
-from nerfro.progress import track
-from nerfro.types import WORLD_ORIGIN
 
 
 @dataclass(frozen=True)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from nerfro.allowed import Distance, Range
 from nerfro.data.frames import FrameSet, PosedImages
 from nerfro.data.transforms import find_splits, read_manifest
-from nerfro.registry import register
+from nerfro.registry.allowed import Distance, Range
+from nerfro.registry.registration import register
 
 
 @register("data", "blender")

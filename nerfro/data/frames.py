@@ -13,15 +13,15 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from nerfro.allowed import Coordinate, Distance, Factor, Range, check, checked
-from nerfro.cameras import Cameras, central_window
+from nerfro.core.cameras import Cameras, central_window
+from nerfro.core.errors import NerfroError, first_of
+from nerfro.core.paths import refuse_root, resolve_path
 from nerfro.data.base import DataSource, Frame, Views
 from nerfro.data.image_files import IMAGE_SUFFIXES, Alpha, read_rgb
 from nerfro.data.lazy_images import LazyImages
 from nerfro.data.lenses import Lens, check_lenses
 from nerfro.data.masks import find_mask, find_masks, find_usable, require_used, unused_masks
-from nerfro.errors import NerfroError, first_of
-from nerfro.paths import refuse_root, resolve_path
+from nerfro.registry.allowed import Coordinate, Distance, Factor, Range, check, checked
 
 Every = Annotated[int, Range(at_least=2)]  # every n-th view is a test view
 SPLITS = ["train", "val", "test"]

@@ -11,7 +11,7 @@ from jaxtyping import Float, UInt8, UInt16
 from PIL import Image
 from scipy.sparse import csr_array
 
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
 from nerfro.files.deep_images import read_16bit
 from nerfro.files.reading import open_image
 

@@ -15,9 +15,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.cameras import Window
+from nerfro.core.cameras import Window
+from nerfro.core.errors import NerfroError
 from nerfro.data.image_files import Levels, area_mean, downscaled, read_size, to_levels, to_unit
-from nerfro.errors import NerfroError
 
 # Maximum number of files decoded at the same time, which bounds the memory for decoding.
 _MAX_THREADS = 8

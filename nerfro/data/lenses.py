@@ -13,10 +13,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.allowed import Range, check
-from nerfro.errors import NerfroError, first_of, warn
+from nerfro.core.errors import NerfroError, first_of, warn
+from nerfro.core.lens import coefficients, distort, opencv_coefficients, undistort
 from nerfro.files.reading import is_number, parse_matrix
-from nerfro.lens import coefficients, distort, opencv_coefficients, undistort
+from nerfro.registry.allowed import Range, check
 
 # Perspective lenses in the files of nerfstudio, COLMAP and Blender. They differ in the coefficients that are zero.
 _PERSPECTIVE = ("OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE", "PERSP")
@@ -60,7 +60,7 @@ class Lens:
     Attributes:
         fx, fy: focal lengths in pixels.
         cx, cy: principal point in pixels; the corner of the image is at (0, 0).
-        distortion: nine coefficients (see `nerfro.lens.coefficients`), or None.
+        distortion: nine coefficients (see `nerfro.core.lens.coefficients`), or None.
     """
 
     fx: float

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from nerfro.core.errors import NerfroError, first_of, warn
 from nerfro.data.base import DataSource, Views
 from nerfro.data.image_files import IMAGE_SUFFIXES, Levels, read_levels, read_mask, read_size
 from nerfro.data.lazy_images import LazyImages
-from nerfro.errors import NerfroError, first_of, warn
 from nerfro.files.reading import open_image
 
 _SPLIT_FOLDERS = ("train", "val", "test")

@@ -9,14 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from nerfro.allowed import check
+from nerfro.core.errors import NerfroError, first_of, warn
 from nerfro.data.base import Frame
 from nerfro.data.frames import SPLITS, check_pose, require_root
 from nerfro.data.image_files import IMAGE_SUFFIXES, read_size
 from nerfro.data.lenses import Lens, read_lens
 from nerfro.data.masks import find_mask, mask_beside
-from nerfro.errors import NerfroError, first_of, warn
 from nerfro.files.reading import parse_matrix, read_json
+from nerfro.registry.allowed import check
 
 _PATHS = dict.fromkeys(("file_path", "mask_path", "mask_file_path", "object_mask_path"), str)
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from nerfro.core.errors import NerfroError
 from nerfro.data.base import DataSource, Views
-from nerfro.errors import NerfroError
 
 
 class WithValidationViews(DataSource):

@@ -6,9 +6,9 @@ import torch
 import torchmetrics
 from torch import Tensor
 
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
 from nerfro.evaluation.image_metrics import ImageMetric, build_metrics
-from nerfro.registry import discover, find
+from nerfro.registry.registration import discover, find
 
 
 def metrics(*names: str) -> torchmetrics.MetricCollection:

@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerfro.core.errors import NerfroError
 from nerfro.data.image_files import IMAGE_SUFFIXES, Alpha, read_rgb, to_unit
 from nerfro.data.masks import find_mask, find_masks, require_used
-from nerfro.errors import NerfroError
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,11 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
 from nerfro.evaluation.error_maps import SQUARED_ERROR_LIMIT, ErrorMap, squared_error_map
 from nerfro.evaluation.regions import mean_over, require_images
 from nerfro.evaluation.ssim import WINDOW, ssim, ssim_map
-from nerfro.registry import CHECKS, Plugin, create, discover, plugins, register
+from nerfro.registry.registration import CHECKS, Plugin, create, discover, plugins, register
 
 MAX_PSNR = 100.0  # dB; the infinite PSNR of equal images has no mean and no representation in JSON
 

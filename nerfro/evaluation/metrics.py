@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
 from nerfro.evaluation.image_metrics import ImageMetric, build_metrics
 from nerfro.evaluation.regions import crop_rectangle, object_pixels, require_images
 from nerfro.evaluation.results import FULL, OBJECT_REGIONS, EvaluationResult, Region, Score, ViewScores

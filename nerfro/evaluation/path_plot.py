@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from nerfro.core.types import Path
 from nerfro.files.atomic import atomic_file
 from nerfro.media.base import Medium
-from nerfro.types import Path
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -5,7 +5,7 @@ from __future__ import annotations
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
 
 COVERED = 0.5  # minimum coverage of a pixel of the object
 DILATION = 35  # pixels; the paper's authors dilate masks by a box of this side before the crop

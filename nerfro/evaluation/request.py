@@ -14,12 +14,12 @@ from typing import Annotated, Literal, Optional
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from nerfro.allowed import Natural, NumRays, refuse_unused
-from nerfro.errors import Interrupted, NerfroError, warn
+from nerfro.core.errors import Interrupted, NerfroError, warn
+from nerfro.core.paths import user_path
+from nerfro.core.subdivision import SubdivisionChanges
 from nerfro.files.atomic import refuse_existing, write_atomically
 from nerfro.files.folder_lock import lock_folder, require_only
-from nerfro.paths import user_path
-from nerfro.subdivision import SubdivisionChanges
+from nerfro.registry.allowed import Natural, NumRays, refuse_unused
 
 REQUEST_FILE = "evaluate.yaml"
 

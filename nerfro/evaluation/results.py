@@ -9,11 +9,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from nerfro.allowed import Range, check
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
 from nerfro.evaluation.image_metrics import image_metrics
 from nerfro.files.atomic import write_atomically
 from nerfro.files.reading import is_number, read_json
+from nerfro.registry.allowed import Range, check
 
 TOO_LARGE = 1e15  # for scores, steps and times; sums of larger numbers may overflow
 _Amount = Annotated[float, Range(at_least=0, less_than=TOO_LARGE)]

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from skimage.metrics import structural_similarity
 from torch import Tensor
 
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
 from nerfro.evaluation.regions import mean_over, require_images
 
 WINDOW = 11  # pixels; Gaussian of sigma 1.5, truncated at 3.5 sigma

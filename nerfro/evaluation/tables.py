@@ -16,7 +16,7 @@ import rich.console
 import rich.table
 import rich.text
 
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
 from nerfro.evaluation.image_metrics import image_metrics
 from nerfro.evaluation.results import (
     AS_GIVEN,

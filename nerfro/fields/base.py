@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from nerfro.cameras import Cameras
-from nerfro.types import FieldValues, Samples
+from nerfro.core.cameras import Cameras
+from nerfro.core.types import FieldValues, Samples
 
 
 class Field(nn.Module, ABC):

@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from nerfro.allowed import Depth, Positive, Range, Width, corners_of_box
-from nerfro.cameras import Cameras
+from nerfro.core.cameras import Cameras
+from nerfro.core.types import FieldValues, Samples
 from nerfro.fields import hash_encoding
 from nerfro.fields import spherical_harmonics as harmonics
 from nerfro.fields.base import Field
@@ -21,8 +21,8 @@ from nerfro.fields.observed_space import NUM_CELLS, observed_cells
 from nerfro.fields.selection import evaluate_selected, inside_box
 from nerfro.geometry.contraction import contract, contracted_box, contraction_scale
 from nerfro.kernels.available import fast_bfloat16
-from nerfro.registry import register
-from nerfro.types import FieldValues, Samples
+from nerfro.registry.allowed import Depth, Positive, Range, Width, corners_of_box
+from nerfro.registry.registration import register
 
 # Number of features that the density network passes to the colour network.
 _GEOMETRY_FEATURES = 16

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
 
 # Activation whose squared sigmoid is 1 / 240 in sRGB.
 _BLACK = -4.0

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerfro.cameras import Cameras
+from nerfro.core.cameras import Cameras
 from nerfro.geometry.contraction import contracted_box, expand
 
 # Cells along each side of the grid.

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerfro.types import FieldValues, Samples
+from nerfro.core.types import FieldValues, Samples
 
 Decoder = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 """Maps positions and unit directions [points, 3] to density [points] and radiance [points, 3]."""

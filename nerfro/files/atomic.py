@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO
 
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
 from nerfro.files.folder_lock import PARTIAL, hold, require_lock
 
 

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
+from nerfro.core.paths import cache_dir, user_path
 from nerfro.files.atomic import atomic_file
 from nerfro.files.reading import load_arrays
-from nerfro.paths import cache_dir, user_path
 
 # Maximum size of all entries in bytes; the least recently used entries are removed first.
 LIMIT = 32 * 2**30

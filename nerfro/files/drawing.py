@@ -12,7 +12,7 @@ from jaxtyping import Float
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
 from nerfro.files.images import to_8bit
 
 GAP = 6  # pixels between images

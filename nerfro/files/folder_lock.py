@@ -10,8 +10,8 @@ from typing import IO
 
 from filelock import FileLock, Timeout
 
-from nerfro.errors import NerfroError, first_of
-from nerfro.paths import refuse_root
+from nerfro.core.errors import NerfroError, first_of
+from nerfro.core.paths import refuse_root
 
 _LOCK, PARTIAL = ".lock", ".partial"  # lock file, and ending of files that are being written
 _locked: dict[Path, int] = {}  # folders that this process has locked, with the inode of each lock file

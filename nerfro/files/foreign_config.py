@@ -9,10 +9,10 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from nerfro.errors import NerfroError
+from nerfro.cli.old_names import renamed_config
+from nerfro.core.errors import NerfroError
+from nerfro.core.trust import require_bounded_yaml
 from nerfro.files.reading import read_text
-from nerfro.old_names import renamed_config
-from nerfro.trust import require_bounded_yaml
 
 
 def foreign_config(text: str, origin: Path) -> DictConfig:

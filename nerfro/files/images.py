@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 from torch import Tensor
 
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
 from nerfro.files.atomic import atomic_file
 from nerfro.files.reading import open_image
 

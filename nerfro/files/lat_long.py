@@ -14,11 +14,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
+from nerfro.core.light import to_linear, to_srgb
 from nerfro.files.deep_images import read_16bit, read_radiance, write_radiance
 from nerfro.files.images import save_png
 from nerfro.files.reading import open_image, reading
-from nerfro.light import to_linear, to_srgb
 
 _FORMATS = (".png", ".jpg", ".jpeg", ".hdr", ".exr")
 

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
+from nerfro.core.paths import cache_dir
 from nerfro.files.atomic import atomic_file
 from nerfro.files.cache import make_room
-from nerfro.paths import cache_dir
 
 _CHECKSUM_BYTES = 4  # after the array
 _BLOCK = 2**26  # bytes per step of the checksum

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Float
 from PIL import ExifTags, Image, TiffImagePlugin, UnidentifiedImageError
 
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
 
 # Pixels of the largest image, 134 million; bytes of the largest JSON document, and of all arrays of a file in memory.
 MAX_PIXELS, MAX_JSON_BYTES, MAX_ARRAY_BYTES = 2**27, 2**27, 2**31

@@ -8,9 +8,9 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
+from nerfro.core.rays import Rays
 from nerfro.kernels.constants import constant
-from nerfro.rays import Rays
 
 
 def trilinear(

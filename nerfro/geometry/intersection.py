@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.geometry.normals import corner_normals
 from nerfro.geometry.orientation import patches

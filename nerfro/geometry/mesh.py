@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from nerfro.allowed import Coordinate, check
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
 from nerfro.files.atomic import write_atomically
 from nerfro.files.reading import reading
 from nerfro.geometry.file_normals import informative_normals
 from nerfro.geometry.orientation import area_vectors, inward_faces
+from nerfro.registry.allowed import Coordinate, check
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from numba import prange
 
+from nerfro.core.progress import track
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.kernels.compilation import compiled, compiled_parallel
-from nerfro.progress import track
 
 PLANES = 16  # planes of a grid per update of the progress bar
 

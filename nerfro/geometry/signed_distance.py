@@ -9,11 +9,11 @@ from jaxtyping import Bool, Float
 from numba import prange
 from scipy.ndimage import distance_transform_edt
 
+from nerfro.core.progress import track
 from nerfro.geometry.mesh import TriangleMesh, require_inside
 from nerfro.geometry.normals import corner_normals
 from nerfro.geometry.occupancy import PLANES, occupancy_fraction, triangles_by_plane
 from nerfro.kernels.compilation import compiled, compiled_parallel
-from nerfro.progress import track
 
 _MIN_DEPTH = 0.01  # of a vertex inside the mesh, voxels
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
 
 
 def require_bytes(num_bytes: float, purpose: str) -> None:

@@ -18,9 +18,9 @@ from typing import Any, TypeVar, cast
 
 import numba
 
-from nerfro.errors import warn
+from nerfro.core.errors import warn
+from nerfro.core.paths import cache_dir
 from nerfro.kernels.threads import num_threads, parallel_threads
-from nerfro.paths import cache_dir
 
 _KERNEL_BYTES = 2**24  # free disk space for the machine code of a kernel
 Function = TypeVar("Function", bound=Callable)

@@ -1,11 +1,11 @@
-"""The random number generator of `nerfro.draws` for kernels."""
+"""The random number generator of `nerfro.core.draws` for kernels."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from nerfro.core.philox import philox4x32
 from nerfro.kernels.compilation import compiled
-from nerfro.philox import philox4x32
 
 _philox4x32 = compiled(philox4x32)
 

@@ -8,11 +8,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
+from nerfro.core.types import Batch, Rendering
 from nerfro.losses.base import Loss
-from nerfro.registry import register
+from nerfro.registry.registration import register
 from nerfro.rendering import Scene
-from nerfro.types import Batch, Rendering
 
 # Tolerance of one level of 255, plus rounding errors.
 _NEAR = 1.5 / 255

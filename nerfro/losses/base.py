@@ -8,9 +8,9 @@ from typing import ClassVar
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from nerfro.allowed import Natural, NotNegative
+from nerfro.core.types import Batch, Rendering
+from nerfro.registry.allowed import Natural, NotNegative
 from nerfro.rendering import Scene
-from nerfro.types import Batch, Rendering
 
 
 class Loss(nn.Module, ABC):

@@ -5,12 +5,12 @@ from __future__ import annotations
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.distributed import rank_and_size, sum_over_processes
-from nerfro.errors import renamed_classes
+from nerfro.core.distributed import rank_and_size, sum_over_processes
+from nerfro.core.errors import renamed_classes
+from nerfro.core.types import Batch, Rendering
 from nerfro.losses.base import Loss
-from nerfro.registry import register
+from nerfro.registry.registration import register
 from nerfro.rendering import Scene
-from nerfro.types import Batch, Rendering
 
 # Pixels count if their final transmittance is above this value, as in the paper.
 _MIN_TRANSMITTANCE = 0.5

@@ -8,11 +8,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.allowed import corners_of_box
+from nerfro.core.types import Batch, Rendering
 from nerfro.losses.base import Loss
-from nerfro.registry import register
+from nerfro.registry.allowed import corners_of_box
+from nerfro.registry.registration import register
 from nerfro.rendering import Scene
-from nerfro.types import Batch, Rendering
 
 
 @register("loss", "near_camera")

@@ -6,11 +6,11 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import mse_loss
 
-from nerfro.allowed import NotNegative
+from nerfro.core.types import Batch, Rendering
 from nerfro.losses.base import Loss
-from nerfro.registry import register
+from nerfro.registry.allowed import NotNegative
+from nerfro.registry.registration import register
 from nerfro.rendering import Scene
-from nerfro.types import Batch, Rendering
 
 
 @register("loss", "photometric")

@@ -9,11 +9,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.allowed import Range
+from nerfro.core.types import Batch, Exits, Rendering
 from nerfro.losses.base import Loss
-from nerfro.registry import register
+from nerfro.registry.allowed import Range
+from nerfro.registry.registration import register
 from nerfro.rendering import Scene
-from nerfro.types import Batch, Exits, Rendering
 
 # Random pairs of directions for each step.
 _NUM_PAIRS = 1024

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from nerfro.media.base import Medium, Scalars, Vectors
-from nerfro.registry import register
+from nerfro.registry.registration import register
 
 
 @register("medium", "vacuum")

@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from nerfro.errors import NerfroError
-from nerfro.types import WORLD_ORIGIN, Path
+from nerfro.core.errors import NerfroError
+from nerfro.core.types import WORLD_ORIGIN, Path
 
 Scalars = Float[Tensor, "*batch"]
 Vectors = Float[Tensor, "*batch 3"]

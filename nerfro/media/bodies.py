@@ -13,12 +13,12 @@ from jaxtyping import Float
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from nerfro.allowed import NotNegative, Positive, check
-from nerfro.errors import NerfroError, nearest_of
+from nerfro.core.errors import NerfroError, nearest_of
+from nerfro.core.paths import resolve_path
 from nerfro.geometry.mesh import local_origin, origin_of_file
 from nerfro.media.material import Abbe, Material, find_material
 from nerfro.media.surface import make_surface
-from nerfro.paths import resolve_path
+from nerfro.registry.allowed import NotNegative, Positive, check
 
 _LEARNED = ("ior", "absorption")
 

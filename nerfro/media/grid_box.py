@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from nerfro.allowed import corners_of_box
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
 from nerfro.geometry.mesh import num_decimals
+from nerfro.registry.allowed import corners_of_box
 
 _AIR = 4  # voxels around the object if its box is not given
 BYTES_PER_VERTEX = 64  # peak memory while a grid is built

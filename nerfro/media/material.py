@@ -16,8 +16,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from nerfro.allowed import OnlyWith
-from nerfro.errors import NerfroError, nearest_of
+from nerfro.core.errors import NerfroError, nearest_of
+from nerfro.registry.allowed import OnlyWith
 
 # Whether training learns a quantity of the medium, which only some path samplers trace.
 Learns = Annotated[bool, OnlyWith("sampler.path", attribute="needs_medium")]

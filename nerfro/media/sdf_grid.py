@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.allowed import NotNegative, Positive, Resolution
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
+from nerfro.core.variants import variant
 from nerfro.geometry.intersection import LayeredIntersector, Triangles
 from nerfro.geometry.mesh import TriangleMesh, local_origin
 from nerfro.kernels.available import require_bytes
@@ -23,8 +23,8 @@ from nerfro.media.grid_box import BYTES_PER_VERTEX, grid_box
 from nerfro.media.material import Learns, learned_quantities, materials_of
 from nerfro.media.solid import Solid, body_names
 from nerfro.media.surface import Grid, make_surface
-from nerfro.registry import register
-from nerfro.variants import variant
+from nerfro.registry.allowed import NotNegative, Positive, Resolution
+from nerfro.registry.registration import register
 
 if TYPE_CHECKING:
     from nerfro.kernels.lookup import Solids

@@ -9,11 +9,11 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from nerfro.allowed import NotNegative, Positive
 from nerfro.media.base import Vectors
 from nerfro.media.material import Learns
 from nerfro.media.solid import Solid
-from nerfro.registry import register
+from nerfro.registry.allowed import NotNegative, Positive
+from nerfro.registry.registration import register
 
 # Air around the ball as a share of its radius, because half of the shell lies outside the surface.
 _MARGIN = 0.05

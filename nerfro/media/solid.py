@@ -11,14 +11,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from nerfro.allowed import NotNegative, Positive, checked
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
+from nerfro.core.types import Path
+from nerfro.core.variants import variant
 from nerfro.kernels.constants import constant
 from nerfro.kernels.tolerances import MIN_COSINE, SAFE_SHARE, STEPS_PER_SHELL
 from nerfro.media.base import Medium, Scalars, Vectors
 from nerfro.media.material import Material, materials_of
-from nerfro.types import Path
-from nerfro.variants import variant
+from nerfro.registry.allowed import NotNegative, Positive, checked
 
 _COLOURS = ("red", "green", "blue")
 # Paths record bodies as 8-bit integers.

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
+from nerfro.core.paths import resolve_path
 from nerfro.files.cache import cached_arrays, content_hash
 from nerfro.geometry.bodies import require_separate
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.geometry.signed_distance import signed_distance_grid
 from nerfro.media.distance_grid import BAND
-from nerfro.paths import resolve_path
-from nerfro.registry import create, discover, find, register
+from nerfro.registry.registration import create, discover, find, register
 
 # Part of the cache key. Increase it when the same mesh and settings give different distances.
 _VERSION = 3

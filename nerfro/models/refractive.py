@@ -7,10 +7,10 @@ from typing import Literal
 from jaxtyping import Bool
 from torch import Tensor
 
-from nerfro.draws import Draws
-from nerfro.registry import register
+from nerfro.core.draws import Draws
+from nerfro.core.types import Path, Rendering
+from nerfro.registry.registration import register
 from nerfro.rendering import Components, Renderer, composite
-from nerfro.types import Path, Rendering
 
 
 @register("model", "refractive")

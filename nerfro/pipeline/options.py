@@ -10,9 +10,9 @@ from typing import Annotated, Any, Optional
 
 from omegaconf import MISSING, DictConfig
 
-from nerfro.allowed import Count, Natural, Range
-from nerfro.errors import NerfroError
-from nerfro.overrides import as_overrides, is_given
+from nerfro.cli.overrides import as_overrides, is_given
+from nerfro.core.errors import NerfroError
+from nerfro.registry.allowed import Count, Natural, Range
 
 
 @dataclass

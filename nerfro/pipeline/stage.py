@@ -14,10 +14,10 @@ from types import FrameType
 
 import torch
 
-from nerfro.cli import call
-from nerfro.errors import Interrupted, NerfroError
-from nerfro.failures import EXIT_INTERRUPTED, in_one_line
-from nerfro.overrides import command_line, without_hints
+from nerfro.cli.entry import call
+from nerfro.cli.failures import EXIT_INTERRUPTED, in_one_line
+from nerfro.cli.overrides import command_line, without_hints
+from nerfro.core.errors import Interrupted, NerfroError
 
 _SEED = 67280421310721  # of torch in a new process
 

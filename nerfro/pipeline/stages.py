@@ -10,14 +10,14 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from nerfro.capture.preprocess_options import MESH
-from nerfro.errors import NerfroError, warn
+from nerfro.cli.overrides import as_overrides, is_given, not_given
+from nerfro.core.errors import NerfroError, warn
 from nerfro.evaluation.results import EXPOSED, FULL, read_metrics_json
 from nerfro.files.reading import read_json
-from nerfro.overrides import as_overrides, is_given, not_given
 from nerfro.pipeline.hypotheses import Hypothesis, hypotheses
 from nerfro.pipeline.options import common_options
 from nerfro.pipeline.stage import Stage, is_older, move_aside
-from nerfro.registry import plugin_module
+from nerfro.registry.registration import plugin_module
 from nerfro.rendering.scene_file import OLD_SCENE, SCENE, SceneFile, read_scene_file
 from nerfro.silhouettes.overlaps import SHEET
 from nerfro.training.run_folder import CONFIG_FILE

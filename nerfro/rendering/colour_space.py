@@ -7,7 +7,7 @@ from enum import Enum
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.light import clipped_alike, to_linear, to_srgb
+from nerfro.core.light import clipped_alike, to_linear, to_srgb
 
 
 class ColourSpace(Enum):

@@ -5,8 +5,8 @@ from __future__ import annotations
 from jaxtyping import Float
 from torch import Tensor
 
+from nerfro.core.types import FieldValues, Path, Rendering, Samples
 from nerfro.samplers.points.stepfun import volume_weights
-from nerfro.types import FieldValues, Path, Rendering, Samples
 
 
 def composite(

@@ -12,20 +12,20 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from nerfro.allowed import checked
 from nerfro.boundaries.base import Boundary, background_radiance
 from nerfro.camera.base import CameraModel
 from nerfro.camera.given import GivenCamera
-from nerfro.draws import Draws
+from nerfro.core.draws import Draws
+from nerfro.core.rays import Rays
+from nerfro.core.types import Exits, Path, Rendering
 from nerfro.fields.base import Field
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.media.base import Medium
-from nerfro.rays import Rays
+from nerfro.registry.allowed import checked
 from nerfro.rendering.colour_space import ColourSpace
 from nerfro.rendering.scene import Scene
 from nerfro.samplers.base import PathSampler, PointSampler
 from nerfro.samplers.paths.surface_normals import first_normals
-from nerfro.types import Exits, Path, Rendering
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from torch import nn
 from nerfro.boundaries.base import Boundary
 from nerfro.camera.base import CameraModel
 from nerfro.camera.given import GivenCamera
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
 from nerfro.fields.base import Field
 from nerfro.media.base import Medium
 from nerfro.rendering.colour_space import ColourSpace

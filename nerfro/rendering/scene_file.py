@@ -16,15 +16,15 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from nerfro.allowed import Count, check_settings
-from nerfro.errors import NerfroError, warn
+from nerfro.cli.overrides import as_overrides, is_given, is_scene_file
+from nerfro.core.errors import NerfroError, warn
+from nerfro.core.paths import EMBEDDED_PREFIX, user_path
+from nerfro.core.provenance import command_line, versions
 from nerfro.files.atomic import write_atomically
 from nerfro.files.reading import read_json
 from nerfro.media.bodies import BodySettings
-from nerfro.overrides import as_overrides, is_given, is_scene_file
-from nerfro.paths import EMBEDDED_PREFIX, user_path
-from nerfro.provenance import command_line, versions
-from nerfro.registry import plugin_of
+from nerfro.registry.allowed import Count, check_settings
+from nerfro.registry.registration import plugin_of
 
 SCENE, OLD_SCENE = "scene.json", "preprocess.json"  # names of the scene file in this release and in earlier ones
 _ADVICE = "see docs/reference/file_formats.md, or run nerfro.preprocess again"

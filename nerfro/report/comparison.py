@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
 from nerfro.evaluation.image_metrics import ImageMetric, image_metrics
 from nerfro.evaluation.results import FULL, OBJECT, Region
 from nerfro.evaluation.tables import MISSING, Column, Row, Table, short

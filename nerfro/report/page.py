@@ -10,12 +10,12 @@ from typing import Any
 import torch
 from omegaconf import OmegaConf
 
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
+from nerfro.core.paths import PACKAGE_DIR
 from nerfro.evaluation.error_maps import SQUARED_ERROR_LIMIT
 from nerfro.evaluation.tables import Table
 from nerfro.files.drawing import magma
 from nerfro.files.templates import fill_template
-from nerfro.paths import PACKAGE_DIR
 from nerfro.report.comparison import Comparison
 from nerfro.report.runs import EvaluatedRun, device, duration, shown
 from nerfro.report.views import JPEG_QUALITY, PNG_SIDE, SceneImages, Selection, embed_image, scene_images

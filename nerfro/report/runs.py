@@ -15,12 +15,12 @@ from typing import Any
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from nerfro.allowed import Count, check
-from nerfro.errors import NerfroError, first_of
+from nerfro.core.errors import NerfroError, first_of
+from nerfro.core.paths import EMBEDDED_PREFIX, refuse_root, scene_name, user_path
 from nerfro.evaluation.results import RunMetrics, read_metrics_json
 from nerfro.files.foreign_config import read_foreign_config
 from nerfro.files.reading import open_image, read_json
-from nerfro.paths import EMBEDDED_PREFIX, refuse_root, scene_name, user_path
+from nerfro.registry.allowed import Count, check
 from nerfro.training.config import check_trained
 from nerfro.training.run_folder import CELL_FILE, LAST_CHECKPOINT
 

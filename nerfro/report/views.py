@@ -11,8 +11,8 @@ from jaxtyping import Float
 from omegaconf import OmegaConf
 from torch import Tensor
 
+from nerfro.core.errors import NerfroError
 from nerfro.data.base import Views
-from nerfro.errors import NerfroError
 from nerfro.evaluation.error_maps import squared_error_colours
 from nerfro.evaluation.image_metrics import image_metrics
 from nerfro.evaluation.results import FULL, Region, Score

@@ -9,12 +9,12 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor, nn
 
-from nerfro.draws import Draws
-from nerfro.errors import accept_old_methods
+from nerfro.core.draws import Draws
+from nerfro.core.errors import accept_old_methods
+from nerfro.core.types import Path, Rays, Rendering, Samples
 from nerfro.fields.base import Field
 from nerfro.media.base import Medium
 from nerfro.samplers.paths.branching import ONE_PATH
-from nerfro.types import Path, Rays, Rendering, Samples
 
 _OLD_METHODS = {"refine": "replay", "main": "trace_main"}
 

@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerfro.core.errors import first_of, warn
 from nerfro.data.base import Views
-from nerfro.errors import first_of, warn
 from nerfro.files.atomic import write_atomically
 from nerfro.files.drawing import sheet
 from nerfro.files.images import save_image

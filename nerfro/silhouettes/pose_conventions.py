@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.silhouettes.silhouettes import mesh_silhouettes, pixel_stride
 from nerfro.silhouettes.visual_hull import Silhouettes, carve_mesh, find_box

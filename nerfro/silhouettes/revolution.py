@@ -15,9 +15,9 @@ from torch.func import jacfwd
 from torch.nn import functional
 from torch.nn.functional import normalize
 
+from nerfro.core.robust import geman_mcclure_weight
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.geometry.revolve import revolve
-from nerfro.robust import geman_mcclure_weight
 from nerfro.silhouettes.upright import body_axis
 from nerfro.silhouettes.visual_hull import Silhouettes
 

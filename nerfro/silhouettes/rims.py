@@ -11,8 +11,8 @@ from jaxtyping import Float, Int
 from scipy.ndimage import binary_erosion, distance_transform_edt
 from torch import Tensor
 
-from nerfro.cameras import Cameras
-from nerfro.errors import NerfroError
+from nerfro.core.cameras import Cameras
+from nerfro.core.errors import NerfroError
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.geometry.normals import unit
 from nerfro.silhouettes.moving_mesh import MeshGeometry, MovingMesh

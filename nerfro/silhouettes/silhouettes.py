@@ -9,7 +9,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter
 from scipy.special import ndtri
 from torch import Tensor
 
-from nerfro.cameras import Cameras, Window
+from nerfro.core.cameras import Cameras, Window
 from nerfro.geometry.intersection import MeshIntersector
 from nerfro.geometry.mesh import TriangleMesh
 

@@ -6,10 +6,10 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from nerfro.core.errors import NerfroError, first_of, warn
+from nerfro.core.progress import fraction_bar
 from nerfro.data.base import Views
-from nerfro.errors import NerfroError, first_of, warn
 from nerfro.geometry.mesh import TriangleMesh, num_decimals
-from nerfro.progress import fraction_bar
 from nerfro.silhouettes.pose_conventions import overlap
 from nerfro.silhouettes.revolution import Symmetry, fit_revolution
 from nerfro.silhouettes.silhouette_fit import fit_surface

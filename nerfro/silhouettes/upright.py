@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from nerfro.cameras import Cameras
+from nerfro.core.cameras import Cameras
 from nerfro.geometry.mesh import TriangleMesh
 
 # Cameras are level if their x axes lie close to a plane (first limit) but not close to a line (second limit); both

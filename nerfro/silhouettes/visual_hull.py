@@ -13,8 +13,8 @@ from scipy.ndimage import binary_fill_holes, label
 from skimage.measure import marching_cubes
 from torch import Tensor
 
-from nerfro.cameras import Cameras
-from nerfro.errors import NerfroError
+from nerfro.core.cameras import Cameras
+from nerfro.core.errors import NerfroError
 from nerfro.geometry.lines import nearest_point
 from nerfro.geometry.mesh import TriangleMesh, merge_vertices
 from nerfro.silhouettes.silhouettes import border_pixels, outline_distance

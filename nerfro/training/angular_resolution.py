@@ -6,8 +6,8 @@ import math
 
 from omegaconf import DictConfig
 
-from nerfro.cameras import Cameras
-from nerfro.registry import find
+from nerfro.core.cameras import Cameras
+from nerfro.registry.registration import find
 
 # Texels along each side of a face of the coarsest level, and bounds of the finest one.
 _COARSEST, _MIN_TEXELS, _MAX_TEXELS = 4, 64, 1024

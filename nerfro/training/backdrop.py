@@ -7,10 +7,10 @@ from jaxtyping import Bool, Float
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
+from nerfro.core.light import to_linear
 from nerfro.data.lazy_images import LazyImages
-from nerfro.light import to_linear
 from nerfro.losses.backdrop import shows
-from nerfro.registry import find
+from nerfro.registry.registration import find
 
 # Number of images that are examined.
 _NUM_IMAGES = 8

@@ -12,15 +12,15 @@ from hydra.errors import HydraException
 from lightning.pytorch import seed_everything
 from omegaconf import DictConfig
 
-from nerfro.cli import check_configuration
+from nerfro.cli.entry import check_configuration
+from nerfro.cli.failures import in_one_line
+from nerfro.cli.old_names import renamed_override
+from nerfro.cli.options import describe_command
+from nerfro.cli.overrides import prints_hints
+from nerfro.core.errors import NerfroError, warn
+from nerfro.core.paths import CONF_DIR
 from nerfro.data.base import DataSource, Views
-from nerfro.errors import NerfroError, warn
-from nerfro.failures import in_one_line
-from nerfro.old_names import renamed_override
-from nerfro.options import describe_command
-from nerfro.overrides import prints_hints
-from nerfro.paths import CONF_DIR
-from nerfro.registry import discover
+from nerfro.registry.registration import discover
 from nerfro.rendering import Renderer
 from nerfro.rendering.scene_file import with_scene
 from nerfro.samplers.paths.thin_walls import warn_of_thin_walls

@@ -15,9 +15,9 @@ from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar, Timer
 from lightning.pytorch.trainer.states import RunningStage
 from tqdm import tqdm
 
-from nerfro.progress import progress_bar
+from nerfro.core.progress import progress_bar
+from nerfro.core.types import Batch
 from nerfro.training.module import training_progress
-from nerfro.types import Batch
 
 
 def steps_by_phase(callbacks: Mapping[str, Any], num_steps: int) -> dict[str, int]:

@@ -14,7 +14,15 @@ import torch
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from nerfro.allowed import (
+from nerfro.core.errors import NerfroError
+from nerfro.core.paths import resolve_path, scene_name
+from nerfro.core.subdivision import Subdivision
+from nerfro.data.base import DataSource, Views
+from nerfro.data.validation_views import WithValidationViews
+from nerfro.evaluation.results import Region
+from nerfro.media.analytic import Vacuum
+from nerfro.media.bodies import origin_of
+from nerfro.registry.allowed import (
     Count,
     Names,
     Natural,
@@ -28,17 +36,9 @@ from nerfro.allowed import (
     check_settings,
     corners_of_box,
 )
-from nerfro.data.base import DataSource, Views
-from nerfro.data.validation_views import WithValidationViews
-from nerfro.errors import NerfroError
-from nerfro.evaluation.results import Region
-from nerfro.media.analytic import Vacuum
-from nerfro.media.bodies import origin_of
-from nerfro.paths import resolve_path, scene_name
-from nerfro.registry import build, check_node, configure, create, find, plugins, require_lightning
+from nerfro.registry.registration import build, check_node, configure, create, find, plugins, require_lightning
 from nerfro.rendering import Components, Renderer
-from nerfro.subdivision import Subdivision
-from nerfro.synthetic import SCENES
+from nerfro.synthetic.options import SCENES
 from nerfro.training.angular_resolution import derive_angular_resolution
 from nerfro.training.backdrop import derive_backdrop
 from nerfro.training.content import ContentConfig, derive_content, derive_unit, require_contraction

@@ -10,16 +10,16 @@ import numpy as np
 from jaxtyping import Float
 from omegaconf import DictConfig, OmegaConf
 
-from nerfro.allowed import Count, NotNegative, OnlyWith, Positive
-from nerfro.cameras import Cameras
-from nerfro.errors import NerfroError
+from nerfro.core.cameras import Cameras
+from nerfro.core.errors import NerfroError
+from nerfro.core.paths import resolve_path
 from nerfro.geometry.mesh import local_origin, num_decimals
 from nerfro.media.analytic import Vacuum
 from nerfro.media.base import Medium
 from nerfro.media.bodies import surfaces_of
 from nerfro.media.surface import make_surface
-from nerfro.paths import resolve_path
-from nerfro.registry import build
+from nerfro.registry.allowed import Count, NotNegative, OnlyWith, Positive
+from nerfro.registry.registration import build
 
 # Radius of the uncontracted ball, as a fraction of the median distance from the cameras to the point they face.
 _RADIUS_SHARE = 0.5

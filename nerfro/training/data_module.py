@@ -15,14 +15,14 @@ from lightning.pytorch import LightningDataModule, Trainer
 from omegaconf import DictConfig
 from torch import Tensor, nn
 
+from nerfro.core.subdivision import Subdivision
+from nerfro.core.types import Batch
 from nerfro.data.base import Views
 from nerfro.kernels.threads import HELPERS
 from nerfro.rendering import Renderer
-from nerfro.subdivision import Subdivision
 from nerfro.training.module import TrainingModule
 from nerfro.training.ray_batches import RayBatches
 from nerfro.training.validation import ValidationPixels
-from nerfro.types import Batch
 
 # Number of validations for each validation image, so that the curve has more points; each costs a few steps.
 _VALIDATIONS_PER_IMAGE = 5

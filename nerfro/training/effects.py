@@ -11,8 +11,8 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
-from nerfro.allowed import OnlyWith
-from nerfro.registry import SEVERAL, Plugin, find, plugin_of
+from nerfro.registry.allowed import OnlyWith
+from nerfro.registry.registration import SEVERAL, Plugin, find, plugin_of
 from nerfro.training.settings import flat
 
 

@@ -10,11 +10,11 @@ from typing import Any
 import torch
 from omegaconf import DictConfig
 
-from nerfro.cameras import Cameras
-from nerfro.errors import NerfroError
+from nerfro.core.cameras import Cameras
+from nerfro.core.errors import NerfroError
+from nerfro.core.paths import resolve_path
 from nerfro.files.cache import file_hash
-from nerfro.paths import resolve_path
-from nerfro.registry import plugin_of
+from nerfro.registry.registration import plugin_of
 from nerfro.training.settings import first_difference, flat
 
 # Entry of a checkpoint.

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from lightning.pytorch import callbacks
 
-from nerfro.registry import add
+from nerfro.registry.registration import add
 
 for _name, _cls in {
     "device_stats_monitor": callbacks.DeviceStatsMonitor,

@@ -8,10 +8,10 @@ from typing import Any
 import torch
 from omegaconf import DictConfig
 
+from nerfro.core.paths import user_path
+from nerfro.core.subdivision import Subdivision
 from nerfro.evaluation.request import find_device
-from nerfro.paths import user_path
-from nerfro.registry import discover
-from nerfro.subdivision import Subdivision
+from nerfro.registry.registration import discover
 from nerfro.training.config import build_data
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint, restore
 from nerfro.viewing.trained_scene import TrainedScene

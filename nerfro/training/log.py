@@ -17,7 +17,8 @@ from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger, Wand
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from nerfro.cameras import Cameras
+from nerfro.core.cameras import Cameras
+from nerfro.core.types import Batch, Exits, Rays, Rendering
 from nerfro.evaluation.error_maps import triptych
 from nerfro.evaluation.path_plot import image_of_paths
 from nerfro.files.lat_long import directions
@@ -25,7 +26,6 @@ from nerfro.files.reading import reading
 from nerfro.media.analytic import Vacuum
 from nerfro.rendering import Scene
 from nerfro.training.module import TrainingModule
-from nerfro.types import Batch, Exits, Rays, Rendering
 
 _SKY_HEIGHT = 128  # rows of the image of the background
 _NUM_RAYS = 128  # largest number of rays for the histograms

@@ -8,10 +8,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from nerfro.draws import Draws
-from nerfro.errors import NerfroError
+from nerfro.core.draws import Draws
+from nerfro.core.errors import NerfroError
+from nerfro.core.rays import Rays
 from nerfro.kernels.available import available_bytes, number_in
-from nerfro.rays import Rays
 from nerfro.rendering import Renderer
 
 _PROBED_RAYS = 128

@@ -11,9 +11,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerfro.cameras import Cameras
+from nerfro.core.cameras import Cameras
+from nerfro.core.errors import NerfroError, warn
 from nerfro.data.base import Views
-from nerfro.errors import NerfroError, warn
 from nerfro.geometry.intersection import MeshIntersector
 from nerfro.geometry.lines import nearest_point
 from nerfro.geometry.mesh import TriangleMesh, num_decimals

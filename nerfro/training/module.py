@@ -13,17 +13,17 @@ from lightning.pytorch.callbacks import Timer
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor, nn
 
-from nerfro.cameras import Cameras
-from nerfro.errors import NerfroError
+from nerfro.core.cameras import Cameras
+from nerfro.core.errors import NerfroError
+from nerfro.core.paths import user_path
+from nerfro.core.types import Batch
 from nerfro.losses.base import Loss
-from nerfro.paths import user_path
-from nerfro.registry import discover
+from nerfro.registry.registration import discover
 from nerfro.rendering import Renderer, Scene
 from nerfro.training.config import build_each
 from nerfro.training.inputs import INPUTS, inputs_of
 from nerfro.training.optimizer import OptimizerConfig, learning_rate_factor
 from nerfro.training.run_folder import load_checkpoint, restore
-from nerfro.types import Batch
 
 
 class TrainingModule(LightningModule):

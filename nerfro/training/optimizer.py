@@ -11,8 +11,8 @@ from typing import Annotated, Optional
 
 from torch import nn
 
-from nerfro.allowed import Natural, NotNegative, OnlyWith, Positive, checked
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
+from nerfro.registry.allowed import Natural, NotNegative, OnlyWith, Positive, checked
 
 # Patterns that have no effect in a scene without these parameters.
 OPTIONAL_PATTERNS = (

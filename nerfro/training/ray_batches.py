@@ -13,15 +13,15 @@ from jaxtyping import Bool, Float, Int, UInt8
 from omegaconf import DictConfig
 from torch import Tensor
 
-from nerfro.allowed import Count, Natural, Range, checked
-from nerfro.cameras import Cameras, Window, central_window
+from nerfro.core.cameras import Cameras, Window, central_window
+from nerfro.core.distributed import share_of
+from nerfro.core.draws import Draws
+from nerfro.core.errors import NerfroError, warn, warn_of_old_name
+from nerfro.core.subdivision import PixelRays, Subdivision, Trace, TraceExits, contrast, subdivide
+from nerfro.core.types import Batch
 from nerfro.data.base import Views
 from nerfro.data.pixel_store import PixelStore
-from nerfro.distributed import share_of
-from nerfro.draws import Draws
-from nerfro.errors import NerfroError, warn, warn_of_old_name
-from nerfro.subdivision import PixelRays, Subdivision, Trace, TraceExits, contrast, subdivide
-from nerfro.types import Batch
+from nerfro.registry.allowed import Count, Natural, Range, checked
 
 Batching = Literal["single_image", "all_images"]
 

@@ -7,13 +7,13 @@ import math
 import torch
 
 from nerfro.boundaries.constant import ConstantBoundary
-from nerfro.errors import NerfroError, warn
+from nerfro.core.errors import NerfroError, warn
+from nerfro.core.rays import Rays
+from nerfro.core.types import Batch
 from nerfro.fields.base import Field
 from nerfro.geometry.interpolation import intersect_box
-from nerfro.rays import Rays
 from nerfro.rendering import Renderer
 from nerfro.training.ray_batches import RayBatches
-from nerfro.types import Batch
 
 # Fraction of rays that may miss the field without a warning if the background does not learn.
 _FEW = 0.1

@@ -18,15 +18,15 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor, nn
 
-from nerfro.cameras import Cameras
-from nerfro.errors import Interrupted, NerfroError, first_of, warn
+from nerfro.core.cameras import Cameras
+from nerfro.core.errors import Interrupted, NerfroError, first_of, warn
+from nerfro.core.paths import PACKAGE_DIR, user_path
+from nerfro.core.provenance import command_line, versions
 from nerfro.files.atomic import require_room, write_atomically
 from nerfro.files.folder_lock import lock_folder, require_only
 from nerfro.files.foreign_config import foreign_config, read_foreign_config
 from nerfro.files.reading import reading
 from nerfro.kernels.available import fast_bfloat16
-from nerfro.paths import PACKAGE_DIR, user_path
-from nerfro.provenance import command_line, versions
 from nerfro.rendering import Renderer
 from nerfro.training import backdrop, content
 from nerfro.training.config import build_model, check_trained, training_device

@@ -7,9 +7,9 @@ from typing import Any, cast
 
 from lightning.pytorch import Callback, LightningModule, Trainer
 
+from nerfro.core.errors import NerfroError
+from nerfro.core.progress import track
 from nerfro.data.base import Views
-from nerfro.errors import NerfroError
-from nerfro.progress import track
 from nerfro.training.callbacks import StopOnSignal
 from nerfro.training.module import TrainingModule, training_progress
 from nerfro.training.phases.base import Phase, TrainingRun

@@ -16,15 +16,15 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
+from nerfro.cli.failures import in_one_line
+from nerfro.cli.old_names import MOVED_CLASSES
+from nerfro.core.errors import NerfroError
+from nerfro.core.paths import resolve_path, scene_name
 from nerfro.data.image_files import IMAGE_SUFFIXES
-from nerfro.errors import NerfroError
 from nerfro.evaluation.results import RunMetrics, read_metrics_json
-from nerfro.failures import in_one_line
 from nerfro.files.atomic import write_atomically
 from nerfro.files.folder_lock import lock_folder
 from nerfro.files.reading import read_json
-from nerfro.old_names import MOVED_CLASSES
-from nerfro.paths import resolve_path, scene_name
 from nerfro.training.inputs import file_hashes
 from nerfro.training.run_folder import CELL_FILE, CONFIG_FILE, in_sweep
 from nerfro.training.settings import RESULT, first_difference, settings

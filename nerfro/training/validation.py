@@ -15,12 +15,12 @@ from torch import Tensor
 from tqdm import tqdm
 
 from nerfro.camera.exposure import fit_gain
-from nerfro.cameras import Cameras
+from nerfro.core.cameras import Cameras
+from nerfro.core.subdivision import PixelRays, Subdivision, contrast, subdivide
+from nerfro.core.types import Batch, mean_per_pixel
 from nerfro.data.base import Views
 from nerfro.rendering import Renderer
-from nerfro.subdivision import PixelRays, Subdivision, contrast, subdivide
 from nerfro.training.module import TrainingModule
-from nerfro.types import Batch, mean_per_pixel
 
 # Number of validation pixels, and largest number of their views.
 _NUM_PIXELS, _MAX_VIEWS = 2048, 32

@@ -8,9 +8,9 @@ from typing import Any
 from lightning.pytorch import Callback, LightningModule, Trainer
 from omegaconf import DictConfig
 
+from nerfro.core.types import Batch
 from nerfro.data.base import DataSource, Views
 from nerfro.training.module import TrainingModule
-from nerfro.types import Batch
 from nerfro.viewing.baking import bake_surface
 from nerfro.viewing.live import LivePage
 from nerfro.viewing.server import PageServer

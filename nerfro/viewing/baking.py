@@ -14,8 +14,9 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from nerfro.boundaries.base import Boundary
-from nerfro.errors import NerfroError
-from nerfro.light import to_srgb
+from nerfro.core.errors import NerfroError
+from nerfro.core.light import to_srgb
+from nerfro.core.types import Exits
 from nerfro.media.analytic import Vacuum
 from nerfro.media.base import Medium
 from nerfro.media.distance_grid import BLOCK
@@ -23,7 +24,6 @@ from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.solid import Solid
 from nerfro.rendering import ColourSpace, Renderer
 from nerfro.samplers.paths.snell import Snell
-from nerfro.types import Exits
 from nerfro.viewing import packing
 from nerfro.viewing.changes import absorption_of
 from nerfro.viewing.surface import body_on_grid

@@ -15,18 +15,18 @@ from jaxtyping import Float
 
 from nerfro.camera.base import CameraModel
 from nerfro.camera.similarity import motion_between
-from nerfro.cameras import Cameras
+from nerfro.core.cameras import Cameras
+from nerfro.core.errors import NerfroError
+from nerfro.core.paths import relative_path
+from nerfro.core.types import WORLD_ORIGIN
 from nerfro.data.base import Views
 from nerfro.data.frames import check_pose
 from nerfro.data.lenses import Lens, check_lenses, read_lens
-from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
 from nerfro.files.reading import is_number, parse_matrix, read_json
-from nerfro.paths import relative_path
-from nerfro.types import WORLD_ORIGIN
 from nerfro.viewing.camera_paths import CaptureGeometry
 
-# Names of the nine coefficients (`nerfro.lens`) without and with a denominator. OpenCV's rational model has no r^8.
+# Names of the nine coefficients (`nerfro.core.lens`) without and with a denominator. OpenCV's rational model has no r^8.
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 _RATIONAL = ("k1", "k2", "k3", "", "p1", "p2", "k4", "k5", "k6")
 

@@ -11,8 +11,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from nerfro.cameras import Cameras, up_direction
-from nerfro.errors import NerfroError
+from nerfro.core.cameras import Cameras, up_direction
+from nerfro.core.errors import NerfroError
 
 # Sine of the angle to the vertical below which a camera counts as directly above or below its target.
 _ABOVE = 1e-4

@@ -7,15 +7,15 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerfro.boundaries.envmap import EnvironmentMap
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
+from nerfro.core.light import to_srgb
+from nerfro.core.types import FieldValues, Samples
+from nerfro.core.variants import variant
 from nerfro.fields.base import Field
-from nerfro.light import to_srgb
 from nerfro.media.analytic import Vacuum
 from nerfro.media.solid import Solid
 from nerfro.rendering import ColourSpace, Renderer, Scene
 from nerfro.samplers.paths.straight import Straight
-from nerfro.types import FieldValues, Samples
-from nerfro.variants import variant
 
 
 class EmptyField(Field):

@@ -12,9 +12,9 @@ from typing import Annotated, Optional
 
 from omegaconf import MISSING, DictConfig
 
-from nerfro.allowed import Count, Names, Positive
-from nerfro.errors import NerfroError
-from nerfro.registry import discover
+from nerfro.core.errors import NerfroError
+from nerfro.registry.allowed import Count, Names, Positive
+from nerfro.registry.registration import discover
 from nerfro.viewing import PLUGIN_EXPORTS
 from nerfro.viewing.trained_scene import TrainedScene
 

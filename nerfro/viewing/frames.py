@@ -8,13 +8,13 @@ from pathlib import Path
 
 import torch
 
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
+from nerfro.core.progress import progress_bar
 from nerfro.files.atomic import write_atomically
 from nerfro.files.cache import content_hash
 from nerfro.files.deep_images import write_radiance
 from nerfro.files.images import save_png
 from nerfro.files.reading import read_json
-from nerfro.progress import progress_bar
 from nerfro.viewing.layers import Layer
 from nerfro.viewing.render_request import Shots
 from nerfro.viewing.trained_scene import TrainedScene

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.cameras import Cameras
+from nerfro.core.cameras import Cameras
 from nerfro.viewing.trained_scene import RenderedViews, TrainedScene
 
 Images = Float[Tensor, "V H W C"]

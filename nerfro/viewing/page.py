@@ -13,13 +13,13 @@ from omegaconf import DictConfig
 from PIL import Image
 from torch import Tensor
 
-from nerfro.cameras import Cameras, up_direction
+from nerfro.core.cameras import Cameras, up_direction
+from nerfro.core.errors import NerfroError
+from nerfro.core.paths import ASSETS_DIR
 from nerfro.data.base import DataSource, Views
-from nerfro.errors import NerfroError
 from nerfro.files.atomic import write_atomically
 from nerfro.files.images import data_uri, to_8bit
 from nerfro.files.templates import fill_template
-from nerfro.paths import ASSETS_DIR
 from nerfro.rendering import ColourSpace
 from nerfro.viewing.baking import Baked, bake_sky, bake_surface, bake_volume
 from nerfro.viewing.exports import Export

@@ -15,14 +15,14 @@ from jaxtyping import Float
 from omegaconf import MISSING, DictConfig, ListConfig
 from torch import Tensor
 
-from nerfro.allowed import Count, Positive, Range, refuse_unused
-from nerfro.cameras import Cameras
+from nerfro.core.cameras import Cameras
+from nerfro.core.errors import NerfroError
+from nerfro.core.lens import distort, fold_radius
+from nerfro.core.paths import user_path
+from nerfro.core.subdivision import SubdivisionChanges
+from nerfro.core.variants import variant
 from nerfro.data.lenses import Lens, check_lenses
-from nerfro.errors import NerfroError
-from nerfro.lens import distort, fold_radius
-from nerfro.paths import user_path
-from nerfro.subdivision import SubdivisionChanges
-from nerfro.variants import variant
+from nerfro.registry.allowed import Count, Positive, Range, refuse_unused
 from nerfro.viewing.camera_files import read_cameras
 from nerfro.viewing.camera_paths import PATHS, CaptureGeometry, OrbitPosition, path_cameras
 from nerfro.viewing.trained_scene import TrainedScene

@@ -17,7 +17,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
 
 _WATCHED_SECONDS = 10.0  # a page counts as watched for so long after a request
 _MAX_LOSSES = 500  # maximum number of points of the curve

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.geometry.normals import corner_normals
 from nerfro.media.base import Medium

@@ -11,21 +11,21 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.cameras import Cameras
+from nerfro.core.cameras import Cameras
+from nerfro.core.errors import NerfroError
+from nerfro.core.paths import user_path
+from nerfro.core.progress import track
+from nerfro.core.subdivision import Subdivision
+from nerfro.core.types import Exits
+from nerfro.core.variants import variant
 from nerfro.data.base import DataSource, Views
-from nerfro.errors import NerfroError
 from nerfro.evaluation.render_view import render_view
 from nerfro.fields.base import Field
 from nerfro.files import lat_long
 from nerfro.files.images import data_uri, to_8bit
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.paths import user_path
-from nerfro.progress import track
 from nerfro.rendering import Renderer
 from nerfro.samplers.paths.snell import Snell
-from nerfro.subdivision import Subdivision
-from nerfro.types import Exits
-from nerfro.variants import variant
 from nerfro.viewing.changes import with_absorption, with_indices, with_sky, without_glass, without_inside
 from nerfro.viewing.surface import surface_of
 
@@ -100,7 +100,7 @@ class TrainedScene:
         """Render images of cameras, in chunks that limit the memory.
 
         Args:
-            cameras: cameras on any device; see `nerfro.cameras.Cameras` for their axes.
+            cameras: cameras on any device; see `nerfro.core.cameras.Cameras` for their axes.
             subdivision: rays per pixel, by default those of the run's evaluation; `Subdivision()` means one ray.
             chunk_size: rays rendered at once, by default those of the run's evaluation.
             progress: whether to show a progress bar.

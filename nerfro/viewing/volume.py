@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.allowed import Range, check
-from nerfro.errors import accept_old_fields
+from nerfro.core.errors import accept_old_fields
+from nerfro.core.progress import track
 from nerfro.geometry.contraction import contraction_scale, expand
-from nerfro.progress import track
+from nerfro.registry.allowed import Range, check
 from nerfro.viewing.trained_scene import TrainedScene
 
 RESOLUTION = 128

@@ -10,10 +10,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.boundaries.base import Boundary
+from nerfro.core.types import Exits, FieldValues, Samples
 from nerfro.fields.base import Field
 from nerfro.fields.selection import inside_box
 from nerfro.geometry.interpolation import smooth, trilinear
-from nerfro.types import Exits, FieldValues, Samples
 
 # Directions are looked up on the unit sphere in a grid over this cube.
 _SKY_SIDE = 1.1

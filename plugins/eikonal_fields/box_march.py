@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import torch
 from jaxtyping import Float
-from nerfro_plugins.paper.eikonal import march_uniform
-from nerfro_plugins.paper.integrators import Index, RayState
 from torch import Tensor
 
-from nerfro.allowed import Count
+from nerfro.core.types import Path, Rays
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.media.base import Medium
-from nerfro.registry import register
+from nerfro.paper.eikonal import march_uniform
+from nerfro.paper.integrators import Index, RayState
+from nerfro.registry.allowed import Count
+from nerfro.registry.registration import register
 from nerfro.samplers.base import PathSampler
 from nerfro.samplers.paths.straight import straight_path
-from nerfro.types import Path, Rays
 
 
 @register("sampler/path", "box_march")

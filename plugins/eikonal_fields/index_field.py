@@ -9,13 +9,13 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from nerfro.allowed import Depth, Natural, Positive, Width
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
+from nerfro.core.paths import resolve_path
 from nerfro.fields.selection import inside_box
 from nerfro.geometry.mesh import load_mesh, local_origin
 from nerfro.media.base import Medium
-from nerfro.paths import resolve_path
-from nerfro.registry import register
+from nerfro.registry.allowed import Depth, Natural, Positive, Width
+from nerfro.registry.registration import register
 
 # Sharpness of the activation (authors' code): the Eikonal equation needs a smooth one, not ReLU.
 _BETA = 5.0

@@ -10,15 +10,15 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerfro.allowed import Count, Positive, Range, Share
-from nerfro.draws import Draws
-from nerfro.errors import NerfroError
+from nerfro.core.draws import Draws
+from nerfro.core.errors import NerfroError
+from nerfro.core.types import FieldValues, Path, Rays, Rendering, Samples
 from nerfro.fields.base import Field
 from nerfro.fields.selection import inside_box
-from nerfro.registry import register
+from nerfro.registry.allowed import Count, Positive, Range, Share
+from nerfro.registry.registration import register
 from nerfro.rendering import Components, Renderer, composite
 from nerfro.samplers.paths.straight import straight_path
-from nerfro.types import FieldValues, Path, Rays, Rendering, Samples
 
 from .background import BackgroundGrids
 

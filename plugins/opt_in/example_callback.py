@@ -10,8 +10,8 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from torch.optim import Optimizer
 
-from nerfro.allowed import Count
-from nerfro.registry import register
+from nerfro.registry.allowed import Count
+from nerfro.registry.registration import register
 
 
 @register("callbacks", "gradient_norm")

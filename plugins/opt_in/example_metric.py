@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerfro.evaluation.image_metrics import ImageMetric
-from nerfro.registry import register
+from nerfro.registry.registration import register
 
 
 @register("metric", "mean_absolute_error")

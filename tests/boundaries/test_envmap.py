@@ -10,10 +10,10 @@ import torch.nn.functional as F
 from nerfro.boundaries import cube_map
 from nerfro.boundaries import cube_map_cpu as kernels
 from nerfro.boundaries.envmap import EnvironmentMap, Observed
+from nerfro.core.light import to_srgb
+from nerfro.core.types import Exits
 from nerfro.files import lat_long
 from nerfro.files.images import save_png
-from nerfro.light import to_srgb
-from nerfro.types import Exits
 from tests.conftest import refused
 from tests.gradients import require_equal_gradients
 

@@ -3,7 +3,7 @@
 import torch
 
 from nerfro.boundaries.constant import ConstantBoundary
-from nerfro.types import Exits
+from nerfro.core.types import Exits
 from tests.paper import Skybox
 
 

@@ -10,11 +10,11 @@ from torch import Tensor
 
 from benchmarks.cameras import disturbed
 from nerfro.camera.similarity import motion_between
-from nerfro.cameras import Cameras
+from nerfro.core.cameras import Cameras
+from nerfro.core.light import to_linear, to_srgb
+from nerfro.core.rays import Rays
 from nerfro.geometry.interpolation import misses
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.light import to_linear, to_srgb
-from nerfro.rays import Rays
 from nerfro.samplers.paths.snell import Snell
 from nerfro.silhouettes.visual_hull import Silhouettes
 from tests.ball_photographs import BOX, NUM_VIEWS, RADIUS, SIZE, cameras, photographs, sky, soft_masks, solid

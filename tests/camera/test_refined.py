@@ -8,8 +8,8 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from nerfro.camera.similarity import Similarity, motion_between, similarity
-from nerfro.cameras import Cameras
-from nerfro.lens import coefficients
+from nerfro.core.cameras import Cameras
+from nerfro.core.lens import coefficients
 from tests.camera.refined_cameras import phase, pixel_units, refined
 
 NUM_VIEWS, SIZE = 8, 20

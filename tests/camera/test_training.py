@@ -12,12 +12,12 @@ import torch
 
 from benchmarks.cameras import disturbed
 from nerfro.camera.similarity import motion_between
+from nerfro.core.light import to_linear, to_srgb
 from nerfro.data.blender import BlenderData
 from nerfro.evaluation.results import read_metrics_json
 from nerfro.files.images import save_png
 from nerfro.geometry.mesh import load_mesh
-from nerfro.light import to_linear, to_srgb
-from nerfro.registry import discover
+from nerfro.registry.registration import discover
 from nerfro.silhouettes.silhouettes import mesh_silhouettes
 from nerfro.training.load import load
 from nerfro.training.run_folder import load_checkpoint
@@ -25,7 +25,7 @@ from tests.ball_photographs import TRAINING, photographs, save
 from tests.conftest import Runner, weights_of
 
 discover()
-NerfstudioData = import_module("nerfro_plugins.data_formats.nerfstudio").NerfstudioData
+NerfstudioData = import_module("nerfro.data.formats.nerfstudio").NerfstudioData
 
 # A scene of a few steps has slopes for cameras to go by.
 LEARNED_SKY = ["optimizer.groups={background.*: {learning_rate: 0.1, start: 0}}", "optimizer.warmup_steps=0"]

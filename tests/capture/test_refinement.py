@@ -17,14 +17,14 @@ from nerfro.capture import refinement
 from nerfro.capture.refinement import DescentStage, Refined, RefinementProblem, RefinementSettings, refine_surface
 from nerfro.capture.room_panorama import panorama_of
 from nerfro.capture.surroundings import Pixels, Room, Surroundings, divide_pixels, learn_surroundings
-from nerfro.draws import Draws
-from nerfro.errors import NerfroError
+from nerfro.core.draws import Draws
+from nerfro.core.errors import NerfroError
+from nerfro.core.types import Exits
 from nerfro.geometry.mesh import load_mesh
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.samplers.paths.snell import Snell
 from nerfro.silhouettes.silhouettes import mesh_silhouettes
 from nerfro.silhouettes.visual_hull import Silhouettes
-from nerfro.types import Exits
 from tests.ball_photographs import BOX, RADIUS, cameras, mesh, photographs_of, save, sky, solid
 from tests.closed_forms import grid_points
 from tests.conftest import Runner

@@ -11,14 +11,14 @@ from torch import Tensor
 from nerfro.boundaries.base import Boundary
 from nerfro.capture.object_errors import unsupported_bodies
 from nerfro.capture.surroundings import Observations, Pixels, Surroundings
+from nerfro.core.subdivision import pixel_rays
+from nerfro.core.types import Exits
 from nerfro.data.base import Views
 from nerfro.geometry.mesh import load_mesh
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.solid import Solid
-from nerfro.registry import plugin_module
+from nerfro.registry.registration import plugin_module
 from nerfro.samplers.paths.snell import Snell
-from nerfro.subdivision import pixel_rays
-from nerfro.types import Exits
 from tests.ball_photographs import NUM_VIEWS, SIZE, cameras, sky
 from tests.media.vessels import SdfVessel
 

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from nerfro.data.base import DataSource, Views
 from nerfro.data.blender import BlenderData, OpenCVData
-from nerfro.registry import discover
+from nerfro.registry.registration import discover
 
 from .photographs import (
     CX,
@@ -37,7 +37,7 @@ from .photographs import (
 
 discover()
 NAMES = ("colmap", "colmap_model", "idr", "llff", "nerfstudio", "refref")
-_MODULES = [import_module(f"nerfro_plugins.data_formats.{name}") for name in NAMES]
+_MODULES = [import_module(f"nerfro.data.formats.{name}") for name in NAMES]
 colmap, colmap_model, idr, llff, nerfstudio, refref = _MODULES
 ColmapData, NerfstudioData = colmap.ColmapData, nerfstudio.NerfstudioData
 CAMERA_MODELS = colmap_model.CAMERA_MODELS

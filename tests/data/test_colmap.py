@@ -13,8 +13,8 @@ import torch
 import trimesh
 from omegaconf import OmegaConf
 
+from nerfro.core.errors import NerfroError
 from nerfro.data.base import Views
-from nerfro.errors import NerfroError
 from tests.conftest import SMALL, refused
 
 from .formats import BROWN, CAMERA_MODELS, FORMATS, OPENCV, TRAIN, colmap_model, write_colmap

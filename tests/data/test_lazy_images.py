@@ -9,11 +9,11 @@ import pytest
 import torch
 from PIL import Image
 
+from nerfro.core.errors import NerfroError
 from nerfro.data import pixel_store
 from nerfro.data.image_files import read_rgb
 from nerfro.data.lazy_images import LazyImages, decoded_once
 from nerfro.data.pixel_store import PixelStore
-from nerfro.errors import NerfroError
 
 read = partial(read_rgb, alpha="drop")
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from nerfro.camera.base import CameraModel
+from nerfro.core.lens import coefficients, opencv_coefficients
 from nerfro.data.blender import BlenderData
 from nerfro.data.lenses import Lens, check_lenses, read_lens
-from nerfro.lens import coefficients, opencv_coefficients
 from nerfro.viewing.camera_files import write_cameras
 from tests.conftest import refused
 

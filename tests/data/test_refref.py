@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
 from tests.conftest import refused
 
 from .formats import REFREF_LENS, few_refref_views, refref, write_refref  # noqa: F401

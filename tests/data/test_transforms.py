@@ -11,9 +11,9 @@ import torch
 import trimesh
 from PIL import Image
 
+from nerfro.core.errors import NerfroError
 from nerfro.data.base import Views
 from nerfro.data.blender import BlenderData, OpenCVData
-from nerfro.errors import NerfroError
 from tests.conftest import refused
 
 from .formats import (

@@ -11,10 +11,10 @@ from nerfro.evaluation.image_metrics import ImageMetric, build_metrics, psnr
 from nerfro.evaluation.ssim import ssim
 from nerfro.files.drawing import magma
 from nerfro.files.images import load_png, round_to_8bit
-from nerfro.registry import discover
+from nerfro.registry.registration import discover
 
 discover()
-flip = import_module("nerfro_plugins.perceptual_metrics.flip").flip
+flip = import_module("nerfro.evaluation.perceptual.flip").flip
 
 
 class Difference(torch.nn.Module):

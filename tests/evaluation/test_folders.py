@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
 from nerfro.evaluation.folders import match_folders
 from tests.conftest import refused
 

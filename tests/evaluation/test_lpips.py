@@ -6,12 +6,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfro.registry import discover
+from nerfro.registry.registration import discover
 from tests.conftest import refused
 from tests.processes import printed_by
 
 discover()
-pretrained, lpips = (import_module(f"nerfro_plugins.perceptual_metrics.{name}") for name in ("pretrained", "lpips"))
+pretrained, lpips = (import_module(f"nerfro.evaluation.perceptual.{name}") for name in ("pretrained", "lpips"))
 CONVOLUTIONS, Lpips, LpipsNetwork = lpips.CONVOLUTIONS, lpips.Lpips, lpips.LpipsNetwork
 load_lpips_network = lpips.load_lpips_network
 

@@ -20,11 +20,11 @@ from nerfro.evaluation.regions import crop_rectangle, mean_over, object_pixels
 from nerfro.evaluation.results import EvaluationResult
 from nerfro.evaluation.ssim import ssim, ssim_map
 from nerfro.files.images import load_png, round_to_8bit, save_png
-from nerfro.registry import discover
+from nerfro.registry.registration import discover
 from tests.conftest import refused
 
 discover()
-flips = import_module("nerfro_plugins.perceptual_metrics.flip")
+flips = import_module("nerfro.evaluation.perceptual.flip")
 flip, flip_map = flips.flip, flips.flip_map
 
 

@@ -12,11 +12,11 @@ import torch
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from nerfro.registry import discover
+from nerfro.registry.registration import discover
 from tests.conftest import refused
 
 discover()
-pretrained = import_module("nerfro_plugins.perceptual_metrics.pretrained")
+pretrained = import_module("nerfro.evaluation.perceptual.pretrained")
 ALEXNET, load_weights, unreachable = pretrained.ALEXNET, pretrained.load_weights, pretrained.unreachable
 
 WEIGHTS = {"features.0.weight": torch.arange(6.0)}

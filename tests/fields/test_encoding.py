@@ -5,10 +5,10 @@ import math
 import pytest
 import torch
 
+from nerfro.core.types import Rays, Samples
 from nerfro.samplers.paths.straight import straight_path
 from nerfro.samplers.points.stratified import cone_samples
 from nerfro.testing import example_path
-from nerfro.types import Rays, Samples
 from tests.paper import frustum_gaussians, integrated_positional_encoding, positional_encoding
 
 

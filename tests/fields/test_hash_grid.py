@@ -5,12 +5,12 @@ from dataclasses import replace
 import pytest
 import torch
 
+from nerfro.core.types import Samples
 from nerfro.fields import hash_encoding
 from nerfro.fields.hash_grid import HashGridField
 from nerfro.fields.selection import evaluate_selected, inside_box
 from nerfro.fields.spherical_harmonics import spherical_harmonics
 from nerfro.geometry.contraction import contract, expand
-from nerfro.types import Samples
 from tests.exact_silhouettes import cameras_around
 
 

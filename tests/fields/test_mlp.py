@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
+from nerfro.core.light import to_srgb
 from nerfro.fields.networks import compile_networks, radiance
-from nerfro.light import to_srgb
 from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import example_path, example_samples
 from tests.gradients import require_equal_gradients

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
 from nerfro.files import cache
 from nerfro.files.cache import cached_arrays, content_hash, save_arrays
 from nerfro.files.mapped import mapped_array

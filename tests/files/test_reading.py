@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from PIL import Image, ImageFile
 
+from nerfro.core.errors import NerfroError
 from nerfro.data.image_files import read_levels, read_rgb, read_size
-from nerfro.errors import NerfroError
 from nerfro.files.foreign_config import read_foreign_config
 from nerfro.files.images import load_png
 from nerfro.files.reading import load_array, load_arrays, read_json

@@ -26,9 +26,9 @@ from unittest import mock
 
 import numpy as np
 
-from nerfro.errors import NerfroError
+from nerfro.cli.failures import in_one_line
+from nerfro.core.errors import NerfroError
 from nerfro.evaluation.metrics import ImageMetrics
-from nerfro.failures import in_one_line
 from nerfro.files import cache
 
 SECONDS = 60

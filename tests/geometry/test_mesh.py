@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
 from nerfro.geometry.mesh import load_mesh
 from tests.conftest import refused
 

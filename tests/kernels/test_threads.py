@@ -25,7 +25,7 @@ TWO_THREADS = """
 import threading, numba, torch
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.samplers.paths.snell import Snell
-from nerfro.types import Rays
+from nerfro.core.types import Rays
 
 torch.set_num_threads(2)
 axis = torch.linspace(-1.5, 1.5, 16)

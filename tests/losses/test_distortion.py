@@ -6,13 +6,13 @@ from unittest.mock import Mock
 import pytest
 import torch
 
-from nerfro.registry import discover
+from nerfro.core.types import Path, Rendering, Samples
+from nerfro.registry.registration import discover
 from nerfro.rendering import Scene
 from nerfro.testing import example_batch
-from nerfro.types import Path, Rendering, Samples
 
 discover()
-plugin = import_module("nerfro_plugins.distortion")
+plugin = import_module("nerfro.losses.distortion")
 Distortion, distortion = plugin.Distortion, plugin.distortion
 
 SCENE = Mock(spec=Scene)

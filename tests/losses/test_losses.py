@@ -10,16 +10,16 @@ from torch import Tensor
 from torch.nn.functional import conv2d
 
 from nerfro.boundaries.envmap import EnvironmentMap
-from nerfro.light import to_srgb
+from nerfro.core.light import to_srgb
+from nerfro.core.types import Batch, Rendering
 from nerfro.losses.boundary import BoundaryRegularizer
 from nerfro.losses.photometric import Photometric
 from nerfro.losses.total_variation import TotalVariation, direction_pairs
 from nerfro.models.refractive import RefractiveModel
-from nerfro.registry import create, find
+from nerfro.registry.registration import create, find
 from nerfro.rendering import ColourSpace, Renderer, Scene
 from nerfro.samplers.points.stratified import point_samples
 from nerfro.testing import NUM_RAYS, example_batch, example_components, example_draws, example_path, example_rendering
-from nerfro.types import Batch, Rendering
 from tests.paper import Smoothness, small_components, tile_roughness
 
 

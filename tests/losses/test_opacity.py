@@ -6,6 +6,7 @@ from unittest.mock import Mock
 import pytest
 import torch
 
+from nerfro.core.types import FieldValues, Path, Rays, Rendering, Samples
 from nerfro.losses.backdrop import Backdrop
 from nerfro.losses.base import Loss
 from nerfro.losses.near_camera import NearCamera
@@ -14,7 +15,6 @@ from nerfro.media.shapes import Ball
 from nerfro.rendering import Scene, composite
 from nerfro.samplers.paths.straight import Straight
 from nerfro.testing import example_batch, example_path
-from nerfro.types import FieldValues, Path, Rays, Rendering, Samples
 
 SCENE = Mock(spec=Scene)
 

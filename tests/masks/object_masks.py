@@ -1,6 +1,6 @@
 """The modules of the plugin that makes masks."""
 
-from nerfro.registry import plugin_module
+from nerfro.registry.registration import plugin_module
 
 _NAMES = ("mask_files", "masking", "tracking")
 mask_files, masking, tracking = (plugin_module(f"object_masks.{name}") for name in _NAMES)

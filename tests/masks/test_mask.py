@@ -16,7 +16,7 @@ from scipy.ndimage import gaussian_filter
 
 pytest.importorskip("cv2")
 
-from nerfro.cameras import Cameras
+from nerfro.core.cameras import Cameras
 from nerfro.data.blender import OpenCVData
 from nerfro.data.masks import method_of
 from tests.forked import Command

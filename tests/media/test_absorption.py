@@ -7,13 +7,13 @@ import pytest
 import torch
 from torch import Tensor
 
+from nerfro.core.types import FieldValues, Path, Rays
 from nerfro.media.shapes import Ball
 from nerfro.models.refractive import RefractiveModel
 from nerfro.rendering import composite
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.points.stratified import point_samples
 from nerfro.testing import example_components, example_rays
-from nerfro.types import FieldValues, Path, Rays
 from tests.closed_forms import beam, random_rays
 from tests.conftest import refused
 from tests.paper import Eikonal

@@ -11,11 +11,11 @@ import torch
 import trimesh
 from torch import Tensor
 
+from nerfro.core.types import Path as RayPath
+from nerfro.core.types import Rays
 from nerfro.media.material import MATERIALS
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.samplers.paths.snell import Snell, trace_interfaces
-from nerfro.types import Path as RayPath
-from nerfro.types import Rays
 from tests.closed_forms import angle, ball_exits, make_rays
 from tests.conftest import refused
 from tests.paper import Eikonal

@@ -7,7 +7,7 @@ import pytest
 import torch
 import trimesh
 
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
 from nerfro.media.analytic import Vacuum
 from nerfro.media.base import Medium
 from nerfro.media.distance_grid import SURFACE_BLOCK

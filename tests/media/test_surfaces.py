@@ -15,7 +15,7 @@ from torch import Tensor
 
 from nerfro.media.bodies import origin_of
 from nerfro.media.sdf_grid import SdfGrid
-from nerfro.registry import discover
+from nerfro.registry.registration import discover
 from nerfro.samplers.paths.snell import Snell
 from tests.closed_forms import angle, make_rays
 from tests.conftest import refused

@@ -8,7 +8,7 @@ import torch
 import trimesh
 
 from nerfro.geometry.mesh import load_mesh
-from nerfro.registry import plugin_module
+from nerfro.registry.registration import plugin_module
 from nerfro.samplers.paths.snell import Snell, trace_interfaces
 from nerfro.viewing.surface import surface_of
 from tests.closed_forms import angle, make_rays

@@ -6,7 +6,7 @@ import pytest
 import torch
 import trimesh
 
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
 from tests.closed_forms import grid_points
 from tests.conftest import refused
 from tests.paper import VoxelGrid, gradient

@@ -6,7 +6,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Bool, Float
 
-from nerfro.registry import plugin_module
+from nerfro.registry.registration import plugin_module
 
 SdfVessel = plugin_module("vessels.vessel").SdfVessel
 RADIUS, WALL = 0.8, 0.1

@@ -7,11 +7,11 @@ import torch
 from torch import Tensor
 
 from nerfro.boundaries.base import Boundary
+from nerfro.core.types import Exits
 from nerfro.models.refractive import RefractiveModel
 from nerfro.rendering import Components
 from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import example_rays
-from nerfro.types import Exits
 from tests.paper import MipNerfModel, small_components
 
 

@@ -6,13 +6,13 @@ from torch.nn.functional import normalize
 from nerfro.boundaries.base import Boundary
 from nerfro.boundaries.constant import ConstantBoundary
 from nerfro.boundaries.envmap import EnvironmentMap
-from nerfro.draws import Draws
+from nerfro.core.draws import Draws
+from nerfro.core.types import Path
 from nerfro.fields.hash_grid import HashGridField
 from nerfro.media.shapes import Ball
 from nerfro.rendering import composite
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.points.density_grid import DensityGridSampler
-from nerfro.types import Path
 from tests.cameras_at import cameras_at
 
 WALL = 3.0  # half side of the room

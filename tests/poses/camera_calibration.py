@@ -1,6 +1,6 @@
 """The modules of the plugin that estimates lens and poses of photographs."""
 
-from nerfro.registry import plugin_module
+from nerfro.registry.registration import plugin_module
 
 _NAMES = ("boards", "calibration", "collection", "photographs", "structure_from_motion", "video")
 _MODULES = [plugin_module(f"camera_calibration.{name}") for name in _NAMES]

@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from nerfro.core.types import Path, Rays
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball
 from nerfro.media.solid import Solid
@@ -17,7 +18,6 @@ from nerfro.samplers.paths import compiled
 from nerfro.samplers.paths.replay import smallest_cosine
 from nerfro.samplers.paths.snell import Snell, trace_interfaces
 from nerfro.samplers.paths.snell_law import reflectance
-from nerfro.types import Path, Rays
 from tests.closed_forms import RoundedBox, Slab, beam, make_rays, random_rays
 from tests.samplers.nested import NestedBalls, nested_grid, nested_mesh
 

@@ -13,8 +13,8 @@ import torch
 from scipy.integrate import quad, simpson
 from torch import Tensor
 
+from nerfro.core.types import Path, Rays
 from nerfro.media.base import Medium
-from nerfro.types import Path, Rays
 from tests.closed_forms import (
     FIBRE_ALPHA,
     FunctionMedium,

@@ -5,11 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
+from nerfro.core.types import FieldValues, Path, Samples
 from nerfro.fields.base import Field
 from nerfro.geometry.contraction import contracted_length, contraction_scale
 from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.testing import example_draws, example_path
-from nerfro.types import FieldValues, Path, Samples
 
 RADIUS = 0.4
 

@@ -6,12 +6,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfro.draws import Draws
+from nerfro.core.draws import Draws
+from nerfro.core.types import FieldValues, Path, Rendering
 from nerfro.rendering import composite
 from nerfro.samplers.paths.straight import straight_path
 from nerfro.samplers.points.stepfun import midpoints
 from nerfro.testing import example_draws, example_path, example_rays
-from nerfro.types import FieldValues, Path, Rendering
 from tests.paper import Hierarchical
 
 

@@ -4,6 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from nerfro.core.types import FieldValues, Path, Rendering
 from nerfro.media.analytic import Vacuum
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
@@ -14,7 +15,6 @@ from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.paths.straight import Straight
 from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import example_rays
-from nerfro.types import FieldValues, Path, Rendering
 from tests.closed_forms import (
     FunctionMedium,
     Squared,

@@ -8,12 +8,12 @@ import torch
 import trimesh
 from torch import Tensor
 
+from nerfro.core.types import Path
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.samplers.base import PathSampler
 from nerfro.samplers.paths.snell import Snell
-from nerfro.types import Path
 from tests.closed_forms import RoundedBox, random_rays
 from tests.paper import Eikonal
 

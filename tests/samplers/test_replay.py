@@ -11,6 +11,7 @@ import torch
 import trimesh
 from torch import Tensor
 
+from nerfro.core.types import Path, Rays, Samples
 from nerfro.media.analytic import Vacuum
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
@@ -19,7 +20,6 @@ from nerfro.samplers.base import PathSampler
 from nerfro.samplers.paths.replay import smallest_cosine
 from nerfro.samplers.paths.snell import Snell, trace_interfaces
 from nerfro.samplers.paths.straight import Straight
-from nerfro.types import Path, Rays, Samples
 from tests.closed_forms import RoundedBox, beam, grid_points, make_rays, random_rays
 from tests.paper import Eikonal, VoxelGrid, march_adaptive
 from tests.samplers.nested import NestedBalls, nested_grid, nested_mesh

@@ -10,12 +10,12 @@ import trimesh
 from torch import Tensor
 
 from benchmarks.rounded_cube import trace_rounded_cube
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
+from nerfro.core.types import Rays
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball
 from nerfro.samplers.paths.snell import Snell, trace_interfaces
 from nerfro.samplers.paths.snell_law import refract
-from nerfro.types import Rays
 from tests.closed_forms import Luneburg, RoundedBox, Slab, angle, ball_exits, beam, grid_points, make_rays, random_rays
 from tests.conftest import refused
 

@@ -5,10 +5,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from nerfro.core.types import Path
 from nerfro.samplers.paths.straight import straight_path
 from nerfro.samplers.points.stepfun import invert_cdf, spread_uniform
 from nerfro.testing import example_draws
-from nerfro.types import Path
 from tests.closed_forms import make_rays
 from tests.paper import blur_weights
 

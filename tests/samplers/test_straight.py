@@ -2,9 +2,9 @@
 
 import torch
 
+from nerfro.core.types import Rays
 from nerfro.media.shapes import Ball
 from nerfro.samplers.paths.straight import Straight
-from nerfro.types import Rays
 
 
 def test_path_is_the_line_from_near_to_far_in_any_medium() -> None:

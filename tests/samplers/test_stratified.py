@@ -5,11 +5,11 @@ import math
 import pytest
 import torch
 
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
+from nerfro.core.types import Path
 from nerfro.samplers.paths.straight import straight_path
 from nerfro.samplers.points.stratified import LAST_FRACTION, Stratified
 from nerfro.testing import example_draws, example_rays
-from nerfro.types import Path
 from tests.closed_forms import Luneburg
 from tests.paper import Eikonal
 

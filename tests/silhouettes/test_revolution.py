@@ -5,7 +5,7 @@ import pytest
 import torch
 import trimesh
 
-from nerfro.cameras import Cameras
+from nerfro.core.cameras import Cameras
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.silhouettes import surface
 from nerfro.silhouettes.revolution import fit_revolution

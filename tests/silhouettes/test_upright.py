@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from nerfro.cameras import Cameras
+from nerfro.core.cameras import Cameras
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.silhouettes.upright import body_axis, camera_up, find_up
 from tests.cameras_at import upright_cameras

@@ -8,9 +8,9 @@ import torch
 import trimesh
 from scipy.spatial import cKDTree
 
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
+from nerfro.core.paths import ASSETS_DIR
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
-from nerfro.paths import ASSETS_DIR
 from nerfro.silhouettes import surface
 from nerfro.silhouettes.pose_conventions import overlap, require_consistent_poses
 from nerfro.silhouettes.silhouette_fit import fit_surface

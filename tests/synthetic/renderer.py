@@ -1,12 +1,12 @@
-"""Functions and classes of `plugins/synthetic_scenes/`, for imports by tests."""
+"""Functions and classes of `nerfro/synthetic/`, for imports by tests."""
 
 from importlib import import_module
 
-from nerfro.registry import discover
+from nerfro.registry.registration import discover
 
 discover()
 dataset, glass, llvm, path_tracer, scene, surface, synthesis, viewpoints = (
-    import_module(f"nerfro_plugins.synthetic_scenes.{name}")
+    import_module(f"nerfro.synthetic.{name}")
     for name in ("dataset", "glass", "llvm", "path_tracer", "scene", "surface", "synthesis", "viewpoints")
 )
 CAMERA_ANGLE_X, CAMERA_DISTANCE = dataset.CAMERA_ANGLE_X, dataset.CAMERA_DISTANCE

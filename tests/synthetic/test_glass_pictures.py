@@ -7,13 +7,13 @@ import pytest
 import torch
 from torch import Tensor
 
+from nerfro.core.light import to_srgb
+from nerfro.core.subdivision import part_rays
+from nerfro.core.types import Path, Rays
 from nerfro.evaluation.image_metrics import psnr
-from nerfro.light import to_srgb
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball
 from nerfro.samplers.paths.snell import Snell
-from nerfro.subdivision import part_rays
-from nerfro.types import Path, Rays
 from tests.cameras_at import cameras_at
 from tests.closed_forms import RoundedBox, grid_points
 from tests.synthetic.empty_glass import empty_glass

@@ -12,11 +12,11 @@ newest, version_in_name = llvm.newest, llvm.version_in_name
 # Old libraries of this machine; Dr.Jit accepts LLVM 15, but aborts the process when it compiles with it.
 OLD = sorted(str(file) for file in Path("/usr/lib").glob("*/libLLVM*.so.*") if (version_in_name(file) or 99) < 16)
 RENDER = """
-from nerfro.registry import discover
+from nerfro.registry.registration import discover
 discover()
-from nerfro_plugins.synthetic_scenes.path_tracer import PathTracer, Pinhole
-from nerfro_plugins.synthetic_scenes.synthesis import find_scene
-from nerfro_plugins.synthetic_scenes.viewpoints import look_at_origin
+from nerfro.synthetic.path_tracer import PathTracer, Pinhole
+from nerfro.synthetic.synthesis import find_scene
+from nerfro.synthetic.viewpoints import look_at_origin
 tracer = PathTracer(find_scene("torus").build(0.3), False, Pinhole.square(0.7, 2))
 print(tracer.mitsuba.variant(), tracer.render(look_at_origin([0, 0.1, 4]), spp=1, seed=0).mean() > 0)
 """

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
 from tests.processes import python
 from tests.synthetic.renderer import (
     CAMERA_ANGLE_X,
@@ -135,8 +135,8 @@ def test_background_pixels_show_the_sky_in_the_direction_of_the_pixel(poses):
 
 def test_missing_mitsuba_names_the_extra_to_install():
     """In a process of its own, which has not imported Mitsuba before."""
-    code = "import sys; sys.modules['mitsuba'] = None; from nerfro.registry import discover; discover()\n"
-    code += "import nerfro_plugins.synthetic_scenes.path_tracer as t; t.load_mitsuba()"
+    code = "import sys; sys.modules['mitsuba'] = None; from nerfro.registry.registration import discover; discover()\n"
+    code += "import nerfro.synthetic.path_tracer as t; t.load_mitsuba()"
     errors = python("-c", code).stderr
     assert "NerfroError" in errors
     assert "pip install 'nerfro[synthesize]'" in errors

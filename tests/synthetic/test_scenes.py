@@ -5,9 +5,9 @@ from importlib import import_module
 import numpy as np
 import pytest
 
-from nerfro.light import to_srgb
-from nerfro.registry import discover
-from nerfro.synthetic import SCENES
+from nerfro.core.light import to_srgb
+from nerfro.registry.registration import discover
+from nerfro.synthetic.options import SCENES
 from tests.synthetic.renderer import (
     directions_on_sphere,
     find_scene,
@@ -19,7 +19,7 @@ from tests.synthetic.renderer import (
 )
 
 discover()
-distance = import_module("nerfro_plugins.synthetic_scenes.scenes.distance")
+distance = import_module("nerfro.synthetic.scenes.distance")
 
 
 def test_triangulation_lies_on_the_surface_and_faces_outward():

@@ -9,8 +9,8 @@ import trimesh
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from nerfro.core.rays import Rays
 from nerfro.media.solid import Solid
-from nerfro.rays import Rays
 from nerfro.samplers.paths.snell import Snell
 from tests.closed_forms import angle, make_rays
 from tests.media.vessels import SdfVessel

@@ -14,18 +14,18 @@ from lightning.pytorch.callbacks import timer
 from torch import Tensor
 
 from nerfro.boundaries.envmap import EnvironmentMap
+from nerfro.core.light import to_srgb
+from nerfro.core.types import Exits
 from nerfro.data.blender import BlenderData
 from nerfro.evaluation.results import read_metrics_json
 from nerfro.fields.base import Field
 from nerfro.fields.hash_grid import HashGridField
-from nerfro.light import to_srgb
 from nerfro.training.build import build
 from nerfro.training.callbacks import steps_by_phase
 from nerfro.training.phases.background import BackgroundSteps
 from nerfro.training.phases.base import TrainingRun
 from nerfro.training.ray_batches import RayBatches
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
-from nerfro.types import Exits
 from tests.conftest import Runner, weights_of
 
 

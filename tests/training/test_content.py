@@ -5,9 +5,9 @@ import pytest
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from nerfro.cameras import Cameras
+from nerfro.core.cameras import Cameras
 from nerfro.media.analytic import Vacuum
-from nerfro.registry import discover, find
+from nerfro.registry.registration import discover, find
 from nerfro.training.angular_resolution import derive_angular_resolution
 from nerfro.training.config import TrainConfig
 from nerfro.training.content import common_target, derive_content, describe

@@ -12,6 +12,7 @@ import pytest
 import torch
 from lightning.pytorch import Trainer
 
+from nerfro.core.types import Batch
 from nerfro.data.blender import BlenderData
 from nerfro.data.pixel_store import PixelStore
 from nerfro.media.sdf_grid import SdfGrid
@@ -21,7 +22,6 @@ from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.training.data_module import Prefetcher, RayDataModule, can_prefetch, multiplies_large_matrices
 from nerfro.training.module import TrainingModule
 from nerfro.training.ray_batches import RayBatches
-from nerfro.types import Batch
 from tests.closed_forms import grid_points, random_rays
 from tests.conftest import Runner, weights_of
 from tests.paper import Eikonal

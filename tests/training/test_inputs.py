@@ -9,7 +9,7 @@ import pytest
 import torch
 import trimesh
 
-from nerfro.cameras import Cameras
+from nerfro.core.cameras import Cameras
 from nerfro.training.inputs import INPUTS, changed_file, inputs_of, require_same_inputs
 from nerfro.training.load import load
 from tests.conftest import Runner, composed, refused

@@ -10,7 +10,7 @@ import torch
 from nerfro.boundaries.base import Boundary
 from nerfro.boundaries.constant import ConstantBoundary
 from nerfro.boundaries.envmap import EnvironmentMap
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
 from nerfro.kernels import available
 from nerfro.kernels.available import available_bytes, require_bytes
 from nerfro.media.analytic import Vacuum

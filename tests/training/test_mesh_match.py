@@ -8,8 +8,8 @@ import pytest
 import torch
 import trimesh
 
+from nerfro.core.errors import NerfroError
 from nerfro.data.base import Views
-from nerfro.errors import NerfroError
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.training.mesh_match import require_match
 from tests.exact_silhouettes import cameras_around, photographed

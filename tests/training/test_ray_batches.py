@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
+from nerfro.core.subdivision import Subdivision
 from nerfro.data.base import Views
 from nerfro.media.shapes import Ball
 from nerfro.samplers.paths.snell import Snell
-from nerfro.subdivision import Subdivision
 from nerfro.training.ray_batches import RayBatches
 from tests.cameras_at import cameras_at, random_poses
 from tests.conftest import refused

@@ -11,7 +11,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from nerfro.cli import entry_point
+from nerfro.cli.entry import entry_point
 from nerfro.files.folder_lock import hold
 from nerfro.training.config import TrainConfig
 from nerfro.training.data_module import RayDataModule

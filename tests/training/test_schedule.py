@@ -13,8 +13,8 @@ from lightning.pytorch.callbacks import Timer
 from torch import nn
 from torch.optim import Adam
 
+from nerfro.core.errors import NerfroError
 from nerfro.data.base import Views
-from nerfro.errors import NerfroError
 from nerfro.rendering import Renderer
 from nerfro.training.callbacks import Throughput, steps_by_phase
 from nerfro.training.phases.base import Phase, TrainingRun

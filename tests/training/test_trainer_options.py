@@ -15,8 +15,8 @@ from lightning.pytorch.callbacks import Timer
 from omegaconf import OmegaConf
 
 import nerfro.training.trainer
-from nerfro.allowed import Refused, check_settings
-from nerfro.registry import build, find, register
+from nerfro.registry.allowed import Refused, check_settings
+from nerfro.registry.registration import build, find, register
 from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.testing import check
 from nerfro.training.config import TrainConfig, TrainerConfig, clock_time, resolve_trainer_options
@@ -33,7 +33,7 @@ REFUSED = {
 }
 CALLBACK = '''
 from lightning.pytorch import Callback
-from nerfro.registry import register
+from nerfro.registry.registration import register
 
 
 @register("callbacks", "step_file")

@@ -9,16 +9,16 @@ import pytest
 import torch
 
 from nerfro.boundaries.envmap import EnvironmentMap
+from nerfro.core.types import FieldValues, Samples
 from nerfro.data.base import DataSource, Views
 from nerfro.fields.base import Field
 from nerfro.files import lat_long
 from nerfro.media.shapes import Ball
 from nerfro.models.refractive import RefractiveModel
-from nerfro.registry import discover
+from nerfro.registry.registration import discover
 from nerfro.rendering import Components
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.points.stratified import Stratified
-from nerfro.types import FieldValues, Samples
 from nerfro.viewing.server import PageServer
 from nerfro.viewing.trained_scene import TrainedScene
 from tests.cameras_at import cameras_at
@@ -51,7 +51,7 @@ class Photographs(DataSource):
     def load(self, split: str) -> Views:
         places = [(4, 0, 1), (0, 4, 0.5), (-3, 2, -1)] if split == "test" else [(4, 0, 0), (0, -4, 0), (-2, 2, 2.8)]
         discover()
-        look_at_origin = import_module("nerfro_plugins.synthetic_scenes.viewpoints").look_at_origin
+        look_at_origin = import_module("nerfro.synthetic.viewpoints").look_at_origin
         poses = np.stack([look_at_origin(np.array(place, float))[:3] for place in places])
         size = 32
         cameras = cameras_at(poses, size, size, 0.5 * size / math.tan(0.5 * 0.7))

@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from nerfro.boundaries.envmap import EnvironmentMap
-from nerfro.types import Exits
+from nerfro.core.types import Exits
 from nerfro.viewing.baking import bake_sky, cube_directions
 from nerfro.viewing.packing import pack, shared_exponent
 

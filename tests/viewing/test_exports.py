@@ -18,10 +18,10 @@ import trimesh
 from omegaconf import OmegaConf
 from PIL import Image
 
-from nerfro.errors import NerfroError
-from nerfro.light import to_linear, to_srgb
+from nerfro.core.errors import NerfroError
+from nerfro.core.light import to_linear, to_srgb
+from nerfro.core.subdivision import Subdivision
 from nerfro.media.sdf_grid import SdfGrid
-from nerfro.subdivision import Subdivision
 from nerfro.viewing.changes import with_changed_scene
 from nerfro.viewing.exports import ExportConfig, export_of, find_export
 from nerfro.viewing.trained_scene import TrainedScene

@@ -14,21 +14,21 @@ from jaxtyping import Float
 from PIL import Image
 
 from nerfro.boundaries.envmap import EnvironmentMap
-from nerfro.cameras import Cameras
+from nerfro.core.cameras import Cameras
+from nerfro.core.light import to_linear
+from nerfro.core.paths import resolve_path
+from nerfro.core.subdivision import Subdivision
+from nerfro.core.types import FieldValues, Samples
+from nerfro.core.variants import variant
 from nerfro.data.blender import BlenderData
 from nerfro.evaluation.image_metrics import psnr
 from nerfro.fields.base import Field
 from nerfro.files import lat_long
 from nerfro.files.deep_images import write_radiance
-from nerfro.light import to_linear
 from nerfro.media.sdf_grid import SdfGrid
-from nerfro.paths import resolve_path
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.points.density_grid import DensityGridSampler
-from nerfro.subdivision import Subdivision
 from nerfro.testing import example_draws
-from nerfro.types import FieldValues, Samples
-from nerfro.variants import variant
 from nerfro.viewing.changes import with_changed_scene
 from nerfro.viewing.page import make_page
 from nerfro.viewing.trained_scene import TrainedScene

@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 
+from nerfro.core.variants import variant
 from nerfro.files import lat_long
 from nerfro.samplers.paths.snell import Snell
-from nerfro.variants import variant
 from nerfro.viewing.changes import with_changed_scene
 from nerfro.viewing.trained_scene import TrainedScene
 from tests.closed_forms import ball_exits

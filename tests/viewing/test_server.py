@@ -8,7 +8,7 @@ import threading
 
 import pytest
 
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
 from nerfro.viewing.server import PageServer, _Handler
 from tests.conftest import refused
 

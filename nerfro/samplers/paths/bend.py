@@ -12,13 +12,13 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 from torch.nn import functional
 
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
+from nerfro.core.paths import resolve_path
 from nerfro.geometry.mesh import load_mesh
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.solid import Solid
-from nerfro.paths import resolve_path
-from nerfro.registry import discover, find
+from nerfro.registry.registration import discover, find
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.paths.thin_walls import warn_of_thin_walls
 from nerfro.samplers.paths.traced_file import leave_box, make_rays

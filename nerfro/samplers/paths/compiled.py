@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from jaxtyping import Int
 
+from nerfro.core.types import Path, Rays
 from nerfro.kernels.arrays import input_arrays
 from nerfro.samplers.paths.branching import Branching
 from nerfro.samplers.paths.polylines import SnellTrace
-from nerfro.types import Path, Rays
 
 if TYPE_CHECKING:
     from nerfro.media.sdf_grid import SdfGrid

@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from nerfro.core.types import Path, Rays
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.kernels.tolerances import BEYOND_BOX
-from nerfro.types import Path, Rays
 
 
 def distance_to_end(

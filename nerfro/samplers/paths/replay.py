@@ -17,13 +17,13 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
+from nerfro.core.types import Path, Rays
 from nerfro.geometry.intersection import Triangles
 from nerfro.media.base import Medium
 from nerfro.media.solid import Solid
 from nerfro.samplers.paths.branching import ONE_PATH, Branching
 from nerfro.samplers.paths.polylines import distance_to_end
 from nerfro.samplers.paths.snell_law import reflectance, refract, turning_normals
-from nerfro.types import Path, Rays
 
 # Lower bound of the cosine between ray and normal in a division, so that gradients stay finite.
 _MIN_COSINE = 1e-6

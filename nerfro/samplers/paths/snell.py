@@ -12,15 +12,16 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import one_hot
 
-from nerfro.allowed import OnlyWith, Positive, Range, Share
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
+from nerfro.core.types import Path, Rays
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.kernels.tolerances import MIN_SEARCH_STEP
 from nerfro.media.analytic import Vacuum
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.solid import Solid
-from nerfro.registry import register
+from nerfro.registry.allowed import OnlyWith, Positive, Range, Share
+from nerfro.registry.registration import register
 from nerfro.samplers.base import PathSampler
 from nerfro.samplers.paths.branching import ONE_PATH, Branching
 from nerfro.samplers.paths.compiled import snell_on_grid
@@ -28,7 +29,6 @@ from nerfro.samplers.paths.polylines import SnellTrace
 from nerfro.samplers.paths.replay import intersect_solid, intersect_triangles, replay, smallest_cosine
 from nerfro.samplers.paths.straight import replay_straight, straight_path
 from nerfro.samplers.paths.wavefront import Wavefront
-from nerfro.types import Path, Rays
 
 _ROOT_ITERATIONS = 60
 # The search for the next triangle begins at this share of the box's diagonal from the last one, beyond the rounding

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import torch
 
+from nerfro.core.types import Path, Rays
 from nerfro.media.base import Medium
-from nerfro.registry import register
+from nerfro.registry.registration import register
 from nerfro.samplers.base import PathSampler
-from nerfro.types import Path, Rays
 
 
 @register("sampler/path", "straight")

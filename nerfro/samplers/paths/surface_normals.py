@@ -7,11 +7,11 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
+from nerfro.core.types import Path
 from nerfro.media.base import Medium
 from nerfro.media.solid import Solid
 from nerfro.samplers.paths.replay import indices_of
 from nerfro.samplers.paths.snell_law import turning_normals
-from nerfro.types import Path
 
 
 def first_normals(path: Path, medium: Medium) -> Float[Tensor, "R 3"]:

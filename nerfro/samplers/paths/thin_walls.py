@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from nerfro.errors import NerfroError, warn
+from nerfro.core.errors import NerfroError, warn
 from nerfro.geometry.intersection import MeshIntersector
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.geometry.orientation import area_vectors

@@ -13,12 +13,12 @@ from jaxtyping import Float
 from omegaconf import MISSING
 from torch import Tensor
 
-from nerfro.allowed import Coordinate, Distance, check
-from nerfro.errors import NerfroError
+from nerfro.core.errors import NerfroError
+from nerfro.core.types import Path, Rays
 from nerfro.files.reading import load_arrays
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.media.base import Medium
-from nerfro.types import Path, Rays
+from nerfro.registry.allowed import Coordinate, Distance, check
 
 # Without `far`, paths end this number of diagonals beyond the box of the medium, because reflected paths are long.
 _DIAGONALS = 2

@@ -10,13 +10,13 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
+from nerfro.core.types import Rays
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.media.solid import Solid
 from nerfro.samplers.paths.branching import Branching
 from nerfro.samplers.paths.polylines import Crossed, PolylineBuilder, SnellTrace
 from nerfro.samplers.paths.replay import indices_of
 from nerfro.samplers.paths.snell_law import reflectance, refract
-from nerfro.types import Rays
 
 # Attributes of `Wavefront` with one row for each polyline.
 _COLUMNS = ("x", "d", "s", "inside", "triangles", "start", "moving", "ray", "weight", "num_events", "exceeded")

@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from nerfro.allowed import Count, NotNegative, Positive, Range, Share, corners_of_box
-from nerfro.draws import Draws
+from nerfro.core.draws import Draws
+from nerfro.core.types import Path, Rendering, Samples
 from nerfro.fields.base import Field
 from nerfro.geometry.contraction import (
     FAR,
@@ -24,11 +24,11 @@ from nerfro.geometry.contraction import (
     world_length,
 )
 from nerfro.kernels.arrays import arrays
-from nerfro.registry import register
+from nerfro.registry.allowed import Count, NotNegative, Positive, Range, Share, corners_of_box
+from nerfro.registry.registration import register
 from nerfro.samplers.base import PointSampler
 from nerfro.samplers.points.stepfun import invert_cdf, midpoints, spread_uniform, volume_weights
 from nerfro.samplers.points.stratified import cone_samples
-from nerfro.types import Path, Rendering, Samples
 
 # Smallest optical depth, predicted by the grid, of samples at which the field is queried.
 _EMPTY = 0.005

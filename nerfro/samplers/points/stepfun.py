@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.draws import Draws
-from nerfro.types import Path
+from nerfro.core.draws import Draws
+from nerfro.core.types import Path
 
 # Rays with a smaller total weight are sampled uniformly, as in the code of mip-NeRF.
 _MIN_TOTAL_WEIGHT = 1e-5

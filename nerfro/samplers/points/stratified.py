@@ -9,12 +9,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.allowed import Range
-from nerfro.draws import Draws
-from nerfro.errors import NerfroError
-from nerfro.registry import register
+from nerfro.core.draws import Draws
+from nerfro.core.errors import NerfroError
+from nerfro.core.types import Path, Rendering, Samples
+from nerfro.registry.allowed import Range
+from nerfro.registry.registration import register
 from nerfro.samplers.base import PointSampler
-from nerfro.types import Path, Rendering, Samples
 
 # Width of the interval of the last point sample, behind which the background is seen: in world units for
 # `draw=vertices`, as in the authors' code, and relative to the length of the path for other arc lengths.

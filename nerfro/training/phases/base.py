@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from nerfro.core.errors import NerfroError, renamed_classes
 from nerfro.data.base import Views
-from nerfro.errors import NerfroError, renamed_classes
 from nerfro.rendering import Renderer
 from nerfro.training.optimizer import require_matches
 from nerfro.training.ray_batches import RayBatches

@@ -1,0 +1,147 @@
+"""Gauss-Newton steps that align cameras with their photographs while the scene is fixed.
+
+Hundreds of pixels of a photograph determine the six parameters of its camera, so one Gauss-Newton step replaces many
+gradient steps with few pixels. Cameras are coupled by the common lens and by priors from panorama and silhouettes.
+Derivatives are finite differences of rendered colours over about a pixel. In contrast to automatic differentiation,
+these include moving silhouettes and ignore details below a pixel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from nerfro.camera.refined.least_squares import (
+    PriorInformation,
+    axes_across,
+    normal_equations,
+    robust_weights,
+    with_priors,
+)
+from nerfro.camera.refined.pixel_units import object_distances
+from nerfro.camera.refined.refined import RefinedCamera
+from nerfro.core.cameras import Cameras
+from nerfro.core.rays import Rays
+from nerfro.core.subdivision import contrast, pixel_rays
+
+# Rendered colours of rays, sRGB in [0, 1], with the exposure of the views.
+Render = Callable[[Rays, Int[Tensor, "R"]], Float[Tensor, "R 3"]]
+# Colours [R, 3] of pixels in the photographs.
+Photographed = Callable[[Int[Tensor, "R"]], Float[Tensor, "R 3"]]
+
+# Pixels with a smaller contrast to their neighbours (sRGB) carry no information about the pose.
+_MIN_CONTRAST = 0.03
+# Colour change per pixel of motion above which the weight decreases, because steep gradients hold over short distances.
+_STEEP_SLOPE = 0.1
+_TINY = 1e-9
+
+
+@dataclass(frozen=True)
+class Step:
+    """Settings of a Gauss-Newton step.
+
+    Attributes:
+        difference_pixels: distance of the finite differences in pixels.
+        scale: scale of the robust loss, see `robust_weights`, sRGB.
+        max_pixels: maximum motion of a camera, and maximum change of the lens, in pixels.
+        fraction: fraction of the step that is applied.
+    """
+
+    difference_pixels: float
+    scale: float
+    max_pixels: float
+    fraction: float = 1.0
+
+
+def gauss_newton_step(
+    camera: RefinedCamera,
+    cameras: Cameras,
+    pixels: Int[Tensor, "R"],
+    photographed: Photographed,
+    render: Render,
+    step: Step,
+    priors: Sequence[PriorInformation] = (),
+) -> None:
+    """Move each camera and change the common lens by one Gauss-Newton step.
+
+    Args:
+        camera: estimated cameras, changed in place.
+        cameras: cameras of the data set.
+        pixels: pixels of all views that are compared.
+        photographed: colours of pixels in the photographs.
+        render: colours of rays in the current scene.
+        step: settings of the step.
+        priors: prior information about the cameras.
+    """
+    view = cameras.view_of(pixels)
+    given, target = pixel_rays(cameras, pixels), photographed(pixels)
+    rays = camera(given, view)
+    angle = step.difference_pixels / cameras.fx[view]
+    distances = object_distances(cameras).to(angle)[view]
+    rendered, by_origin, by_direction = _differences(render, rays, view, angle, distances)
+    slopes = camera.slopes(given, view, by_origin, by_direction)
+    error = rendered - target
+    # A steep derivative is valid for small motions only, because colours are bounded.
+    weights = robust_weights(error, step.scale) / (1 + (slopes[..., :6] / _STEEP_SLOPE).square().sum((1, 2)))
+    matrix, vector = normal_equations(slopes.double(), error.double(), weights.double(), view, len(cameras))
+    variance = (weights[:, None] * error.square()).sum() / (3 * weights.sum()).clamp(min=_TINY)
+    matrix, vector = with_priors(matrix, vector, camera.parameter_vector(), variance, priors)
+    motion, lens = camera.split(-torch.linalg.solve(matrix, vector))
+    motion, lens = (
+        change * (step.max_pixels / change.norm(dim=-1, keepdim=True).clamp(min=_TINY)).clamp(max=1)
+        for change in (motion, lens)
+    )
+    camera.move(step.fraction * motion.to(angle), step.fraction * lens.to(angle))
+
+
+def informative_pixels(
+    candidates: Int[Tensor, "V M"],
+    num_pixels: int,
+    photographed: Photographed,
+    cameras: Cameras,
+    excluded: Bool[Tensor, "V M"] | None = None,
+) -> Int[Tensor, "R"]:
+    """Select pixels of each view for a Gauss-Newton step: candidates with contrast first, in the given order.
+
+    Args:
+        candidates: candidate pixels of each view.
+        num_pixels: maximum number of pixels per view.
+        photographed: colours of pixels in the photographs.
+        cameras: cameras of the data set.
+        excluded: candidates that must not be selected.
+    """
+    flat = (contrast(photographed, cameras, candidates.flatten()) < _MIN_CONTRAST).view(candidates.shape)
+    excluded = torch.zeros_like(flat) if excluded is None else excluded
+    order = (flat + 2 * excluded).argsort(dim=1, stable=True)[:, :num_pixels]
+    return candidates.gather(1, order)[~excluded.gather(1, order)]
+
+
+def _differences(
+    render: Render,
+    rays: Rays,
+    view: Int[Tensor, "R"],
+    angle: Float[Tensor, "R"],
+    distances: Float[Tensor, "R"],
+) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R 3 3"], Float[Tensor, "R 3 3"]]:
+    """Render colours, and their derivatives by origins and directions of rays (last axis x, y, z).
+
+    Differences are one-sided, with alternating signs from ray to ray, so that second derivatives cancel in sums over
+    pixels. Motions along a ray change nothing, so each ray has two rotations and two translations. A translation moves
+    the point at the object's distance as far as a rotation by `angle` does.
+    """
+    d = rays.directions
+    rendered, sign = render(rays, view), 1.0 - 2.0 * (torch.arange(len(d), device=d.device) % 2).to(d)
+    by_origin, by_direction = (d.new_zeros(len(d), 3, 3) for _ in range(2))
+    for axis in axes_across(d):
+        step = (sign * angle)[:, None]
+        rotated = render(replace(rays, directions=normalize(d + step * axis, dim=-1)), view)
+        by_direction += ((rotated - rendered) / step)[:, :, None] * axis[:, None]
+        step = step * distances[:, None]
+        translated = render(replace(rays, origins=rays.origins + step * axis), view)
+        by_origin += ((translated - rendered) / step)[:, :, None] * axis[:, None]
+    return rendered, by_origin, by_direction

@@ -1,0 +1,150 @@
+"""Alignment of cameras by the outlines of the masks of a known surface.
+
+Antialiased masks give outlines with an accuracy of hundredths of a pixel, and determine the pose of a camera more
+accurately than colours do. However, outlines hardly distinguish a rotation from a translation across the line of sight;
+the distant surroundings do (`panorama`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from nerfro.camera.refined.least_squares import PriorInformation, normal_equations, with_priors
+from nerfro.camera.refined.refined import RefinedCamera
+from nerfro.core.cameras import Cameras
+from nerfro.core.progress import track
+from nerfro.data.base import Views
+from nerfro.geometry.mesh import TriangleMesh
+from nerfro.media.base import Medium
+from nerfro.media.sdf_grid import SdfGrid
+from nerfro.silhouettes.rims import RimFinder
+from nerfro.silhouettes.silhouettes import PixelBlocks
+from nerfro.silhouettes.visual_hull import Silhouettes
+
+# Largest side of the reduced images in which outlines are compared, pixels.
+_MAX_PIXELS = 256
+_STEPS = 8
+_MAX_STEP = 2.0  # pixels
+# Accuracy of outlines in pixels, and number of neighbouring contour points with a common error.
+_ACCURACY, _CORRELATED = 0.02, 3.0
+# Standard deviation of the prior of each parameter, in pixels, which fixes parameters that outlines do not determine.
+_PRIOR_DEVIATION = 1.0
+# Largest final distance between the surface and its masks, in pixels of the reduced masks; otherwise mesh and masks
+# differ.
+_MAX_DISTANCE = 0.2
+
+
+def align_to_masks(
+    camera: RefinedCamera, views: Views, medium: Medium, panorama: PriorInformation | None
+) -> PriorInformation | None:
+    """Move cameras so that the outlines of the surface agree with the masks.
+
+    Args:
+        camera: estimated cameras; they are changed.
+        views: training views.
+        medium: medium with the surface.
+        panorama: prior of the camera rotations from the background; None without a panorama.
+
+    Returns:
+        Prior of the cameras from the outlines; None without masks or without a surface.
+    """
+    if not isinstance(medium, SdfGrid) or not medium.meshes or views.masks is None:
+        return None
+    blocks = PixelBlocks(views.cameras, _MAX_PIXELS)
+    masks = torch.stack([blocks.mean(mask) for mask in views.masks])
+    silhouettes = Silhouettes.of(blocks.cameras(views.cameras), masks)
+    priors = [] if panorama is None else [panorama]
+    return align_to_outlines(camera, views.cameras, blocks.cameras, silhouettes, medium.outline, priors)
+
+
+@torch.no_grad()
+def align_to_outlines(
+    camera: RefinedCamera,
+    cameras: Cameras,
+    downscaled: Callable[[Cameras], Cameras],
+    silhouettes: Silhouettes,
+    mesh: TriangleMesh,
+    priors: Sequence[PriorInformation] = (),
+) -> PriorInformation | None:
+    """Move the cameras until the contours of a surface meet the outlines of the masks.
+
+    A common width by which all masks are too large or too small is eliminated.
+
+    Args:
+        camera: estimated cameras, changed in place.
+        cameras: cameras of the data set.
+        downscaled: conversion of cameras to the size of the silhouettes.
+        silhouettes: silhouettes of all views.
+        mesh: the surface.
+        priors: prior information about the cameras.
+
+    Returns:
+        The information that the outlines give about the cameras. None if the surface does not fit its masks; the
+        cameras are then unchanged.
+    """
+    initial = camera.parameter_vector()
+    weak = PriorInformation(initial, torch.eye(len(initial)).to(initial) / _PRIOR_DEVIATION**2)
+    finder = RimFinder(mesh, silhouettes)
+    for step in track("outlines", range(_STEPS + 1)):
+        slopes, error, weights, view = _observations(camera, cameras, downscaled, finder)
+        variance = float((weights * error[:, 0].square()).sum() / weights.sum()) + _ACCURACY**2
+        if step < _STEPS:
+            matrix, vector = normal_equations(slopes, error, weights, view, len(cameras))
+            matrix, vector = _without_width(matrix, vector)
+            parameters = camera.parameter_vector()
+            matrix, vector = with_priors(matrix, vector, parameters, _CORRELATED * variance, [*priors, weak])
+            motion, lens = camera.split(-torch.linalg.solve(matrix, vector).to(camera.motions.motion))
+            camera.move(motion * (_MAX_STEP / motion.norm(dim=-1, keepdim=True).clamp(min=_MAX_STEP)), lens)
+    distance = float((error - error.median()).abs().median())
+    if distance > _MAX_DISTANCE:
+        camera.restore(initial, torch.ones(len(cameras), dtype=torch.bool), lens=True)
+        print(
+            f"outlines: the surface is {distance:.2f} pixels off its masks (of at most {_MAX_PIXELS} pixels), so the "
+            "cameras are not aligned"
+        )
+        return None
+    matrix, vector = normal_equations(slopes, error, weights, view, len(cameras), damping=0.0)
+    information = _without_width(matrix, vector)[0] / (_CORRELATED * variance)
+    return PriorInformation(camera.parameter_vector(), information.to(initial))
+
+
+def _observations(
+    camera: RefinedCamera,
+    cameras: Cameras,
+    downscaled: Callable[[Cameras], Cameras],
+    finder: RimFinder,
+) -> tuple[Float[Tensor, "R 1 M"], Float[Tensor, "R 1"], Float[Tensor, "R"], Int[Tensor, "R"]]:
+    """Compute derivatives, errors, weights and views of the contour points, in pixels of the silhouettes.
+
+    The last derivative is by the common width of the masks.
+    """
+    estimated = downscaled(camera.estimated(cameras))
+    rims = finder.find(estimated)
+    device, views = camera.motions.motion.device, torch.from_numpy(rims.view)
+    points, normals, misfits, weights, widths = (
+        torch.from_numpy(each).float() for each in (rims.points, rims.normal, rims.misfit, rims.weight, rims.width)
+    )
+    of_views = points.split(torch.bincount(views, minlength=len(cameras)).tolist())
+    place = torch.cat([estimated.select([view]).project(each)[0][0] for view, each in enumerate(of_views)])
+    place = place * place.new_tensor([cameras.width / estimated.width, cameras.height / estimated.height])
+    pixel = place.floor()
+    rays = cameras.rays(views, pixel[:, 1], pixel[:, 0], place - pixel)
+    # The ray of a fixed pixel that moves outwards misses the surface, as if the mask were larger.
+    outwards = normals / widths[:, None]
+    distances = (points - estimated.camera_to_world[views, :, 3]).norm(dim=-1, keepdim=True)
+    views, by_origin, by_direction = (x.to(device) for x in (views, outwards, distances * outwards))
+    slopes = camera.slopes(rays.to(device), views, by_origin[:, None], by_direction[:, None]).double()
+    slopes = torch.cat([slopes, torch.ones_like(slopes[..., :1])], -1)
+    return slopes, (misfits / widths).to(slopes)[:, None], weights.to(slopes), views
+
+
+def _without_width(
+    matrix: Float[Tensor, "parameters parameters"], vector: Float[Tensor, " parameters"]
+) -> tuple[Float[Tensor, "parameters-1 parameters-1"], Float[Tensor, " parameters-1"]]:
+    """Eliminate the last parameter from normal equations (Schur complement)."""
+    column, last = matrix[:-1, -1], matrix[-1, -1]
+    return matrix[:-1, :-1] - torch.outer(column, column) / last, vector[:-1] - column * (vector[-1] / last)

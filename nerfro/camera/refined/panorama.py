@@ -1,0 +1,309 @@
+"""Alignment of camera rotations by the panorama of a distant sky.
+
+The radiance of the sky in each direction is the mean of the photographs that show this direction, and is therefore
+eliminated. The unknowns are three rotation parameters per camera, and each Gauss-Newton step solves for all cameras. If
+the sky were trained together with the cameras, each camera would stay where the sky has reproduced its photograph.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy import sparse
+from scipy.ndimage import gaussian_filter
+from torch import Tensor
+from torch.nn import functional as F
+
+from nerfro.camera.refined.least_squares import PriorInformation, axes_across, robust_weights
+from nerfro.camera.refined.refined import RefinedCamera
+from nerfro.core.cameras import Cameras
+from nerfro.core.light import to_linear
+from nerfro.core.progress import track
+from nerfro.core.rays import Rays
+from nerfro.core.subdivision import pixel_rays
+
+# Photographs are downscaled to this width in pixels; the alignment is accurate to a few hundredths of a pixel.
+_WIDTH = 256
+
+
+class _Level(NamedTuple):
+    """Gauss-Newton steps with one blur of the photographs."""
+
+    blur: float  # standard deviation, as a fraction of the image width
+    num_directions: int  # that each photograph contributes
+    repetitions: int  # number of steps
+
+
+# Coarse to fine: the blur limits the details, and thereby the distance over which derivatives are valid.
+_LEVELS = (_Level(1 / 32, 150, 4), _Level(1 / 64, 150, 3), _Level(1 / 128, 200, 3), _Level(0.0, 300, 3))
+_MIN_BLUR = 0.7  # pixels
+# Minimum fraction of sky in a blurred pixel, and scale of the robust loss (see `robust_weights`) in square roots of
+# linear radiance.
+_MIN_SKY, _SCALE = 0.9, 0.1
+_REWEIGHTINGS = 2
+# Damping relative to the diagonal, which keeps cameras fixed that share no direction with others.
+_DAMPING = 1e-2
+# Minimum variance of colours: the square of half an 8-bit level.
+_MIN_VARIANCE = (0.5 / 255) ** 2
+_TINY = 1e-9
+
+
+@torch.no_grad()
+def align(
+    camera: RefinedCamera,
+    cameras: Cameras,
+    photographed: Callable[[Int[Tensor, "R"]], Float[Tensor, "R 3"]],
+    of_sky: Callable[[Rays], Bool[Tensor, "R"]],
+) -> PriorInformation | None:
+    """Rotate the cameras, and adapt the common lens if it is refined, until photographs of the sky agree.
+
+    Args:
+        camera: estimated cameras, changed in place.
+        cameras: cameras of the data set.
+        photographed: colours of pixels in the photographs, sRGB in [0, 1].
+        of_sky: whether rays reach the sky without meeting the object.
+
+    Returns:
+        Prior information about rotations and lens, except for a common rotation of all cameras. None if no two
+        photographs show the same part of the sky.
+    """
+    images = _downscaled_roots(cameras, photographed)
+    gains, generator = images.new_ones(len(cameras), 3), torch.Generator().manual_seed(0)
+    information = None
+    steps = [level for level in _LEVELS for _ in range(level.repetitions)]
+    for level in track("panorama", steps):
+        blur = max(level.blur * images.shape[-1], _MIN_BLUR)
+        overlap = _find_overlap(camera, cameras, images, of_sky, blur, level.num_directions, generator)
+        if overlap is None:
+            continue  # if little sky is visible, strongly blurred pixels always contain other objects
+        matrix, vector, variance = _equations(overlap, gains, learn_gains=camera.exposure is not None)
+        num_rotations, num_lens = 3 * len(cameras), overlap.by_lens.shape[-1]
+        step = _solve(matrix, vector).to(images)
+        rotations, lens, log_gains = step.split([num_rotations, num_lens, len(step) - num_rotations - num_lens])
+        gains = gains * log_gains.exp().view(-1, 3) if len(log_gains) else gains
+        rotations, max_pixels = rotations.view(-1, 3), 2 * blur * cameras.width / images.shape[-1]
+        rotations = rotations * (max_pixels / rotations.norm(dim=-1, keepdim=True).clamp(min=_TINY)).clamp(max=1)
+        camera.move(F.pad(rotations, (0, 3)), lens)
+        information = _marginalized(matrix, num_rotations + num_lens) / max(variance, _MIN_VARIANCE)
+    return None if information is None else _prior(camera, information)
+
+
+def _prior(camera: RefinedCamera, information: Float[Tensor, "M M"]) -> PriorInformation:
+    """Convert information about all rotations and the lens to a prior of all parameters."""
+    # The photographs do not determine a common rotation of all cameras.
+    common = camera.motions.common_rotations().to(information)
+    projection = torch.eye(len(information)).to(information)
+    projection[: len(common), : len(common)] -= common @ common.mT
+    mean = camera.parameter_vector()
+    motions, lens = camera.split(torch.arange(len(mean), device=information.device))
+    index = torch.cat([motions[:, :3].flatten(), lens])
+    known = information.new_zeros(len(mean), len(mean))
+    known[index[:, None], index] = projection @ information @ projection
+    return PriorInformation(mean, known.to(mean))
+
+
+def _solve(
+    matrix: Float[Tensor, "parameters parameters"], right: Float[Tensor, " parameters *columns"]
+) -> Float[Tensor, " parameters *columns"]:
+    """Return the damped Gauss-Newton step for a normal matrix and a gradient."""
+    return -torch.linalg.solve(matrix + torch.diag(_DAMPING * matrix.diagonal() + _TINY), right)
+
+
+def _marginalized(matrix: Float[Tensor, "parameters parameters"], num: int) -> Float[Tensor, "M M"]:
+    """Return the information about the first `num` parameters, with the others eliminated (Schur complement)."""
+    own, mixed = matrix[:num, :num], matrix[num:, :num]
+    return own + mixed.mT @ _solve(matrix[num:, num:], mixed) if len(mixed) else own
+
+
+def _downscaled_roots(cameras: Cameras, photographed: Callable[[Tensor], Tensor]) -> Float[Tensor, "V 3 h w"]:
+    """Return square roots of linear radiance, at most `_WIDTH` wide, in which exposures are factors as well."""
+    height, width = cameras.height, cameras.width
+    factor = min(1.0, _WIDTH / width)
+    size = max(1, round(factor * height)), max(1, round(factor * width))
+    pixels = torch.arange(height * width, device=cameras.device)
+    images = []
+    for view in range(len(cameras)):
+        image = photographed(view * height * width + pixels).view(1, height, width, 3).permute(0, 3, 1, 2)
+        images.append(F.interpolate(to_linear(image.float()), size, mode="area").sqrt())
+    return torch.cat(images)
+
+
+def _blurred(images: Float[Tensor, "V C h w"], deviation: float) -> Float[Tensor, "V C h w"]:
+    """Convolve images with a Gaussian; pixels outside the images are black."""
+    deviations = 0, 0, deviation, deviation
+    blurred = gaussian_filter(images.cpu().numpy(), deviations, mode="constant", radius=int(3 * deviation) + 1)
+    return torch.from_numpy(blurred).to(images)
+
+
+@dataclass(frozen=True)
+class _Overlap:
+    """O observations of K directions by V cameras; each direction is observed at least twice.
+
+    Attributes:
+        num_views: number of cameras.
+        view: index of the camera of each observation.
+        direction: index of the direction of each observation.
+        colour: blurred colours.
+        by_rotation: derivatives of the colours by the rotation of the camera.
+        by_lens: derivatives of the colours by the lens.
+    """
+
+    num_views: int
+    view: Int[Tensor, "O"]
+    direction: Int[Tensor, "O"]
+    colour: Float[Tensor, "O 3"]
+    by_rotation: Float[Tensor, "O 3 3"]
+    by_lens: Float[Tensor, "O 3 L"]
+
+
+def _find_overlap(
+    camera: RefinedCamera,
+    cameras: Cameras,
+    images: Float[Tensor, "V 3 h w"],
+    of_sky: Callable[[Rays], Bool[Tensor, "R"]],
+    blur: float,
+    num: int,
+    generator: torch.Generator,
+) -> _Overlap | None:
+    """Draw directions of the sky in each photograph, and find their colours in all photographs that show these.
+
+    Args:
+        camera: estimated cameras.
+        cameras: cameras of the data set.
+        images: downscaled photographs.
+        of_sky: whether rays reach the sky without meeting the object.
+        blur: standard deviation of the blur, in pixels of these images.
+        num: number of directions per photograph.
+        generator: random numbers.
+
+    Returns:
+        The observations; None if no direction is visible in two photographs.
+    """
+    height, width = images.shape[-2:]
+    estimated = camera.estimated(cameras).resized(width, height)
+    images, usable = _blurred_sky(estimated, images, of_sky, blur)
+    directions = _draw_directions(estimated, usable, num, generator)
+    # The sky is infinitely far away, so the positions of the cameras do not matter.
+    distant = replace(estimated, camera_to_world=F.pad(estimated.camera_to_world[..., :3], (0, 1)))
+    position, depth = distant.project(directions)
+    visible = _visible(position, depth, usable)
+    view, direction = visible.nonzero(as_tuple=True)
+    if len(view) == 0:
+        return None
+
+    def sampled(directions: Float[Tensor, "directions 3"]) -> Float[Tensor, "O 3"]:
+        return _sample(images, view, distant.project(directions)[0][visible])
+
+    angle = 1 / estimated.fx.mean()  # of a pixel
+    by_direction = images.new_zeros(len(view), 3, 3)
+    for axis in axes_across(directions):
+        ends = [sampled(directions + side * angle * axis) for side in (0.5, -0.5)]
+        by_direction += ((ends[0] - ends[1]) / angle)[..., None] * axis[direction, None]
+    # A rotation of the camera moves the image in the opposite direction, hence the negative sign.
+    position = position[visible] * position.new_tensor([cameras.width / width, cameras.height / height])
+    pixel = position.floor()
+    rays = cameras.rays(view, pixel[:, 1], pixel[:, 0], position - pixel)
+    slopes = -camera.slopes(rays, view, torch.zeros_like(by_direction), by_direction)
+    return _Overlap(len(images), view, direction, sampled(directions), slopes[..., :3], slopes[..., 6:])
+
+
+def _blurred_sky(
+    cameras: Cameras, images: Float[Tensor, "V 3 h w"], of_sky: Callable[[Rays], Bool[Tensor, "R"]], blur: float
+) -> tuple[Float[Tensor, "V 3 h w"], Bool[Tensor, "V 1 h w"]]:
+    """Blur the sky in images without mixing it with the object; also returns which pixels show enough of the sky."""
+    size = len(images), 1, *images.shape[-2:]
+    sky = torch.stack([of_sky(cameras.image_rays(view)) for view in range(len(images))]).view(size)
+    fraction = _blurred(sky.to(images), blur)
+    return _blurred(images * sky, blur) / fraction.clamp(min=_TINY), sky & (fraction > _MIN_SKY)
+
+
+def _draw_directions(
+    cameras: Cameras, usable: Bool[Tensor, "V 1 h w"], num: int, generator: torch.Generator
+) -> Float[Tensor, "directions 3"]:
+    """Draw at most `num` usable pixels of each view without repetition, and return the directions of their rays."""
+    flat = usable.flatten(1)
+    # Unusable pixels come last.
+    order = torch.rand(*flat.shape, generator=generator).to(flat.device) + ~flat
+    drawn = order.argsort(1)[:, :num]
+    views = torch.arange(len(flat), device=drawn.device)[:, None]
+    return pixel_rays(cameras, (views * flat.shape[1] + drawn)[flat.gather(1, drawn)]).directions
+
+
+def _visible(
+    position: Float[Tensor, "V directions 2"], depth: Float[Tensor, "V directions"], usable: Bool[Tensor, "V 1 h w"]
+) -> Bool[Tensor, "V directions"]:
+    """Test whether directions are seen at usable pixels away from the border, and in at least two views."""
+    height, width = usable.shape[-2:]
+    column, row = position.floor().long().unbind(-1)
+    visible = (depth > 0) & (column >= 1) & (column < width - 1) & (row >= 1) & (row < height - 1)
+    views = torch.arange(len(usable), device=usable.device)[:, None]
+    visible &= usable[views, 0, row.clamp(0, height - 1), column.clamp(0, width - 1)]
+    return visible & (visible.sum(0) > 1)
+
+
+def _sample(
+    images: Float[Tensor, "V 3 h w"], view: Int[Tensor, "O"], position: Float[Tensor, "O 2"]
+) -> Float[Tensor, "O 3"]:
+    """Interpolate colours linearly at positions (column, row); pixel corners are at whole numbers."""
+    (height, width), centre = images.shape[-2:], view[:, None] + 0.5
+    size = position.new_tensor([width, height, len(images)])
+    grid = 2 * torch.cat([position, centre], 1) / size - 1  # the views are the third axis of the grid
+    volume = images.transpose(0, 1)[None]
+    return F.grid_sample(volume, grid[None, None, None], padding_mode="border", align_corners=False)[0, :, 0, 0].T
+
+
+def _equations(
+    overlap: _Overlap, gains: Float[Tensor, "V 3"], learn_gains: bool
+) -> tuple[Float[Tensor, "parameters parameters"], Float[Tensor, " parameters"], float]:
+    """Compute matrix and gradient of the normal equations with the sky eliminated, and the variance of the colours.
+
+    The objective is the sum of w |g_v I_v(d_k) - c_k|^2 over all observations, minimized over the colours c_k of the
+    sky, where I_v(d_k) is the colour of direction d_k in view v, g_v the gain of the view, and w a robust weight. The
+    optimal c_k are weighted means. With the derivatives J of g_v I_v by the parameters and the matrix 1 that assigns
+    observations to directions, their elimination gives
+
+        J^T W J - J^T W 1 (1^T W 1)^-1 1^T W J
+
+    and the gradient J^T W r with r = g_v I_v(d_k) - c_k. Weights and means alternate (iteratively reweighted least
+    squares). The gradient uses the means of the previous weights, for which 1^T W r vanishes only approximately.
+
+    The parameters are three rotations per view, the lens, and, with `learn_gains`, three logarithmic gains per view.
+    """
+    view, direction, num = overlap.view, overlap.direction, len(overlap.view)
+    colour, weight, num_directions = overlap.colour * gains[view], gains.new_ones(num), int(direction.max()) + 1
+    for _ in range(_REWEIGHTINGS):
+        total = weight.new_zeros(num_directions).index_add(0, direction, weight).clamp(min=_TINY)
+        mean = colour.new_zeros(num_directions, 3).index_add(0, direction, weight[:, None] * colour) / total[:, None]
+        error = colour - mean[direction]
+        weight = robust_weights(error, _SCALE)
+    total = weight.new_zeros(num_directions).index_add(0, direction, weight).clamp(min=_TINY)
+
+    of_view, num_lens = torch.arange(3, device=view.device) + 3 * view[:, None], overlap.by_lens.shape[-1]
+    of_lens = 3 * overlap.num_views + torch.arange(num_lens, device=view.device)
+    slopes, indices = [torch.cat([overlap.by_rotation, overlap.by_lens], -1) * gains[view][..., None]], [of_view]
+    indices.append(of_lens.expand(num, -1))
+    if learn_gains:
+        slopes.append(torch.diag_embed(colour))
+        indices.append(3 * overlap.num_views + num_lens + of_view)
+    values, columns = torch.cat(slopes, -1).double().cpu(), torch.cat(indices, -1).cpu()
+    rows = torch.arange(3 * num).view(num, 3, 1).expand(values.shape)
+    columns = columns[:, None].expand(values.shape)
+    size = 3 * num, 3 * overlap.num_views * (2 if learn_gains else 1) + num_lens
+    jacobian = sparse.csr_matrix((values.flatten(), (rows.flatten(), columns.flatten())), size)
+
+    weight, total, direction = (tensor.cpu() for tensor in (weight.double(), total.double(), direction))
+    root = np.repeat(weight.sqrt().numpy(), 3)  # W^1/2
+    sky_weights = np.repeat((weight / total[direction].sqrt()).numpy(), 3)
+    channels = (3 * direction[:, None] + torch.arange(3)).flatten()
+    # (1^T W 1)^-1/2 1^T W
+    eliminated = sparse.csr_matrix((sky_weights, (channels, np.arange(3 * num))), (3 * num_directions, 3 * num))
+    weighted, common = sparse.diags(root) @ jacobian, eliminated @ jacobian
+    matrix = torch.from_numpy((weighted.T @ weighted - common.T @ common).toarray())
+    residual = root * error.double().cpu().flatten().numpy()
+    variance = float(residual @ residual / (root @ root))
+    return matrix, torch.from_numpy(weighted.T @ residual), variance

@@ -1,0 +1,250 @@
+"""Camera model that refines poses and lens during training."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int, Shaped
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from nerfro.camera.base import CameraModel
+from nerfro.camera.exposure import PerView
+from nerfro.camera.refined.pixel_units import (
+    even_weights,
+    gauge_basis,
+    object_distances,
+    pixel_motions,
+    project_out_gauge,
+)
+from nerfro.camera.similarity import similarity
+from nerfro.core.cameras import Cameras
+from nerfro.core.lens import distort, undistort
+from nerfro.core.rays import Rays
+from nerfro.registry.registration import register
+
+
+class _Motions(PerView):
+    """Rotation and translation of each camera in its own axes, in units of pixels.
+
+    Attributes:
+        poses: camera-to-world matrices of the data set.
+        focal, distortion: focal lengths and distortion coefficients of the data set.
+        units: rotation or translation that moves the image by one pixel, for each parameter.
+        weights: weights of the parameters for the gauge.
+        gauge_basis: basis of the gauge freedom (see `pixel_units.gauge_basis`); empty if the gauge is not fixed.
+        focal_unit: change of the logarithmic focal length that moves the image by one pixel.
+        motion: parameters in pixels.
+    """
+
+    poses: Float[Tensor, "V 3 4"]
+    focal: Float[Tensor, "V 2"]
+    distortion: Float[Tensor, "V 9"]
+    units: Float[Tensor, "V 6"]
+    weights: Float[Tensor, "V 6"]
+    gauge_basis: Float[Tensor, "gauge V 6"]
+    focal_unit: Float[Tensor, "1"]
+    motion: Float[Tensor, "V 6"]
+
+    def __init__(self, fix_gauge: bool = True) -> None:
+        super().__init__()
+        self.fix_gauge = fix_gauge
+        for name in ("motion", "poses", "focal", "distortion", "units", "weights", "gauge_basis", "focal_unit"):
+            self.register_buffer(name, torch.zeros(0))
+
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
+        if prefix + "of_world" in state_dict:  # old name, in checkpoints of earlier releases
+            state_dict[prefix + "gauge_basis"] = state_dict.pop(prefix + "of_world")
+        super()._load_from_state_dict(state_dict, prefix, *rest)
+
+    def begin(self, cameras: Cameras) -> None:
+        poses = cameras.camera_to_world.double().cpu()
+        pixels = pixel_motions(cameras, object_distances(cameras))
+        weights = even_weights(pixels)
+        distortion = torch.zeros(0, 9) if cameras.distortion is None else cameras.distortion
+        found = {
+            "motion": torch.zeros(len(cameras), 6),
+            "poses": poses,
+            "focal": torch.stack([cameras.fx, cameras.fy], -1),
+            "distortion": distortion,
+            "units": 1 / pixels[:, :6],
+            "weights": weights,
+            "gauge_basis": gauge_basis(poses, weights) if self.fix_gauge else weights.new_zeros(0, *weights.shape),
+            "focal_unit": 1 / pixels[:, 6].square().mean().sqrt()[None],
+        }
+        for name, tensor in found.items():
+            setattr(self, name, tensor.to(getattr(self, name)))
+
+    def forward(self) -> tuple[Float[Tensor, "V 3 3"], Float[Tensor, "V 3"]]:
+        """Return rotation and translation of each camera, in the given camera axes."""
+        motion = self.fixed()
+        return rotation_matrices(motion[:, :3]), motion[:, 3:]
+
+    def fixed(self) -> Float[Tensor, "V 6"]:
+        """Return rotations (radians) and translations (world units), without the gauge freedom."""
+        return project_out_gauge(self.motion * self.units, self.gauge_basis, self.weights)
+
+    def common_rotations(self) -> Float[Tensor, "M 3"]:
+        """Return an orthonormal basis of common rotations of all cameras, each about its centre; units of pixels."""
+        own = self.moved()[..., :3].mT / self.units[:, :3, None]
+        return torch.linalg.qr(own.flatten(0, 1))[0]
+
+    def moved(self) -> Float[Tensor, "V 3 4"]:
+        """Return the estimated poses."""
+        rotations, translations = self()
+        axes = self.poses[..., :3]
+        return torch.cat([axes @ rotations, self.poses[..., 3:] + axes @ translations[..., None]], -1)
+
+
+@register("camera", "refined")
+class RefinedCamera(CameraModel):
+    """Refine the pose of each training camera, and optionally the common lens, during training.
+
+    The phase `cameras` moves the cameras. The motion that a similarity transformation of the world would cause (gauge
+    freedom) is removed to first order, so that the world and the surface keep their place.
+
+    Args:
+        lens: whether to refine the focal length and the principal point, which all views share.
+        exposure: whether to estimate a gain for each training view and colour channel.
+        fix_gauge: whether to remove the gauge freedom. Disable this for cameras of a scene that is fixed.
+    """
+
+    moves = True
+    lens: Float[Tensor, "3"] | None
+
+    def __init__(
+        self,
+        lens: bool = False,
+        exposure: bool = False,
+        fix_gauge: bool = True,
+    ) -> None:
+        super().__init__(exposure)
+        self.motions = _Motions(fix_gauge)
+        self.register_buffer("lens", torch.zeros(3) if lens else None)  # focal length and principal point in pixels
+
+    def begin(self, cameras: Cameras) -> None:
+        super().begin(cameras)
+        self.motions.begin(cameras)
+
+    def forward(self, rays: Rays, view: Int[Tensor, "R"]) -> Rays:
+        rotations, translations = self.motions()
+        axes = self.motions.poses[view, :, :3]
+        local = (rays.directions[:, None] @ axes)[:, 0]
+        if self.lens is not None:
+            local = self._through_lens(local, view)
+        directions = (axes @ (rotations[view] @ local[..., None]))[..., 0]
+        origins = rays.origins + (axes @ translations[view, :, None])[..., 0]
+        return replace(rays, origins=origins, directions=normalize(directions, dim=-1))
+
+    def slopes(
+        self,
+        rays: Rays,
+        view: Int[Tensor, "R"],
+        by_origin: Float[Tensor, "R C 3"],
+        by_direction: Float[Tensor, "R C 3"],
+    ) -> Float[Tensor, "R C parameters"]:
+        """Convert derivatives by rays to derivatives by camera parameters in pixels.
+
+        Args:
+            rays: rays of the cameras of the data set.
+            view: index of the training view of each ray.
+            by_origin: derivatives of C quantities by the origins of the estimated rays.
+            by_direction: derivatives by the directions of the estimated rays.
+
+        Returns:
+            Derivatives by the six parameters of the camera, followed by three of the lens if it is refined.
+        """
+        axes, moved = self.motions.poses[view, :, :3], self(rays, view)
+        by_rotation = torch.linalg.cross(moved.directions[:, None].expand_as(by_direction), by_direction)
+        by_motion = torch.cat([by_rotation @ axes, by_origin @ axes], -1) * self.motions.units[view, None]
+        if self.lens is None:
+            return by_motion
+        kept, by_lens = self.lens.clone(), []
+        for number in range(len(kept)):  # central differences over one pixel
+            ends = []
+            for half in (0.5, -0.5):
+                self.lens[number] = kept[number] + half
+                ends.append(self(rays, view).directions)
+            self.lens.copy_(kept)
+            by_lens.append((by_direction * (ends[0] - ends[1])[:, None]).sum(-1))
+        return torch.cat([by_motion, torch.stack(by_lens, -1)], -1)
+
+    def parameter_vector(self) -> Float[Tensor, " parameters"]:
+        """Return a copy of the parameters of all cameras in pixels, followed by the lens if it is refined."""
+        return torch.cat([self.motions.motion.flatten(), *([] if self.lens is None else [self.lens])])
+
+    def split(self, parameters: Shaped[Tensor, " parameters"]) -> tuple[Shaped[Tensor, "V 6"], Shaped[Tensor, "L"]]:
+        """Split a vector of parameters (see `parameter_vector`) into motions of the cameras and lens."""
+        num = self.motions.motion.numel()
+        return parameters[:num].view(-1, 6), parameters[num:]
+
+    def move(self, motion: Float[Tensor, "V 6"], lens: Float[Tensor, "L"]) -> None:
+        """Add to the parameters of cameras and lens, in pixels."""
+        self.motions.motion.add_(motion)
+        if self.lens is not None:
+            self.lens += lens
+
+    def restore(self, parameters: Float[Tensor, " parameters"], views: Bool[Tensor, "V"], lens: bool) -> None:
+        """Restore earlier parameters (see `parameter_vector`) of some views, and of the lens if `lens` is true."""
+        motion, old_lens = self.split(parameters)
+        self.motions.motion[views] = motion[views]
+        if lens and self.lens is not None:
+            self.lens.copy_(old_lens)
+
+    def _through_lens(self, local: Float[Tensor, "R 3"], view: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
+        """Return the directions, in camera axes, of the same pixels through the estimated lens."""
+        growth, shift = self._lens()
+        ideal = local[:, :2] / -local[:, 2:]
+        flipped = ideal * ideal.new_tensor([1.0, -1.0])  # y down, as in the image
+        distorted = len(self.motions.distortion) > 0
+        if distorted:
+            flipped, _ = distort(flipped, self.motions.distortion[view])
+        flipped = (flipped - shift / self.motions.focal[view]) / growth
+        if distorted:
+            flipped, _ = undistort(flipped, self.motions.distortion[view])
+        return torch.cat([flipped * ideal.new_tensor([1.0, -1.0]), -torch.ones_like(local[:, 2:])], -1)
+
+    def _lens(self) -> tuple[Float[Tensor, ""], Float[Tensor, "2"]]:
+        """Return the factor of the focal length, and the shift of the principal point in pixels."""
+        assert self.lens is not None
+        return torch.exp(self.lens[0] * self.motions.focal_unit[0]), self.lens[1:]
+
+    @torch.no_grad()
+    def estimated(self, cameras: Cameras) -> Cameras:
+        poses = self.motions.moved().to(cameras.camera_to_world)
+        return self._with_lens(replace(cameras, camera_to_world=poses))
+
+    @torch.no_grad()
+    def aligned(self, cameras: Cameras) -> Cameras:
+        """Apply the similarity transformation of the training cameras, and the estimated lens, to other cameras."""
+        old, new, weights = (x.double() for x in (self.motions.poses, self.motions.moved(), self.motions.weights))
+        transformation = similarity(old, new, weights[:, 0], weights[:, 3])
+        poses = transformation.apply(cameras.camera_to_world.to(transformation.shift)).to(cameras.camera_to_world)
+        return self._with_lens(replace(cameras, camera_to_world=poses))
+
+    def _with_lens(self, cameras: Cameras) -> Cameras:
+        if self.lens is None:
+            return cameras
+        growth, shift = (values.to(cameras.fx) for values in self._lens())
+        x, y = cameras.cx + shift[0], cameras.cy + shift[1]
+        return replace(cameras, fx=cameras.fx * growth, fy=cameras.fy * growth, cx=x, cy=y)
+
+    @torch.no_grad()
+    def measurements(self) -> dict[str, float]:
+        motion = (self.motions.fixed() / self.motions.units).square().sum(-1).mean().sqrt()
+        found = super().measurements() | {"cameras.motion_pixels": float(motion)}
+        if self.lens is not None:
+            growth, (x, y) = self._lens()
+            named = {"focal_length_factor": growth, "principal_x": x, "principal_y": y}
+            found |= {f"cameras.{name}": float(value) for name, value in named.items()}
+        return found
+
+
+def rotation_matrices(vectors: Float[Tensor, "V 3"]) -> Float[Tensor, "V 3 3"]:
+    """Convert rotation vectors (axis times angle in radians) to rotation matrices."""
+    x, y, z = vectors.unbind(-1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1)
+    return torch.linalg.matrix_exp(cross.view(-1, 3, 3))

@@ -1,0 +1,1 @@
+"""The command line: composition of settings, help, completion, and errors in one line."""

@@ -1,0 +1,315 @@
+"""Options of commands and plugins, described by their annotations, docstrings and comments, and a cache of them.
+
+The cache lets a command print its help, and refuse misspelt options, before it imports torch and Lightning.
+"""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import dataclasses
+import hashlib
+import importlib.metadata
+import importlib.util
+import inspect
+import json
+import os
+import re
+import sys
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, cast, get_args, get_type_hints
+
+from hydra import compose, initialize_config_dir
+from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
+from omegaconf import MISSING, DictConfig, OmegaConf
+
+from nerfro.core.errors import NerfroError, nearest_of
+from nerfro.core.paths import CONF_DIR, PACKAGE_DIR, cache_dir
+from nerfro.registry.allowed import Refused
+from nerfro.registry.registration import ENTRY_POINTS, KINDS, SEVERAL, Plugin, plugin_folders, plugins, type_name
+
+# Groups without a default in conf/train.yaml.
+ADDED_GROUPS = ("callbacks", "evaluation", "experiment", "scene", "sweep")
+# Options that add a plugin of a type that a run, or a medium, may have several of.
+_ADDED_PLUGINS = {
+    "loss": "+loss.NAME.weight=0.1",
+    "phase": "+phase.NAME={}",
+    "surface": "+bodies.BODY.surface.name=NAME",
+}
+_TOOLS = re.compile(r"#\s*(noqa|type:).*?(?= - (?!OmegaConf)|#|$)")  # comments for linters
+_WIDTH = 100  # characters in a line of the help
+
+
+class Option(NamedTuple):
+    """One option.
+
+    Attributes:
+        name: full name, such as `trainer.max_time`.
+        type: type and allowed values, in Markdown.
+        default: default value, or the text `required`.
+        text: explanation.
+    """
+
+    name: str
+    type: str
+    default: object
+    text: str
+
+    def __str__(self) -> str:
+        default = "null" if self.default is None else str(self.default)
+        default = default.lower() if isinstance(self.default, bool) else default
+        heading = f"  {self.name}={default}" + ("" if self.type == "any" else f"  ({self.type})")
+        lines = textwrap.wrap(heading, _WIDTH, subsequent_indent=" " * 4)
+        lines += textwrap.wrap(self.text, _WIDTH, initial_indent=" " * 6, subsequent_indent=" " * 6)
+        return "\n".join(lines).replace("`", "")
+
+
+@dataclasses.dataclass(frozen=True)
+class Described:
+    """Description of the options of a command.
+
+    Attributes:
+        help: text of `--help`.
+        names: names of the settings in each node that has a fixed set of settings, by the full name of the node.
+        choices: names of the options of each configuration group.
+    """
+
+    help: str
+    names: Mapping[str, Sequence[str]]
+    choices: Mapping[str, Sequence[str]]
+
+    def require_known(self, arguments: Sequence[str]) -> None:
+        """Refuse the first override with a name that the command cannot know, whatever options are chosen.
+
+        Raises:
+            NerfroError: a setting or an option does not exist.
+        """
+        for argument in arguments:
+            key, equals, value = argument.lstrip("+~").partition("=")
+            if not equals or not re.fullmatch(r"[\w./]+", key) or key.startswith("hydra"):
+                continue
+            if key == "metric" and key not in self.names[""]:
+                raise NerfroError(f"{argument}: all registered metrics are scored, so there is nothing to choose")
+            if key in self.choices:
+                if re.fullmatch(r"\w+", value) and value not in (*self.choices[key], "null"):
+                    own = "; --config-dir FOLDER adds your experiments" if key == "experiment" else ""
+                    raise NerfroError(f"{key}={value} does not exist; {nearest_of(value, self.choices[key])}{own}")
+                continue
+            if key in _ADDED_PLUGINS and re.fullmatch(r"\w+", value) and key in self.names.get("", ()):
+                option = _ADDED_PLUGINS[key].replace("NAME", value)
+                raise NerfroError(f"{argument}: a training may have several of this type; write {option}")
+            if argument.startswith("+") and "." not in key:  # perhaps a group of another package
+                continue
+            parts = key.split(".")
+            for depth, name in enumerate(parts):
+                known = self.names.get(".".join(parts[:depth]))
+                if known is None:
+                    break
+                if name not in known:
+                    place = ".".join(parts[: depth + 1])
+                    raise NerfroError(f"{place} is not a setting; {nearest_of(name, known)}")
+
+
+def describe_command(command: str, schema: type, folder: Path) -> Described:
+    """Describe a command; its plugins must have been discovered.
+
+    Args:
+        command: name of the command, and of its YAML file.
+        schema: dataclass of the configuration.
+        folder: folder of the YAML file.
+    """
+    ConfigStore.instance().store(name=f"{command}_schema", node=schema, provider="nerfro")
+    with initialize_config_dir(str(folder), version_base="1.3"):
+        config = compose(command, return_hydra_config=True)
+        groups = [kind for kind in KINDS if isinstance(OmegaConf.select(config, kind.replace("/", ".")), DictConfig)]
+        groups = list(dict.fromkeys([*groups, "logger", *ADDED_GROUPS])) if command == "train" else groups
+        loader = GlobalHydra.instance().config_loader()
+        choices = {group: loader.get_group_options(group) for group in groups if group not in _ADDED_PLUGINS}
+    kinds = [*groups, *(["surface"] if "medium" in groups else [])]
+    added = {option: [p.name for p in plugins(kind)] for kind, option in _ADDED_PLUGINS.items() if kind in kinds}
+    names = _names(schema)
+    names[""] += [group.partition("/")[0] for group in groups]
+    options = list(schema_options(schema, config, yaml_comments(folder / f"{command}.yaml")))
+    for kind in [group for group in groups if group in KINDS]:
+        path, of_kind = kind.replace("/", "."), plugins(kind)
+        nodes = {path: OmegaConf.select(config, path)}
+        if kind in SEVERAL:
+            nodes = {f"{path}.{name}": node for name, node in nodes[path].items()}
+            names[path] = [plugin.name for plugin in of_kind]
+            names |= {f"{path}.{plugin.name}": plugin.setting_names for plugin in of_kind}
+        else:
+            names[path] = sorted({name for plugin in of_kind for name in plugin.setting_names})
+        for place, node in nodes.items():
+            plugin = next((plugin for plugin in of_kind if plugin.target == node.get("_target_")), None)
+            options += [] if plugin is None else plugin_options(plugin, f"{place}.", node)
+    chosen = {group: f"{group}={config.hydra.runtime.choices.get(group, 'NAME')}" for group in choices}
+    listed = {chosen[group]: found for group, found in choices.items()} | added
+    return Described(_page(command, options, listed), names, choices)
+
+
+def usage(command: str) -> str:
+    """Return the purpose and the examples of a command, from the docstring of its module."""
+    source = (PACKAGE_DIR / f"{command}.py").read_text(encoding="utf-8")
+    first, _, examples = (ast.get_docstring(ast.parse(source)) or "").partition("\n")
+    return f"{_sentence(first.rpartition('`: ')[2])}\n{examples}\n"
+
+
+def _page(command: str, options: Sequence[Option], choices: Mapping[str, Sequence[str]]) -> str:
+    lines = [usage(command), *(["Choices:"] if choices else [])]
+    for choice, names in choices.items():
+        lines.append(textwrap.fill(f"  {choice}  ({', '.join(names)})", _WIDTH, subsequent_indent=" " * 6))
+    lines += [""] if choices else []
+    sections: dict[str, list[Option]] = {}
+    for option in options:
+        sections.setdefault(option.name.rpartition(".")[0].partition(".")[0], []).append(option)
+    for section, members in sections.items():
+        lines += [f"Options of {section}:" if section else "Options:", *map(str, members), ""]
+    lines.append("`--help hydra` explains the flags of Hydra, such as -m for sweeps and --cfg job.")
+    return "\n".join(lines).replace("`", "")
+
+
+def schema_options(schema: type, values: DictConfig, comments: Mapping[str, str], prefix: str = "") -> Iterator[Option]:
+    """Yield the options of a configuration dataclass and of nested dataclasses.
+
+    Args:
+        schema: the dataclass.
+        values: composed configuration, which holds the defaults.
+        comments: explanations by name, which override those of the dataclass.
+        prefix: full name of the node, with a dot at the end.
+    """
+    hints = get_type_hints(schema, include_extras=True)
+    explained = google_docstring(inspect.getdoc(schema) or "")[1] | _field_comments(schema)
+    for field in dataclasses.fields(schema):
+        hint, name = hints[field.name], prefix + field.name
+        if field.name.startswith("_") or any(isinstance(limit, Refused) for limit in get_args(hint)):
+            continue
+        if dataclasses.is_dataclass(hint):
+            yield from schema_options(cast(type, hint), values[field.name], {}, f"{name}.")
+            continue
+        default = _plain(values).get(field.name, field.default)
+        text = comments.get(field.name) or explained.get(field.name, "")
+        if "_target_" in hints and not text:
+            text = f"As in `{values['_target_']}`"
+        if isinstance(default, dict) and default:
+            if hint is Any:  # a component, whose options are those of its class
+                continue
+            default = ", ".join(default)
+        yield Option(name, type_name(hint), default, _sentence(text))
+
+
+def plugin_options(plugin: Plugin, prefix: str, values: DictConfig | None = None) -> list[Option]:
+    """Return the options of a plugin.
+
+    Args:
+        plugin: the plugin.
+        prefix: full name of its node, with a dot at the end.
+        values: configuration that replaces the defaults.
+    """
+    explained: dict[str, str] = {}
+    for base in plugin.cls.__mro__:
+        for documented in (vars(base).get("__init__"), base):
+            explained = google_docstring(inspect.cleandoc(documented.__doc__ or ""))[1] | explained
+    given = {} if values is None else _plain(values)
+    return [
+        Option(prefix + name, kind, given.get(name, default), _sentence(explained.get(name, "")))
+        for name, kind, default in plugin.fields()
+    ]
+
+
+def _plain(values: DictConfig) -> dict[str, Any]:
+    given = cast(dict[str, Any], OmegaConf.to_container(values, resolve=False))
+    return {name: "required" if value == MISSING else value for name, value in given.items()}
+
+
+def _sentence(text: str) -> str:
+    return text[:1].upper() + text[1:].rstrip(".") + "." if text else ""
+
+
+def google_docstring(docstring: str) -> tuple[str, dict[str, str]]:
+    """Split a docstring into its text and the explanations of the sections Args and Attributes."""
+    parts = re.split(r"^(Args|Attributes|Returns|Raises|Shape|Example[s]?|Note):\n", docstring, flags=re.MULTILINE)
+    explained: dict[str, str] = {}
+    for title, section in zip(parts[1::2], parts[2::2], strict=True):
+        if title in ("Args", "Attributes"):
+            for entry in re.split(r"\n(?=\S)", textwrap.dedent(section).strip()):
+                names, _, text = entry.partition(": ")
+                explained |= {name.strip(): " ".join(text.split()) for name in names.split(",")}
+    return parts[0].strip(), explained
+
+
+def yaml_comments(file: Path) -> dict[str, str]:
+    """Return the comments on the lines of the settings in a YAML file, by name."""
+    return dict(re.findall(r"^(\w+):.*?\s# (.*)$", file.read_text(encoding="utf-8"), re.MULTILINE))
+
+
+def _names(schema: type, prefix: str = "") -> dict[str, list[str]]:
+    """Return the names of the settings of a dataclass and of nested dataclasses, by the full name of the node."""
+    hints = get_type_hints(schema)
+    found = {prefix: list(hints)}
+    for name, hint in hints.items():
+        if dataclasses.is_dataclass(hint):
+            found |= _names(hint, f"{prefix}.{name}".lstrip("."))  # type: ignore[arg-type]
+    return found
+
+
+def _field_comments(schema: type) -> dict[str, str]:
+    """Return the comments of the fields of a dataclass: on the line of the field, or on the lines above."""
+    lines = inspect.getsource(schema).split("\n")
+    found = {}
+    for node in ast.parse(textwrap.dedent("\n".join(lines))).body[0].body:  # type: ignore[attr-defined]
+        if not isinstance(node, ast.AnnAssign):
+            continue
+        above: list[str] = []
+        number = node.lineno - 2
+        while lines[number].lstrip().startswith("#"):
+            above.insert(0, lines[number].lstrip(" #"))
+            number -= 1
+        end = lines[(node.end_lineno or node.lineno) - 1].partition("  #")[2]
+        beside = _TOOLS.sub("", f"#{end}").lstrip("# ").removeprefix("- ") if end else ""
+        inside = [part for line in lines[node.lineno : node.end_lineno] if (part := line.partition("  # ")[2])]
+        found[ast.unparse(node.target)] = " ".join([*above, *inside, beside]).strip()
+    return {name: comment for name, comment in found.items() if comment}
+
+
+def recall(command: str) -> Described | None:
+    """Return the description of a command from the cache; None if a file of nerfro or of a plugin has changed."""
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+        content = json.loads(_cache_file(command).read_text(encoding="utf-8"))
+        if content.pop("state") == _state_of_files():
+            return Described(**content)
+    return None
+
+
+def remember(command: str, described: Described) -> None:
+    """Write the description of a command to the cache, if possible."""
+    file = _cache_file(command)
+    partial = file.with_suffix(f".{os.getpid()}")
+    with contextlib.suppress(OSError):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            content = {"state": _state_of_files(), **dataclasses.asdict(described)}
+            partial.write_text(json.dumps(content), encoding="utf-8")
+            partial.replace(file)
+        finally:
+            partial.unlink(missing_ok=True)
+
+
+def _cache_file(command: str) -> Path:
+    return cache_dir() / f"options_{command}.json"
+
+
+def _state_of_files() -> str:
+    """Hash the names, times and sizes of all files that define options."""
+    files = [*PACKAGE_DIR.rglob("*.py"), *CONF_DIR.rglob("*.yaml")]
+    for folder in plugin_folders():
+        files += folder.glob("*.py")
+        files += [file for package in folder.glob("*/__init__.py") for file in package.parent.rglob("*.py")]
+    for entry_point in importlib.metadata.entry_points(group=ENTRY_POINTS):
+        found = importlib.util.find_spec(entry_point.module.partition(".")[0])
+        places = [] if found is None else [Path(found.origin or ""), *map(Path, found.submodule_search_locations or ())]
+        files += [file for place in places for file in ([place] if place.is_file() else place.rglob("*.py"))]
+    facts = sorted((str(file), status.st_mtime_ns, status.st_size) for file in files for status in [file.stat()])
+    return hashlib.sha256(repr((facts, sys.version)).encode()).hexdigest()

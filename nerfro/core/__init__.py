@@ -1,0 +1,1 @@
+"""Values and functions that all rooms share."""

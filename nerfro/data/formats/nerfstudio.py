@@ -1,0 +1,108 @@
+"""Data format of nerfstudio."""
+
+from __future__ import annotations
+
+import functools
+import os
+from pathlib import PurePosixPath
+from typing import Any, Literal
+
+import numpy as np
+
+from nerfro.core.errors import NerfroError
+from nerfro.data.formats.bounds import find_bounds, image_edges, usable_points
+from nerfro.data.frames import SPLITS, Every, FrameSet, PosedImages
+from nerfro.data.image_files import read_size
+from nerfro.data.masks import find_mask
+from nerfro.data.transforms import Manifest, find_splits, parse_manifest, read_manifest
+from nerfro.geometry.mesh import load_points
+from nerfro.registry.allowed import check
+from nerfro.registry.registration import register
+
+_SINGLE, _MASK_KEY = "transforms.json", "object_mask_path"
+
+
+@register("data", "nerfstudio")
+class NerfstudioData(PosedImages):
+    """Read the format of nerfstudio: transforms.json, or one file per split, with intrinsics and distortion.
+
+    Poses have OpenGL camera axes and keep the world of the file. nerfstudio rotates, centres and scales the world for
+    training; here the world stays unchanged so that a mesh of the object fits. `mask_path` marks pixels to ignore
+    (black), which are not used for training. The silhouette of the refractive object is `object_mask_path`.
+
+    Args:
+        near, far: bounds of the rays, arc lengths in world units; by default estimated from the sparse points
+            (`ply_file_path`) or from the cameras, see `find_bounds`.
+        options: see `PosedImages`.
+        missing: whether to `skip` frames whose image does not exist, with a warning, or to `refuse` the data set.
+        test_every: every n-th frame by name, from the first, belongs to val and test, unless the file has the lists
+            {train,val,test}_filenames.
+    """
+
+    def __init__(
+        self,
+        root: str,
+        missing: Literal["skip", "refuse"] = "skip",
+        test_every: Every = 10,
+        **options: Any,
+    ) -> None:
+        super().__init__(root, **options)
+        self.skip_missing, self.test_every = missing == "skip", test_every
+
+    @property
+    def splits(self) -> list[str]:
+        return SPLITS if self._is_single else list(find_splits(self.root))
+
+    @property
+    def _is_single(self) -> bool:
+        return (self.root / _SINGLE).is_file()
+
+    def _manifest(self, split: str) -> Manifest:
+        return self._whole if self._is_single else read_manifest(self.root, split, _MASK_KEY, self.skip_missing)
+
+    @functools.cached_property
+    def _whole(self) -> Manifest:
+        return parse_manifest(self.root / _SINGLE, _MASK_KEY, self.skip_missing)
+
+    def read(self, split: str) -> FrameSet:
+        manifest = self._manifest(split)
+        chosen = self._choose(manifest, split) if self._is_single else list(range(len(manifest.frames)))
+        entries: Any = manifest.document["frames"]
+        frames, stated = [manifest.frames[i] for i in chosen], [entries[i].get("mask_path") for i in chosen]
+        usable = [path and find_mask(self.root, frame.image, path) for path, frame in zip(stated, frames, strict=True)]
+        return FrameSet(frames, manifest.lenses(chosen), "opengl", *self._bounds(split), usable=usable)
+
+    def _bounds(self, split: str) -> tuple[float, float]:
+        """Return the bounds, which are estimated from the training cameras for all splits."""
+        if self.near is not None and self.far is not None:
+            return self.near, self.far
+        manifest = self._manifest("train" if "train" in self.splits else split)
+        points, file = np.empty((0, 3)), manifest.document.get("ply_file_path")
+        check(f"{manifest.path}: ", {"ply_file_path": str}, {"ply_file_path": file})
+        if isinstance(file, str) and os.path.isfile(self.root / file):  # False for a name that is too long
+            points = usable_points(load_points(self.root / file), self.root / file)
+        width, height, _ = read_size(manifest.frames[0].image)
+        edges = np.stack([image_edges(lens, width, height) for lens in manifest.lenses()])
+        return find_bounds(np.stack([frame.camera_to_world for frame in manifest.frames]), edges, points)
+
+    def _choose(self, manifest: Manifest, split: str) -> list[int]:
+        """Return the indices of the frames of a split."""
+        listed = {name: manifest.document.get(f"{name}_filenames") for name in SPLITS}
+        by_name = sorted(range(len(manifest.frames)), key=lambda i: manifest.frames[i].name)
+        if not any(listed.values()):
+            return self.held_out(by_name, self.test_every, split)
+        names = listed[split]
+        if not isinstance(names, list) or not names or not all(isinstance(name, str) for name in names):
+            raise NerfroError(
+                f"{manifest.path} lists the files of other splits but has no '{split}_filenames'; "
+                "add it, or remove all lists"
+            )
+        known = {manifest.frames[i].name: i for i in by_name}
+        names = [PurePosixPath(name.replace("\\", "/")).as_posix() for name in names]
+        unknown = [name for name in names if name not in known and name not in manifest.skipped]
+        if unknown:
+            raise NerfroError(f"{manifest.path}: {split}_filenames lists '{unknown[0]}', but no frame has this name")
+        chosen = [known[name] for name in names if name in known]
+        if not chosen:
+            raise NerfroError(f"{manifest.path}: no image of {split}_filenames exists; restore {names[0]}")
+        return chosen

@@ -1,0 +1,62 @@
+"""The command `mask`: from the options to the masks."""
+
+from __future__ import annotations
+
+import json
+
+import torch
+from omegaconf import DictConfig
+
+from nerfro.core.errors import NerfroError
+from nerfro.core.paths import EMBEDDED_PREFIX
+from nerfro.core.progress import progress_bar
+from nerfro.data.base import DataSource
+from nerfro.data.frames import require_root
+from nerfro.files.atomic import write_atomically
+from nerfro.files.folder_lock import lock_folder
+from nerfro.masks.mask_files import MaskTask, read_outlines
+from nerfro.masks.masking import Segmentation
+from nerfro.masks.outline_page import OutlinePage
+from nerfro.registry.registration import build
+
+_OUTLINES = "outlines.json"
+
+
+@torch.no_grad()
+def run(config: DictConfig) -> None:
+    """Segment the outlined views, then all other views, and write the missing masks.
+
+    Args:
+        config: resolved `nerfro.mask.MaskConfig`.
+
+    Raises:
+        NerfroError: the data set is part of nerfro, there is nothing to start from, or the views disagree.
+    """
+    if str(config.data.root).startswith(EMBEDDED_PREFIX):
+        raise NerfroError(f"data.root={config.data.root} is part of nerfro and has masks; set data.root to your folder")
+    source = build(config.data)
+    require_root(source.root)
+    with lock_folder(source.root, "data.root"):
+        _mask(config, source)
+
+
+def _mask(config: DictConfig, source: DataSource) -> None:
+    drawn = source.root / _OUTLINES
+    continues = config.view and config.outlines is None and drawn.is_file()
+    outlines = read_outlines(str(drawn) if continues else config.outlines)
+    task = MaskTask.load(source, config, outlines)
+    if config.view:
+
+        def save(outlines: dict[str, list], found: Segmentation) -> str:
+            write_atomically(drawn, json.dumps(outlines) + "\n")
+            return f"{task.save(outlines, found)}; the outlines are in {drawn}"
+
+        page = OutlinePage(task.images, task.frames, outlines, task.segment, save)
+        page.serve(source.root.name, config.host, config.port, config.open)
+    else:
+        missing = len(task.frames) - len(task.kept) - len(outlines)
+        print(f"{len(task.kept)} existing masks, {len(outlines)} outlines; segmenting {missing} further views")
+        with progress_bar("segmenting", missing) as progress:
+            found = task.segment(outlines, progress.update)
+        print(task.save(outlines, found))
+        print("correct wrong masks in a paint program; or delete them, outline one of these views, and repeat")

@@ -1,0 +1,238 @@
+"""Paths of rays through a continuous refractive index."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Annotated, Any, Literal
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from nerfro.core.errors import NerfroError
+from nerfro.core.types import Path, Rays
+from nerfro.geometry.interpolation import intersect_box
+from nerfro.kernels.tolerances import STEPS_PER_SHELL
+from nerfro.media.base import Medium
+from nerfro.media.sdf_grid import SdfGrid
+from nerfro.paper.compiled import eikonal_on_grid, uniform_on_grid
+from nerfro.paper.integrators import Integrator, RayState, euler, leapfrog
+from nerfro.paper.tolerances import MIN_TURN, REACHED
+from nerfro.paper.voxel_grid import VoxelGrid
+from nerfro.registry.allowed import Count, OnlyWith, Positive, Range
+from nerfro.registry.registration import register
+from nerfro.samplers.base import PathSampler
+from nerfro.samplers.paths.polylines import PolylineBuilder
+from nerfro.samplers.paths.replay import Vertices, assembled, is_interior, with_gradient
+
+# Fraction of a step by which a replay may reach the end of a step earlier than the trace.
+_ROUNDING = 0.01
+
+
+@register("sampler/path", "eikonal")
+class Eikonal(PathSampler):
+    """Trace rays by the Eikonal equation, with adaptive steps or with the equal Euler steps of the paper.
+
+    Args:
+        integrator: `adaptive` takes leapfrog steps where the index varies, jumps elsewhere, and keeps few vertices.
+            `euler` takes equal steps from near to far and keeps all vertices, as the paper does.
+        num_steps: number of vertices of a path of equal steps; 768 in the paper.
+        tolerance: largest distance of an adaptive path from its polyline, as a fraction of the box's diagonal.
+        max_steps: largest number of adaptive steps of a ray, after which the path continues straight.
+    """
+
+    def __init__(
+        self,
+        integrator: Literal["adaptive", "euler"] = "adaptive",
+        num_steps: Annotated[int, Range(at_least=2, at_most=8192), OnlyWith("integrator", ("euler",))] = 768,
+        tolerance: Annotated[Positive, OnlyWith("integrator", ("adaptive",))] = 2e-4,
+        max_steps: Annotated[Count, OnlyWith("integrator", ("adaptive",))] = 16384,
+    ) -> None:
+        super().__init__()
+        self.integrator, self.num_steps, self.tolerance, self.max_steps = integrator, num_steps, tolerance, max_steps
+
+    @torch.no_grad()
+    def forward(self, rays: Rays, medium: Medium) -> Path:
+        """Trace rays from near to far; bent adaptive paths end outside the medium's box, beyond far if necessary."""
+        if medium.absorption is not None or medium.disperses:
+            raise NerfroError("medium.absorption and medium.abbe need sharp surfaces; take sampler/path=snell")
+        if self.integrator != "adaptive":
+            if isinstance(medium, VoxelGrid):
+                return uniform_on_grid(rays, medium, self.num_steps)
+            return march_uniform(rays, medium, euler, self.num_steps)
+        tolerance = self.tolerance * float(torch.linalg.vector_norm(medium.box[1] - medium.box[0]))
+        if isinstance(medium, VoxelGrid):
+            return eikonal_on_grid(rays, medium, 0.5 * float(medium.spacing.min()), tolerance, self.max_steps)[0]
+        if isinstance(medium, SdfGrid):
+            step = 2 * medium.shell / STEPS_PER_SHELL
+            return eikonal_on_grid(rays, medium, step, tolerance, self.max_steps)[0]
+        return march_adaptive(rays, medium, tolerance, self.max_steps)[0]
+
+    def replay(self, path: Path, rays: Rays, medium: Medium) -> Path:
+        """Repeat the steps of a path with gradients with respect to rays and medium, and keep the states of all steps.
+
+        At a thin shell, gradients grow without bound towards grazing and critical angles, as at a sharp surface.
+        """
+        if self.integrator == "adaptive":
+            return replay_adaptive(path, rays, medium, self.max_steps)
+        rays = rays[path.ray]
+        replayed = march_uniform(rays, medium, euler, self.num_steps)
+        names = ("positions", "directions", "s")
+        columns: dict[str, Any] = {n: with_gradient(getattr(path, n), getattr(replayed, n)) for n in names}
+        return replace(path, **columns)
+
+    def releases_gil(self, medium: Medium) -> bool:
+        return isinstance(medium, VoxelGrid) or (self.integrator == "adaptive" and isinstance(medium, SdfGrid))
+
+
+def march_uniform(rays: Rays, medium: Medium, integrator: Integrator, num_steps: int) -> Path:
+    """Trace rays by equal steps ds = (far - near) / (num_steps - 1) (paper, Eqn. 4).
+
+    The arc length of a vertex is the length of the polyline. At near, v = n d.
+    """
+    ds = (rays.far - rays.near) / (num_steps - 1)
+    x = rays.origins + rays.near[:, None] * rays.directions
+    n, gradients = medium(x)
+    state = RayState(x, n[:, None] * rays.directions, n, gradients)
+    states = [state]
+    for _ in range(num_steps - 1):
+        state = integrator(state, ds, medium)
+        states.append(state)
+    positions = torch.stack([state.positions for state in states], 1)
+    velocities = torch.stack([state.velocities for state in states], 1)
+    directions = velocities / velocities.norm(dim=-1, keepdim=True)
+    lengths = (positions[:, 1:] - positions[:, :-1]).norm(dim=-1)
+    s = torch.cat([rays.near[:, None], rays.near[:, None] + lengths.cumsum(-1)], -1)
+    refracted = torch.stack([(state.gradients != 0).any(-1) for state in states], -1).any(-1)
+    return Path.unbranched(positions, directions, s, refracted, rays.radii)
+
+
+class _NewVertices:
+    """Vertices of a trace: recorded where a path is far from its last tangent, and at the start of jumps."""
+
+    def __init__(self, rays: Rays, tolerance: float) -> None:
+        self.kept = _start(rays)
+        self.lines = PolylineBuilder(len(rays), rays.near)
+        self.lines.append(torch.arange(len(rays), device=rays.near.device), *self.kept)
+        self.tolerance = tolerance
+
+    def before_jump(self, rows: Tensor, x: Tensor, d: Tensor, s: Tensor) -> None:
+        self._keep(rows[(d[rows] - self.kept[1][rows]).square().sum(-1) > MIN_TURN], x, d, s)
+
+    def after_step(self, rows: Tensor, length: Tensor, x: Tensor, d: Tensor, s: Tensor) -> None:
+        kept_x, kept_d, kept_s = (values[rows] for values in self.kept)
+        tangent = kept_x + (s[rows] - kept_s)[:, None] * kept_d
+        self._keep(rows[(x[rows] - tangent).square().sum(-1) > self.tolerance**2], x, d, s)
+
+    def _keep(self, rows: Tensor, *state: Tensor) -> None:
+        x, d, s = state
+        self.lines.append(rows, x[rows], d[rows], s[rows])
+        for kept, values in zip(self.kept, state, strict=True):
+            kept[rows] = values[rows]
+
+
+class _KnownVertices:
+    """Vertices of a replay: at the arc lengths of the traced vertices."""
+
+    def __init__(self, path: Path) -> None:
+        self.s, self.last = path.s, is_interior(path).sum(-1)
+        self.next = torch.ones_like(path.ray)
+        self.found: list[Vertices] = []
+
+    def before_jump(self, rows: Tensor, x: Tensor, d: Tensor, s: Tensor) -> None:
+        """Do nothing: the vertex at the start of a jump is at the end of the previous step."""
+
+    def after_step(self, rows: Tensor, length: Tensor, x: Tensor, d: Tensor, s: Tensor) -> None:
+        column = self.next[rows]
+        # A vertex lies at the end of a step; rounding errors must not move the vertex to the next step.
+        due = (column <= self.last[rows]) & (s[rows] >= self.s[rows, column] - _ROUNDING * length)
+        rows, column = rows[due], column[due]
+        self.found.append((rows, column, x[rows], d[rows], s[rows]))
+        self.next[rows] += 1
+
+
+def march_adaptive(rays: Rays, medium: Medium, tolerance: float, max_steps: int) -> tuple[Path, Bool[Tensor, "R"]]:
+    """Trace rays by leapfrog steps where the index varies and by straight jumps elsewhere.
+
+    This is the reference implementation of the compiled kernel. A vertex is recorded when the path is more than
+    `tolerance` world units from the tangent of the last vertex, and at the start of jumps.
+
+    Returns:
+        The path, and whether each ray met the limit of steps, after which the path continues straight.
+    """
+    vertices = _NewVertices(rays, tolerance)
+    state, refracted, exceeded = _march(rays, medium, max_steps, vertices)
+    vertices.before_jump(torch.arange(len(rays), device=rays.near.device), *state)
+    vertices.lines.append_ends(rays.far, medium.box, refracted, *state)
+    return vertices.lines.path(rays, refracted), exceeded
+
+
+def replay_adaptive(path: Path, rays: Rays, medium: Medium, max_steps: int) -> Path:
+    """Repeat the steps of `march_adaptive` with gradients with respect to rays and medium, including the step lengths.
+
+    The precision is double, as in the compiled kernel. The backward pass needs the states of all steps.
+    """
+    precise = rays[path.ray].to(torch.float64)
+    vertices = _KnownVertices(path)
+    state, _, _ = _march(precise, medium, max_steps, vertices)
+    rows = torch.arange(len(precise), device=path.s.device)
+    first = (rows, torch.zeros_like(rows), *_start(precise))
+    return assembled(path, rays, medium, [first, *vertices.found], state)
+
+
+def _start(rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
+    return rays.origins + rays.near[:, None] * rays.directions, rays.directions.clone(), rays.near.clone()
+
+
+def _march(
+    rays: Rays, medium: Medium, max_steps: int, vertices: _NewVertices | _KnownVertices
+) -> tuple[tuple[Tensor, Tensor, Tensor], Bool[Tensor, "R"], Bool[Tensor, "R"]]:
+    """Trace rays until they leave the medium's box; outside the box, rays are straight.
+
+    Inside the box, a ray jumps by the clearance of the medium if there is any, and otherwise takes a leapfrog step.
+
+    Returns:
+        Last positions, directions and arc lengths; whether the index varied on the path; whether a ray met the limit.
+    """
+    num_rays = len(rays)
+    rows = torch.arange(num_rays, device=rays.near.device)
+    x, d, s = _start(rays)
+    refracted = torch.zeros(num_rays, dtype=torch.bool, device=x.device)
+    enter, leave = intersect_box(medium.box, x, d)
+    active = rows[(enter < leave) & (leave > 0) & (enter < rays.far - s)]
+    jump = enter[active].clamp(min=0)
+    x[active] += jump[:, None] * d[active]
+    s[active] += jump
+    # Tensors of all rays are changed in place, so autograd must save only tensors of selected rows.
+    n, g, v = torch.ones_like(s), torch.zeros_like(x), torch.zeros_like(x)
+    n[active], g[active] = medium(x[active])
+    v[active] = n[active, None] * d[active]
+    for _ in range(max_steps):
+        if not len(active):
+            break
+        step = medium.step_length(d[active], g[active])
+        free = medium.clearance(x[active])
+        jumps = free > REACHED * step
+        jumping, stepping = active[jumps], active[~jumps]
+        vertices.before_jump(jumping, x, d, s)
+        length = free[jumps]
+        x[jumping] += length[:, None] * d[jumping]
+        s[jumping] += length
+        n[jumping], g[jumping] = medium(x[jumping])
+        v[jumping] = n[jumping, None] * d[jumping]
+        varies = (g[stepping] != 0).any(-1)
+        refracted[stepping] |= varies
+        ds = step[~jumps]
+        state = leapfrog(RayState(x[stepping], v[stepping], n[stepping], g[stepping]), ds, medium)
+        length = torch.linalg.vector_norm(state.positions - x[stepping], dim=-1)
+        s[stepping] += length
+        x[stepping], v[stepping], n[stepping], g[stepping] = state
+        # A straight step must not change the direction by rounding, but a replay needs the gradients of the direction.
+        bent = stepping if v.requires_grad else stepping[varies | (state.gradients != 0).any(-1)]
+        d[bent] = torch.nn.functional.normalize(v[bent], dim=-1)
+        vertices.after_step(stepping, length, x, d, s)
+        outside = ((x[active] < medium.box[0]) | (x[active] > medium.box[1])).any(-1)
+        active = active[~outside]
+    exceeded = torch.zeros_like(refracted)
+    exceeded[active] = True
+    return (x, d, s), refracted, exceeded

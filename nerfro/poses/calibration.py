@@ -1,0 +1,198 @@
+"""Estimation of lens and poses from the detected tags of a known board."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from nerfro.core.errors import NerfroError
+from nerfro.poses.boards import TagDetections
+from nerfro.poses.opencv import opencv
+
+LensModel = Literal["pinhole", "radial", "opencv"]
+
+# A corner is an outlier (of a misread tag, or of a tag seen through the glass) if its error exceeds so many standard
+# deviations and so many pixels. The median of 2-D normal errors is 1.18 standard deviations.
+_OUTLIER_DEVIATIONS, _MIN_OUTLIER_ERROR = 5.0, 1.0
+_MAX_ESTIMATES = 10
+# Images with fewer tags are skipped; the paper's authors require twelve corners, four for each tag. Fewer images do
+# not determine the lens.
+_MIN_TAGS, _MIN_IMAGES = 3, 3
+# Initial focal length of the paper's authors, in units of the longer side of the image.
+_INITIAL_FOCAL = 1.2
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """Intrinsics of the one lens of all images, in pixels from the corner of the image.
+
+    Attributes:
+        matrix: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]].
+        distortion: OpenCV's coefficients k1, k2, p1, p2 and optionally k3, k4, k5, k6; empty for an ideal lens.
+        focal_deviation: standard deviation of fx estimated from the residuals, in pixels; None for a model of COLMAP.
+    """
+
+    matrix: Float[np.ndarray, "3 3"]
+    distortion: tuple[float, ...] = ()
+    focal_deviation: float | None = None
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Pose of one image.
+
+    Attributes:
+        camera_to_world: [R | centre] in OpenCV's camera axes.
+        num_observations: number of tags, or of 3-D points of COLMAP, that determine the pose.
+        error: root mean square reprojection error, in pixels; NaN without observations.
+    """
+
+    camera_to_world: Float[np.ndarray, "3 4"]
+    num_observations: int
+    error: float
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Estimated lens and poses.
+
+    Attributes:
+        intrinsics: the lens.
+        poses: poses by image name.
+        skipped: reason by name, for images without a pose.
+        num_outliers: number of corners of tags that were removed as outliers; 0 for a model of COLMAP.
+    """
+
+    intrinsics: Intrinsics
+    poses: dict[str, Pose]
+    skipped: dict[str, str]
+    num_outliers: int
+
+    @property
+    def errors(self) -> list[float]:
+        """Root mean square reprojection errors of the images with observations, in pixels."""
+        return [pose.error for pose in self.poses.values() if pose.num_observations]
+
+    @property
+    def mean_error(self) -> float:
+        """Mean over the images of the root mean square reprojection error, in pixels; 0 without observations."""
+        return float(np.mean(self.errors)) if self.errors else 0.0
+
+    def lines(self, observations: str) -> list[str]:
+        """Format a report: the error of each image, skipped images, and the lens.
+
+        Args:
+            observations: noun for the observations, in the plural.
+        """
+        lines = [f"reprojection error in pixels (rms) and number of {observations} by image:"]
+        for name, pose in sorted(self.poses.items()):
+            error = f"{pose.error:6.3f}" if pose.num_observations else f"{'-':>6}"
+            lines.append(f"  {error}  {pose.num_observations:4d}  {name}")
+        if self.errors:
+            lines.append(f"  {self.mean_error:6.3f}  mean; {max(self.errors):.3f} largest")
+        lines += [f"  skipped: {name}: {reason}" for name, reason in sorted(self.skipped.items())]
+        if self.num_outliers:
+            lines.append(f"{self.num_outliers} points removed as outliers: misread, or seen through the object")
+        matrix, deviation = self.intrinsics.matrix, self.intrinsics.focal_deviation
+        lens = f"fx={matrix[0, 0]:.2f} fy={matrix[1, 1]:.2f} cx={matrix[0, 2]:.2f} cy={matrix[1, 2]:.2f} "
+        lens += f"distortion={[round(number, 5) for number in self.intrinsics.distortion]}"
+        return [*lines, lens + ("" if deviation is None else f"; standard deviation of fx {deviation:.2f}")]
+
+
+def calibrate(detections: dict[str, TagDetections], size: tuple[int, int], model: LensModel) -> Calibration:
+    """Minimize the reprojection error over all poses and the lens.
+
+    Estimation and removal of outliers alternate until no outliers remain, for at most ten estimates.
+
+    Args:
+        detections: detected tags by image name.
+        size: width and height of the images, in pixels.
+        model: distortion coefficients to estimate.
+
+    Raises:
+        NerfroError: too few images have enough tags, or the lens cannot be estimated.
+    """
+    skipped: dict[str, str] = {}
+    num_outliers = dict.fromkeys(detections, 0)
+    current = dict(detections)
+    for number in range(1, _MAX_ESTIMATES + 1):
+        kept = {name: each for name, each in current.items() if each.num_tags >= _MIN_TAGS}
+        for name, each in current.items():
+            if name not in kept:
+                removed = f" ({num_outliers[name]} points removed as outliers)" if num_outliers[name] else ""
+                skipped[name] = f"{each.num_tags} tags found, {_MIN_TAGS} needed{removed}"
+        if len(kept) < _MIN_IMAGES:
+            raise NerfroError(
+                f"{len(kept)} of {len(detections)} images show at least {_MIN_TAGS} tags of the board, {_MIN_IMAGES} "
+                "are needed; check board=, and that the board is sharp and large enough in the images"
+            )
+        intrinsics, extrinsics = _estimate(list(kept.values()), size, model)
+        located = dict(zip(kept, extrinsics, strict=True))
+        errors = {name: _errors(each, intrinsics, *located[name]) for name, each in kept.items()}
+        deviation = float(np.median(np.concatenate(list(errors.values())))) / 1.18
+        limit = max(_MIN_OUTLIER_ERROR, _OUTLIER_DEVIATIONS * deviation)
+        outliers = {name: _outliers(kept[name], error, limit) for name, error in errors.items()}
+        if number == _MAX_ESTIMATES or not any(chosen.any() for chosen in outliers.values()):
+            break
+        for name, chosen in outliers.items():
+            num_outliers[name] += int(chosen.sum())
+        current = {name: kept[name].select(~chosen) for name, chosen in outliers.items()}
+    poses = {}
+    for name, (rotation, translation) in located.items():
+        camera_axes = opencv().Rodrigues(rotation)[0].T
+        error = float(np.sqrt((errors[name] ** 2).mean()))
+        pose = np.column_stack([camera_axes, -camera_axes @ translation])
+        poses[name] = Pose(pose, kept[name].num_tags, error)
+    return Calibration(intrinsics, poses, skipped, sum(num_outliers.values()))
+
+
+def _outliers(
+    detections: TagDetections, errors: Float[np.ndarray, " corners"], limit: float
+) -> Bool[np.ndarray, " corners"]:
+    """Select all corners of the tags of which an error exceeds the limit and half the largest error of the image.
+
+    One misread tag disturbs the whole pose, so smaller errors are judged again after the largest ones are removed.
+    """
+    return detections.of_same_tags(errors > max(limit, 0.5 * errors.max()))
+
+
+def _estimate(
+    detections: list[TagDetections], size: tuple[int, int], model: LensModel
+) -> tuple[Intrinsics, list[tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]]]:
+    """Estimate the lens, and for each image the rotation vector and translation from world to camera."""
+    cv2 = opencv()
+    flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_K3
+    if model != "opencv":
+        flags |= cv2.CALIB_ZERO_TANGENT_DIST
+    if model == "pinhole":
+        flags |= cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2
+    focal = _INITIAL_FOCAL * max(size)
+    guess = np.array([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1]])
+    _, matrix, distortion, rotations, translations, deviations, _, _ = cv2.calibrateCameraExtended(
+        [each.board_points.astype(np.float32) for each in detections],
+        [each.image_points.astype(np.float32) for each in detections],
+        size,
+        guess,
+        np.zeros(5),
+        flags=flags,
+    )
+    if not np.isfinite(matrix).all() or min(matrix[0, 0], matrix[1, 1]) <= 0:
+        raise NerfroError("the lens cannot be estimated from these images; photograph the board from more directions")
+    coefficients = () if model == "pinhole" else tuple(map(float, np.ravel(distortion)[:4]))
+    extrinsics = [(np.ravel(r), np.ravel(t)) for r, t in zip(rotations, translations, strict=True)]
+    return Intrinsics(np.asarray(matrix), coefficients, float(np.ravel(deviations)[0])), extrinsics
+
+
+def _errors(
+    detections: TagDetections,
+    intrinsics: Intrinsics,
+    rotation: Float[np.ndarray, "3"],
+    translation: Float[np.ndarray, "3"],
+) -> Float[np.ndarray, " corners"]:
+    """Compute the distances between corners and their projections, in pixels."""
+    distortion = np.array(intrinsics.distortion) if intrinsics.distortion else None
+    projected, _ = opencv().projectPoints(detections.board_points, rotation, translation, intrinsics.matrix, distortion)
+    return np.linalg.norm(projected.reshape(-1, 2) - detections.image_points, axis=1)

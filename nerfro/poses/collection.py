@@ -1,0 +1,158 @@
+"""Collection of photographs, frames of a video, and masks in the folder of a data set."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from omegaconf import DictConfig
+from PIL import ExifTags, Image, ImageOps
+
+from nerfro.core.errors import NerfroError, first_of, warn
+from nerfro.core.paths import user_path
+from nerfro.core.progress import track
+from nerfro.data.frames import list_images
+from nerfro.data.image_files import IMAGE_SUFFIXES, to_unit
+from nerfro.files.atomic import atomic_file
+from nerfro.files.deep_images import read_16bit
+from nerfro.files.reading import open_image, orientation_of
+from nerfro.poses.calibrated_data import REPORT
+from nerfro.poses.photographs import HEIF_SUFFIXES, PHOTOGRAPH_SUFFIXES, one_of_each_pair, require_one_of_each_name
+from nerfro.poses.video import extract_frames
+
+_QUALITY = 95  # of converted photographs
+# EXIF data of 16-bit files that are kept; others describe the file.
+_KEPT_TAGS = (ExifTags.Base.Orientation, ExifTags.Base.Make, ExifTags.Base.Model)
+
+
+def collect_photographs(config: DictConfig, out: Path) -> list[Path]:
+    """Link the photographs, or the sharpest frames of a video, and the masks into the folder of the data set.
+
+    Args:
+        config: the settings `images`, `video`, `frames` and `masks` of `nerfro.reconstruct`.
+        out: folder of the data set.
+
+    Returns:
+        The linked photographs.
+    """
+    if config.video is None:
+        photographs = user_path(config.images)
+    else:
+        photographs = out / "frames"
+        if not (out / REPORT).is_file():
+            extract_frames(user_path(config.video), photographs, config.frames)
+    link_photographs(photographs, None if config.masks is None else user_path(config.masks), out)
+    return list_images(out / "images")
+
+
+def link_photographs(photographs: Path, masks: Path | None, out: Path) -> None:
+    """Link photographs into `out`/images and masks into `out`/masks, so that no result lies among the originals.
+
+    Photographs in HEIC format and those with an EXIF orientation are converted. Existing files are kept. Links to
+    deleted files are removed. Links to other files of the same name are replaced, those to photographs only before the
+    calibration, to which their poses belong. A warning names photographs in `out`/images that `photographs` lacks.
+
+    Args:
+        photographs: folder of the photographs, which may also contain masks (`mask_*`).
+        masks: folder of the masks, `<name>.png`, `<name>.<extension of the photograph>.png` or `mask_<name>.png`.
+        out: folder of the data set.
+
+    Raises:
+        NerfroError: a folder does not exist or holds no photograph, or photographs differ only in their extension.
+    """
+    given = one_of_each_pair(list_images(photographs, PHOTOGRAPH_SUFFIXES))
+    if masks is not None and not masks.is_dir():
+        raise NerfroError(f"masks={masks} is not a folder; give the folder of the masks of the photographs")
+    is_calibrated = (out / REPORT).is_file()
+    if not is_calibrated:
+        require_one_of_each_name(given)
+    for link in (*out.glob("images/*"), *out.glob("masks/*")):
+        if not link.exists():
+            link.unlink()
+    (out / "images").mkdir(parents=True, exist_ok=True)
+    beside = (file for file in photographs.glob("mask_*") if file.suffix.lower() in IMAGE_SUFFIXES)
+    for file in track("linking", sorted([*given, *beside])):
+        _place_photograph(file, out / "images", replaces=not is_calibrated)
+    of_folder = [] if masks is None else [file for file in masks.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES]
+    for file in track("linking", sorted(file for file in of_folder if not file.name.startswith("."))):
+        place = out / ("images" if file.name.startswith("mask_") else "masks")
+        place.mkdir(exist_ok=True)
+        # A converted photograph has another extension, so that of the photograph is left out.
+        stem = Path(file.stem).stem if (photographs / file.stem).is_file() else file.stem
+        _link(place / f"{stem}{file.suffix}", file)
+    if not is_calibrated:
+        _warn_of_others(given, out / "images")
+
+
+def _warn_of_others(given: Sequence[Path], folder: Path) -> None:
+    """Warn of photographs in a folder that are not given, or are older than a given photograph of the same name."""
+    originals = {file.stem: file for file in given}
+    others, outdated = [], []
+    for file in list_images(folder):
+        original = originals.get(file.stem)
+        if original is None:
+            others.append(file.name)
+        elif not file.is_symlink() and file.stat().st_mtime_ns < original.stat().st_mtime_ns:
+            outdated.append(file.name)
+    for names, what in ((others, "not in"), (outdated, "older than those in")):
+        if names:
+            warn(
+                f"{folder} has photographs that are {what} {given[0].parent}: {first_of(names)}; they are used, so "
+                "delete them if they are wrong"
+            )
+
+
+def _links_to_other(link: Path, file: Path) -> bool:
+    """Return whether a path is a link to another file than the given one."""
+    return link.is_symlink() and link.resolve() != file.resolve()
+
+
+def _link(link: Path, file: Path) -> None:
+    """Link a file, unless there is another file of the name; replaces a link to another file."""
+    if _links_to_other(link, file):
+        link.unlink()
+    if not link.exists():
+        link.symlink_to(file.resolve())
+
+
+def _place_photograph(file: Path, folder: Path, replaces: bool) -> None:
+    """Link a photograph into a folder; one in HEIC format or with an EXIF orientation is converted to an upright JPEG.
+
+    Args:
+        file: photograph.
+        folder: folder of the link or of the converted photograph, whose existing files are kept.
+        replaces: whether to replace a link to another file.
+    """
+    if file.suffix.lower() in HEIF_SUFFIXES:
+        try:
+            import pillow_heif
+        except ImportError as error:
+            raise NerfroError(f"{file} needs pillow-heif; pip install 'nerfro[capture]', or give JPEG files") from error
+        pillow_heif.register_heif_opener()
+    place, converted = folder / file.name, folder / f"{file.stem}.jpg"
+    for existing in (place, converted):
+        if existing.exists() and not (replaces and _links_to_other(existing, file)):
+            return
+        existing.unlink(missing_ok=True)
+    with open_image(file, upright=False) as (image, bits):
+        if file.suffix.lower() in HEIF_SUFFIXES or orientation_of(image) in range(2, 9):
+            upright = ImageOps.exif_transpose(_as_stored(file, image, bits)).convert("RGB")
+            with atomic_file(converted) as output:
+                upright.save(output, "JPEG", quality=_QUALITY, exif=upright.getexif())
+            return
+    place.symlink_to(file.resolve())
+
+
+def _as_stored(file: Path, image: Image.Image, bits: int) -> Image.Image:
+    """Return a photograph in the orientation of its file, with 8 bits per channel and its EXIF data."""
+    if bits <= 8:
+        return image
+    levels = read_16bit(file)  # Pillow clips 16-bit grey levels
+    colours = levels[..., 0] if levels.shape[-1] < 3 else levels[..., :3]
+    stored = Image.fromarray(np.uint8(np.rint(255 * to_unit(colours))))
+    exif, given = Image.Exif(), Image.Image.getexif(image)
+    exif.update({tag: given[tag] for tag in _KEPT_TAGS if tag in given})
+    exif.get_ifd(ExifTags.IFD.Exif).update(given.get_ifd(ExifTags.IFD.Exif))  # the focal length, among others
+    stored.info["exif"] = exif.tobytes()
+    return stored

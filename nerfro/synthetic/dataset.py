@@ -1,0 +1,217 @@
+"""Output folder of a rendered scene: views in Blender format, or photographs; an interrupted rendering resumes."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import json
+import platform
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from omegaconf import DictConfig, OmegaConf
+from PIL import Image
+
+from nerfro.cli.overrides import as_overrides, command_line
+from nerfro.core.errors import NerfroError
+from nerfro.core.light import to_srgb
+from nerfro.files import lat_long
+from nerfro.files.atomic import write_atomically
+from nerfro.files.folder_lock import require_only
+from nerfro.files.images import save_image
+from nerfro.files.reading import read_json
+from nerfro.synthetic.path_tracer import Pinhole
+from nerfro.synthetic.scene import SyntheticScene, lat_long_texture
+from nerfro.synthetic.viewpoints import directions_on_sphere, look_at_origin
+
+CAMERA_ANGLE_X = 0.6911112070083618  # field of view of the NeRF synthetic scenes and of the paper's scenes
+CAMERA_DISTANCE = 4.03
+SPLITS = ("train", "val", "test")
+
+
+@dataclass(frozen=True)
+class PlannedImage:
+    """An image that has to be rendered.
+
+    Attributes:
+        image_path, mask_path: paths of image and mask within the folder.
+        pose: camera-to-world matrix [4, 4], OpenGL axes.
+        spp: samples per pixel.
+        seed: seed of the sampler (and of noise), different for every image.
+    """
+
+    image_path: str
+    mask_path: str
+    pose: np.ndarray
+    spp: int
+    seed: int
+
+
+@dataclass(frozen=True)
+class DataSet(ABC):
+    """Images of a scene in a folder; `config` is a resolved `SynthesizeConfig`."""
+
+    config: DictConfig
+    scene: SyntheticScene
+    folder: Path
+
+    META: ClassVar[str]  # file with the settings
+    FILES: ClassVar[tuple[str, ...]]  # patterns of all files
+    FACTS: ClassVar[dict[str, Any]] = {}  # further content of META
+    OPTIONS: ClassVar[tuple[str, ...]]  # options that change the images
+    NOUN: ClassVar[str]
+    WIDTH: ClassVar[float]  # width of an image in the plane through the object, world units
+
+    @property
+    @abstractmethod
+    def camera(self) -> Pinhole:
+        """Camera of all images."""
+
+    @abstractmethod
+    def planned(self) -> list[PlannedImage]:
+        """Return all images in the order of rendering."""
+
+    @abstractmethod
+    def write(self, image: PlannedImage, radiance: np.ndarray, coverage: np.ndarray) -> None:
+        """Write an image of linear radiance [H, W, 3], and a mask of the covered fraction of each pixel [H, W]."""
+
+    @abstractmethod
+    def finish(self, planned: list[PlannedImage]) -> None:
+        """Write the files that belong to the images; the cameras come last and mark the data set as complete."""
+
+    @abstractmethod
+    def next_command(self) -> str:
+        """Return what to do with the data set, with the command."""
+
+    def lit(self) -> SyntheticScene:
+        """Return the scene as the renderer receives the scene."""
+        return self.scene
+
+    def prepare(self, mitsuba: ModuleType) -> None:
+        """Create the folder, keep a folder with equal settings, or remove the files of another data set.
+
+        Raises:
+            NerfroError: the folder contains other files, or another data set while `overwrite` is false.
+        """
+        options: Any = OmegaConf.to_container(self.config)
+        settings = {"scene": self.config.scene, "fingerprint": fingerprint(self.scene)}
+        settings |= {name: options[name] for name in self.OPTIONS}
+        try:
+            stored = read_json(self.folder / self.META, "").get("settings")
+        except (NerfroError, AttributeError):
+            stored = None
+        if stored == settings:
+            return
+        if stored is not None:
+            if not self.config.overwrite:
+                raise NerfroError(
+                    f"'{self.folder}' holds a data set with other settings; choose another folder with out=DIR, "
+                    "or replace the data set with overwrite=true"
+                )
+            # Other files in the folder may belong to the user.
+            for path in [path for pattern in self.FILES for path in self.folder.glob(pattern)]:
+                path.unlink()
+        else:
+            require_only(self.folder, (), "it is no data set of nerfro; choose another folder with out=DIR")
+        versions = {name: importlib.metadata.version(name) for name in ("mitsuba", "drjit", "numpy")}
+        versions |= {"python": platform.python_version(), "variant": mitsuba.variant()}
+        meta = {"scene": self.config.scene, "ior": self.scene.ior, "tint": list(self.scene.tint)}
+        meta |= {"absorption": list(self.scene.absorption), **self.FACTS}
+        write_json(self.folder / self.META, {**meta, "settings": settings, "versions": versions})
+
+    def missing(self, planned: list[PlannedImage]) -> list[PlannedImage]:
+        """Return the images without file or mask."""
+        return [
+            image
+            for image in planned
+            if not all((self.folder / path).is_file() for path in (image.image_path, image.mask_path))
+        ]
+
+
+class ViewSplits(DataSet):
+    """Views from all sides in Blender format, in splits."""
+
+    META = "meta.json"
+    FILES = (
+        *(f"transforms_{split}.json" for split in SPLITS),
+        *(f"{folder}{split}/r_*.png" for split in SPLITS for folder in ("", "masks/")),
+        *("mesh.ply", "interior.ply", "sky.png", "sky.exr", META),
+    )
+    FACTS: ClassVar[dict[str, Any]] = {"box": ((-1.5, -1.5, -1.5), (1.5, 1.5, 1.5)), "near": 2.0, "far": 6.0}
+    OPTIONS = ("resolution", "spp", "test_spp", "views", "fresnel", "seed")
+    NOUN = "views"
+    WIDTH = CAMERA_DISTANCE * CAMERA_ANGLE_X
+
+    @property
+    def camera(self) -> Pinhole:
+        return Pinhole.square(CAMERA_ANGLE_X, self.config.resolution)
+
+    def planned(self) -> list[PlannedImage]:
+        planned = []
+        for number, split in enumerate(SPLITS):
+            spp = self.config.test_spp if split == "test" else self.config.spp
+            directions = directions_on_sphere(self.config.views[split], self.config.seed, number)
+            for index, direction in enumerate(directions):
+                pose = look_at_origin(CAMERA_DISTANCE * direction)
+                seed, name = (self.config.seed * 3 + number) * 100_000 + index, f"{split}/r_{index:03d}.png"
+                planned.append(PlannedImage(name, f"masks/{name}", pose, spp, seed))
+        return planned
+
+    def write(self, image: PlannedImage, radiance: np.ndarray, coverage: np.ndarray) -> None:
+        write_image(self.folder / image.mask_path, coverage)
+        write_image(self.folder / image.image_path, to_srgb(radiance))
+
+    def finish(self, planned: list[PlannedImage]) -> None:
+        assert self.scene.sky is not None
+        sky = lat_long_texture(self.scene.sky, self.config.sky_height)
+        self.scene.glass.save(self.folder / "mesh.ply")
+        write_image(self.folder / "sky.png", to_srgb(sky))
+        if self.config.extras:
+            self.scene.interior.save(self.folder / "interior.ply")
+            lat_long.save_lat_long(self.folder / "sky.exr", torch.from_numpy(sky))
+        for split in SPLITS:
+            frames = [
+                {
+                    "file_path": "./" + view.image_path.removesuffix(".png"),
+                    "mask_path": "./" + view.mask_path,
+                    "transform_matrix": view.pose.tolist(),
+                }
+                for view in planned
+                if view.image_path.startswith(f"{split}/")
+            ]
+            content = {"camera_angle_x": CAMERA_ANGLE_X, "frames": frames}
+            write_json(self.folder / f"transforms_{split}.json", content)
+
+    def next_command(self) -> str:
+        mesh = self.folder / "mesh.ply"
+        options = as_overrides({"data.root": self.folder, "medium.mesh": mesh, "medium.ior": self.scene.ior})
+        return f"train on it: {command_line('train', options)}"
+
+
+def fingerprint(scene: SyntheticScene) -> str:
+    """Compute a short hash of a scene, so that images of different scenes are not mixed in one folder."""
+    digest = hashlib.sha256(repr((scene.ior, scene.tint, scene.absorption)).encode())
+    for surface in (scene.glass, scene.interior):
+        for array in (surface.vertices, surface.faces, surface.normals, surface.colours):
+            if array is not None:
+                digest.update(array.tobytes())
+    if scene.sky is not None:
+        digest.update(scene.sky(lat_long.directions(64).numpy()).astype(np.float32).tobytes())
+    for panel in scene.panels:
+        digest.update(repr((panel.to_world.tolist(), panel.glows, panel.smooth)).encode() + panel.image.tobytes())
+    return digest.hexdigest()[:16]
+
+
+def write_image(path: Path, image: np.ndarray) -> None:
+    """Write sRGB [H, W, 3] or coverage [H, W], clipped to [0, 1], as an 8-bit PNG, or bool [H, W] as a 1-bit PNG."""
+    levels = image if image.dtype == bool else np.rint(np.clip(image, 0.0, 1.0) * 255).astype(np.uint8)
+    save_image(path, Image.fromarray(levels), optimize=True)
+
+
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    write_atomically(path, json.dumps(content, indent=1) + "\n")

@@ -1,0 +1,62 @@
+"""Names of synthetic scenes, and options of `nerfro.synthesize`; `nerfro/synthetic/` renders the scenes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Optional
+
+from omegaconf import MISSING, DictConfig
+
+from nerfro.registry.allowed import Count, Names, Natural, NotNegative, Positive, Range
+from nerfro.registry.registration import plugin_module
+
+SCENES: dict[str, str] = {}
+"""Module of each scene, by name; plugins add scenes. `build(spacing)` of the module returns the `SyntheticScene`."""
+
+SceneName = Annotated[str, Names(lambda: SCENES)]
+
+
+@dataclass
+class ViewCounts:
+    """Number of views per split."""
+
+    train: Count = MISSING  # number of training views
+    val: Count = MISSING  # number of validation views
+    test: Count = MISSING  # number of test views
+
+
+@dataclass
+class SynthesizeConfig:
+    """Options of `nerfro.synthesize`; conf/synthesize/synthesize.yaml gives and explains the defaults."""
+
+    scene: SceneName = MISSING
+    out: str = MISSING
+    resolution: Annotated[int, Range(at_least=8, at_most=16384)] = MISSING
+    spp: Count = MISSING
+    test_spp: Count = MISSING
+    views: ViewCounts = field(default_factory=ViewCounts)
+    photographs: Count = MISSING
+    noise: NotNegative = MISSING
+    fresnel: bool = MISSING
+    absorption: list[NotNegative] = MISSING
+    ior: Optional[Positive] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
+    seed: Natural = MISSING
+    sky_height: Annotated[int, Range(at_least=16, at_most=16384)] = MISSING
+    extras: bool = MISSING
+    variant: str = MISSING
+    overwrite: bool = MISSING
+
+
+def synthesize(config: DictConfig) -> Any:
+    """Render the missing images of a data set.
+
+    Args:
+        config: resolved `SynthesizeConfig`.
+
+    Returns:
+        The data set, a `DataSet` of the renderer.
+
+    Raises:
+        NerfroError: Mitsuba is missing, or `out` contains another data set or other files.
+    """
+    return plugin_module("synthetic_scenes.synthesis").synthesize(config)

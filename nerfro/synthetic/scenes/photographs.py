@@ -1,0 +1,114 @@
+"""Photographs of a scene as from a real capture, held by hand and without poses."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from nerfro.cli.overrides import as_overrides, command_line
+from nerfro.core.light import to_srgb
+from nerfro.synthetic.dataset import DataSet, PlannedImage, write_image, write_json
+from nerfro.synthetic.path_tracer import Pinhole
+from nerfro.synthetic.scene import SyntheticScene, Vector
+from nerfro.synthetic.scenes.baking import bake
+from nerfro.synthetic.viewpoints import look_at_origin
+
+DISTANCE, ELEVATIONS, LAPS = 4.5, (5.0, 68.0), 4
+# Focal length, and offset of the principal point from the centre of the image, relative to the width of the image.
+FOCAL, OFF_CENTRE = 1.18, (0.006, -0.005)
+BAKING_SPP = 256
+
+
+class Photographs(DataSet):
+    """Photographs and masks without poses, as from a real capture; the true poses and surfaces are in `truth/`."""
+
+    META = "truth/meta.json"
+    FILES = (
+        *("images/photo_*.png", "masks/photo_*.png"),
+        *(f"truth/{name}" for name in ("transforms_train.json", "mesh.ply", "interior.ply", "meta.json")),
+    )
+    OPTIONS = ("resolution", "photographs", "spp", "noise", "fresnel", "seed")
+    NOUN = "photographs"
+    WIDTH = DISTANCE / FOCAL
+
+    @property
+    def camera(self) -> Pinhole:
+        width, height = self.config.resolution, self.config.resolution * 3 // 4
+        cx, cy = 0.5 * width + OFF_CENTRE[0] * width, 0.5 * height + OFF_CENTRE[1] * width
+        return Pinhole(width, height, FOCAL * width, cx, cy)
+
+    def lit(self) -> SyntheticScene:
+        return bake(self.scene, BAKING_SPP, self.config.variant)
+
+    def planned(self) -> list[PlannedImage]:
+        config = self.config
+        poses = hand_held(config.photographs, config.seed, self.scene.aim, DISTANCE, ELEVATIONS, LAPS)
+        return [
+            PlannedImage(f"images/{name}", f"masks/{name}", pose, config.spp, config.seed * 100_000 + index)
+            for index, pose in enumerate(poses)
+            for name in [f"photo_{index:03d}.png"]
+        ]
+
+    def write(self, image: PlannedImage, radiance: np.ndarray, coverage: np.ndarray) -> None:
+        """Write 8-bit sRGB with noise, and a mask in black and white.
+
+        Noise of constant strength in sRGB approximates the noise of counted photons after encoding.
+        """
+        grain = np.random.default_rng(image.seed).normal(scale=self.config.noise, size=radiance.shape)
+        write_image(self.folder / image.mask_path, coverage >= 0.5)
+        write_image(self.folder / image.image_path, to_srgb(np.clip(radiance, 0.0, 1.0)) + grain)
+
+    def finish(self, planned: list[PlannedImage]) -> None:
+        """Write the true surfaces, and the true cameras in the format `opencv`."""
+        camera, truth = self.camera, self.folder / "truth"
+        self.scene.glass.save(truth / "mesh.ply")
+        self.scene.interior.save(truth / "interior.ply")
+        frames = [
+            {
+                "file_path": f"../{photograph.image_path}",
+                "mask_path": f"../{photograph.mask_path}",
+                "transform_matrix": (photograph.pose @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist(),
+            }
+            for photograph in planned
+        ]
+        matrix = [[camera.focal, 0.0, camera.cx], [0.0, camera.focal, camera.cy], [0.0, 0.0, 1.0]]
+        content = {"cam_mat": matrix, "w": camera.width, "h": camera.height, "frames": frames}
+        write_json(truth / "transforms_train.json", content)
+
+    def next_command(self) -> str:
+        options = as_overrides({"images": self.folder / "images", "target": "apriltag", "out": self.folder})
+        return f"calibrate it: {command_line('calibrate', options)}"
+
+
+def hand_held(
+    count: int, seed: int, target: Vector, distance: float, elevations: tuple[float, float], laps: int
+) -> list[np.ndarray]:
+    """Return the poses of a photographer who climbs around the object in `laps` laps, none of them exactly.
+
+    Args:
+        count: number of photographs.
+        seed: of what is not exact: direction, distance and aim (some per cent), and roll (6 degrees).
+        target: what the camera looks at, world units.
+        distance: distance of the camera from the target, world units.
+        elevations: lowest and highest above the target, degrees; equal areas in between get equally many photographs.
+        laps: number of times around.
+
+    Returns:
+        Camera-to-world matrices [4, 4], OpenGL axes, in the order in which they are taken.
+    """
+    generator = np.random.default_rng(seed)
+    low, high = np.sin(np.radians(elevations))
+    poses = []
+    for index in range(count):
+        share = (index + 0.5) / count
+        azimuth = 2 * np.pi * (laps * share + 0.02 * generator.normal())
+        height = np.clip(low + (high - low) * (share + 0.03 * generator.normal()), low, high)
+        level = np.sqrt(1 - height**2)
+        direction = np.array([level * np.cos(azimuth), level * np.sin(azimuth), height])
+        pose = look_at_origin(distance * generator.uniform(0.95, 1.05) * direction)
+        pose[:3, 3] += np.asarray(target) + 0.02 * distance * generator.uniform(-1, 1, 3)
+        roll = np.radians(6.0) * generator.uniform(-1, 1)
+        right, up = pose[:3, 0].copy(), pose[:3, 1].copy()
+        pose[:3, 0] = np.cos(roll) * right + np.sin(roll) * up
+        pose[:3, 1] = np.cos(roll) * up - np.sin(roll) * right
+        poses.append(pose)
+    return poses

@@ -1,0 +1,80 @@
+"""Rendering of the missing images of a synthetic scene."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+from omegaconf import DictConfig
+
+from nerfro.core.errors import NerfroError
+from nerfro.core.paths import user_path
+from nerfro.core.progress import progress_bar
+from nerfro.files.folder_lock import lock_folder
+from nerfro.registry.registration import discover
+from nerfro.synthetic.dataset import DataSet, ViewSplits
+from nerfro.synthetic.options import SCENES
+from nerfro.synthetic.path_tracer import PathTracer, load_mitsuba
+from nerfro.synthetic.scene import SyntheticScene
+
+
+def find_scene(name: str) -> ModuleType:
+    """Import the module of a scene.
+
+    Raises:
+        NerfroError: the name is unknown.
+    """
+    discover()
+    if name not in SCENES:
+        raise NerfroError(f"unknown scene '{name}'; choose one of {', '.join(SCENES)}")
+    return importlib.import_module(SCENES[name])
+
+
+def data_set_type(scene: ModuleType) -> type[DataSet]:
+    """Return the class of the data set of a scene; the module of the scene may define it as `DATA_SET`."""
+    return getattr(scene, "DATA_SET", ViewSplits)
+
+
+def build_scene(name: str, resolution: int) -> SyntheticScene:
+    """Model a scene. Colours have a resolution of half a pixel in images of `resolution` pixels."""
+    module = find_scene(name)
+    return module.build(spacing=max(0.5 * data_set_type(module).WIDTH / resolution, 0.0025))
+
+
+def synthesize(config: DictConfig) -> DataSet:
+    """Render the missing images of a data set.
+
+    Args:
+        config: resolved `SynthesizeConfig`.
+
+    Raises:
+        NerfroError: Mitsuba is missing, or `out` contains another data set or other files.
+    """
+    if len(config.absorption) != 3:
+        raise NerfroError(f"absorption={list(config.absorption)} is not allowed; give red, green and blue")
+    with lock_folder(user_path(config.out), "out"):
+        return _synthesize(config, user_path(config.out))
+
+
+def _synthesize(config: DictConfig, folder: Path) -> DataSet:
+    scene = build_scene(config.scene, config.resolution)
+    ior = scene.ior if config.ior is None else config.ior
+    scene = replace(scene, absorption=tuple(config.absorption), ior=ior)
+    mitsuba = load_mitsuba(config.variant)  # a missing Mitsuba is reported before files are removed
+    data = data_set_type(find_scene(config.scene))(config, scene, folder)
+    data.prepare(mitsuba)
+    planned = data.planned()
+    waiting = data.missing(planned)
+    print(f"{config.scene}: {len(planned)} {data.NOUN}, {len(planned) - len(waiting)} of them already in {folder}")
+    if waiting:
+        tracer = PathTracer(data.lit(), config.fresnel, data.camera, config.variant)
+        # The remaining time is estimated from samples, because test views have more samples.
+        with progress_bar("render", sum(image.spp for image in waiting)) as bar:
+            for image in waiting:
+                radiance = tracer.render(image.pose, image.spp, image.seed)
+                data.write(image, radiance, tracer.silhouette(image.pose))
+                bar.update(image.spp)
+    data.finish(planned)
+    return data

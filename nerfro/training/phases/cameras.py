@@ -1,0 +1,103 @@
+"""Alignment of the training cameras before training, and Gauss-Newton steps between training steps."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from nerfro.camera.refined.gauss_newton import Step, gauss_newton_step, informative_pixels
+from nerfro.camera.refined.least_squares import PriorInformation
+from nerfro.camera.refined.outlines import align_to_masks
+from nerfro.camera.refined.panorama import align
+from nerfro.camera.refined.refined import RefinedCamera
+from nerfro.core.rays import Rays
+from nerfro.core.subdivision import pixel_rays
+from nerfro.geometry.interpolation import misses
+from nerfro.registry.allowed import Count, Natural, OnlyWith
+from nerfro.registry.registration import register
+from nerfro.training.phases.background import occupied_box
+from nerfro.training.phases.base import Phase, TrainingRun
+
+# First and least distance of finite differences in pixels, and its factor from one step to the next.
+_FIRST_DIFFERENCE, _MIN_DIFFERENCE, _DECAY = 2.0, 0.5, 0.85
+# Number of full steps. The fraction of later steps decreases, so that errors of single steps average out.
+_FULL_STEPS = 10
+# Scale of the robust loss (sRGB) per pixel of difference, and maximum motion of a camera in pixels.
+_ERROR_SCALE, _MAX_PIXELS = 0.5, 1.0
+# Candidates that are drawn for each pixel; the candidates with the most contrast are used.
+_NUM_CANDIDATES = 6
+_WITH_REFINED = OnlyWith("camera", ("refined",))
+
+
+@register("phase", "cameras")
+class CameraSteps(Phase):
+    """Align the training cameras of `camera=refined` before training, and refine them between training steps.
+
+    The alignment uses background and outlines (`panorama`, `outlines`), if the data contain these.
+    The steps are Gauss-Newton steps of all cameras (`gauss_newton`) with a fixed scene.
+
+    Args:
+        start: training step of the first Gauss-Newton step. Earlier, the scene is too inaccurate.
+        every: number of training steps between two Gauss-Newton steps.
+        num_pixels: number of pixels of each photograph in a Gauss-Newton step.
+    """
+
+    def __init__(
+        self,
+        start: Annotated[Natural, _WITH_REFINED] = 50,
+        every: Annotated[Count, _WITH_REFINED] = 50,
+        num_pixels: Annotated[Count, _WITH_REFINED] = 300,
+    ) -> None:
+        self.start, self.every, self.num_pixels = start, every, num_pixels
+
+    def begin(self, run: TrainingRun) -> dict[str, Any]:
+        """Align the cameras; returns the prior information about the cameras by source."""
+        scene, box = run.renderer.scene, occupied_box(run.renderer)
+        camera = scene.camera
+        if box is None or not isinstance(camera, RefinedCamera):
+            return {}
+        panorama = align(camera, run.batches.cameras, run.batches.photographed, lambda rays: misses(box, rays))
+        priors = {"panorama": panorama, "outlines": align_to_masks(camera, run.views, scene.medium, panorama)}
+        return {source: dict(vars(prior)) for source, prior in priors.items() if prior is not None}
+
+    def steps_before(self, training_step: int) -> int:
+        return 0 if training_step < self.start else 1 + (training_step - self.start) // self.every
+
+    @torch.no_grad()
+    def step(self, run: TrainingRun, number: int, state: dict[str, Any]) -> bool:
+        """Take a Gauss-Newton step of all cameras with newly drawn pixels of high contrast.
+
+        If the panorama has aligned the rotations, pixels of the background are excluded, because the background was
+        learned from the same cameras.
+        """
+        renderer, batches = run.renderer, run.batches
+        camera, box = renderer.scene.camera, occupied_box(renderer)
+        if not isinstance(camera, RefinedCamera):
+            return False
+        candidates = batches.of_each_view(_NUM_CANDIDATES * self.num_pixels, self.start + number * self.every)
+        past = None
+        if "panorama" in state and box is not None:
+            drawn = candidates.flatten()
+            rays = camera(pixel_rays(batches.cameras, drawn), batches.cameras.view_of(drawn))
+            past = misses(box, rays).view(candidates.shape)
+        pixels = informative_pixels(candidates, self.num_pixels, batches.photographed, batches.cameras, past)
+
+        def shown(rays: Rays, view: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
+            return renderer.scene.colour_space.to_display(renderer.radiance(rays), camera.gains(view))
+
+        difference = max(_MIN_DIFFERENCE, _FIRST_DIFFERENCE * _DECAY**number)
+        fraction = min(1.0, _FULL_STEPS / (number + 1))
+        # The step is accepted even if the error rises, because the scene was trained with the current cameras, which
+        # are therefore a local minimum.
+        settings = Step(difference, _ERROR_SCALE * difference, _MAX_PIXELS, fraction)
+        priors = [_prior(prior) for prior in state.values()]
+        gauss_newton_step(camera, batches.cameras, pixels, batches.photographed, shown, settings, priors)
+        return True
+
+
+def _prior(state: dict[str, Tensor]) -> PriorInformation:
+    """Read a prior of the state of the phase; checkpoints of earlier releases call the mean `numbers`."""
+    return PriorInformation(state["mean"] if "mean" in state else state["numbers"], state["information"])

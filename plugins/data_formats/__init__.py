@@ -1,8 +1,0 @@
-"""Data formats of other projects: `data=colmap`, `data=nerfstudio`, `data=llff`, `data=idr` and `data=refref`.
-
-See docs/guides/data_formats.md.
-"""
-
-from . import colmap, idr, llff, nerfstudio, refref
-
-__all__ = ["colmap", "idr", "llff", "nerfstudio", "refref"]

@@ -1,1 +1,0 @@
-"""Films of rendered frames, MP4 and GIF: `film=` of `python -m nerfro.render`."""

@@ -1,5 +1,0 @@
-"""Perceptual metrics of images: LPIPS and FLIP; see docs/reference/metrics.md."""
-
-from . import flip, lpips
-
-__all__ = ["flip", "lpips"]

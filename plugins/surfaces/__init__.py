@@ -1,3 +1,0 @@
-"""Surfaces of bodies: balls, boxes, bodies of revolution, distances in files, and offsets of other surfaces."""
-
-from . import ball, box, grid, offset, revolution  # noqa: F401 - registers the surfaces
