@@ -19,6 +19,7 @@ os.environ["OMP_NUM_THREADS"] = os.environ["NUMBA_NUM_THREADS"] = "1"
 import sys
 import tempfile
 from collections import Counter
+from itertools import pairwise
 from pathlib import Path
 from types import FrameType
 
@@ -33,7 +34,7 @@ def main() -> None:
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     calls = calls_of_step(sys.argv[1:])
     modules = [module for module, _ in calls]
-    moves = sum(before != after for before, after in zip(modules, modules[1:], strict=False))
+    moves = sum(before != after for before, after in pairwise(modules))
     of_module = Counter(modules)
     print(f"{len(of_module)} modules, {len(set(calls))} functions, {len(calls)} calls, {moves} moves, "
           f"{moves - len(of_module) + 1} returns\n")  # fmt: skip

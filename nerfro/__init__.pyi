@@ -20,7 +20,7 @@ from .training.data_module import RayDataModule
 from .training.load import load
 from .training.module import TrainingModule
 from .training.optimizer import GroupConfig, OptimizerConfig
-from .training.ray_batches import RayBatches
+from .training.pixel_batches import PixelBatches
 from .viewing.trained_scene import TrainedScene
 
 __version__: str
@@ -35,7 +35,7 @@ __all__ = [
     "HashGridField",
     "OptimizerConfig",
     "Photometric",
-    "RayBatches",
+    "PixelBatches",
     "RayDataModule",
     "Rays",
     "RefractiveModel",

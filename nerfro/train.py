@@ -66,8 +66,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetr
     trainer = make_trainer(config, folder, throughput, [interruption, Viewer(config, source, test)], num_steps)
     device = trainer.strategy.root_device
     require_match(renderer.scene.medium, training)
-    # These batches are not kept, because the data module moves the pixels to the training device.
-    memory = check_before_training(renderer, datamodule.batches_of(trainer), device)
+    memory = check_before_training(renderer, datamodule, trainer)
     if trainer.is_global_zero:
         begin(folder, config, renderer, has_steps=not 0 <= trainer.max_steps <= num_steps)
         print(memory, flush=True)

@@ -11,7 +11,7 @@ from nerfro.media.sdf_grid import SdfGrid
 from nerfro.registry.registration import build
 from nerfro.training.config import build_model
 from nerfro.training.module import TrainingModule
-from nerfro.training.ray_batches import RayBatches
+from nerfro.training.pixel_batches import PixelBatches
 from nerfro.viewing.baking import bake_surface
 from tests.conftest import composed
 from tests.pretended_gpu import GPU, OnGpu, PretendedGpu
@@ -63,7 +63,7 @@ def test_training_and_rendering_stay_on_the_gpu(
     with PretendedGpu() as gpu, warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*CUDA is not available.*")
         module.to(GPU)
-        batches, cameras = RayBatches(views, 8, config.batches.batching).to(GPU), views.cameras.to(GPU)
+        batches, cameras = PixelBatches(views, 8, config.batches.batching).to(GPU), views.cameras.to(GPU)
         gpu.waits.clear()
         batch = batches.batch(STEP)
         loss = module.training_step(batch, 0)["loss"]

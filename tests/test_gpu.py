@@ -17,7 +17,7 @@ from nerfro.registry.registration import build
 from nerfro.training.config import build_model
 from nerfro.training.data_module import traced
 from nerfro.training.module import TrainingModule
-from nerfro.training.ray_batches import RayBatches
+from nerfro.training.pixel_batches import PixelBatches
 from tests.conftest import composed
 from tests.test_experiments import EXPERIMENTS, SMALL, shrunk
 
@@ -36,7 +36,7 @@ def step_on(device: str, overrides: list[str]) -> tuple[float, Tensor, Tensor]:
     renderer = build_model(config, views)
     module = TrainingModule.of(renderer, config).to(device)
     module.log = lambda *values, **options: None  # type: ignore[method-assign]
-    batches = traced(RayBatches(views, 256, config.batches.batching), renderer, config).to(device)
+    batches = traced(PixelBatches(views, 256, config.batches.batching), renderer, config).to(device)
     loss = module.training_step(batches.batch(STEP), 0)["loss"]
     loss.backward()
     gradients = [p.grad if p.grad is not None else torch.zeros_like(p) for p in module.parameters()]

@@ -44,7 +44,7 @@ from nerfro.testing import (
 from nerfro.training.phases import background
 from nerfro.training.phases import base as phase_base
 from nerfro.training.phases.base import Phase, TrainingRun
-from nerfro.training.ray_batches import RayBatches
+from nerfro.training.pixel_batches import PixelBatches
 from nerfro.viewing import PLUGIN_EXPORTS
 from nerfro.viewing.exports import Export, find_export
 from nerfro.viewing.trained_scene import TrainedScene
@@ -317,7 +317,7 @@ def test_old_names_work_with_a_warning() -> None:
         assert boundary.BoundaryRegulariser is boundary.BoundaryRegularizer
     with pytest.warns(UserWarning, match="BackgroundSteps"):
         assert background.Background is background.BackgroundSteps
-    batches = RayBatches(example_views(), 4)
+    batches = PixelBatches(example_views(), 4)
     with pytest.warns(UserWarning, match="for_rank"):
         assert torch.equal(batches.share(1, 2).batch(0).rgb, batches.for_rank(1, 2).batch(0).rgb)
     # For both releases: nothing is replaced.

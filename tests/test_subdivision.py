@@ -18,7 +18,7 @@ from nerfro.models.refractive import RefractiveModel
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.paths.straight import Straight
 from nerfro.testing import example_batch, example_components
-from nerfro.training.ray_batches import RayBatches
+from nerfro.training.pixel_batches import PixelBatches
 from tests.cameras_at import cameras_at, random_poses
 from tests.closed_forms import RoundedBox
 from tests.paper import Hierarchical, NerfField
@@ -98,8 +98,8 @@ def test_divergence_behind_a_ball_matches_its_deviation(above: Cameras) -> None:
     np.testing.assert_allclose(angles.numpy(), expected, atol=0.01 * FOCAL)
 
 
-def batches_of(views: Views, subdivision: Subdivision, size: int = 64) -> RayBatches:
-    batches = RayBatches(views, size, "all_images", seed=3)
+def batches_of(views: Views, subdivision: Subdivision, size: int = 64) -> PixelBatches:
+    batches = PixelBatches(views, size, "all_images", seed=3)
     return batches.traced(through_cube, subdivision=subdivision)
 
 

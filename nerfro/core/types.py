@@ -19,8 +19,8 @@ are defined where they are used. A name on its own begins with a space, which li
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -30,12 +30,82 @@ from torch import Tensor
 
 from nerfro.core.cameras import Cameras
 from nerfro.core.draws import Draws
-from nerfro.core.errors import accept_old_fields, accept_old_methods, renamed_classes, warn_of_old_name
 from nerfro.core.rays import Rays
 
-__all__ = ["WORLD_ORIGIN", "Batch", "Exits", "FieldValues", "Path", "Rays", "Rendering", "Samples"]
+__all__ = [
+    "WORLD_ORIGIN",
+    "Batch",
+    "Exits",
+    "FieldValues",
+    "OpticalRecord",
+    "Path",
+    "Pixels",
+    "Rays",
+    "Rendering",
+    "Samples",
+]
 
 WORLD_ORIGIN = np.zeros(3)
+
+
+@dataclass(frozen=True)
+class OpticalRecord:
+    """Bodies and surfaces that the vertices of P polylines meet.
+
+    Attributes:
+        body: body of the segment after each vertex (`Solid.deciding_body`), numbered from 1; 0 in air.
+        surface_body: body on whose surface each vertex lies, numbered as `body`; 0 for vertices on no surface, such as
+            both ends.
+        far_side: body on the other side of the surface, numbered as `body`. Transmitted light enters the body,
+            reflected light does not. 0 for vertices on no surface.
+        triangle: triangle on which each vertex lies; -1 if the surface has no triangles.
+        band: number of the wavelength of the polyline in dispersive media; otherwise 0.
+        absorption: absorption coefficients of air and of each body for red, green and blue, per world unit; empty if
+            all media are clear.
+    """
+
+    body: Int[Tensor, "P S"]
+    surface_body: Int[Tensor, "P S"]
+    far_side: Int[Tensor, "P S"]
+    triangle: Int[Tensor, "P S"]
+    band: Int[Tensor, "P"]
+    absorption: Float[Tensor, "media 3"]
+
+    @classmethod
+    def of_bodies(
+        cls, body: Int[Tensor, "P S"], surface_body: Int[Tensor, "P S"], far_side: Int[Tensor, "P S"]
+    ) -> OpticalRecord:
+        """Create the record of clear bodies at one wavelength, whose surfaces have no triangles.
+
+        The class documents the arguments. The other fields are expanded constants, which take no memory.
+        """
+        zero = torch.zeros((), dtype=torch.int8, device=body.device)
+        absorption = torch.empty(0, 3, device=body.device)
+        return cls(body, surface_body, far_side, (zero - 1).expand(body.shape), zero.expand(len(body)), absorption)
+
+    def __getitem__(self, index: slice | Tensor) -> OpticalRecord:
+        """Select polylines."""
+        return replace(self, **{name: getattr(self, name)[index] for name in _OF_ROWS})
+
+    def padded(self, num_vertices: int) -> OpticalRecord:
+        """Repeat the last vertices, so that all polylines have `num_vertices`."""
+        return replace(self, **{name: _padded(getattr(self, name), num_vertices) for name in _OF_VERTICES})
+
+    @classmethod
+    def joined(cls, records: Sequence[OpticalRecord]) -> OpticalRecord:
+        """Concatenate the polylines of records with the same number of vertices."""
+        rows: dict[str, Any] = {name: torch.cat([getattr(record, name) for record in records]) for name in _OF_ROWS}
+        return cls(**rows, absorption=max((record.absorption for record in records), key=len))
+
+
+# Fields of `OpticalRecord` with a column for each vertex, and with a row for each polyline.
+_OF_VERTICES = ("body", "surface_body", "far_side", "triangle")
+_OF_ROWS = (*_OF_VERTICES, "band")
+
+
+def _padded(values: Shaped[Tensor, "P S *C"], num_vertices: int) -> Shaped[Tensor, "P vertices *C"]:
+    missing = num_vertices - values.shape[1]
+    return values if missing == 0 else torch.cat([values, values[:, -1:].expand(-1, missing, *values.shape[2:])], 1)
 
 
 @dataclass(frozen=True)
@@ -57,21 +127,10 @@ class Path:
             or more if the ray leaves the object later.
         refracted: whether the polyline meets the medium (an index other than 1, or an absorbing body).
         radii: pixel cone radius at unit distance, from the rays.
-        splits: whether rays may have several polylines. If not, `ray` counts from 0 and `throughput` is 1 everywhere.
         ray: ray of each polyline, non-decreasing; every ray has at least one polyline.
         throughput: linear factor of the light of the polyline; the factors of a ray sum to at most 1.
-        body: body of the segment after each vertex (`Solid.deciding_body`), numbered from 1; 0 in air, or if the index
-            varies continuously.
-        surface_body: body on whose surface each vertex lies, numbered as `body`; 0 for vertices on no sharp surface,
-            such as both ends.
-        across: body on the other side of the surface, numbered as `body`. Transmitted light enters the body, reflected
-            light does not. 0 for vertices on no surface.
-        triangle: triangle on which each vertex lies; -1 if the surface has no triangles.
-        absorption: absorption coefficients of air and of each body for red, green and blue, per world unit; empty if
-            all media are clear.
-        band: number of the wavelength of the polyline in dispersive media; otherwise 0.
-        samples: samples of the first sampling level, if they were chosen with the path; selected or joined polylines
-            have none.
+        splits: whether rays may have several polylines. If not, `ray` counts from 0 and `throughput` is 1 everywhere.
+        record: bodies and surfaces that the vertices meet; None in media without sharp surfaces.
     """
 
     positions: Float[Tensor, "P S 3"]
@@ -79,16 +138,10 @@ class Path:
     s: Float[Tensor, "P S"]
     refracted: Bool[Tensor, "P"]
     radii: Float[Tensor, "P"]
-    splits: bool
     ray: Int[Tensor, "P"]
     throughput: Float[Tensor, "P 3"]
-    body: Int[Tensor, "P S"]
-    surface_body: Int[Tensor, "P S"]
-    across: Int[Tensor, "P S"]
-    triangle: Int[Tensor, "P S"]
-    absorption: Float[Tensor, "media 3"]
-    band: Int[Tensor, "P"]
-    samples: Samples | None = None
+    splits: bool = False
+    record: OpticalRecord | None = None
 
     @classmethod
     def unbranched(
@@ -98,39 +151,32 @@ class Path:
         s: Float[Tensor, "R S"],
         refracted: Bool[Tensor, "R"],
         radii: Float[Tensor, "R"],
+        record: OpticalRecord | None = None,
     ) -> Path:
-        """Create a path of one polyline per ray, in clear media and without sharp surfaces.
-
-        The class documents the arguments. The other fields are expanded constants, which take no memory.
-        """
-        zero = torch.zeros((), dtype=torch.int8, device=s.device)
-        air, no_triangle = zero.expand(s.shape), (zero - 1).expand(s.shape)
-        return cls(
-            positions, directions, s, refracted, radii,
-            splits=False, ray=torch.arange(len(s), device=s.device), throughput=s.new_ones(()).expand(len(s), 3),
-            body=air, surface_body=air, across=air, triangle=no_triangle,
-            absorption=s.new_empty(0, 3), band=zero.expand(len(s)),
-        )  # fmt: skip
+        """Create a path of one polyline per ray. The class documents the arguments."""
+        ray, throughput = torch.arange(len(s), device=s.device), s.new_ones(()).expand(len(s), 3)
+        return cls(positions, directions, s, refracted, radii, ray, throughput, record=record)
 
     @classmethod
     def joined(cls, paths: Sequence[Path]) -> Path:
-        """Concatenate the polylines of paths; the rays of each path follow the rays of the previous path."""
+        """Concatenate the polylines of paths; the rays of each path follow the rays of the previous path.
+
+        Either all paths have a record, or none.
+        """
         num_vertices = max(path.s.shape[1] for path in paths)
-        columns: dict[str, list[Any]] = {field.name: [] for field in fields(cls)}
-        num_rays = 0
+        columns: dict[str, list[Tensor]] = {name: [] for name in _OF_PATHS}
+        num_rays, records = 0, []
         for path in paths:
-            for name, value in vars(path).items():
-                if name == "ray":
-                    value = value + num_rays
-                elif name in _OF_VERTICES:
-                    last = value[:, -1:].expand(-1, num_vertices - value.shape[1], *value.shape[2:])
-                    value = torch.cat([value, last], 1)
-                columns[name].append(value)
+            for name in ("positions", "directions", "s"):
+                columns[name].append(_padded(getattr(path, name), num_vertices))
+            for name in ("refracted", "radii", "throughput"):
+                columns[name].append(getattr(path, name))
+            columns["ray"].append(path.ray + num_rays)
             num_rays += path.num_rays
-        splits, absorption = any(columns.pop("splits")), max(columns.pop("absorption"), key=len)
-        columns.pop("samples")
+            records += [] if path.record is None else [path.record.padded(num_vertices)]
         together: dict[str, Any] = {name: torch.cat(values) for name, values in columns.items()}
-        return cls(splits=splits, absorption=absorption, **together)
+        record = OpticalRecord.joined(records) if records else None
+        return cls(**together, splits=any(path.splits for path in paths), record=record)
 
     def __repr__(self) -> str:
         polylines, vertices = self.s.shape
@@ -141,7 +187,7 @@ class Path:
     @property
     def absorbs(self) -> bool:
         """Whether the path may cross absorbing bodies."""
-        return len(self.absorption) > 0
+        return self.record is not None and len(self.record.absorption) > 0
 
     @property
     def num_rays(self) -> int:
@@ -167,14 +213,16 @@ class Path:
 
     def transmitted(self, s: Float[Tensor, "P N"]) -> Float[Tensor, "P N 3"]:
         """Compute the transmittance of absorbing bodies between the camera and arc lengths `s` (Beer-Lambert law)."""
+        assert self.record is not None
+        absorption, body = self.record.absorption, self.record.body
         vertex, lengths = self._vertex_before(s), self.s.diff(dim=1)
         since = s - self.s.gather(1, vertex)
         depth = s.new_zeros(*s.shape, 3)
-        for number in range(1, len(self.absorption)):
-            within = (self.body == number).to(s)
+        for number in range(1, len(absorption)):
+            within = (body == number).to(s)
             before = torch.nn.functional.pad((within[:, :-1] * lengths).cumsum(1), (1, 0))
             length = before.gather(1, vertex) + within.gather(1, vertex) * since
-            depth = depth + length[..., None] * self.absorption[number]
+            depth = depth + length[..., None] * absorption[number]
         return torch.exp(-depth)
 
     def exits(self, directions: Float[Tensor, "P 3"] | None = None) -> Exits:
@@ -194,21 +242,9 @@ class Path:
         return self.s[:, -1]
 
     @property
-    def surface(self) -> Int[Tensor, "P S"]:
-        """Old form of `surface_body`, numbered from 0; -1 for none."""
-        warn_of_old_name("Path.surface", "Path.surface_body, which counts from 1")
-        return self.surface_body - 1
-
-    @property
     def end_positions(self) -> Float[Tensor, "P 3"]:
         """End of each polyline, behind the last event."""
         return self.positions[:, -1]
-
-    @property
-    def exit_positions(self) -> Float[Tensor, "P 3"]:
-        """Old name of `end_positions`."""
-        warn_of_old_name("Path.exit_positions", "Path.end_positions")
-        return self.end_positions
 
     @property
     def exit_directions(self) -> Float[Tensor, "P 3"]:
@@ -217,9 +253,9 @@ class Path:
 
     def __getitem__(self, index: slice | Tensor) -> Path:
         """Select polylines; each becomes the only polyline of a new ray."""
-        rows = {name: value[index] for name, value in vars(self).items() if name not in _OF_PATHS}
+        rows = {name: getattr(self, name)[index] for name in _OF_PATHS}
         rows["ray"] = torch.arange(len(rows["s"]), device=self.s.device)
-        return replace(self, samples=None, **rows)
+        return Path(**rows, splits=self.splits, record=None if self.record is None else self.record[index])
 
     def select_rays(self, rows: Int[Tensor, " selected"]) -> Path:
         """Select rays with all their polylines."""
@@ -228,8 +264,8 @@ class Path:
         counts = torch.bincount(self.ray, minlength=self.num_rays)
         first, num = (counts.cumsum(0) - counts)[rows], counts[rows]
         ray = torch.arange(len(rows), device=rows.device).repeat_interleave(num)
-        place = torch.arange(len(ray), device=rows.device) - (num.cumsum(0) - num)[ray]
-        return replace(self[first[ray] + place], ray=ray)
+        branch = torch.arange(len(ray), device=rows.device) - (num.cumsum(0) - num)[ray]
+        return replace(self[first[ray] + branch], ray=ray)
 
     def span(self, box: Float[Tensor, "2 3"]) -> tuple[Float[Tensor, "P"], Float[Tensor, "P"]]:
         """Return the arc lengths of the first entry into a box and of the last exit.
@@ -266,19 +302,8 @@ class Path:
         return vertex.clamp(min=0)
 
 
-accept_old_methods(
-    Path,
-    {
-        "per_ray": "sum_polylines",
-        "of_ray": "broadcast_to_polylines",
-        "of_rays": "select_rays",
-        "first_of_ray": "main_polyline",
-    },
-)
-
-# Fields of `Path` with a column for each vertex, and fields without rows.
-_OF_VERTICES = frozenset({"positions", "directions", "s", "body", "surface_body", "across", "triangle"})
-_OF_PATHS = frozenset({"splits", "absorption", "samples"})
+# Fields of `Path` with a row for each polyline.
+_OF_PATHS = ("positions", "directions", "s", "refracted", "radii", "ray", "throughput")
 
 
 @dataclass(frozen=True)
@@ -337,13 +362,15 @@ class Samples:
         positions, directions = path.at(s)
         return cls(positions, directions, s, edges, path.radii)
 
+    def on(self, path: Path) -> Samples:
+        """Return the samples with the positions and directions of a path, and their gradients."""
+        positions, directions = path.at(self.s)
+        return replace(self, positions=positions, directions=directions)
+
     @property
     def deltas(self) -> Float[Tensor, "P N"]:
         """Length by which the density of each sample is multiplied, in world units."""
         return self.lengths if self.lengths is not None else self.edges[:, 1:] - self.edges[:, :-1]
-
-
-accept_old_fields(Samples, {"measure": "contracted_edges"})
 
 
 @dataclass(frozen=True)
@@ -352,9 +379,6 @@ class FieldValues:
 
     density: Float[Tensor, "P N"]
     radiance: Float[Tensor, "P N 3"]
-
-
-accept_old_fields(FieldValues, {"rgb": "radiance"})
 
 
 @dataclass(frozen=True)
@@ -415,7 +439,27 @@ class Rendering:
         return self.path.main_polyline(self.path.exit_directions)
 
 
-accept_old_fields(Rendering, {"rgb": "radiance", "boundary_rgb": "background_radiance"})
+@dataclass(frozen=True)
+class Pixels:
+    """Q training pixels of one step.
+
+    Attributes:
+        number: number of each pixel in the data set, view * H * W + row * W + column.
+        view: number of the training view of each pixel.
+        rgb: colour of each pixel in its photograph, sRGB in [0, 1].
+        draws: random numbers of the step, with an index for each pixel.
+        cameras: all training cameras.
+        window: all training cameras, cropped to the window of the first steps (`batches.precrop_steps`).
+        photographed: function that returns the colours of pixels by number.
+    """
+
+    number: Int[Tensor, "Q"]
+    view: Int[Tensor, "Q"]
+    rgb: Float[Tensor, "Q 3"]
+    draws: Draws
+    cameras: Cameras
+    window: Cameras
+    photographed: Callable[[Int[Tensor, "P"]], Float[Tensor, "P 3"]]
 
 
 @dataclass(frozen=True)
@@ -426,7 +470,7 @@ class Batch:
     `mean()`. With several processes, the mean is correct because each process has the same number of pixels.
 
     Attributes:
-        rays: rays of the cameras of the data set.
+        rays: rays of the estimated cameras, with gradients if the cameras learn.
         ray_pixel: pixel of each ray, as an index from 0 to Q - 1.
         pixel_number: number of each pixel in the data set, view * H * W + row * W + column.
         view: number of the training view of each pixel.
@@ -436,6 +480,7 @@ class Batch:
             that need further directions.
         draws: random numbers of the step, with an index for each ray.
         path: paths of the rays without gradients; None before tracing.
+        samples: samples of the first sampling level, if they were chosen with the paths.
     """
 
     rays: Rays
@@ -447,18 +492,7 @@ class Batch:
     cameras: Cameras
     draws: Draws
     path: Path | None = None
-
-    @property
-    def pixel(self) -> Int[Tensor, "R"]:
-        """Old name of `ray_pixel`."""
-        warn_of_old_name("Batch.pixel", "Batch.ray_pixel")
-        return self.ray_pixel
-
-    @property
-    def index(self) -> Int[Tensor, "Q"]:
-        """Old name of `pixel_number`."""
-        warn_of_old_name("Batch.index", "Batch.pixel_number")
-        return self.pixel_number
+    samples: Samples | None = None
 
     @property
     def ray_view(self) -> Int[Tensor, "R"]:
@@ -485,6 +519,3 @@ def mean_per_pixel(
     total = values.new_zeros(num_pixels, *values.shape[1:]).index_add(0, ray_pixel, values)
     num_rays = values.new_zeros(num_pixels).index_add(0, ray_pixel, torch.ones_like(ray_pixel, dtype=values.dtype))
     return total / num_rays.view(-1, *[1] * (values.ndim - 1))
-
-
-__getattr__ = renamed_classes(__name__, Radiance=FieldValues)

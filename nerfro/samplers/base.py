@@ -10,13 +10,10 @@ from jaxtyping import Bool
 from torch import Tensor, nn
 
 from nerfro.core.draws import Draws
-from nerfro.core.errors import accept_old_methods
 from nerfro.core.types import Path, Rays, Rendering, Samples
 from nerfro.fields.base import Field
 from nerfro.media.base import Medium
 from nerfro.samplers.paths.branching import ONE_PATH
-
-_OLD_METHODS = {"refine": "replay", "main": "trace_main"}
 
 
 class PathSampler(nn.Module, ABC):
@@ -29,10 +26,6 @@ class PathSampler(nn.Module, ABC):
 
     needs_medium = True
     branching = ONE_PATH
-
-    def __init_subclass__(cls) -> None:
-        super().__init_subclass__()
-        accept_old_methods(cls, _OLD_METHODS)
 
     @abstractmethod
     def forward(self, rays: Rays, medium: Medium) -> Path:
@@ -66,9 +59,6 @@ class PathSampler(nn.Module, ABC):
         return False
 
 
-accept_old_methods(PathSampler, _OLD_METHODS)
-
-
 class PointSampler(nn.Module, ABC):
     """Choose arc lengths on a path.
 
@@ -77,10 +67,6 @@ class PointSampler(nn.Module, ABC):
     """
 
     num_levels: int
-
-    def __init_subclass__(cls) -> None:
-        super().__init_subclass__()
-        accept_old_methods(cls, {"after_step": "update"})
 
     @abstractmethod
     def forward(self, path: Path, previous: Rendering | None, draws: Draws | None = None) -> Samples:
@@ -97,13 +83,13 @@ class PointSampler(nn.Module, ABC):
             Samples in ascending arc length; `Samples.along` looks up positions and directions on the path.
         """
 
-    def choose_ahead(self, path: Path, draws: Draws) -> Path:
-        """Return a traced path with the samples of its first level, or the path itself to sample it in the step.
+    def choose_ahead(self, path: Path, draws: Draws) -> Samples | None:
+        """Return the samples of the first level of a traced path, or None to choose them in the step.
 
         A thread may choose the samples of the next step during a step, so they may depend on the state that
         `update` updates, but on no learned parameter.
         """
-        return path
+        return None
 
     def update(self, fields: Sequence[Field], draws: Draws) -> None:
         """Update the state of the sampler before a training step, except the first.

@@ -24,7 +24,7 @@ from nerfro.training.build import build
 from nerfro.training.callbacks import steps_by_phase
 from nerfro.training.phases.background import BackgroundSteps
 from nerfro.training.phases.base import TrainingRun
-from nerfro.training.ray_batches import RayBatches
+from nerfro.training.pixel_batches import PixelBatches
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
 from tests.conftest import Runner, weights_of
 
@@ -73,8 +73,8 @@ def test_directions_behind_the_object_are_learned_through_it(
 def test_fits_of_few_pixels_use_the_pixels_of_larger_fits(
     tiny_scene: Path, tiny_default_run: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    used, rows = [], RayBatches.rows
-    monkeypatch.setattr(RayBatches, "rows", lambda *given: used.append(rows(*given)) or used[-1])
+    used, rows = [], PixelBatches.rows
+    monkeypatch.setattr(PixelBatches, "rows", lambda *given: used.append(rows(*given)) or used[-1])
     of_limit = {}
     for limit in (10**6, 64):
         module, data = build(overrides=[*tiny_default_run, "trainer.max_steps=1"])
@@ -123,9 +123,9 @@ def test_pretraining_takes_a_bounded_share_of_the_time(
 def test_signal_interrupts_pretraining_and_a_resumed_run_completes_it(
     weights: Callable[..., dict[str, Tensor]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    options, drawn, rows = ("phase.background.steps=20", "trainer.max_steps=2"), [], RayBatches.rows
+    options, drawn, rows = ("phase.background.steps=20", "trainer.max_steps=2"), [], PixelBatches.rows
 
-    def signalled(self: RayBatches, *given: Any) -> Any:
+    def signalled(self: PixelBatches, *given: Any) -> Any:
         drawn.append(given[0])
         if drawn[-1] == 7:
             os.kill(os.getpid(), signal.SIGINT)
@@ -133,7 +133,7 @@ def test_signal_interrupts_pretraining_and_a_resumed_run_completes_it(
 
     undisturbed = weights("undisturbed", *options)
     with monkeypatch.context() as context:
-        context.setattr(RayBatches, "rows", signalled)
+        context.setattr(PixelBatches, "rows", signalled)
         with pytest.raises(AssertionError, match="interrupted after step 0 and saved"):
             weights("run", *options)
     assert drawn == list(range(8))

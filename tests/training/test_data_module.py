@@ -21,7 +21,7 @@ from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.training.data_module import Prefetcher, RayDataModule, can_prefetch, multiplies_large_matrices
 from nerfro.training.module import TrainingModule
-from nerfro.training.ray_batches import RayBatches
+from nerfro.training.pixel_batches import PixelBatches
 from tests.closed_forms import grid_points, random_rays
 from tests.conftest import Runner, weights_of
 from tests.paper import Eikonal
@@ -149,7 +149,7 @@ def test_batch_is_made_when_its_step_begins_if_paths_learn(
     monkeypatch.setattr("os.sched_getaffinity", lambda pid: {0, 1}, raising=False)
     made: list[int] = []
     batch = Mock(spec=Batch, path=None)
-    batches: Any = Mock(spec=RayBatches, batch=lambda step: made.append(step) or batch)
+    batches: Any = Mock(spec=PixelBatches, batch=lambda step: made.append(step) or batch)
     batches.for_rank = lambda rank, size: batches
     batches.to = lambda device, dtype: batches
     batches.release_memory = lambda: None

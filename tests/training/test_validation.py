@@ -22,7 +22,7 @@ from nerfro.media.shapes import Ball
 from nerfro.rendering import ColourSpace, Renderer, Scene
 from nerfro.samplers.paths.snell import Snell
 from nerfro.training.data_module import NO_IMAGE, RayDataModule, RotatingView, validation_interval
-from nerfro.training.ray_batches import RayBatches
+from nerfro.training.pixel_batches import PixelBatches
 from nerfro.training.validation import OverfittingWarning, ValidationPixels
 from tests.conftest import Runner, repaint
 
@@ -125,7 +125,7 @@ def bending() -> Any:
 def test_validation_pixels_have_the_rays_of_training(contrast: float | None, tiny_scene: Path) -> None:
     views = BlenderData(str(tiny_scene), near=2.0, far=6.0).load("val")
     model = bending()
-    batches = RayBatches(views, 256, "single_image")
+    batches = PixelBatches(views, 256, "single_image")
     trace = lambda rays, view: model.path_sampler(rays, model.scene.medium)  # noqa: E731
     batch = batches.traced(trace, subdivision=Subdivision(2, 8.0, contrast)).batch(0)
     watched = ValidationPixels.of(views)
@@ -165,7 +165,7 @@ def test_validations_are_five_times_as_frequent_as_images(every: int, looks: int
     assert validation_interval(every) == looks
     if not every:
         return
-    module = RayDataModule(Mock(spec=RayBatches), BlenderData(str(tiny_scene), near=2.0, far=6.0).load("val"), every)
+    module = RayDataModule(Mock(spec=PixelBatches), BlenderData(str(tiny_scene), near=2.0, far=6.0).load("val"), every)
     shown = {}
     for step in range(looks, 10 * every + 1, looks):
         module.trainer = Mock(spec=Trainer, global_step=step)  # type: ignore[assignment]

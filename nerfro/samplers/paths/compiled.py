@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import Int
 
-from nerfro.core.types import Path, Rays
+from nerfro.core.types import OpticalRecord, Path, Rays
 from nerfro.kernels.arrays import input_arrays
 from nerfro.samplers.paths.branching import Branching
 from nerfro.samplers.paths.polylines import SnellTrace
@@ -45,10 +45,10 @@ def snell_on_grid(rays: Rays, medium: SdfGrid, max_events: int, branching: Branc
         order = np.argsort(np.concatenate([part[0] for part in parts]), kind="stable")
         parts = [tuple(np.concatenate(column)[order] for column in zip(*parts, strict=True))]
     owner, *columns = (torch.from_numpy(column).to(rays.radii.device) for column in parts[0])
-    positions, directions, s, body, surface, across, weight, num_vertices, num_events, exceeded = columns
+    positions, directions, s, body, surface, far_side, weight, num_vertices, num_events, exceeded = columns
     radii = rays.radii[owner] if branching.max_split_events else rays.radii
-    path = Path.unbranched(positions, directions, s, num_vertices > 2, radii)
-    path = replace(path, body=body, surface_body=surface, across=across)
+    record = OpticalRecord.of_bodies(body, surface, far_side)
+    path = Path.unbranched(positions, directions, s, num_vertices > 2, radii, record)
     if branching.max_split_events:
         path = replace(path, splits=True, ray=owner, throughput=weight[:, None].expand(-1, 3))
     return SnellTrace(path, num_events, exceeded)

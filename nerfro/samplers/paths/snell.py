@@ -91,12 +91,12 @@ class Snell(PathSampler):
         return self._replay(path, rays, medium)
 
     def _replay(self, path: Path, rays: Rays, medium: Medium) -> Path:
-        if self.interface == "mesh" and isinstance(medium, SdfGrid):
-            intersect = intersect_triangles(medium.triangles, path.triangle)
-        elif isinstance(medium, Solid):
-            intersect = intersect_solid(medium, path.surface_body)
-        else:
+        if path.record is None or not isinstance(medium, Solid):
             return replay_straight(path, rays)
+        if self.interface == "mesh" and isinstance(medium, SdfGrid):
+            intersect = intersect_triangles(medium.triangles, path.record.triangle)
+        else:
+            intersect = intersect_solid(medium, path.record.surface_body)
         return replay(path, rays, medium, intersect, self.branching)
 
     def _at_wavelengths(self, medium: Solid) -> list[Solid]:
@@ -160,7 +160,9 @@ def _traced_in_bands(rays: Rays, media: Sequence[Solid], trace: Callable[[Rays, 
     colours = torch.where(path.refracted[:, None], colours, 1.0)
     ray = torch.cat(of_rays)
     order = ray.argsort(stable=True)
-    path = replace(path, throughput=path.throughput * colours, band=band, splits=True)
+    assert path.record is not None
+    record = replace(path.record, band=band)
+    path = replace(path, throughput=path.throughput * colours, splits=True, record=record)
     path = replace(path[order], ray=ray[order])
     num_events, exceeded = (
         torch.cat([getattr(traced, name) for traced in traces])[order] for name in ("num_events", "exceeded")
@@ -172,7 +174,8 @@ def _replay_in_bands(
     path: Path, rays: Rays, media: Sequence[Solid], replay: Callable[[Path, Rays, Solid], Path]
 ) -> Path:
     """Replay the polylines of each band in the medium at its wavelength; see `_traced_in_bands` for the arguments."""
-    rows = [(path.band == band).nonzero()[:, 0] for band in range(len(media))]
+    assert path.record is not None
+    rows = [(path.record.band == band).nonzero()[:, 0] for band in range(len(media))]
     replayed = [replay(path[some], rays[path.ray[some]], medium) for some, medium in zip(rows, media, strict=True)]
     order, names = torch.cat(rows).argsort(), ("positions", "directions", "s", "throughput")
     columns: dict[str, Any] = {name: torch.cat([getattr(part, name) for part in replayed])[order] for name in names}
