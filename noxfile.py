@@ -24,7 +24,7 @@ EXTRAS = {
     "video": [
         "python",
         "-c",
-        "from nerfro.registry.registration import plugin_module as m; m('film_encoding.film').find_ffmpeg()",
+        "from nerfro.viewing.film import find_ffmpeg; find_ffmpeg()",
     ],
     "capture": ["nerfro", "calibrate", f"images={PHOTOGRAPHS}", "target=apriltag", "out=calibrated"],
 }

@@ -14,7 +14,6 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -22,6 +21,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerfro.camera.refined import pixel_units
+from nerfro.camera.refined.refined import rotation_matrices
 from nerfro.camera.similarity import motion_between
 from nerfro.core.cameras import Cameras
 from nerfro.core.paths import resolve_path
@@ -30,8 +31,6 @@ from nerfro.evaluation.results import read_metrics_json
 from nerfro.registry.registration import discover
 
 discover()
-pixel_units = import_module("nerfro.camera.refined.pixel_units")
-rotation_matrices = import_module("nerfro.camera.refined.refined").rotation_matrices
 
 
 def main() -> None:

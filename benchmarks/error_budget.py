@@ -19,9 +19,9 @@ from torch import Tensor
 
 import nerfro
 from nerfro.core.cameras import Cameras
-from nerfro.core.subdivision import divergence, neighbour_rays, pixel_rays
 from nerfro.evaluation.render_view import render_view
 from nerfro.rendering import Renderer
+from nerfro.samplers.subdivision import divergence, neighbour_rays, pixel_rays
 
 CLASSES = ("background beside the glass", "objects inside", "edges", "background through the glass")
 

@@ -16,7 +16,6 @@ import itertools
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -31,25 +30,15 @@ from skimage.measure import approximate_polygon, find_contours
 from nerfro.core.light import to_srgb
 from nerfro.core.progress import track
 from nerfro.evaluation.results import FULL, read_metrics_json
-from nerfro.registry.registration import discover, plugin_module
-
-discover()
-opencv = plugin_module("camera_calibration.opencv").opencv
-write_film = plugin_module("film_encoding.film").write_film
-dataset = import_module("nerfro.synthetic.dataset")
-PlannedImage, write_image = dataset.PlannedImage, dataset.write_image
-path_tracer = import_module("nerfro.synthetic.path_tracer")
-PathTracer, Pinhole = path_tracer.PathTracer, path_tracer.Pinhole
-panel_shape, triangle_shape = path_tracer.panel_shape, path_tracer.triangle_shape
-modelled = import_module("nerfro.synthetic.scene")
-Panel, Scene = modelled.Panel, modelled.SyntheticScene
-Surface = import_module("nerfro.synthetic.surface").SurfaceMesh
-find_scene = import_module("nerfro.synthetic.synthesis").find_scene
-
-dolphin = find_scene("dolphin_capture")
-distance, patterns, photographs = (
-    import_module(f"{dolphin.__package__}.{name}") for name in ("distance", "patterns", "photographs")
-)
+from nerfro.poses.opencv import opencv
+from nerfro.synthetic.dataset import PlannedImage, write_image
+from nerfro.synthetic.path_tracer import PathTracer, Pinhole, panel_shape, triangle_shape
+from nerfro.synthetic.scene import Panel
+from nerfro.synthetic.scene import SyntheticScene as Scene
+from nerfro.synthetic.scenes import distance, patterns, photographs
+from nerfro.synthetic.scenes import dolphin_capture as dolphin
+from nerfro.synthetic.surface import SurfaceMesh as Surface
+from nerfro.viewing.film import write_film
 
 GLASS, WATER = 1.5, 1.333
 WALL = 0.018

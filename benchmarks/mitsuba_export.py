@@ -10,7 +10,6 @@ model that was trained with `sampler.path.branches=none`; `dielectric` is real g
 from __future__ import annotations
 
 import argparse
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -20,9 +19,9 @@ import nerfro
 from nerfro.core.light import to_srgb
 from nerfro.evaluation.image_metrics import psnr
 from nerfro.registry.registration import discover
+from nerfro.synthetic.path_tracer import load_mitsuba
 
 discover()
-load_mitsuba = import_module("nerfro.synthetic.path_tracer").load_mitsuba
 
 
 def main() -> None:

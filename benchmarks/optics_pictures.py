@@ -15,7 +15,6 @@ from tracing import BOX, EULER, FAR, N_BALL, NEAR, RADIUS, exits, grid_distances
 from nerfro.core.cameras import central_window
 from nerfro.core.light import to_srgb
 from nerfro.core.paths import ASSETS_DIR
-from nerfro.core.subdivision import part_rays
 from nerfro.core.types import Path as RayPath
 from nerfro.core.types import Rays
 from nerfro.evaluation.path_plot import plot_paths
@@ -24,6 +23,7 @@ from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball
 from nerfro.samplers.paths.snell import Snell
+from nerfro.samplers.subdivision import part_rays
 from tests.closed_forms import RoundedBox, angle, ball_exits, make_rays
 from tests.paper import Eikonal, VoxelGrid
 

@@ -34,11 +34,11 @@ from matplotlib.ticker import LogLocator, NullLocator
 from training import SCENE, Training, write_images
 
 import nerfro
-from nerfro.core.subdivision import Subdivision
 from nerfro.core.types import Batch
 from nerfro.evaluation.render_view import render_view
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.registry.registration import build
+from nerfro.samplers.subdivision import Subdivision
 from nerfro.training.module import TrainingModule
 from nerfro.training.validation import ValidationPixels
 

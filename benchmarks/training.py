@@ -39,14 +39,17 @@ from torch.utils.flop_counter import FlopCounterMode
 import nerfro
 from nerfro.core.paths import ASSETS_DIR
 from nerfro.core.rays import Rays
-from nerfro.core.subdivision import Subdivision
 from nerfro.core.types import Batch
 from nerfro.evaluation.render_view import render_view
 from nerfro.evaluation.results import read_metrics_json
 from nerfro.fields.hash_grid import HashGridField
 from nerfro.kernels.allocator import keep_freed_memory
 from nerfro.kernels.available import fast_bfloat16
+<<<<<<< HEAD
 from nerfro.rendering import RayTracer
+=======
+from nerfro.samplers.subdivision import Subdivision
+>>>>>>> main
 from nerfro.training.data_module import RayDataModule
 from nerfro.training.trainer import lightning_precision
 

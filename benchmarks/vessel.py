@@ -16,11 +16,9 @@ import trimesh
 
 from nerfro.core.rays import Rays
 from nerfro.media.sdf_grid import SdfGrid
-from nerfro.registry.registration import plugin_module
+from nerfro.media.vessel import SdfVessel
 from nerfro.samplers.paths.snell import Snell
 from tests.closed_forms import angle, make_rays
-
-SdfVessel = plugin_module("vessels.vessel").SdfVessel
 
 # A drinking glass in millimetres.
 HEIGHT, RADIUS_BELOW, RADIUS_ABOVE, WALL, FOOT, LEVEL = 120.0, 30.0, 38.0, 2.5, 10.0, 80.0

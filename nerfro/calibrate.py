@@ -15,8 +15,8 @@ from omegaconf import DictConfig
 import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
 from nerfro.cli.entry import entry_point
 from nerfro.data.frames import Every
+from nerfro.poses import command
 from nerfro.registry.allowed import Count, Natural, Positive, Range
-from nerfro.registry.registration import plugin_module
 
 Squares = Annotated[int, Range(at_least=1, at_most=100)]  # along a side of a board
 
@@ -68,7 +68,7 @@ class CalibrateConfig:
 @entry_point("calibrate", CalibrateConfig)
 def main(config: DictConfig) -> None:
     """Detect the board, estimate lens and poses, write the data set, and print the next command."""
-    plugin_module("camera_calibration.command").run(config)
+    command.run(config)
 
 
 if __name__ == "__main__":

@@ -16,8 +16,8 @@ from omegaconf import MISSING, DictConfig
 import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
 from nerfro.cli.entry import entry_point
 from nerfro.cli.overrides import is_given, of_groups, print_next
+from nerfro.masks import command
 from nerfro.registry.allowed import Range
-from nerfro.registry.registration import plugin_module
 from nerfro.rendering.scene_file import with_scene
 
 
@@ -56,7 +56,7 @@ class MaskConfig:
 @entry_point("mask", MaskConfig, expand=with_scene)
 def main(config: DictConfig) -> None:
     """Segment the outlined views, then all other views, and write the missing masks."""
-    plugin_module("object_masks.command").run(config)
+    command.run(config)
     given = of_groups(("data",), HydraConfig.get().overrides.task)
     given = given if is_given("data", given) else ["data=opencv", *given]
     print_next("next", "preprocess", given)

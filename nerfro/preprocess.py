@@ -22,6 +22,7 @@ from nerfro.capture.object_errors import unsupported_bodies
 from nerfro.capture.preprocess_options import MESH, PreprocessConfig, Request, surface_settings, write_scene
 from nerfro.capture.refinement import refine
 from nerfro.capture.surroundings import Observations
+from nerfro.capture.vessel_fit import find_vessel
 from nerfro.cli.entry import entry_point
 from nerfro.core.errors import warn
 from nerfro.data.base import Views
@@ -29,7 +30,6 @@ from nerfro.data.masks import EVIDENCE, REVOLUTION, masked_views, method_of, wit
 from nerfro.files.folder_lock import lock_folder
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.media.sdf_grid import SdfGrid
-from nerfro.registry.registration import plugin_module
 from nerfro.rendering.scene_file import SceneFile, with_scene
 from nerfro.silhouettes.overlaps import choose_wrong_masks, report_overlaps
 from nerfro.silhouettes.pose_conventions import require_consistent_poses
@@ -77,7 +77,7 @@ def _preprocess(config: DictConfig, request: Request) -> None:
     vessel, unsupported = dict[str, object](), list[str]()
     if config.vessel:
         solid = cast(SdfGrid, found.medium)  # see Request.check
-        vessel, fitted = plugin_module("vessels.fit").find_vessel(solid, location, mesh, observations)
+        vessel, fitted = find_vessel(solid, location, mesh, observations)
         unsupported = unsupported_bodies(observations, solid, found.is_doubtful, fitted)
     estimated = settings | {"mesh": location} | found.index_settings
     origin = replace(found.provenance, unsupported=unsupported)

@@ -17,8 +17,8 @@ from nerfro.core.paths import CONF_DIR, user_path
 from nerfro.files.cache import file_hash
 from nerfro.files.folder_lock import lock_folder
 from nerfro.kernels.allocator import keep_freed_memory
-from nerfro.registry.registration import plugin_module
 from nerfro.training.load import checkpoint_of, load
+from nerfro.viewing.film import find_ffmpeg, write_film
 from nerfro.viewing.frames import render_frames
 from nerfro.viewing.layers import LAYERS
 from nerfro.viewing.render_request import RenderConfig, check_request, find_shots, prepared
@@ -40,12 +40,12 @@ def _render(config: DictConfig, folder: Path) -> None:
     request = (config.what, scene.subdivision, *map(file_hash, inputs))
     films = config.film if shots.film and config.format == "png" else []
     if "mp4" in films:
-        plugin_module("film_encoding.film").find_ffmpeg()  # a missing ffmpeg is reported before the frames are rendered
+        find_ffmpeg()  # a missing ffmpeg is reported before the frames are rendered
     files = render_frames(LAYERS[config.what], scene, shots, folder, f".{config.format}", request, config.overwrite)
     print(f"{len(files)} frames: {files[0]}")
     for form in films:
         film = folder / f"film.{form}"
-        plugin_module("film_encoding.film").write_film(film, files, config.seconds)
+        write_film(film, files, config.seconds)
         print(f"film: {film}")
 
 

@@ -12,7 +12,8 @@ from omegaconf import DictConfig
 import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
 from nerfro.cli.entry import entry_point
 from nerfro.core.paths import CONF_DIR
-from nerfro.synthetic.options import SynthesizeConfig, synthesize
+from nerfro.synthetic.options import SynthesizeConfig
+from nerfro.synthetic.synthesis import synthesize
 
 
 @entry_point("synthesize", SynthesizeConfig, CONF_DIR / "synthesize")  # conf/scene would turn `scene=` into a group

@@ -18,13 +18,13 @@ from nerfro.cli.entry import entry_point
 from nerfro.cli.failures import EXIT_INTERRUPTED
 from nerfro.cli.overrides import prints_hints
 from nerfro.core.distributed import leave
-from nerfro.core.subdivision import Subdivision
 from nerfro.evaluation.metrics import prepared_metrics
 from nerfro.evaluation.results import RunMetrics, optimized
 from nerfro.evaluation.tables import write_scores
 from nerfro.evaluation.treatments import score_split
 from nerfro.fields.networks import compile_networks
 from nerfro.rendering.scene_file import with_scene
+from nerfro.samplers.subdivision import Subdivision
 from nerfro.training.build import build_training, check_before_training, check_command
 from nerfro.training.callbacks import StopOnSignal, Throughput, steps_by_phase
 from nerfro.training.config import TrainConfig, build_data, resolve_trainer_options

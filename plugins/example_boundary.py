@@ -6,10 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from nerfro.boundaries.base import Boundary
-from nerfro.core.errors import NerfroError
-from nerfro.core.types import Exits
-from nerfro.registry.registration import register
+from nerfro.parts import Boundary, Exits, NerfroError, register
 
 
 @register("boundary", "gradient_sky")

@@ -8,10 +8,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor, nn
 
-from nerfro.camera.base import CameraModel
-from nerfro.core.cameras import Cameras
-from nerfro.core.rays import Rays
-from nerfro.registry.registration import register
+from nerfro.parts import CameraModel, Cameras, Rays, register
 
 
 @register("camera", "shifted")

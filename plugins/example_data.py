@@ -9,13 +9,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from nerfro.core.cameras import Cameras
-from nerfro.core.errors import NerfroError
-from nerfro.core.paths import resolve_path
-from nerfro.data.base import DataSource, Views
-from nerfro.files.reading import load_arrays
-from nerfro.registry.allowed import Distance
-from nerfro.registry.registration import register
+from nerfro.parts import Cameras, DataSource, Distance, NerfroError, Views, load_arrays, register, resolve_path
 
 
 @register("data", "numpy_views")

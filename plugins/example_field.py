@@ -6,10 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from nerfro.core.types import FieldValues, Samples
-from nerfro.fields.base import Field
-from nerfro.registry.allowed import Count, Positive
-from nerfro.registry.registration import register
+from nerfro.parts import Count, Field, FieldValues, Positive, Samples, register
 
 
 @register("field", "blobs")

@@ -6,10 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.core.types import Batch, Rendering
-from nerfro.losses.base import Loss
-from nerfro.registry.registration import register
-from nerfro.rendering import Scene
+from nerfro.parts import Batch, Loss, Rendering, Scene, register
 
 
 @register("loss", "opacity_entropy")

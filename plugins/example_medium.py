@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from nerfro.media.base import Medium, Scalars, Vectors
-from nerfro.registry.allowed import Positive
-from nerfro.registry.registration import register
+from nerfro.parts import Medium, Positive, Scalars, Vectors, register
 
 
 @register("medium", "gradient_rod")

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from nerfro.core.types import Path, Rays
-from nerfro.media.base import Medium
-from nerfro.registry.registration import register
-from nerfro.samplers.base import PathSampler
+from nerfro.parts import Medium, Path, PathSampler, Rays, register
 
 
 @register("sampler/path", "mirror_floor")

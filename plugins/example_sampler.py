@@ -7,12 +7,7 @@ from __future__ import annotations
 
 import torch
 
-from nerfro.core.draws import Draws
-from nerfro.core.types import Path, Rendering, Samples
-from nerfro.registry.allowed import Count
-from nerfro.registry.registration import register
-from nerfro.samplers.base import PointSampler
-from nerfro.samplers.points.stratified import point_samples
+from nerfro.parts import Count, Draws, Path, PointSampler, Rendering, Samples, point_samples, register
 
 _GROWTH = 4.0  # ratio of the last spacing to the first
 

@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from nerfro.media.surface import Grid, Surface
-from nerfro.registry.allowed import Positive
-from nerfro.registry.registration import register
+from nerfro.parts import Grid, Positive, Surface, register
 
 
 @register("surface", "torus")

@@ -60,11 +60,6 @@ class SkippedTests:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    # The option --jaxtyping-packages takes one package beside this checker.
-    checker = (config.option.jaxtyping_packages or "").partition(",")[2]
-    if checker:
-        checked = ("camera_calibration", "data_formats", "object_masks", "paper", "vessels")
-        jaxtyping.install_import_hook([f"nerfro_plugins.{name}" for name in checked], checker)
     worker = hasattr(config, "workerinput")  # of pytest-xdist
     if not worker and not config.option.collectonly and config.cache is not None:
         config.pluginmanager.register(SkippedTests(config.cache))
@@ -141,13 +136,12 @@ def _seed() -> None:
 @pytest.fixture(scope="session")
 def mitsuba() -> ModuleType:
     """Mitsuba with its fastest variant; tests are skipped where only the scalar variant works, which takes minutes."""
-    from nerfro.registry.registration import discover
+    from nerfro.synthetic import llvm
+    from nerfro.synthetic.path_tracer import load_mitsuba
 
-    discover()
-    llvm = importlib.import_module("nerfro.synthetic.llvm")
     llvm.select_llvm()  # before Mitsuba is imported, which loads the library at once
     pytest.importorskip("mitsuba")
-    module = importlib.import_module("nerfro.synthetic.path_tracer").load_mitsuba()
+    module = load_mitsuba()
     if module.variant() == "scalar_rgb":
         pytest.skip(f"needs Mitsuba with LLVM or CUDA, but {llvm.missing_llvm()}; {llvm.HINT}")
     return module

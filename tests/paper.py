@@ -1,26 +1,11 @@
-"""Classes and functions of the plugin `nerfro/paper/`, which have no importable name before `discover`."""
+"""A small model of the paper's components."""
 
-from importlib import import_module
-
-from nerfro.registry.registration import discover
+from nerfro.paper.eikonal import Eikonal
+from nerfro.paper.hierarchical import Hierarchical
+from nerfro.paper.nerf import NerfField
+from nerfro.paper.skybox import Skybox
 from nerfro.rendering import Components
 from tests.closed_forms import Luneburg
-
-discover()
-paper = import_module("nerfro.paper")
-eikonal, integrators, mlp = paper.eikonal, paper.integrators, paper.mlp
-
-Eikonal, march_adaptive, march_uniform = eikonal.Eikonal, eikonal.march_adaptive, eikonal.march_uniform
-Hierarchical, blur_weights = paper.hierarchical.Hierarchical, paper.hierarchical.blur_weights
-Integrator, RayState = integrators.Integrator, integrators.RayState
-euler, kick_drift_kick, leapfrog = integrators.euler, integrators.kick_drift_kick, integrators.leapfrog
-MipNerfField, MipNerfModel = paper.mip_nerf.MipNerfField, paper.mip_nerf.MipNerfModel
-NerfField, Skybox, frustum_gaussians = paper.nerf.NerfField, paper.skybox.Skybox, paper.mip_nerf.frustum_gaussians
-RGB_PADDING, RadianceMLP, SkipMLP, padded_sigmoid = mlp.RGB_PADDING, mlp.RadianceMLP, mlp.SkipMLP, mlp.padded_sigmoid
-Linear, positional_encoding = paper.linear.Linear, paper.encoding.positional_encoding
-integrated_positional_encoding = paper.encoding.integrated_positional_encoding
-Smoothness, tile_roughness = paper.smoothness.Smoothness, paper.smoothness.tile_roughness
-VoxelGrid, gradient = paper.voxel_grid.VoxelGrid, paper.voxel_grid.gradient
 
 
 def small_components() -> Components:

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from nerfro.core.light import to_linear, to_srgb
-from tests.poses.camera_calibration import Sheet
+from nerfro.poses.boards import Sheet
 
 _SAMPLES = 3  # per pixel and side
 _TO_CENTRES = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])  # OpenCV's pixel coordinates

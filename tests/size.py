@@ -40,11 +40,14 @@ def count_by_component(folder: Path) -> Counter[str]:
 
 def main() -> None:
     """Print one table: a row for each component and a total for each folder."""
+    totals = {}
     for folder in FOLDERS:
         lines = count_by_component(ROOT / folder)
+        totals[folder] = lines.total()
         for component, number in sorted(lines.items()):
             print(f"{folder + '/' + component:<28}{number:>8,}")
         print(f"{folder + ' total':<28}{lines.total():>8,}\n")
+    print(f"{'product (nerfro, plugins)':<28}{totals['nerfro'] + totals['plugins']:>8,}")
 
 
 if __name__ == "__main__":

@@ -22,10 +22,10 @@ from benchmarks.capture import align_to_truth
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.files.images import save_png
 from nerfro.geometry.mesh import TriangleMesh
+from nerfro.poses.video import extract_frames
 from tests import ball_photographs
 from tests.cameras_at import upright_cameras
 from tests.conftest import refused
-from tests.poses.camera_calibration import extract_frames
 from tests.viewing.test_exports import write
 
 FOLDER = Path(__file__).resolve().parent.parent / "benchmarks"

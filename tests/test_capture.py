@@ -7,7 +7,6 @@ import shlex
 import shutil
 from collections.abc import Iterator
 from functools import cache
-from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
@@ -18,15 +17,14 @@ from benchmarks.capture import measure
 from nerfro.data.blender import OpenCVData
 from nerfro.geometry.mesh import load_mesh
 from nerfro.registry.registration import discover
-from nerfro.synthetic.options import synthesize
+from nerfro.synthetic import path_tracer
+from nerfro.synthetic.synthesis import synthesize
+from nerfro.synthetic.scenes import dolphin_capture, photographs
 from tests.conftest import Runner
 from tests.exact_silhouettes import overlaps_of_convex_body
 from tests.test_synthesize import configured
 
 discover()
-path_tracer = import_module("nerfro.synthetic.path_tracer")
-photographs = import_module("nerfro.synthetic.scenes.photographs")
-dolphin_capture = import_module("nerfro.synthetic.scenes.dolphin_capture")
 
 
 def photograph(folder: Path, **options: object) -> Path:

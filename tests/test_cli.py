@@ -27,7 +27,8 @@ from tests.conftest import composed, refused
 
 @pytest.mark.parametrize("num_lines", [1, 10_000])  # less and more than a pipe's buffer
 def test_closed_output_pipe_is_no_error(num_lines: int) -> None:
-    program = f"import nerfro.cli.failures\nwith nerfro.cli.failures.errors_in_one_line():\n    print('line\\n' * {num_lines})"
+    program = "from nerfro.cli.failures import errors_in_one_line\nwith errors_in_one_line():\n"
+    program += f"    print('line\\n' * {num_lines})"
     reader, writer = os.pipe()
     os.close(reader)
     done = subprocess.run(

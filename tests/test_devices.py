@@ -4,11 +4,11 @@ import warnings
 
 import pytest
 
-from nerfro.core.subdivision import Subdivision
 from nerfro.evaluation.render_view import render_view
 from nerfro.kernels.constants import constant
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.registry.registration import build
+from nerfro.samplers.subdivision import Subdivision
 from nerfro.training.config import build_model
 from nerfro.training.module import TrainingModule
 from nerfro.training.pixel_batches import PixelBatches

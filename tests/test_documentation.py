@@ -19,8 +19,7 @@ from nerfro.core.paths import PACKAGE_DIR
 from nerfro.media.material import MATERIALS
 from nerfro.registry.registration import discover, find
 from nerfro.testing import check
-from nerfro.viewing import PLUGIN_EXPORTS
-from nerfro.viewing.exports import ExportConfig, find_export
+from nerfro.viewing.exports import EXPORTS, ExportConfig, find_export
 from tests.conftest import Runner
 
 CHECKOUT = PACKAGE_DIR.parent
@@ -42,7 +41,7 @@ def guide_plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, restored_regi
         else:
             (tmp_path / file[1]).write_text(block)
     monkeypatch.setenv("NERFRO_PLUGINS", str(tmp_path))
-    monkeypatch.setitem(PLUGIN_EXPORTS, "centres", "")  # the export ends with the test
+    monkeypatch.setitem(EXPORTS, "centres", "")  # the export ends with the test
     discover()
     return rest
 

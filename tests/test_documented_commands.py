@@ -25,10 +25,9 @@ from nerfro.core.errors import NerfroError
 from nerfro.core.paths import CONF_DIR, PACKAGE_DIR
 from nerfro.registry.allowed import check_names, check_settings
 from nerfro.registry.registration import KINDS, discover, plugins
-from nerfro.synthetic.options import SCENES
+from nerfro.synthetic.scenes import SCENES
 from nerfro.training.effects import settings_without_effect
-from nerfro.viewing import PLUGIN_EXPORTS
-from nerfro.viewing.exports import find_export
+from nerfro.viewing.exports import EXPORTS, find_export
 
 CHECKOUT = PACKAGE_DIR.parent
 PAGES = {
@@ -144,7 +143,7 @@ def test_job_files_are_scripts() -> None:
 
 
 def test_help_lists_plugins() -> None:
-    names: dict[str, list[str]] = {"export": list(PLUGIN_EXPORTS), "synthesize": list(SCENES)}
+    names: dict[str, list[str]] = {"export": list(EXPORTS), "synthesize": list(SCENES)}
     names["train"] = [plugin.name for plugin in plugins()]
     names["trace"] = [plugin.name for kind in ("medium", "surface", "sampler/path") for plugin in plugins(kind)]
     for command, added in names.items():

@@ -19,6 +19,8 @@ from nerfro.files import lat_long
 from nerfro.files.images import save_png
 from nerfro.media.base import Medium
 from nerfro.media.shapes import Ball
+from nerfro.paper.eikonal import Eikonal
+from nerfro.paper.nerf import NerfField
 from nerfro.registry.registration import discover, find
 from nerfro.rendering import Components, Renderer
 from nerfro.samplers.points.stratified import Stratified
@@ -30,7 +32,6 @@ from nerfro.training.run_folder import load_checkpoint, restore
 from tests.ball_photographs import save
 from tests.conftest import QUIET, Runner, refused
 from tests.exact_silhouettes import cameras_around
-from tests.paper import Eikonal, NerfField
 
 discover()
 IndexField = find("medium", "index_field").cls

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 from torch.nn.utils import parameters_to_vector
 
-from nerfro.core.subdivision import Subdivision
 from nerfro.evaluation.render_view import render_view
 from nerfro.registry.registration import build
+from nerfro.samplers.subdivision import Subdivision
 from nerfro.training.config import build_model
 from nerfro.training.data_module import traced
 from nerfro.training.module import TrainingModule

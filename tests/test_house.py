@@ -4,7 +4,6 @@ import ast
 import re
 import sys
 from collections.abc import Iterator
-from graphlib import TopologicalSorter
 from itertools import pairwise
 from pathlib import Path
 
@@ -15,9 +14,9 @@ from tests.size import count_by_component, count_code_lines
 
 # From above to below: a package imports what follows it, and itself.
 ORDER = (
-    "commands", "testing", "pipeline", "report", "training", "viewing", "evaluation", "capture", "models",
-    "losses", "rendering", "silhouettes", "boundaries", "camera", "samplers", "fields", "media",
-    "data", "geometry", "kernels", "files", "core",
+    "commands", "parts", "testing", "pipeline", "report", "training", "paper", "exports", "masks", "synthetic", "poses",
+    "viewing", "evaluation", "capture", "models", "losses", "rendering", "camera", "silhouettes", "boundaries",
+    "samplers", "fields", "media", "data", "geometry", "kernels", "files", "cli", "registry", "core",
 )  # fmt: skip
 FILES = {
     ".".join(("nerfro", *file.relative_to(PACKAGE_DIR).with_suffix("").parts)).removesuffix(".__init__"): file
@@ -47,14 +46,19 @@ def is_command(module: str) -> bool:
 
 
 def room(module: str) -> str:
-    """The package of a module; top-level modules are commands, `testing` (for authors of plugins) or the core.
+    """The package of a module. Top-level modules are commands, or `parts`, the front for authors of plugins.
 
     `nerfro` itself stands with the commands: it hands on what is for everybody, imported when it is asked for.
     """
     name = module.split(".")[1] if "." in module else "commands"
-    if (PACKAGE_DIR / name).is_dir() or name in ("testing", "commands"):
-        return name
-    return "commands" if is_command(module) else "core"
+    return name if (PACKAGE_DIR / name).is_dir() or name == "parts" else "commands"
+
+
+def test_top_level_has_only_commands_and_the_fronts() -> None:
+    modules = {
+        module for module in FILES if module.count(".") == 1 and not (PACKAGE_DIR / module.split(".")[1]).is_dir()
+    }
+    assert {module for module in modules if not is_command(module)} == {"nerfro.parts"}
 
 
 @pytest.mark.parametrize("module", sorted(FILES))
@@ -103,13 +107,13 @@ def test_only_training_imports_lightning() -> None:
 PLUGINS = {str(file.relative_to(PLUGINS_DIR)): file for file in PLUGINS_DIR.rglob("*.py")}
 # Requirement that provides an imported package with another name.
 PROVIDED_BY = {
-    "PIL": "pillow", "OpenImageIO": "openimageio", "hydra": "hydra-core", "markupsafe": "jinja2",
+    "PIL": "pillow", "flip_evaluator": "flip-evaluator", "OpenImageIO": "openimageio", "hydra": "hydra-core", "markupsafe": "jinja2",
     "omegaconf": "hydra-core", "skimage": "scikit-image", "yaml": "hydra-core",
 }  # fmt: skip
 
 
 def test_package_imports_only_required_dependencies() -> None:
-    """A component that needs an extra is a plugin."""
+    """Packages of extras are imported by `optional`, where they are used."""
     project = PACKAGE_DIR.parent / "pyproject.toml"
     if not project.is_file():
         pytest.skip("there is no checkout with pyproject.toml")
@@ -129,13 +133,20 @@ def test_package_imports_only_required_dependencies() -> None:
     assert {module: names for module, names in found.items() if names} == {}
 
 
-def test_plugins_import_each_other_without_cycles() -> None:
-    imported: dict[str, set[str]] = {}
-    for name, file in PLUGINS.items():
-        folder, source = Path(name).parts[0].removesuffix(".py"), file.read_text(encoding="utf-8")
-        imported.setdefault(folder, set()).update(set(re.findall(r"nerfro_plugins\.(\w+)", source)) - {folder})
-    assert "camera_calibration" in imported["object_masks"]
-    TopologicalSorter(imported).prepare()  # raises CycleError
+def test_no_module_is_imported_by_a_string() -> None:
+    """Except by the discovery of plugins, by `optional`, and by the public front."""
+    users = {
+        module
+        for module, file in FILES.items()
+        if re.search(r"\b(import_module|__import__)\(", file.read_text("utf-8"))
+    }
+    assert users == {"nerfro.registry.registration", "nerfro.core.optional", "nerfro.cli.entry"}
+
+
+@pytest.mark.parametrize("file", sorted(PLUGINS_DIR.rglob("example_*.py")), ids=lambda file: file.stem)
+def test_templates_need_one_import_of_nerfro(file: Path) -> None:
+    imports = re.findall(r"^(?:from|import) nerfro[\w.]*", file.read_text(encoding="utf-8"), re.M)
+    assert imports == ["from nerfro.parts"]
 
 
 @pytest.mark.parametrize("module", sorted(filter(is_command, FILES)))

@@ -4,11 +4,11 @@ from pathlib import Path
 
 import pytest
 
+from nerfro.paper.eikonal import Eikonal
 from nerfro.registry.registration import discover, find
 from tests.ball_photographs import TRAINING, photographs, save
 from tests.closed_forms import make_rays
 from tests.conftest import Runner, weights_of
-from tests.paper import Eikonal
 
 FIELDS = {"width": 8, "depth": 2, "skip": 0}
 

@@ -17,6 +17,7 @@ from nerfro.losses.base import Loss
 from nerfro.losses.boundary import BoundaryRegularizer
 from nerfro.losses.photometric import Photometric
 from nerfro.models.refractive import RefractiveModel
+from nerfro.paper.hierarchical import Hierarchical
 from nerfro.registry.registration import find
 from nerfro.rendering import composite
 from nerfro.samplers.paths.straight import straight_path
@@ -25,7 +26,6 @@ from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import NUM_RAYS, example_batch, example_components, example_draws, example_path, example_rays
 from nerfro.training.module import TrainingModule
 from nerfro.training.optimizer import GroupConfig, OptimizerConfig
-from tests.paper import Hierarchical
 
 
 def split_path(of_straight: float) -> Path:

@@ -18,10 +18,14 @@ from nerfro.core.cameras import Cameras
 from nerfro.core.types import Batch, Rays, Rendering
 from nerfro.losses.base import Loss
 from nerfro.models.refractive import RefractiveModel
+from nerfro.paper.eikonal import Eikonal
+from nerfro.paper.hierarchical import Hierarchical
+from nerfro.paper.nerf import NerfField
+from nerfro.paper.skybox import Skybox
+from nerfro.paper.voxel_grid import VoxelGrid
 from nerfro.registry.registration import create, discover, find
 from nerfro.rendering import Components
 from nerfro.testing import example_batch
-from tests.paper import Eikonal, Hierarchical, NerfField, Skybox, VoxelGrid
 
 discover()
 

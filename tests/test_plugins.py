@@ -18,7 +18,8 @@ from omegaconf import DictConfig
 from PIL import Image
 from torch import nn
 
-from nerfro import camera, types
+from nerfro import camera
+from nerfro.core import types
 from nerfro.core.paths import PLUGINS_DIR
 from nerfro.data.base import DataSource, Views
 from nerfro.data.blender import BlenderData
@@ -44,9 +45,14 @@ from nerfro.testing import (
 from nerfro.training.phases import background
 from nerfro.training.phases import base as phase_base
 from nerfro.training.phases.base import Phase, TrainingRun
+<<<<<<< HEAD
 from nerfro.training.pixel_batches import PixelBatches
 from nerfro.viewing import PLUGIN_EXPORTS
 from nerfro.viewing.exports import Export, find_export
+=======
+from nerfro.training.ray_batches import RayBatches
+from nerfro.viewing.exports import EXPORTS, Export, find_export
+>>>>>>> main
 from nerfro.viewing.trained_scene import TrainedScene
 from nerfro.viewing.volume import Volume
 from tests.conftest import Finished, Runner, refused
@@ -456,8 +462,7 @@ def writer(*names: str, text: str | None = "a file") -> Callable[..., str | None
 def test_check_names_the_violated_contract_of_an_export(
     export: Export, contract: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(sys.modules, "broken_export", SimpleNamespace(EXPORT=export))  # type: ignore[arg-type]
-    monkeypatch.setitem(PLUGIN_EXPORTS, "broken", "broken_export")
+    monkeypatch.setitem(EXPORTS, "broken", export)
     with contextlib.nullcontext() if contract is None else pytest.raises(ContractError, match=contract):
         check_export("broken")
 
@@ -469,8 +474,8 @@ def test_exports_keep_their_contract(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_export_without_a_writer_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(PLUGIN_EXPORTS, "broken", __name__)
-    refused(r"test_plugins\.py of what=broken defines no EXPORT", find_export, "broken", Path("out.csv"))
+    monkeypatch.setitem(EXPORTS, "broken", __name__)  # type: ignore[arg-type]
+    refused(r"EXPORTS\['broken'\] of a plugin is .*; make it an Export", find_export, "broken", Path("out.csv"))
 
 
 def test_loss_that_is_no_scalar_is_refused(train_template: Runner) -> None:

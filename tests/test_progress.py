@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from nerfro import progress
+from nerfro.core import progress
 from tests.conftest import Runner
 
 

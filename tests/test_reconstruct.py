@@ -31,9 +31,9 @@ from nerfro.files.reading import open_image
 from nerfro.pipeline import stage
 from nerfro.pipeline.hypotheses import Hypothesis
 from nerfro.pipeline.stage import terminated_in_one_line
+from nerfro.poses import collection
 from tests.ball_photographs import RECONSTRUCTION, RECONSTRUCTION_TRAINING, save_with_masks
 from tests.conftest import Runner, refused, weights_of
-from tests.poses.camera_calibration import collection
 
 
 @pytest.fixture

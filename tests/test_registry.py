@@ -10,7 +10,7 @@ from torch import nn
 import nerfro.registry.registration
 import nerfro.training.lightning_callbacks
 from nerfro.core.errors import NerfroError
-from nerfro.registry.registration import build, configure, discover, find, plugin_module, register
+from nerfro.registry.registration import build, configure, discover, find, register
 from nerfro.training.config import build_each
 from tests.conftest import Runner, refused
 
@@ -151,7 +151,3 @@ def test_mistake_in_an_experiment_file_gives_a_one_line_error(
         assert word in refused.error
     assert "nerfro:" not in refused.out, "nothing has started"
     assert not list((tmp_path / "run").rglob("*")), "nothing is written"
-
-
-def test_missing_plugin_is_named_in_one_line() -> None:
-    refused("lacks the plugin no_such_plugin; install nerfro again", plugin_module, "no_such_plugin.command")

@@ -8,20 +8,21 @@ import pytest
 import torch
 
 from nerfro.core.cameras import Cameras
-from nerfro.core.subdivision import Subdivision, contrast, divergence, neighbour_rays, part_rays, pixel_rays
 from nerfro.core.types import Batch
 from nerfro.data.base import Views
 from nerfro.evaluation.render_view import render_view
 from nerfro.media.analytic import Vacuum
 from nerfro.media.shapes import Ball
 from nerfro.models.refractive import RefractiveModel
+from nerfro.paper.hierarchical import Hierarchical
+from nerfro.paper.nerf import NerfField
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.paths.straight import Straight
+from nerfro.samplers.subdivision import Subdivision, contrast, divergence, neighbour_rays, part_rays, pixel_rays
 from nerfro.testing import example_batch, example_components
 from nerfro.training.pixel_batches import PixelBatches
 from tests.cameras_at import cameras_at, random_poses
 from tests.closed_forms import RoundedBox
-from tests.paper import Hierarchical, NerfField
 
 NUM_VIEWS, HEIGHT, WIDTH = 3, 8, 10
 SIDE, FOCAL = 33, 60.0

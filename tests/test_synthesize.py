@@ -15,8 +15,10 @@ from nerfro.core.paths import ASSETS_DIR, CONF_DIR
 from nerfro.core.types import Exits
 from nerfro.data.blender import BlenderData
 from nerfro.geometry.mesh import load_mesh
-from nerfro.registry.registration import plugin_module
-from nerfro.synthetic.options import SynthesizeConfig, synthesize
+from nerfro.synthetic.dataset import ViewSplits
+from nerfro.synthetic.options import SynthesizeConfig
+from nerfro.synthetic.synthesis import synthesize
+from nerfro.synthetic.scenes.photographs import Photographs
 from tests.conftest import refused
 from tests.exact_silhouettes import overlaps_of_convex_body
 
@@ -54,10 +56,8 @@ def test_embedded_scene_is_complete_and_small():
             assert Image.open(EMBEDDED / frame["mask_path"]).mode == "L"
 
 
-@pytest.mark.parametrize("module", ["dataset.ViewSplits", "scenes.photographs.Photographs"])
-def test_printed_command_quotes_the_folder(module, tmp_path):
-    name, _, kind = module.rpartition(".")
-    data = getattr(plugin_module(f"synthetic_scenes.{name}"), kind)
+@pytest.mark.parametrize("data", [ViewSplits, Photographs])
+def test_printed_command_quotes_the_folder(data, tmp_path):
     folder = tmp_path / "torus [1]"
     words = shlex.split(data(configured(), SimpleNamespace(ior=1.5), folder).next_command())
     assert {f'data.root="{folder}"', f'out="{folder}"'} & set(words)

@@ -22,7 +22,6 @@ from nerfro.core.errors import NerfroError
 from nerfro.core.light import to_linear
 from nerfro.core.progress import fraction_bar
 from nerfro.core.rays import Rays
-from nerfro.core.subdivision import pixel_rays
 from nerfro.core.types import WORLD_ORIGIN, Exits
 from nerfro.data.base import Views
 from nerfro.fields.hash_grid import HashGridField
@@ -30,6 +29,7 @@ from nerfro.geometry.mesh import TriangleMesh
 from nerfro.rendering import composite
 from nerfro.samplers.paths.straight import straight_path
 from nerfro.samplers.points.density_grid import DensityGridSampler
+from nerfro.samplers.subdivision import pixel_rays
 from nerfro.silhouettes.silhouettes import VALIDATION_EVERY, PixelBlocks, mesh_silhouettes
 
 # Photographs are downscaled to at most so many pixels per side, in linear radiance.

@@ -1,8 +1,8 @@
 """Answer `--help` and refuse misspelt options before the imports of a command, which take seconds.
 
 Each command imports this module first. If the command is the main program, importing the module has these effects:
-`--version` and `--help` are answered, misspelt options are refused, as far as the cache of `nerfro.cli.options` knows them,
-and Ctrl-C during the imports ends the program in one line.
+`--version` and `--help` are answered, misspelt options are refused, as far as the cache of `nerfro.cli.options` knows
+them, and Ctrl-C during the imports ends the program in one line.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from nerfro.core.errors import NerfroError
 
-PACKAGE_DIR = Path(__file__).resolve().parent
+PACKAGE_DIR = Path(__file__).resolve().parent.parent
 ASSETS_DIR = PACKAGE_DIR / "assets"
 
 # A wheel contains conf/ and plugins/ inside the package (see pyproject.toml), a checkout beside the package.

@@ -7,8 +7,8 @@ from dataclasses import replace
 import torch
 
 from nerfro.core.cameras import Cameras
-from nerfro.core.subdivision import Subdivision, contrast, divergence, neighbour_rays, part_rays
 from nerfro.rendering import RenderedRays, Renderer
+from nerfro.samplers.subdivision import Subdivision, contrast, divergence, neighbour_rays, part_rays
 
 
 def render_view(renderer: Renderer, cameras: Cameras, view: int, subdivision: Subdivision) -> RenderedRays:

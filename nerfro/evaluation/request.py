@@ -16,10 +16,10 @@ from omegaconf import DictConfig, OmegaConf
 
 from nerfro.core.errors import Interrupted, NerfroError, warn
 from nerfro.core.paths import user_path
-from nerfro.core.subdivision import SubdivisionChanges
 from nerfro.files.atomic import refuse_existing, write_atomically
 from nerfro.files.folder_lock import lock_folder, require_only
 from nerfro.registry.allowed import Natural, NumRays, refuse_unused
+from nerfro.samplers.subdivision import SubdivisionChanges
 
 REQUEST_FILE = "evaluate.yaml"
 

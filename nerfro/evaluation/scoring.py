@@ -10,7 +10,6 @@ import torch
 
 from nerfro.camera.exposure import fit_gain
 from nerfro.core.progress import track
-from nerfro.core.subdivision import Subdivision
 from nerfro.data.base import Views
 from nerfro.data.image_files import Alpha
 from nerfro.evaluation.error_sheets import write_error_sheet
@@ -20,6 +19,7 @@ from nerfro.evaluation.render_view import render_view
 from nerfro.evaluation.results import EvaluationResult, ViewScores
 from nerfro.files.images import save_png
 from nerfro.rendering import Renderer
+from nerfro.samplers.subdivision import Subdivision
 
 
 @dataclass(frozen=True)

@@ -9,12 +9,12 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from nerfro.core.subdivision import Subdivision
 from nerfro.data.base import Views
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.results import AS_GIVEN, EXPOSED, EvaluationResult
 from nerfro.evaluation.scoring import ScoringProtocol, score_views
 from nerfro.rendering import Renderer
+from nerfro.samplers.subdivision import Subdivision
 
 
 def score_split(

@@ -2,8 +2,3 @@
 
 See docs/guides/export_and_share.md.
 """
-
-from nerfro.viewing import PLUGIN_EXPORTS
-
-for _name, _module in (("mesh", "gltf"), ("mitsuba", "mitsuba"), ("sky", "sky"), ("volume", "volume")):
-    PLUGIN_EXPORTS[_name] = f"{__name__}.{_module}"

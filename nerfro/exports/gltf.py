@@ -16,7 +16,7 @@ from nerfro.exports.meshes import glass_meshes, inside_mesh
 from nerfro.files.atomic import write_atomically
 from nerfro.media.material import Dispersion
 from nerfro.viewing.changes import absorption_of
-from nerfro.viewing.exports import Export
+from nerfro.viewing.exports import EXPORTS, Export
 from nerfro.viewing.trained_scene import TrainedScene
 
 # The y axis is up in glTF, and the z axis in nerfro.
@@ -90,4 +90,4 @@ def _glass_material(
     return {"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.0}, "extensions": extensions}
 
 
-EXPORT = Export((".glb",), write_mesh, unused=("sky",))
+EXPORTS["mesh"] = Export((".glb",), write_mesh, unused=("sky",))

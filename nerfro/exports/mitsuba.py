@@ -23,7 +23,7 @@ from nerfro.files.deep_images import write_radiance
 from nerfro.media.solid import Solid
 from nerfro.synthetic.path_tracer import envmap_texture
 from nerfro.viewing.changes import absorption_of
-from nerfro.viewing.exports import Export
+from nerfro.viewing.exports import EXPORTS, Export
 from nerfro.viewing.page import page_split
 from nerfro.viewing.trained_scene import TrainedScene
 
@@ -174,4 +174,4 @@ def _numbers(values: Iterable[float]) -> str:
     return " ".join(f"{value:.9g}" for value in values)
 
 
-EXPORT = Export((".xml",), write_mitsuba, MITSUBA_FILES)
+EXPORTS["mitsuba"] = Export((".xml",), write_mitsuba, MITSUBA_FILES)

@@ -7,7 +7,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from nerfro.files.lat_long import save_lat_long
-from nerfro.viewing.exports import Export
+from nerfro.viewing.exports import EXPORTS, Export
 from nerfro.viewing.trained_scene import TrainedScene
 
 
@@ -18,4 +18,4 @@ def write_sky(scene: TrainedScene, out: Path, config: DictConfig) -> str:
     return f"the sky: {sky.shape[1]}x{sky.shape[0]} pixels, lat-long, z up"
 
 
-EXPORT = Export((".hdr", ".exr", ".png"), write_sky, unused=("half_depth",))
+EXPORTS["sky"] = Export((".hdr", ".exr", ".png"), write_sky, unused=("half_depth",))

@@ -7,7 +7,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from nerfro.files.cache import save_arrays
-from nerfro.viewing.exports import Export
+from nerfro.viewing.exports import EXPORTS, Export
 from nerfro.viewing.trained_scene import TrainedScene
 from nerfro.viewing.volume import RESOLUTION, sample_field
 
@@ -20,4 +20,4 @@ def write_volume(scene: TrainedScene, out: Path, config: DictConfig) -> str:
     return f"the inside: {'x'.join(map(str, volume.density.shape))} vertices with density and linear rgb"
 
 
-EXPORT = Export((".npz",), write_volume, unused=("half_depth", "sky"))
+EXPORTS["volume"] = Export((".npz",), write_volume, unused=("half_depth", "sky"))

@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from nerfro.core.errors import NerfroError
+from nerfro.core.optional import optional
 
 # Mean and standard deviation of the network's input, sRGB, as in its training.
 _MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
@@ -28,20 +29,17 @@ def load_tracker(folder: Path) -> Any:
     Raises:
         NerfroError: the package transformers is missing, or the folder contains no such network.
     """
-    try:
-        from transformers import Sam2VideoModel
-        from transformers.utils import logging
-    except ImportError as error:
-        raise NerfroError(f"sam2={folder} needs transformers ({error}); pip install 'nerfro[sam2]'") from error
+    transformers = optional("transformers", "sam2", f"sam2={folder} needs transformers")
     if not (folder / "config.json").is_file():
         raise NerfroError(
             f"sam2={folder} has no config.json; give a folder with the files config.json and model.safetensors of a "
             "Segment Anything 2 network in the format of transformers"
         )
+    logging = optional("transformers.utils", "sam2", "sam2= needs transformers").logging
     logging.set_verbosity_error()
     logging.disable_progress_bar()
     try:
-        model, found = Sam2VideoModel.from_pretrained(
+        model, found = transformers.Sam2VideoModel.from_pretrained(
             str(folder), local_files_only=True, use_safetensors=True, output_loading_info=True
         )
     except Exception as error:  # the library raises many kinds of exceptions for damaged files
@@ -75,12 +73,13 @@ def track_object(
     Returns:
         Mask of every image without a known mask.
     """
-    from transformers.models.sam2_video.modeling_sam2_video import Sam2VideoInferenceSession
-
+    sam2_video = optional("transformers.models.sam2_video.modeling_sam2_video", "sam2", "sam2= needs transformers")
     side = model.config.image_size
     height, width = images[0].shape[:2]
     frames = torch.cat([_network_input(image, side) for image in images])
-    session = Sam2VideoInferenceSession(frames, height, width, inference_device=model.device, dtype=frames.dtype)
+    session = sam2_video.Sam2VideoInferenceSession(
+        frames, height, width, inference_device=model.device, dtype=frames.dtype
+    )
     index = session.obj_id_to_idx(_OBJECT)
     for number, mask in masks.items():
         covered = interpolate(torch.from_numpy(mask)[None, None].float(), (side, side), mode="bilinear", antialias=True)

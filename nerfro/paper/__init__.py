@@ -10,7 +10,3 @@ The settings `+experiment=paper_*` and the baselines `nerf` and `mipnerf` use th
 
 Other losses and rendering are components of nerfro.
 """
-
-from nerfro.paper import eikonal, hierarchical, mip_nerf, nerf, skybox, smoothness, voxel_grid
-
-__all__ = ["eikonal", "hierarchical", "mip_nerf", "nerf", "skybox", "smoothness", "voxel_grid"]

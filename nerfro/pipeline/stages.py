@@ -17,7 +17,8 @@ from nerfro.files.reading import read_json
 from nerfro.pipeline.hypotheses import Hypothesis, hypotheses
 from nerfro.pipeline.options import common_options
 from nerfro.pipeline.stage import Stage, is_older, move_aside
-from nerfro.registry.registration import plugin_module
+from nerfro.poses import calibrated_data
+from nerfro.poses.collection import collect_photographs
 from nerfro.rendering.scene_file import OLD_SCENE, SCENE, SceneFile, read_scene_file
 from nerfro.silhouettes.overlaps import SHEET
 from nerfro.training.run_folder import CONFIG_FILE
@@ -31,7 +32,7 @@ _MASKS = ("masks/*", "masks/*/*", "mask_*", "*/mask_*")  # where loaders search 
 
 def calibrate(config: DictConfig, data: list[str], out: Path) -> list[str]:
     """Estimate the poses of the photographs, and return the options of the resulting data set."""
-    linked = plugin_module("camera_calibration.collection").collect_photographs(config, out)
+    linked = collect_photographs(config, out)
     if len(linked) < _MIN_PHOTOGRAPHS:
         raise NerfroError(
             f"{len(linked)} photographs do not determine poses and shape; take at least {_MIN_PHOTOGRAPHS}, "
@@ -43,8 +44,7 @@ def calibrate(config: DictConfig, data: list[str], out: Path) -> list[str]:
             "the photographs have no masks; add mask='view=true' to draw the outline of the object in two to five "
             f"images in the browser, outlines={{{linked[0].stem}:[[COLUMN,ROW],...],...}}, or masks=FOLDER"
         )
-    written = plugin_module("camera_calibration.calibrated_data")
-    report, plot = out / written.REPORT, out / written.PLOT
+    report, plot = out / calibrated_data.REPORT, out / calibrated_data.PLOT
     options = [*as_overrides({"images": out / "images", "out": out}), "target=colmap", "overwrite=true"]
     options += [text.removeprefix("data.") for text in data if text.startswith("data.mask_labels=")]
     Stage("calibrate", [*options, *shlex.split(config.calibrate)], report, plot).run()

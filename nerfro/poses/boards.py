@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from nerfro.core.errors import NerfroError
+from nerfro.core.optional import optional
 from nerfro.files.atomic import atomic_file
 
 Family = Literal["tag36h11", "tagStandard41h12"]
@@ -220,13 +221,10 @@ def draw_tag(family: Family, number: int) -> UInt8[np.ndarray, "side side"]:
 @functools.cache
 def tag_detector(family: Family) -> Any:
     """Return the pyapriltags.Detector of a family, which also holds the codes of the family."""
-    try:
-        from pyapriltags import Detector
-    except ImportError as error:
-        raise NerfroError(f"AprilTags need pyapriltags ({error}); pip install 'nerfro[capture]'") from error
+    pyapriltags = optional("pyapriltags", "capture", "AprilTags need pyapriltags")
     # pupil-apriltags is no alternative: its older library writes past its memory on images with much detail.
     # Decimation would be faster, but less accurate.
-    return Detector(families=family, nthreads=1, quad_decimate=1.0)
+    return pyapriltags.Detector(families=family, nthreads=1, quad_decimate=1.0)
 
 
 def _on_face(face: Face, places: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "points 3"]:

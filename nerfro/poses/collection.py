@@ -10,6 +10,7 @@ from omegaconf import DictConfig
 from PIL import ExifTags, Image, ImageOps
 
 from nerfro.core.errors import NerfroError, first_of, warn
+from nerfro.core.optional import optional
 from nerfro.core.paths import user_path
 from nerfro.core.progress import track
 from nerfro.data.frames import list_images
@@ -125,10 +126,7 @@ def _place_photograph(file: Path, folder: Path, replaces: bool) -> None:
         replaces: whether to replace a link to another file.
     """
     if file.suffix.lower() in HEIF_SUFFIXES:
-        try:
-            import pillow_heif
-        except ImportError as error:
-            raise NerfroError(f"{file} needs pillow-heif; pip install 'nerfro[capture]', or give JPEG files") from error
+        pillow_heif = optional("pillow_heif", "capture", f"{file} needs pillow-heif", ", or give JPEG files")
         pillow_heif.register_heif_opener()
     place, converted = folder / file.name, folder / f"{file.stem}.jpg"
     for existing in (place, converted):

@@ -2,18 +2,11 @@
 
 from __future__ import annotations
 
-import functools
 from types import ModuleType
 
-from nerfro.core.errors import NerfroError
+from nerfro.core.optional import optional
 
 
-@functools.cache
 def opencv() -> ModuleType:
     """Import OpenCV, or raise an error with the command that installs OpenCV."""
-    try:
-        import cv2
-    except ImportError as error:
-        message = f"OpenCV is needed ({error}); pip install 'nerfro[capture]', or opencv-python-headless"
-        raise NerfroError(message) from error
-    return cv2
+    return optional("cv2", "capture", "OpenCV is needed", ", or opencv-python-headless")

@@ -21,6 +21,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from nerfro.core.errors import NerfroError
+from nerfro.core.optional import optional
 from nerfro.core.paths import user_path
 from nerfro.core.progress import progress_bar, track
 from nerfro.data.formats.colmap_model import MODEL_FOLDERS, find_model_folder, lens_of, read_colmap
@@ -341,9 +342,6 @@ def _intrinsics(lens: Lens) -> Intrinsics:
 def require_pycolmap() -> Any:
     """Import pycolmap, or raise an error with the command that installs pycolmap."""
     handler = signal.getsignal(signal.SIGTERM)
-    try:
-        import pycolmap
-    except ImportError as error:
-        raise NerfroError(f"target=colmap needs pycolmap ({error}); pip install 'nerfro[capture]'") from error
+    pycolmap = optional("pycolmap", "capture", "target=colmap needs pycolmap")
     signal.signal(signal.SIGTERM, handler)  # the import replaces the handler by one for crashes
     return pycolmap

@@ -41,9 +41,9 @@ SEVERAL = ("loss", "phase", "callbacks")  # a run may have several plugins of th
 
 # Modules and packages with built-in plugins; `discover` imports all of them.
 _BUILT_IN = (
-    "camera", "media", "samplers.paths", "samplers.points", "fields", "boundaries", "losses", "models", "data",
-    "evaluation.image_metrics",
-    "training.phases",
+    "camera", "camera.refined", "media", "media.surfaces", "samplers.paths", "samplers.points", "fields", "boundaries",
+    "losses", "models", "paper", "data", "data.formats", "evaluation.image_metrics", "evaluation.perceptual",
+    "training.phases", "viewing.page", "exports",
 )  # fmt: skip
 ENTRY_POINTS = "nerfro.plugins"
 
@@ -328,22 +328,6 @@ def discover(plugins_dir: Path = PLUGINS_DIR) -> None:
         _discovered.add("built-in")
     for folder in plugin_folders(plugins_dir):
         _import_folder(folder)
-
-
-def plugin_module(name: str) -> types.ModuleType:
-    """Import a module of a local plugin by its place in `plugins/`, such as `synthetic_scenes.synthesis`.
-
-    Raises:
-        NerfroError: the plugin is not installed.
-    """
-    discover()
-    plugin, full_name = name.partition(".")[0], f"{PLUGINS_PACKAGE}.{name}"
-    try:
-        return importlib.import_module(full_name)
-    except ModuleNotFoundError as error:
-        if error.name is None or not f"{full_name}.".startswith(f"{error.name}."):
-            raise
-        raise NerfroError(f"{PLUGINS_DIR} lacks the plugin {plugin}; install nerfro again") from error
 
 
 def plugin_folders(plugins_dir: Path = PLUGINS_DIR) -> list[Path]:

@@ -2,8 +2,3 @@
 
 See docs/guides/synthetic_scenes.md.
 """
-
-from nerfro.synthetic.options import SCENES
-
-for name in ("torus", "ship", "deerglobe", "starlamp", "dolphin_capture"):
-    SCENES[name] = f"{__name__}.scenes.{name}"

@@ -5,6 +5,9 @@ from __future__ import annotations
 import functools
 from typing import Any
 
+from nerfro.core.optional import optional
+from nerfro.synthetic.llvm import PURPOSE
+
 PLUGIN = "transmitting_glass"
 EMBEDDED = "embedded_in_glass"
 
@@ -24,9 +27,7 @@ def register_materials(variant: str) -> None:
     `embedded_in_glass` is the nested BSDF of an object inside the body, attenuated in the same way (`absorption`).
     Together, the two materials attenuate every segment of a path inside the body at its end.
     """
-    import drjit as dr
-    import mitsuba as mi
-
+    dr, mi = (optional(name, "synthesize", PURPOSE) for name in ("drjit", "mitsuba"))
     mi.register_bsdf(PLUGIN, _transmitting_glass(mi, dr))
     mi.register_bsdf(EMBEDDED, _embedded_in_glass(mi, dr))
 

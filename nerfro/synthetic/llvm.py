@@ -15,6 +15,9 @@ import sys
 from collections.abc import Iterable
 from pathlib import Path
 
+from nerfro.core.optional import optional
+
+PURPOSE = "rendering ground truth needs Mitsuba 3"
 MIN_VERSION = 16
 HINT = (
     f"install LLVM {MIN_VERSION} or newer (Debian: apt-get install libllvm19; Linux on x86-64: pip install "
@@ -59,8 +62,7 @@ def missing_llvm() -> str | None:
 
     The reason concerns the library that Dr.Jit has loaded. `select_llvm` chooses the library.
     """
-    import drjit
-
+    drjit = optional("drjit", "synthesize", PURPOSE)
     if not drjit.has_backend(drjit.JitBackend.LLVM):
         return "Dr.Jit finds no usable LLVM library"
     version = int(re.findall(r"\d+", str(drjit.detail.llvm_version()))[0])

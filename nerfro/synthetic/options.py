@@ -1,17 +1,14 @@
-"""Names of synthetic scenes, and options of `nerfro.synthesize`; `nerfro/synthetic/` renders the scenes."""
+"""Options of `nerfro.synthesize`."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Optional
+from typing import Annotated, Optional
 
-from omegaconf import MISSING, DictConfig
+from omegaconf import MISSING
 
 from nerfro.registry.allowed import Count, Names, Natural, NotNegative, Positive, Range
-from nerfro.registry.registration import plugin_module
-
-SCENES: dict[str, str] = {}
-"""Module of each scene, by name; plugins add scenes. `build(spacing)` of the module returns the `SyntheticScene`."""
+from nerfro.synthetic.scenes import SCENES
 
 SceneName = Annotated[str, Names(lambda: SCENES)]
 
@@ -45,18 +42,3 @@ class SynthesizeConfig:
     extras: bool = MISSING
     variant: str = MISSING
     overwrite: bool = MISSING
-
-
-def synthesize(config: DictConfig) -> Any:
-    """Render the missing images of a data set.
-
-    Args:
-        config: resolved `SynthesizeConfig`.
-
-    Returns:
-        The data set, a `DataSet` of the renderer.
-
-    Raises:
-        NerfroError: Mitsuba is missing, or `out` contains another data set or other files.
-    """
-    return plugin_module("synthetic_scenes.synthesis").synthesize(config)

@@ -12,6 +12,7 @@ import numpy as np
 
 from nerfro.core.errors import NerfroError
 from nerfro.core.light import to_linear
+from nerfro.core.optional import optional
 from nerfro.synthetic import llvm
 from nerfro.synthetic.glass import EMBEDDED, PLUGIN, register_materials
 from nerfro.synthetic.scene import Panel, Sky, SyntheticScene
@@ -42,14 +43,7 @@ def load_mitsuba(variant: str = "auto") -> ModuleType:
     if variant not in ("auto", *VARIANTS):
         raise NerfroError(f"unknown Mitsuba variant '{variant}'; choose auto, {', '.join(VARIANTS)}")
     llvm.select_llvm()
-    try:
-        import drjit
-        import mitsuba
-    except ImportError as error:
-        raise NerfroError(
-            f"rendering ground truth needs Mitsuba 3, which cannot be imported ({error}); "
-            "install it with: pip install 'nerfro[synthesize]'"
-        ) from error
+    drjit, mitsuba = (optional(name, "synthesize", llvm.PURPOSE) for name in ("drjit", "mitsuba"))
     chosen, reason = variant, llvm.missing_llvm()
     if variant == "auto":
         cuda = drjit.has_backend(drjit.JitBackend.CUDA)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -13,23 +12,21 @@ from nerfro.core.errors import NerfroError
 from nerfro.core.paths import user_path
 from nerfro.core.progress import progress_bar
 from nerfro.files.folder_lock import lock_folder
-from nerfro.registry.registration import discover
 from nerfro.synthetic.dataset import DataSet, ViewSplits
-from nerfro.synthetic.options import SCENES
 from nerfro.synthetic.path_tracer import PathTracer, load_mitsuba
 from nerfro.synthetic.scene import SyntheticScene
+from nerfro.synthetic.scenes import SCENES
 
 
 def find_scene(name: str) -> ModuleType:
-    """Import the module of a scene.
+    """Return the module of a scene.
 
     Raises:
         NerfroError: the name is unknown.
     """
-    discover()
     if name not in SCENES:
         raise NerfroError(f"unknown scene '{name}'; choose one of {', '.join(SCENES)}")
-    return importlib.import_module(SCENES[name])
+    return SCENES[name]
 
 
 def data_set_type(scene: ModuleType) -> type[DataSet]:

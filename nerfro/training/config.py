@@ -15,8 +15,7 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from nerfro.core.errors import NerfroError
-from nerfro.core.paths import resolve_path, scene_name
-from nerfro.core.subdivision import Subdivision
+from nerfro.core.paths import CONF_DIR, resolve_path, scene_name
 from nerfro.data.base import DataSource, Views
 from nerfro.data.validation_views import WithValidationViews
 from nerfro.evaluation.results import Region
@@ -38,7 +37,7 @@ from nerfro.registry.allowed import (
 )
 from nerfro.registry.registration import build, check_node, configure, create, find, plugins, require_lightning
 from nerfro.rendering import Components, Renderer
-from nerfro.synthetic.options import SCENES
+from nerfro.samplers.subdivision import Subdivision
 from nerfro.training.angular_resolution import derive_angular_resolution
 from nerfro.training.backdrop import derive_backdrop
 from nerfro.training.content import ContentConfig, derive_content, derive_unit, require_contraction
@@ -313,7 +312,7 @@ def build_data(config: DictConfig) -> DataSource:
         NerfroError: there is no data; for a synthetic scene the message names the command that renders the scene.
     """
     scene, root = scene_name(config.data.root), resolve_path(config.data.root)
-    if scene in SCENES and not root.exists():
+    if not root.exists() and (CONF_DIR / "scene" / f"{scene}.yaml").is_file():
         small = "resolution=128 spp=256 test_spp=1024 views.val=10 views.test=20"
         raise NerfroError(
             f"{root} holds no data yet; run python -m nerfro.synthesize scene={scene} out={root} {small} first"

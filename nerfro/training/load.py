@@ -9,9 +9,9 @@ import torch
 from omegaconf import DictConfig
 
 from nerfro.core.paths import user_path
-from nerfro.core.subdivision import Subdivision
 from nerfro.evaluation.request import find_device
 from nerfro.registry.registration import discover
+from nerfro.samplers.subdivision import Subdivision
 from nerfro.training.config import build_data
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint, restore
 from nerfro.viewing.trained_scene import TrainedScene

@@ -26,7 +26,8 @@ from nerfro.files.atomic import write_atomically
 from nerfro.files.reading import is_number, parse_matrix, read_json
 from nerfro.viewing.camera_paths import CaptureGeometry
 
-# Names of the nine coefficients (`nerfro.core.lens`) without and with a denominator. OpenCV's rational model has no r^8.
+# Names of the nine coefficients (`nerfro.core.lens`) without and with a denominator. OpenCV's rational model has no
+# r^8.
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 _RATIONAL = ("k1", "k2", "k3", "", "p1", "p2", "k4", "k5", "k6")
 

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,10 +14,9 @@ from omegaconf import MISSING, DictConfig
 from nerfro.core.errors import NerfroError
 from nerfro.registry.allowed import Count, Names, Positive
 from nerfro.registry.registration import discover
-from nerfro.viewing import PLUGIN_EXPORTS
 from nerfro.viewing.trained_scene import TrainedScene
 
-ExportName = Annotated[str, Names(lambda: PLUGIN_EXPORTS)]
+ExportName = Annotated[str, Names(lambda: EXPORTS)]
 
 
 @dataclass
@@ -61,6 +59,10 @@ class Export:
         return [out, *(out.with_name(out.stem + ending) for ending in self.companions)]
 
 
+EXPORTS: dict[str, Export] = {}
+"""Exports by the name in `what=`; modules that `discover` imports add theirs."""
+
+
 def find_export(what: str, out: Path) -> Export:
     """Return the export of a name, and check the ending of the output file.
 
@@ -77,13 +79,12 @@ def export_of(what: str) -> Export:
     """Return the export of a name.
 
     Raises:
-        NerfroError: the name is unknown, or the module of the plugin defines no export.
+        NerfroError: the name is unknown, or a plugin has added another object than an `Export`.
     """
     discover()
-    if what not in PLUGIN_EXPORTS:
-        raise NerfroError(f"what={what} is not known; choose {', '.join(PLUGIN_EXPORTS)}")
-    module = importlib.import_module(PLUGIN_EXPORTS[what])
-    export = getattr(module, "EXPORT", None)
+    if what not in EXPORTS:
+        raise NerfroError(f"what={what} is not known; choose {', '.join(EXPORTS)}")
+    export = EXPORTS[what]
     if not isinstance(export, Export):
-        raise NerfroError(f"the plugin {module.__file__} of what={what} defines no EXPORT, an exports.Export")
+        raise NerfroError(f"EXPORTS[{what!r}] of a plugin is {export!r}; make it an Export of endings and a function")
     return export

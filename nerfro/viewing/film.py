@@ -14,6 +14,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from nerfro.core.errors import NerfroError
+from nerfro.core.optional import optional
 from nerfro.files.atomic import atomic_file, write_atomically
 
 # Constant rate factor of H.264: 0 is lossless, 18 is visually lossless, 51 is the worst.
@@ -45,15 +46,11 @@ def find_ffmpeg() -> str:
     """
     if (found := shutil.which("ffmpeg")) is not None:
         return found
+    purpose, alternative = "a film in .mp4 format needs ffmpeg", ", or install ffmpeg, or set film=[gif] or film=[]"
     try:
-        from imageio_ffmpeg import get_ffmpeg_exe
-
-        return get_ffmpeg_exe()
-    except (ImportError, RuntimeError) as error:
-        raise NerfroError(
-            "a film in .mp4 format needs ffmpeg, which is not installed; install ffmpeg, or pip install "
-            "'nerfro[video]', or set film=[gif] or film=[]"
-        ) from error
+        return optional("imageio_ffmpeg", "video", purpose, alternative).get_ffmpeg_exe()
+    except RuntimeError as error:
+        raise NerfroError(f"{purpose} ({error}); pip install 'nerfro[video]'{alternative}") from error
 
 
 def _write_mp4(file: Path, frames: Sequence[Path], seconds: float) -> None:

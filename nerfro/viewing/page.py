@@ -22,7 +22,7 @@ from nerfro.files.images import data_uri, to_8bit
 from nerfro.files.templates import fill_template
 from nerfro.rendering import ColourSpace
 from nerfro.viewing.baking import Baked, bake_sky, bake_surface, bake_volume
-from nerfro.viewing.exports import Export
+from nerfro.viewing.exports import EXPORTS, Export
 from nerfro.viewing.trained_scene import TrainedScene
 from nerfro.viewing.volume import MIN_OPTICAL_DEPTH, RESOLUTION, sample_field
 
@@ -161,4 +161,4 @@ def _write(scene: TrainedScene, out: Path, config: DictConfig) -> str:
     return f"an interactive page of {len(page) / 1e6:.1f} MB"
 
 
-EXPORT = Export((".html",), _write, unused=("half_depth",))
+EXPORTS["page"] = Export((".html",), _write, unused=("half_depth",))

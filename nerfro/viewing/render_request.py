@@ -19,10 +19,10 @@ from nerfro.core.cameras import Cameras
 from nerfro.core.errors import NerfroError
 from nerfro.core.lens import distort, fold_radius
 from nerfro.core.paths import user_path
-from nerfro.core.subdivision import SubdivisionChanges
 from nerfro.core.variants import variant
 from nerfro.data.lenses import Lens, check_lenses
 from nerfro.registry.allowed import Count, Positive, Range, refuse_unused
+from nerfro.samplers.subdivision import SubdivisionChanges
 from nerfro.viewing.camera_files import read_cameras
 from nerfro.viewing.camera_paths import PATHS, CaptureGeometry, OrbitPosition, path_cameras
 from nerfro.viewing.trained_scene import TrainedScene

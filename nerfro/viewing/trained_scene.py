@@ -15,7 +15,6 @@ from nerfro.core.cameras import Cameras
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import user_path
 from nerfro.core.progress import track
-from nerfro.core.subdivision import Subdivision
 from nerfro.core.types import Exits
 from nerfro.core.variants import variant
 from nerfro.data.base import DataSource, Views
@@ -26,6 +25,7 @@ from nerfro.files.images import data_uri, to_8bit
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.rendering import Renderer
 from nerfro.samplers.paths.snell import Snell
+from nerfro.samplers.subdivision import Subdivision
 from nerfro.viewing.changes import with_absorption, with_indices, with_sky, without_glass, without_inside
 from nerfro.viewing.surface import surface_of
 

@@ -10,8 +10,7 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from torch.optim import Optimizer
 
-from nerfro.registry.allowed import Count
-from nerfro.registry.registration import register
+from nerfro.parts import Count, register
 
 
 @register("callbacks", "gradient_norm")

@@ -10,10 +10,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from nerfro.files.atomic import write_atomically
-from nerfro.viewing import PLUGIN_EXPORTS
-from nerfro.viewing.exports import Export
-from nerfro.viewing.trained_scene import TrainedScene
+from nerfro.parts import EXPORTS, Export, TrainedScene, write_atomically
 
 
 def write_centres(scene: TrainedScene, out: Path, config: DictConfig) -> str:
@@ -23,5 +20,4 @@ def write_centres(scene: TrainedScene, out: Path, config: DictConfig) -> str:
     return f"the centres of {len(centres)} cameras"
 
 
-PLUGIN_EXPORTS["cameras"] = __name__  # `what=cameras`; the command looks for EXPORT in this module
-EXPORT = Export((".csv",), write_centres)
+EXPORTS["cameras"] = Export((".csv",), write_centres)

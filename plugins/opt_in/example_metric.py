@@ -8,8 +8,7 @@ from __future__ import annotations
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerfro.evaluation.image_metrics import ImageMetric
-from nerfro.registry.registration import register
+from nerfro.parts import ImageMetric, register
 
 
 @register("metric", "mean_absolute_error")

@@ -4,7 +4,7 @@ import torch
 
 from nerfro.boundaries.constant import ConstantBoundary
 from nerfro.core.types import Exits
-from tests.paper import Skybox
+from nerfro.paper.skybox import Skybox
 
 
 def test_published_skybox_has_its_layers() -> None:

@@ -9,6 +9,11 @@ import trimesh
 from torch import Tensor
 
 from benchmarks.cameras import disturbed
+from nerfro.camera.refined import gauss_newton
+from nerfro.camera.refined.least_squares import PriorInformation
+from nerfro.camera.refined.outlines import align_to_outlines
+from nerfro.camera.refined.panorama import align
+from nerfro.camera.refined.refined import RefinedCamera
 from nerfro.camera.similarity import motion_between
 from nerfro.core.cameras import Cameras
 from nerfro.core.light import to_linear, to_srgb
@@ -18,7 +23,6 @@ from nerfro.geometry.mesh import TriangleMesh
 from nerfro.samplers.paths.snell import Snell
 from nerfro.silhouettes.visual_hull import Silhouettes
 from tests.ball_photographs import BOX, NUM_VIEWS, RADIUS, SIZE, cameras, photographs, sky, soft_masks, solid
-from tests.camera.refined_cameras import PriorInformation, RefinedCamera, align, align_to_outlines, gauss_newton
 from tests.conftest import refused
 from tests.pretended_gpu import GPU, PretendedGpu
 

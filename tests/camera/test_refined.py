@@ -7,10 +7,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from nerfro.camera.refined import pixel_units, refined
 from nerfro.camera.similarity import Similarity, motion_between, similarity
 from nerfro.core.cameras import Cameras
 from nerfro.core.lens import coefficients
-from tests.camera.refined_cameras import phase, pixel_units, refined
+from nerfro.training.phases import cameras as phase
 
 NUM_VIEWS, SIZE = 8, 20
 

@@ -4,7 +4,6 @@ import json
 import math
 import shutil
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -14,6 +13,7 @@ from benchmarks.cameras import disturbed
 from nerfro.camera.similarity import motion_between
 from nerfro.core.light import to_linear, to_srgb
 from nerfro.data.blender import BlenderData
+from nerfro.data.formats.nerfstudio import NerfstudioData
 from nerfro.evaluation.results import read_metrics_json
 from nerfro.files.images import save_png
 from nerfro.geometry.mesh import load_mesh
@@ -25,7 +25,6 @@ from tests.ball_photographs import TRAINING, photographs, save
 from tests.conftest import Runner, weights_of
 
 discover()
-NerfstudioData = import_module("nerfro.data.formats.nerfstudio").NerfstudioData
 
 # A scene of a few steps has slopes for cameras to go by.
 LEARNED_SKY = ["optimizer.groups={background.*: {learning_rate: 0.1, start: 0}}", "optimizer.warmup_steps=0"]

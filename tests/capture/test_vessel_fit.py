@@ -11,18 +11,16 @@ from torch import Tensor
 from nerfro.boundaries.base import Boundary
 from nerfro.capture.object_errors import unsupported_bodies
 from nerfro.capture.surroundings import Observations, Pixels, Surroundings
-from nerfro.core.subdivision import pixel_rays
+from nerfro.capture.vessel_fit import fit_vessel
 from nerfro.core.types import Exits
 from nerfro.data.base import Views
 from nerfro.geometry.mesh import load_mesh
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.solid import Solid
-from nerfro.registry.registration import plugin_module
 from nerfro.samplers.paths.snell import Snell
+from nerfro.samplers.subdivision import pixel_rays
 from tests.ball_photographs import NUM_VIEWS, SIZE, cameras, sky
 from tests.media.vessels import SdfVessel
-
-fit_vessel = plugin_module("vessels.fit").fit_vessel
 
 RADIUS, HEIGHT, NUM_PIXELS = 0.45, 1.0, 1000
 # A larger fillet and a thicker foot have similar effects.

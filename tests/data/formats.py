@@ -7,7 +7,6 @@ import json
 import struct
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,9 @@ from scipy.spatial.transform import Rotation
 
 from nerfro.data.base import DataSource, Views
 from nerfro.data.blender import BlenderData, OpenCVData
-from nerfro.registry.registration import discover
+from nerfro.data.formats import colmap_model, idr, llff, refref
+from nerfro.data.formats.colmap import ColmapData
+from nerfro.data.formats.nerfstudio import NerfstudioData
 
 from .photographs import (
     CX,
@@ -34,13 +35,6 @@ from .photographs import (
     save_picture,
     world_to_camera,
 )
-
-discover()
-NAMES = ("colmap", "colmap_model", "idr", "llff", "nerfstudio", "refref")
-_MODULES = [import_module(f"nerfro.data.formats.{name}") for name in NAMES]
-colmap, colmap_model, idr, llff, nerfstudio, refref = _MODULES
-ColmapData, NerfstudioData = colmap.ColmapData, nerfstudio.NerfstudioData
-CAMERA_MODELS = colmap_model.CAMERA_MODELS
 
 TRAIN, TEST = (1, 2, 4, 5), (0, 3)
 IDEAL = (FX, FX, WIDTH / 2, HEIGHT / 2)
@@ -131,7 +125,7 @@ def write_colmap(
 
 
 def _write_colmap_binary(folder: Path, cameras: dict, images: list, points: np.ndarray) -> None:
-    numbers = {name: i for i, (name, _) in enumerate(CAMERA_MODELS)}
+    numbers = {name: i for i, (name, _) in enumerate(colmap_model.CAMERA_MODELS)}
     content = struct.pack("<Q", len(cameras))
     for number, (model, params) in cameras.items():
         content += struct.pack(f"<iiQQ{len(params)}d", number, numbers[model], WIDTH, HEIGHT, *params)

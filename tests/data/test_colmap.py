@@ -15,9 +15,11 @@ from omegaconf import OmegaConf
 
 from nerfro.core.errors import NerfroError
 from nerfro.data.base import Views
+from nerfro.data.formats import colmap_model
+from nerfro.data.formats.colmap_model import CAMERA_MODELS
 from tests.conftest import SMALL, refused
 
-from .formats import BROWN, CAMERA_MODELS, FORMATS, OPENCV, TRAIN, colmap_model, write_colmap
+from .formats import BROWN, FORMATS, OPENCV, TRAIN, write_colmap
 from .photographs import CX, CY, FX, FY, HEIGHT, POINTS, WIDTH, camera_to_world, check_views, project, save_picture
 
 TORCH_POINTS = torch.from_numpy(POINTS).float()

@@ -9,9 +9,10 @@ import pytest
 import torch
 
 from nerfro.data.base import Views
+from nerfro.data.formats import idr
 from tests.conftest import refused
 
-from .formats import SCALE, SHIFT, idr, write_idr
+from .formats import SCALE, SHIFT, write_idr
 from .photographs import POINTS, picture, save_mask
 
 IdrData, decompose = idr.IdrData, idr.decompose

@@ -9,9 +9,10 @@ import pytest
 import torch
 
 from nerfro.data.base import Views
+from nerfro.data.formats import llff
 from tests.conftest import refused
 
-from .formats import FAR, IDEAL, NEAR, llff, write_llff
+from .formats import FAR, IDEAL, NEAR, write_llff
 from .photographs import FX, HEIGHT, POINTS, WIDTH, project
 
 LlffData, frame_transform = llff.LlffData, llff.frame_transform

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from nerfro.core.errors import NerfroError
+from nerfro.data.formats import refref
 from tests.conftest import refused
 
-from .formats import REFREF_LENS, few_refref_views, refref, write_refref  # noqa: F401
+from .formats import REFREF_LENS, few_refref_views, write_refref  # noqa: F401
 from .photographs import check_views
 
 RefRefData = refref.RefRefData

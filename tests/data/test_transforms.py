@@ -14,6 +14,7 @@ from PIL import Image
 from nerfro.core.errors import NerfroError
 from nerfro.data.base import Views
 from nerfro.data.blender import BlenderData, OpenCVData
+from nerfro.data.formats.nerfstudio import NerfstudioData
 from tests.conftest import refused
 
 from .formats import (
@@ -21,7 +22,6 @@ from .formats import (
     IDEAL,
     SHARED,
     K,
-    NerfstudioData,
     P,
     change_json,
     write_blender,

@@ -1,4 +1,3 @@
-from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -8,13 +7,13 @@ from torch import Tensor
 from nerfro.evaluation.error_maps import squared_error_map, triptych
 from nerfro.evaluation.error_sheets import error_maps, write_error_sheet
 from nerfro.evaluation.image_metrics import ImageMetric, build_metrics, psnr
+from nerfro.evaluation.perceptual.flip import flip
 from nerfro.evaluation.ssim import ssim
 from nerfro.files.drawing import magma
 from nerfro.files.images import load_png, round_to_8bit
 from nerfro.registry.registration import discover
 
 discover()
-flip = import_module("nerfro.evaluation.perceptual.flip").flip
 
 
 class Difference(torch.nn.Module):

@@ -1,4 +1,3 @@
-from importlib import import_module
 from pathlib import Path
 from typing import NamedTuple
 
@@ -6,12 +5,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from nerfro.evaluation.perceptual import lpips, pretrained
 from nerfro.registry.registration import discover
 from tests.conftest import refused
 from tests.processes import printed_by
 
 discover()
-pretrained, lpips = (import_module(f"nerfro.evaluation.perceptual.{name}") for name in ("pretrained", "lpips"))
 CONVOLUTIONS, Lpips, LpipsNetwork = lpips.CONVOLUTIONS, lpips.Lpips, lpips.LpipsNetwork
 load_lpips_network = lpips.load_lpips_network
 

@@ -1,7 +1,6 @@
 """Metrics of images against other packages, and scores of views and regions."""
 
 import math
-from importlib import import_module
 from pathlib import Path
 
 import flip_evaluator
@@ -16,6 +15,7 @@ from torchmetrics.functional.image import structural_similarity_index_measure
 import nerfro
 from nerfro.evaluation.image_metrics import psnr
 from nerfro.evaluation.metrics import ImageMetrics
+from nerfro.evaluation.perceptual import flip as flips
 from nerfro.evaluation.regions import crop_rectangle, mean_over, object_pixels
 from nerfro.evaluation.results import EvaluationResult
 from nerfro.evaluation.ssim import ssim, ssim_map
@@ -24,7 +24,6 @@ from nerfro.registry.registration import discover
 from tests.conftest import refused
 
 discover()
-flips = import_module("nerfro.evaluation.perceptual.flip")
 flip, flip_map = flips.flip, flips.flip_map
 
 

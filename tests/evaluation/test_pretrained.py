@@ -4,7 +4,6 @@ import io
 import socket
 import threading
 from collections.abc import Iterator
-from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -12,11 +11,11 @@ import torch
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from nerfro.evaluation.perceptual import pretrained
 from nerfro.registry.registration import discover
 from tests.conftest import refused
 
 discover()
-pretrained = import_module("nerfro.evaluation.perceptual.pretrained")
 ALEXNET, load_weights, unreachable = pretrained.ALEXNET, pretrained.load_weights, pretrained.unreachable
 
 WEIGHTS = {"features.0.weight": torch.arange(6.0)}

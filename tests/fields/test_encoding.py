@@ -6,10 +6,11 @@ import pytest
 import torch
 
 from nerfro.core.types import Rays, Samples
+from nerfro.paper.encoding import integrated_positional_encoding, positional_encoding
+from nerfro.paper.mip_nerf import frustum_gaussians
 from nerfro.samplers.paths.straight import straight_path
 from nerfro.samplers.points.stratified import cone_samples
 from nerfro.testing import example_path
-from tests.paper import frustum_gaussians, integrated_positional_encoding, positional_encoding
 
 
 def test_order_is_identity_then_all_sines_then_all_cosines_octave_by_octave() -> None:

@@ -12,8 +12,8 @@ from torch import Tensor, nn
 
 from nerfro.fields.relu_mlp import relu_mlp
 from nerfro.kernels import threads
+from nerfro.paper.linear import Linear
 from tests.gradients import require_equal_gradients
-from tests.paper import Linear
 
 
 def layers(*widths: int) -> nn.Sequential:

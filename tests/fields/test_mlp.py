@@ -7,10 +7,12 @@ import torch
 
 from nerfro.core.light import to_srgb
 from nerfro.fields.networks import compile_networks, radiance
+from nerfro.paper.mip_nerf import MipNerfField
+from nerfro.paper.mlp import RGB_PADDING, RadianceMLP, SkipMLP, padded_sigmoid
+from nerfro.paper.nerf import NerfField
 from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import example_path, example_samples
 from tests.gradients import require_equal_gradients
-from tests.paper import RGB_PADDING, MipNerfField, NerfField, RadianceMLP, SkipMLP, padded_sigmoid
 
 
 def test_forward_equals_a_slow_loop_over_layers() -> None:

@@ -26,20 +26,21 @@ import trimesh
 from omegaconf import OmegaConf
 from PIL import Image
 
+from nerfro.data.formats import refref
 from nerfro.data.image_files import read_levels, read_mask
 from nerfro.evaluation.results import EvaluationResult, RunMetrics, ViewScores, read_metrics_json, write_metrics_json
 from nerfro.files import lat_long
 from nerfro.files.foreign_config import read_foreign_config
 from nerfro.files.reading import load_array
 from nerfro.geometry.mesh import load_mesh
+from nerfro.masks.mask_files import read_outlines
 from nerfro.rendering.scene_file import with_scene
 from nerfro.samplers.paths.traced_file import read_rays
 from nerfro.training.load import scene_of
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
 from nerfro.training.settings import Role, settings
-from tests.data.formats import FORMATS, refref
+from tests.data.formats import FORMATS
 from tests.fuzz.world import World
-from tests.masks.object_masks import read_outlines
 
 _number = itertools.count()
 

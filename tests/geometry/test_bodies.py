@@ -10,8 +10,8 @@ import trimesh
 from nerfro.geometry.bodies import bodies_of, require_separate
 from nerfro.geometry.mesh import TriangleMesh, load_mesh, merge_vertices
 from nerfro.media.sdf_grid import SdfGrid
+from nerfro.paper.voxel_grid import VoxelGrid
 from tests.conftest import refused
-from tests.paper import VoxelGrid
 
 BOX = {"box_min": [-1.5] * 3, "box_max": [1.5] * 3, "resolution": 24, "cache": False}
 

@@ -1,18 +1,17 @@
 """The distortion loss against its definition."""
 
-from importlib import import_module
 from unittest.mock import Mock
 
 import pytest
 import torch
 
 from nerfro.core.types import Path, Rendering, Samples
+from nerfro.losses import distortion as plugin
 from nerfro.registry.registration import discover
 from nerfro.rendering import Scene
 from nerfro.testing import example_batch
 
 discover()
-plugin = import_module("nerfro.losses.distortion")
 Distortion, distortion = plugin.Distortion, plugin.distortion
 
 SCENE = Mock(spec=Scene)

@@ -16,11 +16,12 @@ from nerfro.losses.boundary import BoundaryRegularizer
 from nerfro.losses.photometric import Photometric
 from nerfro.losses.total_variation import TotalVariation, direction_pairs
 from nerfro.models.refractive import RefractiveModel
+from nerfro.paper.smoothness import Smoothness, tile_roughness
 from nerfro.registry.registration import create, find
 from nerfro.rendering import ColourSpace, Renderer, Scene
 from nerfro.samplers.points.stratified import point_samples
 from nerfro.testing import NUM_RAYS, example_batch, example_components, example_draws, example_path, example_rendering
-from tests.paper import Smoothness, small_components, tile_roughness
+from tests.paper import small_components
 
 
 @pytest.fixture(scope="module")

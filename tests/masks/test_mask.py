@@ -19,8 +19,9 @@ pytest.importorskip("cv2")
 from nerfro.core.cameras import Cameras
 from nerfro.data.blender import OpenCVData
 from nerfro.data.masks import method_of
+from nerfro.masks import mask_files
+from nerfro.masks.masking import polygon_mask, propagate
 from tests.forked import Command
-from tests.masks.object_masks import mask_files, polygon_mask, propagate
 from tests.sheet_photographs import look_at
 from tests.viewing.browser import Browser, needs_chromium
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
+from nerfro.masks.tracking import load_tracker, track_object
 from tests.conftest import refused
-from tests.masks.object_masks import load_tracker, track_object
 
 SIDE, HIDDEN = 64, 128
 MASK = np.zeros((30, 40), bool)

@@ -10,13 +10,13 @@ from torch import Tensor
 from nerfro.core.types import FieldValues, Path, Rays
 from nerfro.media.shapes import Ball
 from nerfro.models.refractive import RefractiveModel
+from nerfro.paper.eikonal import Eikonal
 from nerfro.rendering import composite
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.points.stratified import point_samples
 from nerfro.testing import example_components, example_rays
 from tests.closed_forms import beam, random_rays
 from tests.conftest import refused
-from tests.paper import Eikonal
 from tests.samplers.nested import NestedBalls, nested_grid, nested_mesh
 
 SIGMA = [0.3, 1.0, 2.5]

@@ -15,10 +15,10 @@ from nerfro.core.types import Path as RayPath
 from nerfro.core.types import Rays
 from nerfro.media.material import MATERIALS
 from nerfro.media.sdf_grid import SdfGrid
+from nerfro.paper.eikonal import Eikonal
 from nerfro.samplers.paths.snell import Snell, trace_interfaces
 from tests.closed_forms import angle, ball_exits, make_rays
 from tests.conftest import refused
-from tests.paper import Eikonal
 
 CENTRES = ((-10.0, 0.0, 0.0), (10.0, 0.0, 0.0))  # of balls of radius 1
 

@@ -8,14 +8,12 @@ import torch
 import trimesh
 
 from nerfro.geometry.mesh import load_mesh
-from nerfro.registry.registration import plugin_module
+from nerfro.media.lids import find_lid
 from nerfro.samplers.paths.snell import Snell, trace_interfaces
 from nerfro.viewing.surface import surface_of
 from tests.closed_forms import angle, make_rays
 from tests.conftest import refused
 from tests.media.vessels import RADIUS, WALL, SdfVessel, exit_directions, spherical_vessel
-
-find_lid = plugin_module("vessels.lids").find_lid
 
 # A glass: its height, its radii below and above, its wall.
 HEIGHT, BELOW, ABOVE, THIN = 1.6, 0.4, 0.55, 0.05

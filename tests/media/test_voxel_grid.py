@@ -7,9 +7,9 @@ import torch
 import trimesh
 
 from nerfro.core.errors import NerfroError
+from nerfro.paper.voxel_grid import VoxelGrid, gradient
 from tests.closed_forms import grid_points
 from tests.conftest import refused
-from tests.paper import VoxelGrid, gradient
 
 BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
 

@@ -6,9 +6,8 @@ import numpy as np
 import trimesh
 from jaxtyping import Bool, Float
 
-from nerfro.registry.registration import plugin_module
+from nerfro.media.vessel import SdfVessel
 
-SdfVessel = plugin_module("vessels.vessel").SdfVessel
 RADIUS, WALL = 0.8, 0.1
 GLASS, WATER = 1.5, 1.333
 

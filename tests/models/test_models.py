@@ -9,10 +9,11 @@ from torch import Tensor
 from nerfro.boundaries.base import Boundary
 from nerfro.core.types import Exits
 from nerfro.models.refractive import RefractiveModel
+from nerfro.paper.mip_nerf import MipNerfModel
 from nerfro.rendering import Components
 from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import example_rays
-from tests.paper import MipNerfModel, small_components
+from tests.paper import small_components
 
 
 class Compass(Boundary):

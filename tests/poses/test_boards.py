@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.poses.camera_calibration import draw_tag, tag_grid, twelve_faces
+from nerfro.poses.boards import draw_tag, tag_grid, twelve_faces
 
 
 def test_board_positions_match_the_authors() -> None:

@@ -13,16 +13,10 @@ pytest.importorskip("cv2")
 pytest.importorskip("pyapriltags")
 
 from nerfro.data.blender import OpenCVData
-from tests.poses.camera_calibration import (
-    TagBoard,
-    TagDetections,
-    calibrate,
-    calibration,
-    luminance,
-    photographs,
-    tag_grid,
-    twelve_faces,
-)
+from nerfro.poses import calibration, photographs
+from nerfro.poses.boards import TagBoard, TagDetections, tag_grid, twelve_faces
+from nerfro.poses.calibration import calibrate
+from nerfro.poses.photographs import luminance
 from tests.sheet_photographs import angle, around, photograph
 
 SIZE = (640, 480)

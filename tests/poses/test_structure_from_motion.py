@@ -20,8 +20,10 @@ pytest.importorskip("pycolmap")
 
 import pycolmap
 
+from nerfro.poses import structure_from_motion
+from nerfro.poses.boards import Sheet
+from nerfro.poses.structure_from_motion import numeric_order, sequential_pairs
 from tests.conftest import refused
-from tests.poses.camera_calibration import Sheet, numeric_order, sequential_pairs, structure_from_motion
 from tests.sheet_photographs import angle, look_at, photograph
 
 

@@ -10,8 +10,8 @@ pytest.importorskip("cv2")
 
 import cv2
 
+from nerfro.poses.video import extract_frames
 from tests.conftest import refused
-from tests.poses.camera_calibration import extract_frames
 
 SHARP = (1, 7, 8, 13)  # one in each quarter of the video
 

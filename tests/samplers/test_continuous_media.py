@@ -15,6 +15,8 @@ from torch import Tensor
 
 from nerfro.core.types import Path, Rays
 from nerfro.media.base import Medium
+from nerfro.paper.eikonal import march_uniform
+from nerfro.paper.integrators import Integrator, euler, leapfrog
 from tests.closed_forms import (
     FIBRE_ALPHA,
     FunctionMedium,
@@ -26,7 +28,6 @@ from tests.closed_forms import (
     luneburg,
     make_rays,
 )
-from tests.paper import Integrator, euler, leapfrog, march_uniform
 
 NUM_STEPS = 256
 LEVELS = pytest.mark.parametrize(("dtype", "level"), [(torch.float64, 1e-5), (torch.float32, 1e-4)])

@@ -11,10 +11,10 @@ from torch import Tensor
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball
 from nerfro.media.solid import Solid
+from nerfro.paper.eikonal import Eikonal
 from nerfro.samplers.paths.snell import Snell
 from tests.closed_forms import RoundedBox, angle, beam, make_rays, random_rays
 from tests.conftest import refused
-from tests.paper import Eikonal
 from tests.samplers.test_snell import _prism
 
 # Water: n_d and Abbe's number.

@@ -8,8 +8,10 @@ import torch
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball
+from nerfro.paper.eikonal import Eikonal, march_adaptive, march_uniform
+from nerfro.paper.integrators import euler
+from nerfro.paper.voxel_grid import VoxelGrid
 from tests.closed_forms import Luneburg, RoundedBox, Slab, angle, ball_exits, beam, grid_points, make_rays, random_rays
-from tests.paper import Eikonal, VoxelGrid, euler, march_adaptive, march_uniform
 
 BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
 

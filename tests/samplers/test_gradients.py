@@ -10,9 +10,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from nerfro.paper.eikonal import march_uniform
+from nerfro.paper.integrators import Integrator, euler, leapfrog
+from nerfro.paper.voxel_grid import VoxelGrid
 from nerfro.samplers.paths.snell_law import refract
 from tests.closed_forms import FunctionMedium, Squared, blurred_ball, grid_points, make_rays
-from tests.paper import Integrator, VoxelGrid, euler, leapfrog, march_uniform
 
 ONES = torch.ones(1, dtype=torch.float64)
 

@@ -9,6 +9,10 @@ from nerfro.media.analytic import Vacuum
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball
+from nerfro.paper.eikonal import Eikonal
+from nerfro.paper.hierarchical import Hierarchical
+from nerfro.paper.integrators import RayState, kick_drift_kick, leapfrog
+from nerfro.paper.voxel_grid import VoxelGrid
 from nerfro.rendering import composite
 from nerfro.samplers.base import PathSampler, PointSampler
 from nerfro.samplers.paths.snell import Snell
@@ -24,7 +28,6 @@ from tests.closed_forms import (
     grid_points,
     luneburg,
 )
-from tests.paper import Eikonal, Hierarchical, RayState, VoxelGrid, kick_drift_kick, leapfrog
 
 SMOOTH = [luneburg, fisheye, fibre]
 

@@ -12,10 +12,10 @@ from nerfro.core.types import Path
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
+from nerfro.paper.eikonal import Eikonal
 from nerfro.samplers.base import PathSampler
 from nerfro.samplers.paths.snell import Snell
 from tests.closed_forms import RoundedBox, random_rays
-from tests.paper import Eikonal
 
 _rays = functools.partial(random_rays, 200, 1.2, 4)
 # From the camera at distance 3 the near face of the cube is reached, its far one is not.

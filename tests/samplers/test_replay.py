@@ -16,12 +16,13 @@ from nerfro.media.analytic import Vacuum
 from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball
+from nerfro.paper.eikonal import Eikonal, march_adaptive
+from nerfro.paper.voxel_grid import VoxelGrid
 from nerfro.samplers.base import PathSampler
 from nerfro.samplers.paths.replay import smallest_cosine
 from nerfro.samplers.paths.snell import Snell, trace_interfaces
 from nerfro.samplers.paths.straight import Straight
 from tests.closed_forms import RoundedBox, beam, grid_points, make_rays, random_rays
-from tests.paper import Eikonal, VoxelGrid, march_adaptive
 from tests.samplers.nested import NestedBalls, nested_grid, nested_mesh
 
 BOX = torch.tensor([[-1.2] * 3, [1.2] * 3], dtype=torch.float64)

@@ -6,11 +6,11 @@ import torch
 from torch import Tensor
 
 from nerfro.core.types import Path
+from nerfro.paper.hierarchical import blur_weights
 from nerfro.samplers.paths.straight import straight_path
 from nerfro.samplers.points.stepfun import invert_cdf, spread_uniform
 from nerfro.testing import example_draws
 from tests.closed_forms import make_rays
-from tests.paper import blur_weights
 
 
 def _paths(num: int) -> Path:

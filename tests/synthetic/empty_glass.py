@@ -6,7 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from tests.synthetic.renderer import SurfaceMesh, SyntheticScene, find_scene, torus_angles
+from nerfro.synthetic.scene import SyntheticScene
+from nerfro.synthetic.surface import SurfaceMesh, torus_angles
+from nerfro.synthetic.synthesis import find_scene
 
 
 def empty_glass(glass: SurfaceMesh, sky: Callable[[np.ndarray], np.ndarray], **options: Any) -> SyntheticScene:

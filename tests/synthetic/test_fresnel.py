@@ -3,8 +3,11 @@
 import numpy as np
 import pytest
 
+from nerfro.synthetic import glass
+from nerfro.synthetic.path_tracer import PathTracer, Pinhole, load_mitsuba
+from nerfro.synthetic.surface import rounded_box
+from nerfro.synthetic.viewpoints import look_at_origin
 from tests.synthetic.empty_glass import empty_glass
-from tests.synthetic.renderer import PathTracer, Pinhole, glass, load_mitsuba, look_at_origin, rounded_box
 
 pytestmark = pytest.mark.usefixtures("mitsuba")
 

@@ -8,16 +8,19 @@ import torch
 from torch import Tensor
 
 from nerfro.core.light import to_srgb
-from nerfro.core.subdivision import part_rays
 from nerfro.core.types import Path, Rays
 from nerfro.evaluation.image_metrics import psnr
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.shapes import Ball
 from nerfro.samplers.paths.snell import Snell
+from nerfro.samplers.subdivision import part_rays
+from nerfro.synthetic import path_tracer
+from nerfro.synthetic.path_tracer import PathTracer, Pinhole
+from nerfro.synthetic.surface import SurfaceMesh, rounded_box, sphere
+from nerfro.synthetic.viewpoints import look_at_origin
 from tests.cameras_at import cameras_at
 from tests.closed_forms import RoundedBox, grid_points
 from tests.synthetic.empty_glass import empty_glass
-from tests.synthetic.renderer import PathTracer, Pinhole, SurfaceMesh, look_at_origin, path_tracer, rounded_box, sphere
 
 # Sums over a pixel of a cube converge slowly: an edge sees lamps in many directions.
 SIDE, ANGLE, SPP, PARTS = 12, 0.5, 4096, 16

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from nerfro.synthetic import llvm
 from tests.processes import python
-from tests.synthetic.renderer import llvm
 
 newest, version_in_name = llvm.newest, llvm.version_in_name
 

@@ -6,21 +6,13 @@ import numpy as np
 import pytest
 
 from nerfro.core.errors import NerfroError
+from nerfro.synthetic import path_tracer
+from nerfro.synthetic.dataset import CAMERA_ANGLE_X, CAMERA_DISTANCE
+from nerfro.synthetic.path_tracer import PathTracer, Pinhole, load_mitsuba
+from nerfro.synthetic.surface import rounded_box, sphere, torus_angles
+from nerfro.synthetic.synthesis import find_scene
+from nerfro.synthetic.viewpoints import directions_on_sphere, look_at_origin
 from tests.processes import python
-from tests.synthetic.renderer import (
-    CAMERA_ANGLE_X,
-    CAMERA_DISTANCE,
-    PathTracer,
-    Pinhole,
-    directions_on_sphere,
-    find_scene,
-    load_mitsuba,
-    look_at_origin,
-    path_tracer,
-    rounded_box,
-    sphere,
-    torus_angles,
-)
 
 IOR = 1.5
 

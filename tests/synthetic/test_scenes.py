@@ -1,25 +1,17 @@
 """The synthetic scenes, and the shapes, viewpoints and skies that they are made of."""
 
-from importlib import import_module
-
 import numpy as np
 import pytest
 
 from nerfro.core.light import to_srgb
 from nerfro.registry.registration import discover
-from nerfro.synthetic.options import SCENES
-from tests.synthetic.renderer import (
-    directions_on_sphere,
-    find_scene,
-    lat_long_texture,
-    look_at_origin,
-    rounded_box,
-    sphere,
-    torus_angles,
-)
+from nerfro.synthetic.scene import lat_long_texture
+from nerfro.synthetic.scenes import SCENES, distance
+from nerfro.synthetic.surface import rounded_box, sphere, torus_angles
+from nerfro.synthetic.synthesis import find_scene
+from nerfro.synthetic.viewpoints import directions_on_sphere, look_at_origin
 
 discover()
-distance = import_module("nerfro.synthetic.scenes.distance")
 
 
 def test_triangulation_lies_on_the_surface_and_faces_outward():

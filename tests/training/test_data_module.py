@@ -16,6 +16,7 @@ from nerfro.core.types import Batch
 from nerfro.data.blender import BlenderData
 from nerfro.data.pixel_store import PixelStore
 from nerfro.media.sdf_grid import SdfGrid
+from nerfro.paper.eikonal import Eikonal
 from nerfro.rendering import Renderer, Scene
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.points.density_grid import DensityGridSampler
@@ -24,7 +25,6 @@ from nerfro.training.module import TrainingModule
 from nerfro.training.pixel_batches import PixelBatches
 from tests.closed_forms import grid_points, random_rays
 from tests.conftest import Runner, weights_of
-from tests.paper import Eikonal
 from tests.pretended_gpu import GPU, PretendedGpu
 
 

@@ -15,6 +15,7 @@ from nerfro.kernels import available
 from nerfro.kernels.available import available_bytes, require_bytes
 from nerfro.media.analytic import Vacuum
 from nerfro.models.refractive import RefractiveModel
+from nerfro.paper.nerf import NerfField
 from nerfro.rendering import Components, Renderer
 from nerfro.samplers.paths.straight import Straight
 from nerfro.samplers.points.stratified import Stratified
@@ -22,7 +23,6 @@ from nerfro.testing import example_rays
 from nerfro.training import memory
 from nerfro.training.memory import require_memory
 from tests.conftest import refused
-from tests.paper import NerfField
 from tests.pretended_gpu import GPU, OnGpu, PretendedGpu
 
 

@@ -14,13 +14,13 @@ from lightning.pytorch import Trainer
 
 from nerfro.camera.given import GivenCamera
 from nerfro.core.light import to_srgb
-from nerfro.core.subdivision import Subdivision
 from nerfro.core.types import Rays, mean_per_pixel
 from nerfro.data.base import Views
 from nerfro.data.blender import BlenderData
 from nerfro.media.shapes import Ball
 from nerfro.rendering import ColourSpace, Renderer, Scene
 from nerfro.samplers.paths.snell import Snell
+from nerfro.samplers.subdivision import Subdivision
 from nerfro.training.data_module import NO_IMAGE, RayDataModule, RotatingView, validation_interval
 from nerfro.training.pixel_batches import PixelBatches
 from nerfro.training.validation import OverfittingWarning, ValidationPixels

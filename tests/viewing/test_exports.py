@@ -20,8 +20,8 @@ from PIL import Image
 
 from nerfro.core.errors import NerfroError
 from nerfro.core.light import to_linear, to_srgb
-from nerfro.core.subdivision import Subdivision
 from nerfro.media.sdf_grid import SdfGrid
+from nerfro.samplers.subdivision import Subdivision
 from nerfro.viewing.changes import with_changed_scene
 from nerfro.viewing.exports import ExportConfig, export_of, find_export
 from nerfro.viewing.trained_scene import TrainedScene

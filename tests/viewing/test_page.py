@@ -17,7 +17,6 @@ from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.core.cameras import Cameras
 from nerfro.core.light import to_linear
 from nerfro.core.paths import resolve_path
-from nerfro.core.subdivision import Subdivision
 from nerfro.core.types import FieldValues, Samples
 from nerfro.core.variants import variant
 from nerfro.data.blender import BlenderData
@@ -28,6 +27,7 @@ from nerfro.files.deep_images import write_radiance
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.points.density_grid import DensityGridSampler
+from nerfro.samplers.subdivision import Subdivision
 from nerfro.testing import example_draws
 from nerfro.viewing.changes import with_changed_scene
 from nerfro.viewing.page import make_page

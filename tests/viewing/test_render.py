@@ -5,7 +5,6 @@ import json
 import math
 import sys
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +19,10 @@ from PIL import Image
 import nerfro.render
 from nerfro.core.cameras import Cameras
 from nerfro.core.lens import coefficients
-from nerfro.core.subdivision import Subdivision
 from nerfro.files.lat_long import save_lat_long
 from nerfro.registry.registration import discover
+from nerfro.samplers.subdivision import Subdivision
+from nerfro.viewing.film import write_film
 from nerfro.viewing.render_request import RenderConfig, find_shots
 from nerfro.viewing.trained_scene import TrainedScene
 from tests.conftest import Runner, refused
@@ -77,7 +77,7 @@ def test_gif_has_the_requested_duration(num_frames: int, tmp_path: Path) -> None
     for number, frame in enumerate(frames):
         Image.new("RGB", (2, 2), (number % 256, number // 256, 0)).save(frame)
     discover()
-    import_module("nerfro.viewing.film").write_film(tmp_path / "film.gif", frames, 5.0)
+    write_film(tmp_path / "film.gif", frames, 5.0)
     with Image.open(tmp_path / "film.gif") as gif:
         durations = []
         for number in range(gif.n_frames):  # type: ignore[attr-defined]

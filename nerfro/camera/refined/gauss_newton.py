@@ -27,7 +27,7 @@ from nerfro.camera.refined.pixel_units import object_distances
 from nerfro.camera.refined.refined import RefinedCamera
 from nerfro.core.cameras import Cameras
 from nerfro.core.rays import Rays
-from nerfro.core.subdivision import contrast, pixel_rays
+from nerfro.samplers.subdivision import contrast, pixel_rays
 
 # Rendered colours of rays, sRGB in [0, 1], with the exposure of the views.
 Render = Callable[[Rays, Int[Tensor, "R"]], Float[Tensor, "R 3"]]

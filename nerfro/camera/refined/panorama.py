@@ -25,7 +25,7 @@ from nerfro.core.cameras import Cameras
 from nerfro.core.light import to_linear
 from nerfro.core.progress import track
 from nerfro.core.rays import Rays
-from nerfro.core.subdivision import pixel_rays
+from nerfro.samplers.subdivision import pixel_rays
 
 # Photographs are downscaled to this width in pixels; the alignment is accurate to a few hundredths of a pixel.
 _WIDTH = 256

@@ -2,7 +2,3 @@
 
 See docs/guides/data_formats.md.
 """
-
-from nerfro.data.formats import colmap, idr, llff, nerfstudio, refref
-
-__all__ = ["colmap", "idr", "llff", "nerfstudio", "refref"]

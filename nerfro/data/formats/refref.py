@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nerfro.core.errors import NerfroError
+from nerfro.core.optional import optional
 from nerfro.data.base import Frame, Views
 from nerfro.data.frames import SPLITS, FrameSet, PosedImages, check_pose
 from nerfro.data.image_files import read_size
@@ -95,13 +96,8 @@ def _read_rows(files: list[Path], numbers: range, columns: list[str]) -> list[tu
     Returns:
         Number and content of each row.
     """
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError as error:
-        raise NerfroError(
-            "data=refref reads .parquet files with pyarrow; install it: pip install 'nerfro[refref]'"
-        ) from error
+    pyarrow = optional("pyarrow", "refref", "data=refref reads .parquet files with pyarrow")
+    optional("pyarrow.parquet", "refref", "data=refref reads .parquet files with pyarrow")
     rows: list[tuple[int, dict[str, Any]]] = []
     offset = 0
     for path in files:

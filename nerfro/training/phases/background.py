@@ -12,13 +12,13 @@ from torch import Tensor
 from nerfro.boundaries.envmap import EnvironmentMap, Observed
 from nerfro.core.errors import renamed_classes, warn
 from nerfro.core.rays import Rays
-from nerfro.core.subdivision import DIVERGENT, divergence, main_exits, neighbour_rays, pixel_rays
 from nerfro.core.types import Exits
 from nerfro.fields.base import Field
 from nerfro.geometry.interpolation import misses
 from nerfro.registry.allowed import Count, Natural, OnlyWith, Share
 from nerfro.registry.registration import register
 from nerfro.rendering import Renderer
+from nerfro.samplers.subdivision import DIVERGENT, divergence, main_exits, neighbour_rays, pixel_rays
 from nerfro.training.phases.base import Phase, TrainingRun
 
 # Largest number of pixels of a pass beside the object, relative to the texels of the finest level.

@@ -14,10 +14,10 @@ from nerfro.camera.refined.outlines import align_to_masks
 from nerfro.camera.refined.panorama import align
 from nerfro.camera.refined.refined import RefinedCamera
 from nerfro.core.rays import Rays
-from nerfro.core.subdivision import pixel_rays
 from nerfro.geometry.interpolation import misses
 from nerfro.registry.allowed import Count, Natural, OnlyWith
 from nerfro.registry.registration import register
+from nerfro.samplers.subdivision import pixel_rays
 from nerfro.training.phases.background import occupied_box
 from nerfro.training.phases.base import Phase, TrainingRun
 

@@ -1,0 +1,39 @@
+"""Everything that a plugin needs: base classes, the values that pass between components, `register`, and ranges.
+
+A plugin begins with one import, such as `from nerfro.parts import Loss, register`; see docs/guides/plugins.md.
+"""
+
+from nerfro.boundaries.base import Boundary
+from nerfro.camera.base import CameraModel
+from nerfro.core.cameras import Cameras
+from nerfro.core.draws import Draws
+from nerfro.core.errors import NerfroError
+from nerfro.core.paths import resolve_path
+from nerfro.core.types import Batch, Exits, FieldValues, Path, Rays, Rendering, Samples
+from nerfro.data.base import DataSource, Views
+from nerfro.evaluation.image_metrics import ImageMetric
+from nerfro.fields.base import Field
+from nerfro.files.atomic import write_atomically
+from nerfro.files.reading import load_arrays
+from nerfro.losses.base import Loss
+from nerfro.media.base import Medium, Scalars, Vectors
+from nerfro.media.surface import Grid, Surface
+from nerfro.models.refractive import RefractiveModel
+from nerfro.registry.allowed import Count, Distance, Natural, NotNegative, Positive, Range
+from nerfro.registry.registration import register
+from nerfro.rendering import Components, Renderer, Scene
+from nerfro.samplers.base import PathSampler, PointSampler
+from nerfro.samplers.points.stepfun import invert_cdf, spread_uniform
+from nerfro.samplers.points.stratified import Stratified, point_samples
+from nerfro.training.phases.base import Phase, TrainingRun
+from nerfro.viewing.exports import EXPORTS, Export
+from nerfro.viewing.trained_scene import TrainedScene
+
+__all__ = [
+    "EXPORTS", "Batch", "Boundary", "CameraModel", "Cameras", "Components", "Count", "DataSource", "Distance", "Draws",
+    "Exits", "Export", "Field", "FieldValues", "Grid", "ImageMetric", "Loss", "Medium", "Natural", "NerfroError",
+    "NotNegative", "Path", "PathSampler", "Phase", "PointSampler", "Positive", "Range", "Rays", "RefractiveModel",
+    "Renderer", "Rendering", "Samples", "Scalars", "Scene", "Stratified", "Surface", "TrainedScene", "TrainingRun",
+    "Vectors", "Views", "invert_cdf", "load_arrays", "point_samples", "register", "resolve_path", "spread_uniform",
+    "write_atomically",
+]  # fmt: skip
