@@ -45,11 +45,8 @@ from nerfro.evaluation.results import read_metrics_json
 from nerfro.fields.hash_grid import HashGridField
 from nerfro.kernels.allocator import keep_freed_memory
 from nerfro.kernels.available import fast_bfloat16
-<<<<<<< HEAD
 from nerfro.rendering import RayTracer
-=======
 from nerfro.samplers.subdivision import Subdivision
->>>>>>> main
 from nerfro.training.data_module import RayDataModule
 from nerfro.training.trainer import lightning_precision
 

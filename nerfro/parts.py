@@ -9,7 +9,7 @@ from nerfro.core.cameras import Cameras
 from nerfro.core.draws import Draws
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import resolve_path
-from nerfro.core.types import Batch, Exits, FieldValues, Path, Rays, Rendering, Samples
+from nerfro.core.types import Batch, Exits, FieldValues, OpticalRecord, Path, Rays, Rendering, Samples
 from nerfro.data.base import DataSource, Views
 from nerfro.evaluation.image_metrics import ImageMetric
 from nerfro.fields.base import Field
@@ -32,7 +32,7 @@ from nerfro.viewing.trained_scene import TrainedScene
 __all__ = [
     "EXPORTS", "Batch", "Boundary", "CameraModel", "Cameras", "Components", "Count", "DataSource", "Distance", "Draws",
     "Exits", "Export", "Field", "FieldValues", "Grid", "ImageMetric", "Loss", "Medium", "Natural", "NerfroError",
-    "NotNegative", "Path", "PathSampler", "Phase", "PointSampler", "Positive", "Range", "Rays", "RefractiveModel",
+    "NotNegative", "OpticalRecord", "Path", "PathSampler", "Phase", "PointSampler", "Positive", "Range", "Rays", "RefractiveModel",
     "Renderer", "Rendering", "Samples", "Scalars", "Scene", "Stratified", "Surface", "TrainedScene", "TrainingRun",
     "Vectors", "Views", "invert_cdf", "load_arrays", "point_samples", "register", "resolve_path", "spread_uniform",
     "write_atomically",

@@ -8,14 +8,7 @@ from typing import Any
 import torch
 from torch import nn
 
-<<<<<<< HEAD
-from nerfro.core.types import Batch, Path, Rendering
-from nerfro.models.refractive import RefractiveModel
-from nerfro.registry.allowed import Positive
-from nerfro.registry.registration import register
-=======
-from nerfro.parts import Draws, Path, Positive, RefractiveModel, Rendering, register
->>>>>>> main
+from nerfro.parts import Batch, Path, Positive, RefractiveModel, Rendering, register
 
 
 @register("model", "haze")

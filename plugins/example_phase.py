@@ -4,15 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-<<<<<<< HEAD
-from nerfro.registry.allowed import Count
-from nerfro.registry.registration import register
-from nerfro.training.phases.base import Phase, TrainingRun
-=======
-import torch
-
 from nerfro.parts import Count, Phase, TrainingRun, register
->>>>>>> main
 
 _OTHER_PIXELS = 10**6  # numbers of batches that training steps do not use
 

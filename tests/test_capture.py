@@ -18,8 +18,8 @@ from nerfro.data.blender import OpenCVData
 from nerfro.geometry.mesh import load_mesh
 from nerfro.registry.registration import discover
 from nerfro.synthetic import path_tracer
-from nerfro.synthetic.synthesis import synthesize
 from nerfro.synthetic.scenes import dolphin_capture, photographs
+from nerfro.synthetic.synthesis import synthesize
 from tests.conftest import Runner
 from tests.exact_silhouettes import overlaps_of_convex_body
 from tests.test_synthesize import configured

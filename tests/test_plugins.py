@@ -5,7 +5,6 @@ import csv
 import json
 import os
 import shutil
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -45,14 +44,8 @@ from nerfro.testing import (
 from nerfro.training.phases import background
 from nerfro.training.phases import base as phase_base
 from nerfro.training.phases.base import Phase, TrainingRun
-<<<<<<< HEAD
 from nerfro.training.pixel_batches import PixelBatches
-from nerfro.viewing import PLUGIN_EXPORTS
-from nerfro.viewing.exports import Export, find_export
-=======
-from nerfro.training.ray_batches import RayBatches
 from nerfro.viewing.exports import EXPORTS, Export, find_export
->>>>>>> main
 from nerfro.viewing.trained_scene import TrainedScene
 from nerfro.viewing.volume import Volume
 from tests.conftest import Finished, Runner, refused

@@ -17,8 +17,8 @@ from nerfro.data.blender import BlenderData
 from nerfro.geometry.mesh import load_mesh
 from nerfro.synthetic.dataset import ViewSplits
 from nerfro.synthetic.options import SynthesizeConfig
-from nerfro.synthetic.synthesis import synthesize
 from nerfro.synthetic.scenes.photographs import Photographs
+from nerfro.synthetic.synthesis import synthesize
 from tests.conftest import refused
 from tests.exact_silhouettes import overlaps_of_convex_body
 

@@ -11,7 +11,9 @@ from torch import Tensor
 
 from nerfro.core.cameras import Cameras
 from nerfro.core.rays import Rays
-from nerfro.core.subdivision import (
+from nerfro.core.types import Batch, Path, Pixels
+from nerfro.rendering.renderer import Renderer
+from nerfro.samplers.subdivision import (
     DIVERGENT,
     NEIGHBOUR,
     Subdivision,
@@ -21,8 +23,6 @@ from nerfro.core.subdivision import (
     part_rays,
     pixel_rays,
 )
-from nerfro.core.types import Batch, Path, Pixels
-from nerfro.rendering.renderer import Renderer
 
 # Maps rays of the cameras of the data set, given their views, to rays of the estimated cameras.
 Estimate = Callable[[Rays, Int[Tensor, "R"]], Rays]

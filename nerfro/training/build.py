@@ -18,12 +18,12 @@ from nerfro.cli.options import describe_command
 from nerfro.cli.overrides import prints_hints
 from nerfro.core.errors import NerfroError, warn
 from nerfro.core.paths import CONF_DIR
-from nerfro.core.subdivision import Subdivision
 from nerfro.data.base import DataSource, Views
 from nerfro.registry.registration import discover
 from nerfro.rendering import RayTracer, Renderer
 from nerfro.rendering.scene_file import with_scene
 from nerfro.samplers.paths.thin_walls import warn_of_thin_walls
+from nerfro.samplers.subdivision import Subdivision
 from nerfro.training.config import TrainConfig, build_data, build_each, build_model, check_run, resolve_trainer_options
 from nerfro.training.data_module import RayDataModule
 from nerfro.training.effects import settings_without_effect

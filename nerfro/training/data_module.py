@@ -16,12 +16,8 @@ from torch import Tensor, nn
 from nerfro.core.types import Batch
 from nerfro.data.base import Views
 from nerfro.kernels.threads import HELPERS
-<<<<<<< HEAD
 from nerfro.rendering import RayTracer, Renderer
-=======
-from nerfro.rendering import Renderer
 from nerfro.samplers.subdivision import Subdivision
->>>>>>> main
 from nerfro.training.module import TrainingModule
 from nerfro.training.pixel_batches import PixelBatches
 from nerfro.training.validation import ValidationPixels

@@ -15,17 +15,11 @@ from torch import Tensor
 from nerfro.core.cameras import Cameras, Window, central_window
 from nerfro.core.distributed import share_of
 from nerfro.core.draws import Draws
-<<<<<<< HEAD:nerfro/training/pixel_batches.py
 from nerfro.core.errors import NerfroError, warn
 from nerfro.core.types import Pixels
-=======
-from nerfro.core.errors import NerfroError, warn, warn_of_old_name
-from nerfro.core.types import Batch
->>>>>>> main:nerfro/training/ray_batches.py
 from nerfro.data.base import Views
 from nerfro.data.pixel_store import PixelStore
 from nerfro.registry.allowed import Count, Natural, Range, checked
-from nerfro.samplers.subdivision import PixelRays, Subdivision, Trace, TraceExits, contrast, subdivide
 
 Batching = Literal["single_image", "all_images"]
 

@@ -16,18 +16,11 @@ from tqdm import tqdm
 
 from nerfro.camera.exposure import fit_gain
 from nerfro.core.cameras import Cameras
-<<<<<<< HEAD
-from nerfro.core.subdivision import Subdivision, contrast
 from nerfro.core.types import Batch, mean_per_pixel
 from nerfro.data.base import Views
 from nerfro.rendering import RayTracer, Renderer
 from nerfro.rendering.ray_tracer import PixelRays
-=======
-from nerfro.core.types import Batch, mean_per_pixel
-from nerfro.data.base import Views
-from nerfro.rendering import Renderer
-from nerfro.samplers.subdivision import PixelRays, Subdivision, contrast, subdivide
->>>>>>> main
+from nerfro.samplers.subdivision import Subdivision, contrast
 from nerfro.training.module import TrainingModule
 
 # Number of validation pixels, and largest number of their views.

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from nerfro.core.subdivision import Subdivision
 from nerfro.data.base import Views
 from nerfro.media.shapes import Ball
 from nerfro.samplers.paths.snell import Snell
+from nerfro.samplers.subdivision import Subdivision
 from nerfro.training.pixel_batches import PixelBatches
 from tests.cameras_at import cameras_at, random_poses
 from tests.conftest import refused
@@ -43,8 +43,8 @@ def place(index: torch.Tensor) -> torch.Tensor:
 
 @pytest.mark.parametrize("batching", ["single_image", "all_images"])
 def test_rays_and_colours_belong_to_the_index(views, batching):
-    batch = PixelBatches(views, 50, batching, seed=3).batch(7)
-    view, row, column = place(batch.pixel_number).unbind(-1)
+    batch = PixelBatches(views, 50, batching, seed=3).draw(7)
+    view, row, column = place(batch.number).unbind(-1)
     assert torch.equal(batch.rgb, torch.stack([view, row, column], -1).float() / 16)
     assert torch.equal(batch.rays.directions, views.cameras.rays(view, row, column).directions)
     assert torch.equal(batch.rays.origins, views.cameras.camera_to_world[view, :, 3])
@@ -53,14 +53,14 @@ def test_rays_and_colours_belong_to_the_index(views, batching):
 @pytest.mark.parametrize("batching", ["single_image", "all_images"])
 def test_batch_depends_on_seed_and_step_alone(views, batching):
     batches = PixelBatches(views, 30, batching, seed=3)
-    in_order = [batches.batch(step) for step in range(6)]
+    in_order = [batches.draw(step) for step in range(6)]
     again = PixelBatches(views, 30, batching, seed=3)
     for step in (5, 0, 3):
-        assert torch.equal(again.batch(step).pixel_number, in_order[step].pixel_number)
-        assert torch.equal(again.batch(step).rays.directions, in_order[step].rays.directions)
+        assert torch.equal(again.draw(step).number, in_order[step].number)
+        assert torch.equal(again.draw(step).rays.directions, in_order[step].rays.directions)
     other = PixelBatches(views, 30, batching, seed=4)
-    assert not torch.equal(other.batch(0).pixel_number, in_order[0].pixel_number)
-    assert not torch.equal(in_order[0].pixel_number, in_order[1].pixel_number)
+    assert not torch.equal(other.draw(0).number, in_order[0].number)
+    assert not torch.equal(in_order[0].number, in_order[1].number)
 
 
 @pytest.mark.parametrize(
@@ -71,7 +71,7 @@ def test_masked_pixels_are_never_drawn_and_all_others_equally_often(given, batch
     batches = PixelBatches(given, 96, batching, seed=0)
     counts = torch.zeros(NUM_VIEWS * HEIGHT * WIDTH)
     for step in range(800):
-        counts += torch.bincount(batches.batch(step).pixel_number, minlength=len(counts))
+        counts += torch.bincount(batches.draw(step).number, minlength=len(counts))
     usable = torch.ones(len(counts), dtype=torch.bool) if given.usable is None else given.usable.flatten()
     mean = 800 * 96 / int(usable.sum())
     assert counts[~usable].sum() == 0
@@ -93,7 +93,7 @@ def test_rows_share_all_usable_pixels(kind, request):
 def test_masked_batch_of_one_image_is_different_usable_pixels_of_it(masked):
     seen = set()
     for step in range(200):
-        index = PixelBatches(masked, 1, seed=0).batch(step).pixel_number
+        index = PixelBatches(masked, 1, seed=0).draw(step).number
         assert masked.usable.flatten()[index].all()
         seen.add(int(index) // (HEIGHT * WIDTH))
     assert seen == set(range(NUM_VIEWS))  # views are drawn alike, whatever their masks leave
@@ -101,10 +101,10 @@ def test_masked_batch_of_one_image_is_different_usable_pixels_of_it(masked):
     two.usable[2, 4:6] = True
     smallest = int(two.usable.sum((1, 2)).min())
     for step in range(20):
-        batch = PixelBatches(two, smallest, seed=0).batch(step)
-        assert two.usable.flatten()[batch.pixel_number].all()
-        assert len(batch.pixel_number.unique()) == smallest
-        assert len((batch.pixel_number // (HEIGHT * WIDTH)).unique()) == 1
+        batch = PixelBatches(two, smallest, seed=0).draw(step)
+        assert two.usable.flatten()[batch.number].all()
+        assert len(batch.number.unique()) == smallest
+        assert len((batch.number // (HEIGHT * WIDTH)).unique()) == 1
 
 
 def test_object_fraction_of_the_pixels_is_of_the_object(views, masked):
@@ -118,13 +118,13 @@ def test_object_fraction_of_the_pixels_is_of_the_object(views, masked):
         wanted = of_object if given.usable is None else of_object & given.usable.flatten()
         counts = torch.zeros(len(wanted))
         for step in range(300):
-            counts += torch.bincount(batches.batch(step).pixel_number, minlength=len(counts))
+            counts += torch.bincount(batches.draw(step).number, minlength=len(counts))
         usable = torch.ones_like(wanted) if given.usable is None else given.usable.flatten()
         others, own = 300 * 48 / int(usable.sum()), 300 * 16 / int(wanted.sum())
         expected = torch.where(usable, others, 0.0) + torch.where(wanted, own, 0.0)
         assert ((counts - expected).abs() <= 6 * expected.sqrt()).all()
-        processes = [batches.for_rank(rank, 2).batch(3).pixel_number for rank in range(2)]
-        assert torch.equal(torch.cat(processes), batches.batch(3).pixel_number)
+        processes = [batches.for_rank(rank, 2).draw(3).number for rank in range(2)]
+        assert torch.equal(torch.cat(processes), batches.draw(3).number)
         assert min(int(wanted[index].sum()) for index in processes) >= 8
 
 
@@ -132,7 +132,7 @@ def test_object_fraction_is_ignored_without_masks(views, capsys):
     batches = PixelBatches(views, 64, "all_images", seed=3, object_fraction=0.25)
     assert "not every training photograph has a mask" in capsys.readouterr().out
     assert torch.equal(
-        batches.batch(5).pixel_number, PixelBatches(views, 64, "all_images", seed=3).batch(5).pixel_number
+        batches.draw(5).number, PixelBatches(views, 64, "all_images", seed=3).draw(5).number
     )
 
 
@@ -164,14 +164,14 @@ def test_every_view_has_its_own_usable_pixels(views, masked):
 def test_masks_apply_to_precropped_and_distributed_batches(masked, batching, size):
     whole = PixelBatches(masked, size, batching, seed=3, precrop_steps=20)
     for step in (*range(5), *range(20, 25)):
-        batch = whole.batch(step)
-        shares = [whole.for_rank(rank, size).batch(step) for rank in range(size)]
-        assert torch.equal(torch.cat([share.pixel_number for share in shares]), batch.pixel_number)
+        batch = whole.draw(step)
+        shares = [whole.for_rank(rank, size).draw(step) for rank in range(size)]
+        assert torch.equal(torch.cat([share.number for share in shares]), batch.number)
         for name in ("origins", "directions"):
             parts = [getattr(share.rays, name) for share in shares]
             assert torch.equal(torch.cat(parts), getattr(batch.rays, name))
-        assert masked.usable.flatten()[batch.pixel_number].all()
-        _, row, column = place(batch.pixel_number).unbind(-1)
+        assert masked.usable.flatten()[batch.number].all()
+        _, row, column = place(batch.number).unbind(-1)
         inside = (row >= 3) & (row < 9) & (column >= 4) & (column < 12)
         assert bool(inside.all()) or step >= 20
 
@@ -189,17 +189,17 @@ def test_masks_that_leave_too_few_pixels_are_refused(masked):
 @pytest.mark.parametrize("batching", ["single_image", "all_images"])
 def test_precrop_draws_from_the_middle_and_ends_on_time(views, batching):
     batches = PixelBatches(views, 40, batching, seed=0, precrop_steps=30, precrop_fraction=0.5)
-    cropped = torch.cat([place(batches.batch(step).pixel_number) for step in range(30)])
+    cropped = torch.cat([place(batches.draw(step).number) for step in range(30)])
     assert cropped[:, 1].unique().tolist() == list(range(3, 9))
     assert cropped[:, 2].unique().tolist() == list(range(4, 12))
-    whole = torch.cat([place(batches.batch(step).pixel_number) for step in range(30, 60)])
+    whole = torch.cat([place(batches.draw(step).number) for step in range(30, 60)])
     assert whole[:, 1].unique().tolist() == list(range(HEIGHT))
     assert whole[:, 2].unique().tolist() == list(range(WIDTH))
 
 
 def test_batch_carries_the_cameras_of_the_window_it_is_drawn_from(views):
     batches = PixelBatches(views, 40, seed=0, precrop_steps=1)
-    middle, whole = batches.batch(0).cameras, batches.batch(1).cameras
+    middle, whole = batches.draw(0).cameras, batches.draw(1).cameras
     assert (middle.width, middle.height) == (8, 6)
     assert (whole.width, whole.height) == (WIDTH, HEIGHT)
     full = views.cameras.image_rays(2).directions.reshape(HEIGHT, WIDTH, 3)
@@ -224,7 +224,7 @@ def test_batches_hold_all_polylines_of_their_rays(views):
     towards.camera_to_world[..., 3] = 3 * towards.camera_to_world[..., 2]  # all look at the ball
     views = replace(views, cameras=towards)
     batches = PixelBatches(views, 60, "all_images", seed=1)
-    batch = batches.traced(lambda rays, view: sampler(rays, medium), subdivision=Subdivision(2, 8.0)).batch(3)
+    batch = batches.traced(lambda rays, view: sampler(rays, medium), subdivision=Subdivision(2, 8.0)).draw(3)
     assert 60 < len(batch.rays) < 4 * 60
     assert batch.path.num_rays == len(batch.rays)
     again = sampler(batch.rays, medium)
@@ -238,10 +238,10 @@ def test_batches_made_ahead_do_not_depend_on_the_default_type(views):
     medium, sampler = Ball().double(), Snell()
     batches = PixelBatches(views, 60, "all_images", 1).to("cpu", torch.float64)
     batches = batches.traced(lambda rays, _: sampler(rays, medium), subdivision=Subdivision(2, 0.0))
-    expected = batches.batch(0)
+    expected = batches.draw(0)
     torch.set_default_dtype(torch.float64)
     try:
-        batch = batches.batch(0)
+        batch = batches.draw(0)
     finally:
         torch.set_default_dtype(torch.float32)
     assert len(batch.rays) == 4 * 60, "all pixels are divided"
