@@ -8,6 +8,7 @@ from nerfro.evaluation.render_view import render_view
 from nerfro.kernels.constants import constant
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.registry.registration import build
+from nerfro.rendering import RayTracer
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.training.config import build_model
 from nerfro.training.module import TrainingModule
@@ -65,7 +66,7 @@ def test_training_and_rendering_stay_on_the_gpu(
         module.to(GPU)
         batches, cameras = PixelBatches(views, 8, config.batches.batching).to(GPU), views.cameras.to(GPU)
         gpu.waits.clear()
-        batch = batches.batch(STEP)
+        batch = RayTracer(renderer).trace(batches.draw(STEP))
         loss = module.training_step(batch, 0)["loss"]
         loss.backward()
         renderer.point_sampler.update(list(renderer.scene.fields), batch.draws)

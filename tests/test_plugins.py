@@ -6,7 +6,6 @@ import json
 import os
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,37 +16,23 @@ from omegaconf import DictConfig
 from PIL import Image
 from torch import nn
 
-from nerfro import camera
 from nerfro.core import types
 from nerfro.core.paths import PLUGINS_DIR
 from nerfro.data.base import DataSource, Views
 from nerfro.data.blender import BlenderData
-from nerfro.losses import boundary
 from nerfro.losses.base import Loss
 from nerfro.media.base import Medium
-from nerfro.media.shapes import Ball
 from nerfro.media.surface import Surface
 from nerfro.registry.registration import KINDS, discover, find, plugins, register
 from nerfro.samplers.base import PathSampler, PointSampler
-from nerfro.samplers.paths.snell import Snell
 from nerfro.testing import (
     ContractError,
     check,
     check_export,
-    example_batch,
-    example_draws,
-    example_rays,
-    example_rendering,
-    example_samples,
-    example_views,
 )
-from nerfro.training.phases import background
-from nerfro.training.phases import base as phase_base
 from nerfro.training.phases.base import Phase, TrainingRun
-from nerfro.training.pixel_batches import PixelBatches
 from nerfro.viewing.exports import EXPORTS, Export, find_export
 from nerfro.viewing.trained_scene import TrainedScene
-from nerfro.viewing.volume import Volume
 from tests.conftest import Finished, Runner, refused
 from tests.processes import printed_by, python
 
@@ -257,71 +242,6 @@ def test_check_names_the_violated_contract(kind: str, base: type, members: dict[
     register(kind, "broken")(type("Broken", (base,), {"__doc__": "Broken.", "__module__": __name__, **members}))
     with pytest.raises(ContractError, match=contract):
         check(find(kind, "broken"))
-
-
-def test_old_names_work_with_a_warning() -> None:
-    batch = example_batch()
-    with pytest.warns(UserWarning, match=r"Batch\.pixel is called Batch\.ray_pixel"):
-        assert batch.pixel is batch.ray_pixel
-    with pytest.warns(UserWarning, match=r"Batch\.pixel_number"):
-        assert batch.index is batch.pixel_number
-    with pytest.warns(UserWarning, match="CameraModel"):
-        assert camera.base.Camera is camera.base.CameraModel
-    path = Snell()(example_rays(), Ball())
-    with pytest.warns(UserWarning, match="Path.surface is called Path.surface_body, which counts from 1"):
-        assert torch.equal(path.surface + 1, path.surface_body)
-    with pytest.warns(UserWarning, match="Path.exit_positions is called Path.end_positions"):
-        assert torch.equal(path.exit_positions, path.end_positions)
-    with pytest.warns(UserWarning, match="Path.per_ray is called sum_polylines"):
-        assert torch.equal(path.per_ray(values=path.far), path.sum_polylines(path.far))
-    with pytest.warns(UserWarning, match="Path.of_ray is called broadcast_to_polylines"):
-        assert torch.equal(path.of_ray(path.far), path.broadcast_to_polylines(path.far))
-    with pytest.warns(UserWarning, match="Path.of_rays is called select_rays"):
-        assert torch.equal(path.of_rays(path.ray[1:]).s, path.select_rays(path.ray[1:]).s)
-    with pytest.warns(UserWarning, match="Path.first_of_ray is called main_polyline"):
-        assert torch.equal(path.first_of_ray(path.far), path.main_polyline(path.far))
-    samples = example_samples()
-    with pytest.warns(UserWarning, match="Samples.measure is called contracted_edges"):
-        samples = replace(samples, measure=samples.edges)
-    with pytest.warns(UserWarning, match="Samples.measure is called contracted_edges"):
-        assert samples.measure is samples.contracted_edges is samples.edges
-    with pytest.warns(UserWarning, match="types.Radiance is called nerfro.core.types.FieldValues"):
-        radiance_class = types.Radiance
-    with pytest.warns(UserWarning, match="FieldValues.rgb is called radiance"):
-        values = radiance_class(samples.s, rgb=samples.positions)
-    with pytest.warns(UserWarning, match="FieldValues.rgb is called radiance"):
-        assert values.rgb is values.radiance is samples.positions
-    rendering = example_rendering()
-    with pytest.warns(UserWarning, match="Rendering.rgb is called radiance"):
-        assert torch.equal(replace(rendering, rgb=2 * rendering.radiance).radiance, 2 * rendering.radiance)
-    with pytest.warns(UserWarning, match="Rendering.rgb is called radiance"):
-        assert rendering.rgb is rendering.radiance
-    with pytest.warns(UserWarning, match="Rendering.boundary_rgb is called background_radiance"):
-        assert rendering.boundary_rgb is rendering.background_radiance
-    volume = Volume(values.density[:, :, None], values.radiance[:, :, None], torch.zeros(2, 3))
-    with pytest.warns(UserWarning, match="Volume.rgb is called radiance"):
-        assert volume.rgb is volume.radiance
-    with pytest.warns(UserWarning, match="TrainingRun"):
-        assert phase_base.Run is TrainingRun
-    with pytest.warns(UserWarning, match="after_step is called update"):
-        old = type("Old", (PointSampler,), {"after_step": lambda sampler, fields, draws: 7, "forward": None})
-    assert old().update([], example_draws()) == 7
-    with pytest.warns(UserWarning, match="Bent.refine is called replay"):
-        bent = type("Bent", (PathSampler,), {"refine": lambda sampler, path, rays, medium: 7, "forward": None})
-    assert bent().replay(None, None, None) == 7
-    with pytest.warns(UserWarning, match="Snell.refine is called replay"):
-        again = Snell().refine(path, example_rays(), Ball())
-    assert torch.equal(again.positions, path.positions)
-    with pytest.warns(UserWarning, match="BoundaryRegularizer"):
-        assert boundary.BoundaryRegulariser is boundary.BoundaryRegularizer
-    with pytest.warns(UserWarning, match="BackgroundSteps"):
-        assert background.Background is background.BackgroundSteps
-    batches = PixelBatches(example_views(), 4)
-    with pytest.warns(UserWarning, match="for_rank"):
-        assert torch.equal(batches.share(1, 2).batch(0).rgb, batches.for_rank(1, 2).batch(0).rgb)
-    # For both releases: nothing is replaced.
-    both = {"refine": lambda sampler, *given: sampler.replay(*given), "replay": lambda *given: 7, "forward": None}
-    assert type("Both", (PathSampler,), both)().refine(None, None, None) == 7
 
 
 def test_views_refuse_a_list_of_images() -> None:

@@ -16,12 +16,16 @@ from torch import Tensor
 from nerfro.boundaries.envmap import EnvironmentMap
 from nerfro.core.light import to_srgb
 from nerfro.core.types import Exits
+from nerfro.data.base import Views
 from nerfro.data.blender import BlenderData
 from nerfro.evaluation.results import read_metrics_json
 from nerfro.fields.base import Field
 from nerfro.fields.hash_grid import HashGridField
+from nerfro.rendering import RayTracer
 from nerfro.training.build import build
 from nerfro.training.callbacks import steps_by_phase
+from nerfro.training.data_module import RayDataModule
+from nerfro.training.module import TrainingModule
 from nerfro.training.phases.background import BackgroundSteps
 from nerfro.training.phases.base import TrainingRun
 from nerfro.training.pixel_batches import PixelBatches
@@ -47,13 +51,17 @@ def test_only_the_background_is_fitted_before_the_first_step(weights: Callable[.
     assert changed == {"renderer.scene.boundary.texels"}
 
 
+def run_of(module: TrainingModule, data: RayDataModule, views: Views) -> TrainingRun:
+    optimizer = torch.optim.Adam(module.parameters())
+    return TrainingRun(module.renderer, data.batches, RayTracer(module.renderer), views, optimizer, 0.0)
+
+
 def test_directions_behind_the_object_are_learned_through_it(
     tiny_scene: Path, tiny_default_run: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     module, data = build(overrides=[*tiny_default_run, "medium.ior=1.0001", "trainer.max_steps=1"])
     views = BlenderData(str(tiny_scene), near=2.0, far=6.0).load("train")
-    optimizer = torch.optim.Adam(module.parameters())
-    run, phase = TrainingRun(module.renderer, data.batches, views, optimizer, 0.0), BackgroundSteps(steps=4, start=8)
+    run, phase = run_of(module, data, views), BackgroundSteps(steps=4, start=8)
     state, towards_the_ball = phase.begin(run), -torch.nn.functional.normalize(views.cameras.camera_to_world[:, :, 3])
     sky, background = 0.5 + 0.4 * towards_the_ball, module.renderer.scene.boundary
 
@@ -79,7 +87,7 @@ def test_fits_of_few_pixels_use_the_pixels_of_larger_fits(
     for limit in (10**6, 64):
         module, data = build(overrides=[*tiny_default_run, "trainer.max_steps=1"])
         views = BlenderData(str(tiny_scene), near=2.0, far=6.0).load("train")
-        run = TrainingRun(module.renderer, data.batches, views, torch.optim.Adam(module.parameters()), 0.0)
+        run = run_of(module, data, views)
         phase = BackgroundSteps(steps=2)
         state = phase.begin(run)
         monkeypatch.setattr("nerfro.training.phases.background._MAX_FITTED_PIXELS", limit)
@@ -98,7 +106,7 @@ def test_rays_that_split_into_colours_do_not_show_the_background(
 ) -> None:
     module, data = build(overrides=[*tiny_default_run, "medium.abbe=[30]", "trainer.max_steps=1"])
     views = BlenderData(str(tiny_scene), near=2.0, far=6.0).load("train")
-    run = TrainingRun(module.renderer, data.batches, views, torch.optim.Adam(module.parameters()), 0.0)
+    run = run_of(module, data, views)
     phase = BackgroundSteps(steps=2, start=8)
     state = phase.begin(run)
     monkeypatch.setattr(module.renderer, "trace", lambda *given: pytest.fail("rays through the object are traced"))

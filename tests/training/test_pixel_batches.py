@@ -9,8 +9,11 @@ import torch
 
 from nerfro.data.base import Views
 from nerfro.media.shapes import Ball
+from nerfro.models.refractive import RefractiveModel
+from nerfro.rendering import RayTracer
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.subdivision import Subdivision
+from nerfro.testing import example_components
 from nerfro.training.pixel_batches import PixelBatches
 from tests.cameras_at import cameras_at, random_poses
 from tests.conftest import refused
@@ -46,8 +49,7 @@ def test_rays_and_colours_belong_to_the_index(views, batching):
     batch = PixelBatches(views, 50, batching, seed=3).draw(7)
     view, row, column = place(batch.number).unbind(-1)
     assert torch.equal(batch.rgb, torch.stack([view, row, column], -1).float() / 16)
-    assert torch.equal(batch.rays.directions, views.cameras.rays(view, row, column).directions)
-    assert torch.equal(batch.rays.origins, views.cameras.camera_to_world[view, :, 3])
+    assert torch.equal(batch.view, view)
 
 
 @pytest.mark.parametrize("batching", ["single_image", "all_images"])
@@ -57,7 +59,6 @@ def test_batch_depends_on_seed_and_step_alone(views, batching):
     again = PixelBatches(views, 30, batching, seed=3)
     for step in (5, 0, 3):
         assert torch.equal(again.draw(step).number, in_order[step].number)
-        assert torch.equal(again.draw(step).rays.directions, in_order[step].rays.directions)
     other = PixelBatches(views, 30, batching, seed=4)
     assert not torch.equal(other.draw(0).number, in_order[0].number)
     assert not torch.equal(in_order[0].number, in_order[1].number)
@@ -131,9 +132,7 @@ def test_object_fraction_of_the_pixels_is_of_the_object(views, masked):
 def test_object_fraction_is_ignored_without_masks(views, capsys):
     batches = PixelBatches(views, 64, "all_images", seed=3, object_fraction=0.25)
     assert "not every training photograph has a mask" in capsys.readouterr().out
-    assert torch.equal(
-        batches.draw(5).number, PixelBatches(views, 64, "all_images", seed=3).draw(5).number
-    )
+    assert torch.equal(batches.draw(5).number, PixelBatches(views, 64, "all_images", seed=3).draw(5).number)
 
 
 def test_pixels_of_an_object_need_all_images_and_an_object(views):
@@ -167,9 +166,6 @@ def test_masks_apply_to_precropped_and_distributed_batches(masked, batching, siz
         batch = whole.draw(step)
         shares = [whole.for_rank(rank, size).draw(step) for rank in range(size)]
         assert torch.equal(torch.cat([share.number for share in shares]), batch.number)
-        for name in ("origins", "directions"):
-            parts = [getattr(share.rays, name) for share in shares]
-            assert torch.equal(torch.cat(parts), getattr(batch.rays, name))
         assert masked.usable.flatten()[batch.number].all()
         _, row, column = place(batch.number).unbind(-1)
         inside = (row >= 3) & (row < 9) & (column >= 4) & (column < 12)
@@ -197,9 +193,9 @@ def test_precrop_draws_from_the_middle_and_ends_on_time(views, batching):
     assert whole[:, 2].unique().tolist() == list(range(WIDTH))
 
 
-def test_batch_carries_the_cameras_of_the_window_it_is_drawn_from(views):
+def test_pixels_have_the_cameras_of_the_window_from_which_they_are_drawn(views):
     batches = PixelBatches(views, 40, seed=0, precrop_steps=1)
-    middle, whole = batches.draw(0).cameras, batches.draw(1).cameras
+    middle, whole = batches.draw(0).window, batches.draw(1).window
     assert (middle.width, middle.height) == (8, 6)
     assert (whole.width, whole.height) == (WIDTH, HEIGHT)
     full = views.cameras.image_rays(2).directions.reshape(HEIGHT, WIDTH, 3)
@@ -219,15 +215,16 @@ def test_option_out_of_range_is_refused(views, options, message):
 
 
 def test_batches_hold_all_polylines_of_their_rays(views):
-    medium, sampler = Ball(), Snell(branches="all")
+    sampler = Snell(branches="all")
     towards = replace(views.cameras, camera_to_world=views.cameras.camera_to_world.clone())
     towards.camera_to_world[..., 3] = 3 * towards.camera_to_world[..., 2]  # all look at the ball
     views = replace(views, cameras=towards)
     batches = PixelBatches(views, 60, "all_images", seed=1)
-    batch = batches.traced(lambda rays, view: sampler(rays, medium), subdivision=Subdivision(2, 8.0)).draw(3)
+    model = RefractiveModel(replace(example_components(), medium=Ball(), path_sampler=sampler))
+    batch = RayTracer(model, Subdivision(2, 8.0)).trace(batches.draw(3))
     assert 60 < len(batch.rays) < 4 * 60
     assert batch.path.num_rays == len(batch.rays)
-    again = sampler(batch.rays, medium)
+    again = sampler(batch.rays, Ball())
     assert len(again.ray) > 1.5 * len(batch.rays)
     for name in ("ray", "exit_directions", "throughput"):
         torch.testing.assert_close(getattr(batch.path, name), getattr(again, name))
@@ -235,13 +232,13 @@ def test_batches_hold_all_polylines_of_their_rays(views):
 
 def test_batches_made_ahead_do_not_depend_on_the_default_type(views):
     """Lightning sets it for each step of `trainer.precision=64-true`, while a thread makes the next batch."""
-    medium, sampler = Ball().double(), Snell()
+    model = RefractiveModel(replace(example_components(), medium=Ball(), path_sampler=Snell())).double()
     batches = PixelBatches(views, 60, "all_images", 1).to("cpu", torch.float64)
-    batches = batches.traced(lambda rays, _: sampler(rays, medium), subdivision=Subdivision(2, 0.0))
-    expected = batches.draw(0)
+    tracer = RayTracer(model, Subdivision(2, 0.0))
+    expected = tracer.trace(batches.draw(0))
     torch.set_default_dtype(torch.float64)
     try:
-        batch = batches.draw(0)
+        batch = tracer.trace(batches.draw(0))
     finally:
         torch.set_default_dtype(torch.float32)
     assert len(batch.rays) == 4 * 60, "all pixels are divided"

@@ -18,8 +18,9 @@ from nerfro.core.types import Rays, mean_per_pixel
 from nerfro.data.base import Views
 from nerfro.data.blender import BlenderData
 from nerfro.media.shapes import Ball
-from nerfro.rendering import ColourSpace, Renderer, Scene
+from nerfro.rendering import ColourSpace, RayTracer, Renderer, Scene
 from nerfro.samplers.paths.snell import Snell
+from nerfro.samplers.points.stratified import Stratified
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.training.data_module import NO_IMAGE, RayDataModule, RotatingView, validation_interval
 from nerfro.training.pixel_batches import PixelBatches
@@ -115,9 +116,11 @@ def bending() -> Any:
     ball, sampler = Ball(0.6, 1.5), Snell()
     return Mock(
         spec=Renderer,
-        scene=Mock(spec=Scene, device=torch.device("cpu"), medium=ball, colour_space=ColourSpace.LINEAR),
+        scene=Mock(
+            Scene, device=torch.device("cpu"), medium=ball, colour_space=ColourSpace.LINEAR, camera=GivenCamera()
+        ),
         path_sampler=sampler,
-        exit_directions=lambda rays: sampler.trace_main(rays, ball).exit_directions,
+        point_sampler=Stratified(),
     )
 
 
@@ -126,8 +129,7 @@ def test_validation_pixels_have_the_rays_of_training(contrast: float | None, tin
     views = BlenderData(str(tiny_scene), near=2.0, far=6.0).load("val")
     model = bending()
     batches = PixelBatches(views, 256, "single_image")
-    trace = lambda rays, view: model.path_sampler(rays, model.scene.medium)  # noqa: E731
-    batch = batches.traced(trace, subdivision=Subdivision(2, 8.0, contrast)).batch(0)
+    batch = RayTracer(model, Subdivision(2, 8.0, contrast)).trace(batches.draw(0))
     watched = ValidationPixels.of(views)
     found = watched.rays(model, Subdivision(2, 8.0, contrast))
     trained = rays_of_pixels(batch.rays, batch.pixel_number[batch.ray_pixel])
