@@ -295,7 +295,7 @@ def parts_of_step(training: Training, steps: int, limits: Limits) -> dict[str, t
         return for_each * sum(event.count * event.input_shapes[0][0] for event in events if event.key in names) / steps
 
     products = ("aten::mm", "aten::addmm", "aten::bmm", "mkldnn::_linear_pointwise")
-    (field, *_), sky = model.scene.fields, model.scene.boundary
+    (field, *_), sky = model.scene.fields, model.scene.background
     hashed, sky_levels = (len(getattr(part, "levels", ())) for part in (field, sky))
     rounds = isinstance(field, HashGridField) and fast_bfloat16("cpu")
     rounds = rounds or training.config.trainer.precision != "32-true"
@@ -506,7 +506,7 @@ def report_view(checkpoint: Path, side: int, turns: int) -> None:
         "which rays may meet anything": [(model, "_may_meet")],
         "choosing samples": [(model.point_sampler, "forward")],
         "field": [(field, "forward") for field in model.scene.fields],
-        "sky": [(model.scene.boundary, "forward")],
+        "sky": [(model.scene.background, "forward")],
     }
     fastest, of_parts = float("inf"), dict.fromkeys(parts, 0.0)
     for _ in range(turns):

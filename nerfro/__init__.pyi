@@ -1,6 +1,6 @@
 # Public names of nerfro, which `lazy_loader` imports on first access.
-from .boundaries.constant import ConstantBoundary
-from .boundaries.envmap import EnvironmentMap
+from .backgrounds.constant import ConstantBackground
+from .backgrounds.envmap import EnvironmentMap
 from .core.cameras import Cameras
 from .core.rays import Rays
 from .data.blender import BlenderData
@@ -29,7 +29,7 @@ __all__ = [
     "BlenderData",
     "Cameras",
     "Components",
-    "ConstantBoundary",
+    "ConstantBackground",
     "EnvironmentMap",
     "GroupConfig",
     "HashGridField",

@@ -3,7 +3,7 @@
 A plugin begins with one import, such as `from nerfro.parts import Loss, register`; see docs/guides/plugins.md.
 """
 
-from nerfro.boundaries.base import Boundary
+from nerfro.backgrounds.base import Background
 from nerfro.camera.base import CameraModel
 from nerfro.core.cameras import Cameras
 from nerfro.core.draws import Draws
@@ -30,10 +30,10 @@ from nerfro.viewing.exports import EXPORTS, Export
 from nerfro.viewing.trained_scene import TrainedScene
 
 __all__ = [
-    "EXPORTS", "Batch", "Boundary", "CameraModel", "Cameras", "Components", "Count", "DataSource", "Distance", "Draws",
-    "Exits", "Export", "Field", "FieldValues", "Grid", "ImageMetric", "Loss", "Medium", "Natural", "NerfroError",
-    "NotNegative", "OpticalRecord", "Path", "PathSampler", "Phase", "PointSampler", "Positive", "Range", "Rays", "RefractiveModel",
-    "Renderer", "Rendering", "Samples", "Scalars", "Scene", "Stratified", "Surface", "TrainedScene", "TrainingRun",
-    "Vectors", "Views", "invert_cdf", "load_arrays", "point_samples", "register", "resolve_path", "spread_uniform",
-    "write_atomically",
+    "EXPORTS", "Background", "Batch", "CameraModel", "Cameras", "Components", "Count", "DataSource", "Distance",
+    "Draws", "Exits", "Export", "Field", "FieldValues", "Grid", "ImageMetric", "Loss", "Medium", "Natural",
+    "NerfroError", "NotNegative", "OpticalRecord", "Path", "PathSampler", "Phase", "PointSampler", "Positive", "Range",
+    "Rays", "RefractiveModel", "Renderer", "Rendering", "Samples", "Scalars", "Scene", "Stratified", "Surface",
+    "TrainedScene", "TrainingRun", "Vectors", "Views", "invert_cdf", "load_arrays", "point_samples", "register",
+    "resolve_path", "spread_uniform", "write_atomically",
 ]  # fmt: skip

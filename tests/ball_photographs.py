@@ -29,9 +29,9 @@ BOX = torch.tensor([[-0.9] * 3, [0.9] * 3])
 # Overrides with which a training on photographs of a ball of index 1.45 takes seconds.
 TRAINING = [
     "logger=none", "medium.cache=false", "medium.resolution=48", "medium.box_min=[-1,-1,-1]", "medium.box_max=[1,1,1]",
-    "data.near=0.5", "boundary.resolutions=[4,8,16,32]", "batches.size=384", "evaluation.split=train",
+    "data.near=0.5", "background.resolutions=[4,8,16,32]", "batches.size=384", "evaluation.split=train",
     "sampler.points.num_samples=4", "sampler.points.num_bins=16", "sampler.points.resolution=16",
-    "field.num_levels=2", "field.log2_table_size=8", "field.width=16", "loss.boundary.start=0", "evaluation.every=0",
+    "field.num_levels=2", "field.log2_table_size=8", "field.width=16", "loss.background.start=0", "evaluation.every=0",
     "trainer.accelerator=cpu", "trainer.max_time=null", "evaluation.subdivision.side=1", "batches.subdivision.side=1",
     "medium.ior=1.45",
 ]  # fmt: skip
@@ -40,7 +40,7 @@ TRAINING = [
 RECONSTRUCTION = ["data=blender", "data.near=0.5", "medium.resolution=32", "preprocess=resolution=24"]
 RECONSTRUCTION_TRAINING = [
     "evaluation.split=train", "evaluation.every=0", "evaluation.subdivision.side=1", "logger=none",
-    "trainer.accelerator=cpu", "trainer.max_time=null", "batches.size=64", "boundary.resolutions=[4,8]",
+    "trainer.accelerator=cpu", "trainer.max_time=null", "batches.size=64", "background.resolutions=[4,8]",
     "field.num_levels=2", "field.log2_table_size=8", "sampler.points.num_samples=4", "sampler.points.resolution=16",
 ]  # fmt: skip
 

@@ -305,10 +305,10 @@ def tiny_run(tiny_scene: Path) -> list[str]:
         "sampler/path=eikonal",
         "sampler/points=hierarchical",
         "field=nerf",
-        "boundary=skybox",
+        "background=skybox",
         "sampler.path.integrator=euler",
-        "loss.boundary.weight=0.025",
-        "loss.boundary.ramp=0",
+        "loss.background.weight=0.025",
+        "loss.background.ramp=0",
         "loss.smoothness.weight=1",
         "evaluation.subdivision.side=1",
         "batches.subdivision.side=1",
@@ -321,7 +321,7 @@ def tiny_run(tiny_scene: Path) -> list[str]:
         "batches.size=32",
         "field.width=8",
         "field.view_width=8",
-        "boundary.width=8",
+        "background.width=8",
         "loss.smoothness.tile_size=4",
         *QUIET,
     ]
@@ -354,8 +354,8 @@ def tiny_default_options(scene: Path) -> list[str]:
         f"data.root={scene}",
         *SMALL,
         "sampler.points.update_every=3",  # the grid is updated at steps that write a checkpoint
-        "boundary.resolutions=[4,8]",
-        "loss.boundary={weight: 0.01, start: 2}",
+        "background.resolutions=[4,8]",
+        "loss.background={weight: 0.01, start: 2}",
         "loss.smoothness={weight: 0.1, start: 3, tile_size: 4}",
         "evaluation.subdivision.side=2",
     ]

@@ -15,5 +15,5 @@ def small_components() -> Components:
         path_sampler=Eikonal("euler", 64),
         point_sampler=Hierarchical(8, 8),
         make_field=lambda: NerfField(width=16, depth=2, skip=1, view_width=8),
-        boundary=Skybox(width=8),
+        background=Skybox(width=8),
     )

@@ -52,9 +52,9 @@ MESH = "embedded:torus/mesh.ply"
 @pytest.mark.parametrize(
     ("kind", "name", "options", "message"),
     [
-        ("boundary", "constant", {"rgb": [1.0]}, "give three"),
-        ("boundary", "envmap", {"resolutions": []}, "give one or more"),
-        ("boundary", "envmap", {"resolutions": [4, 0]}, r"resolutions=\[4, 0\] is not allowed; take at least 1"),
+        ("background", "constant", {"rgb": [1.0]}, "give three"),
+        ("background", "envmap", {"resolutions": []}, "give one or more"),
+        ("background", "envmap", {"resolutions": [4, 0]}, r"resolutions=\[4, 0\] is not allowed; take at least 1"),
         ("data", "opencv", {"root": ".", "eval_crop": 0.0}, "eval_crop=0.0 is not allowed"),
         ("data", "opencv", {"root": ".", "eval_crop": 1.2}, "eval_crop=1.2 is not allowed"),
         ("field", "hash_grid", {"box_min": [0.0] * 3, "box_max": [1.0, 0.0, 1.0]}, "min below max"),

@@ -135,7 +135,7 @@ def test_damaged_data_is_refused(
         (["+hydra.run.foo=1"], ["hydra.run.foo is not a setting; known: dir"]),
         (["field.width=abc"], ["Value 'abc' of type 'str' could not be converted to Integer", "field.width"]),
         (["field=null"], ["Got NoneType; give the name of an option"]),
-        (["+loss.boundry.weight=1"], ["no loss is called 'boundry'; known: backdrop, boundary"]),
+        (["+loss.boundry.weight=1"], ["no loss is called 'boundry'; known: backdrop, background"]),
         (["sampler.path.integrator=foo"], ["integrator='foo' is not allowed; choose 'adaptive', 'euler'"]),
         (["field._target_=os.system"], ["'os.system' is not registered"]),
         (["trainer._target_=os.system"], ["'os.system' is not registered"]),
@@ -163,9 +163,9 @@ def test_mistake_on_the_command_line_gives_a_one_line_error(
 def test_field_missed_by_all_rays_is_refused_before_training(
     train_here: Runner, tiny_run: list[str], tmp_path: Path
 ) -> None:
-    sky = "boundary=skybox", "boundary.width=8"
+    sky = "background=skybox", "background.width=8"
     run = [text for text in tiny_run if text not in sky]
-    run += ["trainer.max_steps=1", "evaluation.every=0", "boundary=constant"]
+    run += ["trainer.max_steps=1", "evaluation.every=0", "background=constant"]
     away = ["field.box_min=[50,50,50]", "field.box_max=[51,51,51]"]
     refused = train_here(*run, *away, f"hydra.run.dir={tmp_path / 'away'}", code=1).error
     assert "no ray of the training views meets the field's box from [50.0, 50.0, 50.0]" in refused

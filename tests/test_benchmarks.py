@@ -34,7 +34,7 @@ ELSEWHERE = {"rounded_cube": "samplers/test_snell.py"}
 PAPER = ("medium.resolution=48", "sampler.points.num_coarse=4", "sampler.points.num_fine=4", "batches.size=8")
 SMALL = (
     "medium.resolution=24", "sampler.points.num_samples=4", "sampler.points.num_bins=8", "sampler.points.resolution=8",
-    "field.num_levels=2", "field.log2_table_size=8", "boundary.resolutions=[4]", "batches.size=16",
+    "field.num_levels=2", "field.log2_table_size=8", "background.resolutions=[4]", "batches.size=16",
     "phase.background.steps=0",
 )  # fmt: skip
 

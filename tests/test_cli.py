@@ -11,17 +11,14 @@ import yaml
 from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import OverrideParseException
-from omegaconf import OmegaConf
 
-from nerfro.cli.composition import RenamingFiles
+from nerfro.cli.composition import BoundedFiles
 from nerfro.cli.entry import _flags_first
 from nerfro.cli.failures import errors_in_one_line, in_one_line
-from nerfro.cli.old_names import RENAMED, is_old_name, renamed_override
+from nerfro.cli.overrides import full_key
 from nerfro.core.errors import NerfroError, warn
 from nerfro.core.paths import CONF_DIR, resolve_path, user_path
 from nerfro.core.trust import GuardedConfigLoader
-from nerfro.files.foreign_config import foreign_config
-from nerfro.registry.registration import plugins
 from tests.conftest import composed, refused
 
 
@@ -113,7 +110,7 @@ def test_invalid_yaml_file_is_named_with_the_line(tmp_path: Path) -> None:
         assert f'"{path}", line' in line
     path.write_bytes(b"name: \xe9")
     with pytest.raises(NerfroError, match=r"mine\.yaml is not a text in UTF-8"):
-        RenamingFiles("mine", f"file://{tmp_path}").load_config("mine")
+        BoundedFiles("mine", f"file://{tmp_path}").load_config("mine")
 
 
 @pytest.mark.parametrize("location", ["~nobody_of_that_name/run", "a\0b"])
@@ -127,93 +124,21 @@ def test_unknown_embedded_scene_is_refused(location: str) -> None:
     refused("embedded scenes: torus", resolve_path, location)
 
 
-OLD_NAMES = {
-    "batches.hidden": "batches.size",
-    "loss.near": "loss.distortion",
-    "loss=near": "distortion",
-    "experiment=mirror": "glass",
-    "medium.old_depth": None,
-}
-
-
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        ("batches.hidden=3", "batches.size=3"),
-        ("++batches.hidden=3,4", "++batches.size=3,4"),
-        ("~loss.near", "~loss.distortion"),
-        ("+loss@loss.near=near", "+loss@loss.distortion=distortion"),
-        ("+loss.near.weight=1", "+loss.distortion.weight=1"),
-        ("+experiment=mirror,nerf", "+experiment=glass,nerf"),
-        ("name=near", "name=near"),
-        ("batches.hidden_too=1", "batches.hidden_too=1"),
-        ("medium.old_depths=1", "medium.old_depths=1"),
-    ],
-)
-def test_old_names_in_overrides_are_replaced_with_a_warning(
-    old: str, new: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr("nerfro.cli.old_names.RENAMED", OLD_NAMES)
-    assert is_old_name(old) == (old != new)
-    assert renamed_override(old) == new
-    printed = capsys.readouterr().out
-    assert ("since this release" in printed) == (old != new)
-    refused(r"medium\.old_depth was removed .* leave it out", renamed_override, "medium.old_depth=3")
-
-
-def test_old_names_in_files_and_old_runs_are_replaced_with_a_warning(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr("nerfro.cli.old_names.RENAMED", OLD_NAMES)
-    (tmp_path / "experiment").mkdir()
-    (tmp_path / "experiment" / "mine.yaml").write_text(
-        "# @package _global_\ndefaults:\n  - mirror\n  - /loss@loss.near: near\n  - _self_\nbatches: {hidden: 7}\n"
-    )
-    files = RenamingFiles("main", str(tmp_path))
-    config = files.load_config("experiment/mine").config
-    assert config == {"defaults": ["glass", {"/loss@loss.distortion": "distortion"}, "_self_"], "batches": {"size": 7}}
-    (tmp_path / "experiment" / "mine.yaml").write_text("# @package _global_\nmedium: {old_depth: 7}\n")
-    refused(r"experiment/mine\.yaml: medium\.old_depth was removed", files.load_config, "experiment/mine")
-    assert "experiment/mine.yaml: batches.hidden is called batches.size since this release" in capsys.readouterr().out
-
-    run = foreign_config("batches: {hidden: 7}\nmedium: {old_depth: 7, ior: 1.5}\n", tmp_path / "config.yaml")
-    assert run == {"batches": {"size": 7}, "medium": {"ior": 1.5}}
-    assert capsys.readouterr().out.count("batches.hidden is called batches.size") == 1
-
-
 def test_bodies_are_settings_of_the_medium(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert renamed_override("bodies={a: {ior: 1.5}}") == "medium.bodies={a: {ior: 1.5}}"
-    assert renamed_override("+bodies.a.ior=1.5") == "+medium.bodies.a.ior=1.5"
+    assert full_key("bodies={a: {ior: 1.5}}") == "medium.bodies={a: {ior: 1.5}}"
+    assert full_key("+bodies.a.ior=1.5") == "+medium.bodies.a.ior=1.5"
     (tmp_path / "experiment").mkdir()
     (tmp_path / "experiment" / "mine.yaml").write_text("# @package _global_\nbodies: {a: {ior: 1.5}}\n")
-    config = RenamingFiles("main", str(tmp_path)).load_config("experiment/mine").config
+    config = BoundedFiles("main", str(tmp_path)).load_config("experiment/mine").config
     assert config == {"medium": {"bodies": {"a": {"ior": 1.5}}}}
     assert not capsys.readouterr().out
 
 
 def test_groups_of_parameters_are_added_to_those_of_the_experiment() -> None:
     pattern = "bodies.*.material.ior"
-    for old in ("optimizer.medium_start=7", f'optimizer.groups={{"{pattern}": {{start: 7}}}}'):
-        config = composed("+experiment=unknown", renamed_override(old))
-        assert config.optimizer.groups[pattern] == {"learning_rate": 1e-3, "start": 7}
-    swept = renamed_override("optimizer.medium_start=7,8")
+    config = composed("+experiment=unknown", f"+optimizer.groups={{{pattern}: {{start: 7}}}}")
+    assert config.optimizer.groups[pattern] == {"learning_rate": 1e-3, "start": 7}
+    swept = f"+optimizer.groups={{{pattern}: {{start: 7}}}},{{{pattern}: {{start: 8}}}}"
     choices = OverridesParser.create().parse_override(swept).sweep_string_iterator()
     starts = [composed(f"+optimizer.groups={choice}").optimizer.groups[pattern].start for choice in choices]
     assert starts == [7, 8]
-    for old in ("~optimizer.medium_start", "optimizer.medium_start=range(1,3)"):
-        with pytest.raises(NerfroError) as refused:
-            renamed_override(old)
-        assert str(refused.value) == f"{old}: write 'optimizer.groups={{{pattern}: {{start: VALUE}}}}' instead"
-    run = foreign_config("optimizer: {medium_start: 7}", CONF_DIR / "config.yaml")
-    assert run == {"optimizer": {"groups": {pattern: {"start": 7}}}}
-
-
-def test_renamed_settings_exist_and_their_old_names_do_not() -> None:
-    config = composed("+experiment=straight")
-    for old, new in RENAMED.items():
-        group, is_option, option = old.partition("=")
-        if is_option:
-            assert not (CONF_DIR / group / f"{option}.yaml").exists(), old
-            assert (group, new) in {(p.kind, p.name) for p in plugins()} or (CONF_DIR / group / f"{new}.yaml").exists()
-        else:
-            assert OmegaConf.select(config, old) is None, old

@@ -47,21 +47,21 @@ def test_dense_ball_of_glass_absorbs_along_its_chords() -> None:
 
 
 def test_compositing_equals_a_slow_loop() -> None:
-    samples, boundary = example_samples(), torch.rand(NUM_RAYS, 3)
+    samples, background = example_samples(), torch.rand(NUM_RAYS, 3)
     values = smooth_radiance(samples)
-    rendering = composite(samples, values, boundary, example_path())
+    rendering = composite(samples, values, background, example_path())
     for ray in range(NUM_RAYS):
         colour, transmittance = torch.zeros(3), 1.0
         for i in range(samples.s.shape[1]):
             alpha = 1 - math.exp(-float(values.density[ray, i] * samples.deltas[ray, i]))
             colour += transmittance * alpha * values.radiance[ray, i]
             transmittance *= 1 - alpha
-        colour += transmittance * boundary[ray]
+        colour += transmittance * background[ray]
         torch.testing.assert_close(rendering.radiance[ray], colour, atol=1e-5, rtol=0)
         assert rendering.transmittance[ray] == pytest.approx(transmittance, abs=1e-5)
 
 
-def test_opaque_wall_hides_the_boundary_and_gives_its_depth() -> None:
+def test_opaque_wall_hides_the_background_and_gives_its_depth() -> None:
     samples = example_samples()
     density = torch.where(torch.arange(16) == 5, 1e6, 0.0).expand_as(samples.s)
     radiance = torch.full_like(samples.positions, 0.25)

@@ -47,7 +47,7 @@ def guide_plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, restored_regi
 
 
 def test_plugins_of_the_guide_keep_their_contracts(guide_plugins: list[str]) -> None:
-    named = ["sampler/points=square_root", "loss=half_transparent", "boundary=horizon", "metric=worst_pixel"]
+    named = ["sampler/points=square_root", "loss=half_transparent", "background=horizon", "metric=worst_pixel"]
     named += ["sampler/points=coarse_to_fine", "sampler/path=mirage", "surface=lens", "phase=mean_colour"]
     for kind, _, name in (text.partition("=") for text in named):
         check(find(kind, name))
@@ -63,9 +63,9 @@ def test_plugins_of_the_guide_train(
     path: str, guide_plugins: list[str], train_here: Runner, tiny_default_run: list[str], tmp_path: Path
 ) -> None:
     loss = ("+loss.half_transparent.weight=0.1", "+loss.half_transparent.power=2")
-    options = ("sampler/points=square_root", *loss, "boundary=horizon", "+phase.mean_colour={}", path)
+    options = ("sampler/points=square_root", *loss, "background=horizon", "+phase.mean_colour={}", path)
     finished = train_here(
-        *(option for option in tiny_default_run if not option.startswith(("sampler.points", "boundary."))), *options,
+        *(option for option in tiny_default_run if not option.startswith(("sampler.points", "background."))), *options,
         "trainer.max_steps=2", f"hydra.run.dir={tmp_path}/run",
     )  # fmt: skip
     assert "2 steps in" in finished.out

@@ -18,9 +18,8 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
 from nerfro.cli.entry import _added, _quoted
-from nerfro.cli.old_names import full_key, renamed_override
 from nerfro.cli.options import Described, describe_command, usage
-from nerfro.cli.overrides import is_scene_file
+from nerfro.cli.overrides import full_key, is_scene_file
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import CONF_DIR, PACKAGE_DIR
 from nerfro.registry.allowed import check_names, check_settings
@@ -91,8 +90,7 @@ def require_valid(command: str, options: list[str]) -> None:
     """Raise an error unless a command accepts the options. Hydra composes only the choices of groups, to save time."""
     schema, verbatim = entry_points()[command]
     options = [option for option in options if not is_scene_file(option)]
-    given, options = [full_key(option) for option in options], [renamed_override(option) for option in options]
-    assert [option.lstrip("+") for option in options] == [option.lstrip("+") for option in given], "an old name"
+    options = [full_key(option) for option in options]
     # Of a sweep the first value; no patterns, and no options of Hydra, whose launchers may not be installed.
     options = [re.sub(r"^([^=]+=[^,[{]+),[^]}]*$", r"\1", option) for option in options if "(" not in option]
     options = [_quoted(option, verbatim) for option in options if not option.lstrip("+").startswith("hydra")]

@@ -11,7 +11,7 @@ import torch
 from omegaconf import OmegaConf
 from torch import Tensor
 
-from nerfro.boundaries.constant import ConstantBoundary
+from nerfro.backgrounds.constant import ConstantBackground
 from nerfro.core.types import FieldValues, Samples
 from nerfro.data.base import Views
 from nerfro.fields.base import Field
@@ -119,7 +119,7 @@ def make_model(make_field: Callable[[], Field] = Slanted, **fields: Any) -> Rend
         path_sampler=BoxMarch(16),
         point_sampler=Stratified(64),
         make_field=make_field,
-        boundary=ConstantBoundary([0.2, 0.3, 0.4]),
+        background=ConstantBackground([0.2, 0.3, 0.4]),
     )
     return EikonalFields(parts, **{"resolution": 16, "box_min": [-5.0] * 3, "box_max": [5.0] * 3, **fields})
 
@@ -201,8 +201,8 @@ def test_index_of_a_homogeneous_ball_is_recovered(train_here: Runner, tmp_path: 
         "data.far=6",
         "evaluation.split=train",
         "sampler.path.num_steps=24",
-        "boundary.resolutions=[64]",
-        f"boundary.image={tmp_path / 'sky.png'}",
+        "background.resolutions=[64]",
+        f"background.image={tmp_path / 'sky.png'}",
         "optimizer={learning_rate: 1e-2, final_learning_rate: 1e-3, groups: {background.*: {learning_rate: 1e-9}}}",
         "model={resolution: 64, blur: 1.5, num_levels: 3, scene_fraction: 0.003, index_fraction: 0.997}",
         "batches.size=200",

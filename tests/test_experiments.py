@@ -44,7 +44,7 @@ def shrunk(config: DictConfig) -> list[str]:
     small: dict[str, dict[str, int]] = {
         "medium": {"resolution": 32, "smoothing_size": 3},
         "field": {"width": 8, "view_width": 8, "num_levels": 2, "log2_table_size": 8},
-        "boundary": {"width": 8},
+        "background": {"width": 8},
         "evaluation.subdivision": {"side": 1},
         "loss.smoothness": {"tile_size": 4},
         "model": {"resolution": 16},
@@ -112,8 +112,8 @@ def test_scene_composes_with_every_experiment_of_the_paper(scene: str) -> None:
             if experiment != "paper_mipnerf":
                 assert config.medium.resolution == own.authors.resolution
                 assert config.sampler.path.num_steps == own.authors.num_steps
-                weight = 0 if experiment == "paper_ablation_noBD" else own.authors.boundary_weight
-                assert config.loss.boundary.weight == weight
+                weight = 0 if experiment == "paper_ablation_noBD" else own.authors.background_weight
+                assert config.loss.background.weight == weight
 
 
 def test_eight_scenes_of_the_paper_exist() -> None:
@@ -129,7 +129,7 @@ def test_experiment_accepts_another_point_sampler(experiment: str) -> None:
 def test_experiments_can_be_combined() -> None:
     config = composed("+experiment=[ablation_noH,ablation_noBD]")
     assert "num_samples" in config.sampler.points
-    assert config.loss.boundary.weight == 0
+    assert config.loss.background.weight == 0
     assert config.name == "ablation_noBD"
 
 
@@ -138,8 +138,8 @@ def test_experiments_can_be_combined() -> None:
     [
         ("refractive", "ablation_noH", {"sampler.points"}),
         ("paper_refractive", "paper_ablation_noH", {"sampler.points"}),
-        ("refractive", "ablation_noBD", {"loss.boundary.weight"}),
-        ("paper_refractive", "paper_ablation_noBD", {"loss.boundary.weight"}),
+        ("refractive", "ablation_noBD", {"loss.background.weight"}),
+        ("paper_refractive", "paper_ablation_noBD", {"loss.background.weight"}),
         ("glass", "glass_noReflection", {"sampler.path.branches"}),
         ("glass", "glass_noTint", {"medium.learn_absorption"}),
         (
@@ -148,7 +148,7 @@ def test_experiments_can_be_combined() -> None:
             {
                 "field.box_min",
                 "field.box_max",
-                "boundary",
+                "background",
                 "sampler.points",
                 "model.colour",
                 "loss.total_variation.weight",
@@ -176,7 +176,7 @@ def test_experiments_of_glass_learn_all_bodies_without_their_own_settings(experi
 def test_settings_of_the_paper_match_the_authors() -> None:
     assert composed("+experiment=paper_ablation_noH").sampler.points.num_samples == 256
     config = composed("+experiment=paper_refractive")
-    assert config.loss.boundary.weight == 0.025
+    assert config.loss.background.weight == 0.025
     assert (config.field.width, config.field.depth) == (256, 8)
     assert (config.sampler.points.num_coarse, config.sampler.points.num_fine) == (64, 128)
     assert (config.sampler.path.integrator, config.sampler.path.num_steps) == ("euler", 768)

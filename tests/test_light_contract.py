@@ -9,12 +9,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfro.boundaries.envmap import EnvironmentMap
+from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.core.light import to_linear, to_srgb
 from nerfro.core.types import Exits, FieldValues, Path
 from nerfro.files import lat_long
+from nerfro.losses.background import BackgroundRegularizer
 from nerfro.losses.base import Loss
-from nerfro.losses.boundary import BoundaryRegularizer
 from nerfro.losses.photometric import Photometric
 from nerfro.models.refractive import RefractiveModel
 from nerfro.paper.hierarchical import Hierarchical
@@ -38,9 +38,9 @@ def split_path(of_straight: float) -> Path:
 
 
 def rendered(path: Path) -> Tensor:
-    model = RefractiveModel(replace(example_components(), boundary=EnvironmentMap([4]))).eval()
+    model = RefractiveModel(replace(example_components(), background=EnvironmentMap([4]))).eval()
     torch.manual_seed(1)
-    torch.nn.init.normal_(model.scene.boundary.texels)
+    torch.nn.init.normal_(model.scene.background.texels)
     for parameter in model.scene.fields.parameters():
         torch.nn.init.normal_(parameter, std=0.3)
     with torch.no_grad():
@@ -76,7 +76,7 @@ def test_random_numbers_are_drawn_for_each_ray(sampler: Stratified | Hierarchica
     assert torch.equal(samples.s[::2], sampler(same, None, example_draws()).s), "and splitting changes nobody's"
 
 
-@pytest.mark.parametrize("loss", [Photometric(), BoundaryRegularizer(), find("loss", "distortion").cls()])
+@pytest.mark.parametrize("loss", [Photometric(), BackgroundRegularizer(), find("loss", "distortion").cls()])
 def test_losses_accept_rays_that_split(loss: Loss) -> None:
     model, batch = RefractiveModel(example_components()).eval(), example_batch()
     with torch.no_grad():
@@ -128,10 +128,10 @@ def test_bright_lights_of_a_sky_survive_a_file_and_a_texture(tmp_path: FilePath,
     lat_long.save_lat_long(tmp_path / f"sky{suffix}", sky)
     # Radiance's mantissa of eight bits is shared by the channels.
     torch.testing.assert_close(lat_long.load_lat_long(tmp_path / f"sky{suffix}"), sky, rtol=0.02, atol=1e-3)
-    boundary = EnvironmentMap([64], image=str(tmp_path / f"sky{suffix}"))
+    background = EnvironmentMap([64], image=str(tmp_path / f"sky{suffix}"))
     lamp = lat_long.directions(32)[12, 24]
-    torch.testing.assert_close(boundary(Exits(lamp[None]))[0], sky[12, 24], rtol=0.03, atol=0)
-    boundary.save_lat_long(tmp_path / f"again{suffix}", height=32)
+    torch.testing.assert_close(background(Exits(lamp[None]))[0], sky[12, 24], rtol=0.03, atol=0)
+    background.save_lat_long(tmp_path / f"again{suffix}", height=32)
     assert lat_long.load_lat_long(tmp_path / f"again{suffix}").max() > 35
 
 

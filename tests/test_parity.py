@@ -67,9 +67,9 @@ def model(recorded: dict[str, Tensor], medium: VoxelGrid) -> RefractiveModel:
         path_sampler=Eikonal("euler", num_coarse * steps),
         point_sampler=Hierarchical(num_coarse, int(recorded["num_fine"]), draw="vertices", offset=0.0),
         make_field=lambda: NerfField(width=width, view_width=view_width),
-        boundary=Skybox(width=recorded["weight/bkgd_mlp/Dense_0/kernel"].shape[1]),
+        background=Skybox(width=recorded["weight/bkgd_mlp/Dense_0/kernel"].shape[1]),
     )
-    model = RefractiveModel(parts, boundary_direction="last_coarse", colour="srgb").eval()
+    model = RefractiveModel(parts, background_direction="last_coarse", colour="srgb").eval()
     for name, layer in layers(model).items():
         layer.weight.data.copy_(recorded[f"weight/{name}/kernel"].T)
         layer.bias.data.copy_(recorded[f"weight/{name}/bias"])
@@ -88,7 +88,7 @@ def layers(model: RefractiveModel) -> dict[str, nn.Linear]:
         mlp = field.mlp
         for i, layer in enumerate((*mlp.trunk.layers, mlp.density, mlp.bottleneck, mlp.view, mlp.rgb)):
             named[f"{network}/Dense_{i}"] = layer
-    for i, layer in enumerate((*model.scene.boundary.trunk.layers, model.scene.boundary.rgb)):
+    for i, layer in enumerate((*model.scene.background.trunk.layers, model.scene.background.rgb)):
         named[f"bkgd_mlp/Dense_{i}"] = layer
     return named
 
@@ -123,7 +123,7 @@ def test_parity_of_the_losses_and_their_gradients(
 ) -> None:
     settings: dict[str, dict[str, Any]] = {
         "photometric": {},
-        "boundary": {"weight": 0.025, "start": 0},
+        "background": {"weight": 0.025, "start": 0},
         "smoothness": {"weight": 1.0, "start": 0, "tile_size": len(recorded["sky_patch_directions"])},
     }
     losses: dict[str, Loss] = {name: create(find("loss", name), options) for name, options in settings.items()}
@@ -131,7 +131,7 @@ def test_parity_of_the_losses_and_their_gradients(
     fine_only = losses["photometric"](renderings[1:], batch, model.scene)
     assert_relative(fine_only, recorded["loss_rgb_fine"], 1e-3)
     assert_relative(values["photometric"] - fine_only, recorded["loss_rgb_coarse"], 1e-3)
-    assert_relative(values["boundary"], recorded["loss_boundary"], 1e-3)
+    assert_relative(values["background"], recorded["loss_background"], 1e-3)
     assert_relative(values["smoothness"], recorded["loss_smoothness"], 1e-3)
     total = sum(loss.weight_at(0) * values[name] for name, loss in losses.items())
     assert_relative(total, recorded["loss_total"], 1e-3)

@@ -38,15 +38,15 @@ from tests.processes import printed_by, python
 
 discover()
 
-BOUNDARY = '''
-"""A boundary."""
+BACKGROUND = '''
+"""A background."""
 import torch
-from nerfro.boundaries.base import Boundary
+from nerfro.backgrounds.base import Background
 from nerfro.registry.registration import register
 
 
-@register("boundary", "{name}")
-class OneGrey(Boundary):
+@register("background", "{name}")
+class OneGrey(Background):
     """The same grey in every direction."""
 
     def __init__(self, grey: float = 0.5) -> None:
@@ -251,16 +251,16 @@ def test_views_refuse_a_list_of_images() -> None:
 
 
 def test_plugin_with_a_taken_name_names_both_modules_and_its_file(write_plugin: Callable[[str, str], Path]) -> None:
-    folder = write_plugin("clash", BOUNDARY.format(name="constant"))
-    message = refused("boundary=constant is registered twice", discover, folder)
-    for word in (str(folder / "clash.py"), "nerfro.boundaries.constant", "nerfro_plugins.clash"):
+    folder = write_plugin("clash", BACKGROUND.format(name="constant"))
+    message = refused("background=constant is registered twice", discover, folder)
+    for word in (str(folder / "clash.py"), "nerfro.backgrounds.constant", "nerfro_plugins.clash"):
         assert word in message
 
 
 def test_two_files_of_one_name_are_refused(tmp_path: Path) -> None:
     for folder in ("one", "two"):
         (tmp_path / folder).mkdir()
-        (tmp_path / folder / "same.py").write_text(BOUNDARY.format(name=f"grey_{folder}"))
+        (tmp_path / folder / "same.py").write_text(BACKGROUND.format(name=f"grey_{folder}"))
     discover(tmp_path / "one")
     refused(r"two plugin files are called same: .*one.* and .*two", discover, tmp_path / "two")
 
@@ -275,13 +275,13 @@ def test_plugins_of_the_current_directory_are_registered_unless_the_environment_
     variable: str | None, found: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "plugins").mkdir()
-    (tmp_path / "plugins" / "grey_here.py").write_text(BOUNDARY.format(name="grey_here"))
+    (tmp_path / "plugins" / "grey_here.py").write_text(BACKGROUND.format(name="grey_here"))
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("NERFRO_PLUGINS", raising=False)
     if variable is not None:
         monkeypatch.setenv("NERFRO_PLUGINS", variable)
     discover()
-    assert ("grey_here" in {plugin.name for plugin in plugins("boundary")}) is found
+    assert ("grey_here" in {plugin.name for plugin in plugins("background")}) is found
 
 
 # Overrides that use each template.
@@ -292,7 +292,7 @@ TEMPLATES = {
         "medium.resolution=32",
         "bodies={ring: {surface: {name: torus}, ior: 1.5}}",
     ],
-    "example_boundary": ["boundary=gradient_sky"],
+    "example_background": ["background=gradient_sky"],
     "example_camera": ["camera=shifted"],
     "example_data": ["data=numpy_views"],
     "example_field": ["field=blobs"],
@@ -449,7 +449,7 @@ build-backend = "hatchling.build"
 name = "nerfro-grey"
 version = "1.0"
 [project.entry-points."nerfro.plugins"]
-grey = "nerfro_grey.boundary"
+grey = "nerfro_grey.background"
 [tool.hatch.build.targets.wheel]
 packages = ["nerfro_grey"]
 """
@@ -460,11 +460,11 @@ import sys
 import nerfro.plugins, nerfro.train
 from nerfro.registry.registration import find
 from nerfro.testing import check
-sys.argv = ["nerfro.plugins", "boundary=installed_grey"]
+sys.argv = ["nerfro.plugins", "background=installed_grey"]
 nerfro.plugins.main()
-check(find("boundary", "installed_grey"))
+check(find("background", "installed_grey"))
 print("kept its contract")
-sys.argv = "nerfro.train boundary=installed_grey boundary.grey=0.25 --cfg job -p boundary".split()
+sys.argv = "nerfro.train background=installed_grey background.grey=0.25 --cfg job -p background".split()
 nerfro.train.main()
 """
 
@@ -475,7 +475,7 @@ def test_installed_package_is_found_listed_and_checked(tmp_path: Path) -> None:
     (project / "nerfro_grey").mkdir(parents=True)
     (project / "pyproject.toml").write_text(PYPROJECT)
     (project / "nerfro_grey" / "__init__.py").touch()
-    (project / "nerfro_grey" / "boundary.py").write_text(BOUNDARY.format(name="installed_grey"))
+    (project / "nerfro_grey" / "background.py").write_text(BACKGROUND.format(name="installed_grey"))
     install(project, site)
     found = os.pathsep.join([str(site), os.environ.get("PYTHONPATH", "")])
     used = printed_by("-c", USE_IT, folder=tmp_path, PYTHONPATH=found)
@@ -484,11 +484,11 @@ def test_installed_package_is_found_listed_and_checked(tmp_path: Path) -> None:
     assert kept
     assert "grey: 0.25" in job
     # One that cannot be imported stops the run and is named.
-    (site / "nerfro_grey" / "boundary.py").write_text("import no_such_package\n")
+    (site / "nerfro_grey" / "background.py").write_text("import no_such_package\n")
     broken = python("-m", "nerfro.plugins", folder=tmp_path, PYTHONPATH=found)
     assert broken.returncode == 1
     assert broken.stderr.strip() == (
-        "nerfro: error: plugin 'grey' of an installed package (nerfro_grey.boundary) cannot be imported: "
+        "nerfro: error: plugin 'grey' of an installed package (nerfro_grey.background) cannot be imported: "
         "ModuleNotFoundError: No module named 'no_such_package'"
     )
 

@@ -27,7 +27,7 @@ def _registry_as_before(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_constructor_becomes_the_configuration() -> None:
-    @register("boundary", "of_test")
+    @register("background", "of_test")
     class OfTest(nn.Module):
         """First line.
 
@@ -48,7 +48,7 @@ def test_constructor_becomes_the_configuration() -> None:
             self.arguments = required, rate, names, maybe, newer, mode
             self.medium = medium
 
-    plugin = find("boundary", "of_test")
+    plugin = find("background", "of_test")
     assert plugin.parts == {"medium"}
     assert plugin.summary == "First line."
     assert list(plugin.fields()) == [
@@ -66,7 +66,7 @@ def test_constructor_becomes_the_configuration() -> None:
 
 
 def test_integer_is_accepted_as_float_and_digits_as_integer() -> None:
-    plugin = find("loss", "boundary")
+    plugin = find("loss", "background")
     assert configure(plugin, {"weight": 1, "start": "7"})["weight"] == 1.0
     assert configure(plugin, {"weight": 1, "start": "7"})["start"] == 7
 
@@ -77,7 +77,7 @@ def test_integer_is_accepted_as_float_and_digits_as_integer() -> None:
 def test_constructor_with_arbitrary_arguments_is_refused() -> None:
     with pytest.raises(NerfroError, match=r"takes \*options; name every parameter instead"):
 
-        @register("boundary", "greedy")
+        @register("background", "greedy")
         class Greedy(nn.Module):
             """Takes anything."""
 

@@ -13,9 +13,7 @@ from unittest import mock
 
 import pytest
 import torch
-from omegaconf import OmegaConf
 
-from nerfro.cli.old_names import renamed_config
 from nerfro.core.errors import NerfroError
 from nerfro.evaluation import scoring
 from nerfro.files.images import save_png
@@ -24,8 +22,7 @@ from nerfro.training.run_folder import (
     find_checkpoint,
     load_checkpoint,
 )
-from nerfro.training.settings import RESUMING, first_difference, settings
-from tests.conftest import Bomb, Runner, composed, refused
+from tests.conftest import Bomb, Runner, refused
 from tests.forked import Command
 
 SCHEDULE = ["checkpoint.every_steps=3", "checkpoint.every_seconds=null", "evaluation.every=5", "trainer.max_steps=12"]
@@ -185,14 +182,3 @@ def test_full_disk_is_refused_before_training(train: Runner, tmp_path: Path, mon
     monkeypatch.setattr("shutil.disk_usage", lambda path: usage(100 * 2**20, 99 * 2**20, 2**20))
     assert "has 1 MiB free and this run needs " in train("trainer.max_steps=2", code=1).error
     assert not [path for path in (tmp_path / "run").rglob("*") if path.is_file()]
-
-
-def test_runs_of_earlier_releases_can_be_resumed() -> None:
-    config = composed("+experiment=paper_mipnerf")
-    old = OmegaConf.create(OmegaConf.to_container(config))  # as read from a file
-    old.loss.boundary._target_ = "nerfro.losses.boundary.BoundaryRegulariser"
-    old.phase.background._target_ = "nerfro.training.phases.background.Background"
-    del old.field["unit"]
-    assert first_difference(settings(old, RESUMING), settings(config, RESUMING)) is not None
-    renamed = renamed_config(old, Path("config.yaml"))
-    assert first_difference(settings(renamed, RESUMING), settings(config, RESUMING)) is None

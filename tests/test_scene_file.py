@@ -92,18 +92,6 @@ def test_bodies_with_materials_keep_their_names(tmp_path: Path) -> None:
     }
 
 
-def test_scene_files_of_earlier_releases_are_read(tmp_path: Path) -> None:
-    options = ["data=opencv", "data.root=capture", "medium.box_min=[-1.0,-1.0,-1.0]", "medium.mesh=o/mesh.ply"]
-    vessel = ["data=opencv", "data.root=capture", "medium=vessel", "medium.wall=0.1", "medium.ior=1.52"]
-    old = {"options": options, "doubtful": ["medium.ior=1.4"], "near": True, "pixels": [64, 48], "vessel": vessel}
-    scene = read_scene_file(write(tmp_path / "preprocess.json", **old))
-    assert scene.data == {"type": "opencv", "root": "capture"}
-    assert scene.medium == {"box_min": [-1.0, -1.0, -1.0]}
-    assert scene.bodies == {"object": BodySettings(mesh="o/mesh.ply", ior=1.4)}
-    assert scene.vessel == {"wall": 0.1, "ior": 1.52}
-    assert (scene.surroundings, scene.photograph, len(scene.provenance.doubts)) == ("near", [64, 48], 1)
-
-
 @pytest.mark.parametrize(
     ("content", "message"),
     [
@@ -118,7 +106,6 @@ def test_scene_files_of_earlier_releases_are_read(tmp_path: Path) -> None:
         ({"data": DATA | {"far seed=3": 1}}, "data has the key 'far seed=3'"),
         ({"data": DATA | {"_target_": "os.system"}}, "data has the key '_target_'"),
         ({"data": DATA | {"near": "${oc.env:HOME}"}}, "contains an interpolation"),
-        ({"options": 3, "near": True, "pixels": []}, "is not a result of nerfro.preprocess"),
     ],
 )
 def test_mistakes_give_a_one_line_error(content: Any, message: str, tmp_path: Path) -> None:

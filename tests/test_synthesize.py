@@ -9,7 +9,7 @@ from omegaconf import OmegaConf
 from PIL import Image
 from torch.nn.functional import max_pool2d
 
-from nerfro.boundaries.envmap import EnvironmentMap
+from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.core.light import to_srgb
 from nerfro.core.paths import ASSETS_DIR, CONF_DIR
 from nerfro.core.types import Exits

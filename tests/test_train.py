@@ -17,7 +17,13 @@ from tests.conftest import UTM, Runner, moved_mesh, train_in, weights_of
 
 @pytest.fixture(scope="module")
 def overrides(tiny_run: list[str]) -> list[str]:
-    return [*tiny_run, "trainer.max_steps=6", "evaluation.every=4", "loss.boundary.start=2", "loss.smoothness.start=3"]
+    return [
+        *tiny_run,
+        "trainer.max_steps=6",
+        "evaluation.every=4",
+        "loss.background.start=2",
+        "loss.smoothness.start=3",
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -97,9 +103,9 @@ def test_log_contains_every_loss_and_weight_of_every_second_step_and_images(run:
     rate = "optimizer/learning_rate/common"
     for name in ("loss/total", "loss/photometric", "train/psnr", "train/rays_per_second", rate):
         assert [step for step, _ in logged(name)] == [0, 1, 3, 5], name
-    assert logged("weight/boundary") == [(0, 0), (1, 0), (3, pytest.approx(0.025)), (5, pytest.approx(0.025))]
+    assert logged("weight/background") == [(0, 0), (1, 0), (3, pytest.approx(0.025)), (5, pytest.approx(0.025))]
     assert logged("weight/smoothness") == [(0, 0), (1, 0), (3, 1), (5, 1)]
-    assert [step for step, _ in logged("loss/boundary")] == [3, 5]
+    assert [step for step, _ in logged("loss/background")] == [3, 5]
     assert "val/psnr" in events.Tags()["scalars"]
     assert "epoch" not in events.Tags()["scalars"]
     assert "custom_scalars__config__" in events.Tags()["tensors"]

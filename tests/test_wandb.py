@@ -65,19 +65,19 @@ def test_offline_run_needs_no_account_and_logs_the_values_of_tensorboard_and_csv
     monkeypatch.delenv("WANDB_API_KEY", raising=False)
     train_paper(
         "logger=wandb", "logger.wandb.offline=true", "trainer.max_steps=4", "evaluation.every=2",
-        "trainer.log_every_n_steps=1", "loss.boundary.start=0", "loss.smoothness.start=0",
+        "trainer.log_every_n_steps=1", "loss.background.start=0", "loss.smoothness.start=0",
     )  # fmt: skip
     folder = tmp_path / "run"
     (log,) = folder.glob("wandb/offline-run-*/run-*.wandb")
     settings, logged = read(log)
-    assert (settings["trainer"]["max_steps"], settings["loss"]["boundary"]["start"]) == (4, 0)
+    assert (settings["trainer"]["max_steps"], settings["loss"]["background"]["start"]) == (4, 0)
     events = EventAccumulator(str(folder / "tensorboard"), {"images": 0, "scalars": 0}).Reload()
     tags = events.Tags()
 
     scalars = set(tags["scalars"])
     assert "epoch" not in logged
     assert {
-        "loss/total", "loss/photometric", "loss/boundary", "loss/smoothness", "weight/boundary", "train/psnr",
+        "loss/total", "loss/photometric", "loss/background", "loss/smoothness", "weight/background", "train/psnr",
         "val/psnr", "train/rays_per_second", "train/peak_memory_gib", "optimizer/learning_rate/common",
     } <= scalars  # fmt: skip
     with (folder / "csv" / "metrics.csv").open() as stream:

@@ -48,8 +48,8 @@ def test_installed_wheel_composes_and_lists_its_plugins_from_a_foreign_folder(wh
     python = functools.partial(printed_by, folder=elsewhere, PYTHONPATH=str(site), COLUMNS="200")
     assert python("-c", "import nerfro; print(nerfro.__file__)").strip().startswith(str(site))
     listed = python("-m", "nerfro.plugins")
-    assert "boundary=skybox" in listed
-    assert "boundary=gradient_sky" in listed, "plugins/ travels with it"
+    assert "background=skybox" in listed
+    assert "background=gradient_sky" in listed, "plugins/ travels with it"
     job = python("-m", "nerfro.train", "+experiment=paper_refractive", "--cfg", "job")
     assert "name: paper_refractive" in job
     source = "from nerfro.data.blender import BlenderData as B; print(len(B().load('val')), B().root)"

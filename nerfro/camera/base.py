@@ -9,7 +9,6 @@ from torch import Tensor, nn
 
 from nerfro.camera.exposure import Exposure
 from nerfro.core.cameras import Cameras
-from nerfro.core.errors import renamed_classes
 from nerfro.core.rays import Rays
 
 
@@ -64,6 +63,3 @@ class CameraModel(nn.Module, ABC):
     def measurements(self) -> dict[str, float]:
         """Return estimated physical quantities by name, for the log."""
         return {} if self.exposure is None else {"cameras.gain_spread": self.exposure.spread}
-
-
-__getattr__ = renamed_classes(__name__, Camera=CameraModel)

@@ -121,7 +121,7 @@ def find_indices(
             "medium.inner_iors=, or ior or material of each of bodies="
         )
     plan = _PLANS[num_bodies]
-    if isinstance(surroundings.boundary, Room):
+    if isinstance(surroundings.background, Room):
         plan = plan._replace(coarse_pixels=_NEAR_PIXELS // 4, fine_pixels=_NEAR_PIXELS)
     num_rays = plan.num_rays(num_bodies)
     search = _Search(

@@ -46,7 +46,7 @@ class ObjectErrors:
     def of(self, body: Medium) -> Float[np.ndarray, "V"]:
         """Sum the robust errors over the pixels of each view."""
         path = self._sampler(self._pixels.rays, body)
-        radiance = path.sum_polylines(self._surroundings.boundary(path.exits())).clamp(max=1)
+        radiance = path.sum_polylines(self._surroundings.background(path.exits())).clamp(max=1)
         error = geman_mcclure(radiance - self._pixels.radiance, self._scale).double()
         self._num_bodies += 1
         self._progress(self._num_bodies)

@@ -27,9 +27,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from nerfro.boundaries.base import Boundary
-from nerfro.boundaries.cube_map import texel_directions
-from nerfro.boundaries.envmap import EnvironmentMap
+from nerfro.backgrounds.base import Background
+from nerfro.backgrounds.cube_map import texel_directions
+from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.capture.preprocess_options import FIGURES
 from nerfro.capture.room_panorama import RoomPanorama, panorama_of
 from nerfro.capture.surroundings import Observations, Pixels, Room, Surroundings
@@ -298,8 +298,8 @@ class _Descent:
         middle = torch.from_numpy(mesh.bounds.mean(0)).float()
         distance = (cameras.camera_to_world[:, :, 3] - middle).norm(dim=-1)
         self.contour_deviation = _CONTOUR_DEVIATION * float((distance / cameras.fx).mean())
-        boundary = problem.surroundings.boundary
-        self.panorama = panorama_of(boundary, medium, middle) if isinstance(boundary, Room) else boundary
+        background = problem.surroundings.background
+        self.panorama = panorama_of(background, medium, middle) if isinstance(background, Room) else background
 
     @torch.no_grad()
     def medium(self) -> SdfGrid:
@@ -409,7 +409,7 @@ class _Descent:
 
 
 @torch.no_grad()
-def _blurred(panorama: EnvironmentMap | RoomPanorama, degrees: float) -> Boundary:
+def _blurred(panorama: EnvironmentMap | RoomPanorama, degrees: float) -> Background:
     """Convolve surroundings with a Gaussian of the given standard deviation."""
     if degrees == 0:
         return panorama

@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.boundaries import cube_map
-from nerfro.boundaries.base import Boundary
-from nerfro.boundaries.envmap import EnvironmentMap
+from nerfro.backgrounds import cube_map
+from nerfro.backgrounds.base import Background
+from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.capture.surroundings import Room
 from nerfro.core.rays import Rays
 from nerfro.core.types import Exits
@@ -24,7 +24,7 @@ _CHUNK = 16384  # rays rendered at once
 _STEPS = 5  # fixed-point iterations of the lookup; few suffice, because the object is small beside its surroundings
 
 
-class RoomPanorama(Boundary):
+class RoomPanorama(Background):
     """A panorama with depth around a point; the lookup intersects exit rays from other positions with the depth.
 
     The panorama lacks surfaces that are hidden from the point.

@@ -13,9 +13,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from nerfro.boundaries.base import Boundary
-from nerfro.boundaries.cube_map import project
-from nerfro.boundaries.envmap import EnvironmentMap
+from nerfro.backgrounds.base import Background
+from nerfro.backgrounds.cube_map import project
+from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.core.cameras import Cameras
 from nerfro.core.draws import Draws
 from nerfro.core.errors import NerfroError
@@ -141,20 +141,20 @@ class Surroundings:
     """Reconstructed surroundings.
 
     Attributes:
-        boundary: background model that returns the background radiance.
+        background: background model that returns the background radiance.
         seen: observed directions, by face, row and column of a cube map; None if all directions are known.
         unexplained: fraction of the variance of the validation pixels that is not explained.
         colours: a sample of observed radiances.
     """
 
-    boundary: EnvironmentMap | Room
+    background: EnvironmentMap | Room
     seen: Bool[Tensor, "6 n n"] | None
     unexplained: float
     colours: Float[Tensor, "Q 3"]
 
     def radiance(self, exits: Exits) -> tuple[Float[Tensor, "P 3"], Bool[Tensor, "P"]]:
         """Return the radiance that a photograph records along exit rays, and whether the radiance is known."""
-        return self.boundary(exits).clamp(max=1), self.known(exits)
+        return self.background(exits).clamp(max=1), self.known(exits)
 
     def known(self, exits: Exits) -> Bool[Tensor, "P"]:
         """Test whether the radiance in the exit directions is known."""
@@ -182,12 +182,12 @@ def learn_surroundings(
         # Texels are as wide as pixels, and at most half as many, because unobserved texels would be noise.
         side = min(1.5 * float(beside.cameras.fx.mean()) * math.pi / 2, math.sqrt(len(training) / 12))
         levels = [4 * 2**level for level in range(16) if 4 * 2**level <= max(16, side)]
-        boundary = EnvironmentMap(levels)
-        _learn(boundary, training, _SKY_STEPS, _SKY_PIXELS, progress)
+        background = EnvironmentMap(levels)
+        _learn(background, training, _SKY_STEPS, _SKY_PIXELS, progress)
         n = max(1, min(_SEEN_TEXELS, int(math.sqrt(len(training) / (6 * _SEEN_PIXELS)))))
         seen = torch.zeros(6, n, n, dtype=torch.bool)
         seen[_texel(training.rays.directions, n)] = True
-        found = Surroundings(boundary, seen, _unexplained(boundary, validation), validation.radiance)
+        found = Surroundings(background, seen, _unexplained(background, validation), validation.radiance)
     if near or (near is None and found is not None and found.unexplained > _MAX_SKY_RESIDUAL):
         middle = torch.from_numpy(mesh.bounds.mean(0)).float()
         distance = (beside.cameras.camera_to_world[:, :, 3] - middle).norm(dim=-1)
@@ -223,7 +223,7 @@ class Observations:
     def distance(self) -> str | None:
         """Distance of the surroundings, `near` or `far`; None if neither given nor reconstructed."""
         known = self.__dict__.get("surroundings")
-        near = self._room if known is None else isinstance(known.boundary, Room)
+        near = self._room if known is None else isinstance(known.background, Room)
         return None if near is None else "near" if near else "far"
 
     @cached_property
@@ -236,7 +236,7 @@ class Observations:
         """Reconstructed surroundings; prints their type and accuracy."""
         with fraction_bar("surroundings") as progress:
             found = learn_surroundings(self._divided[0], self._mesh, self._room, progress)
-        distance = "near" if isinstance(found.boundary, Room) else "far away"
+        distance = "near" if isinstance(found.background, Room) else "far away"
         print(f"surroundings: {distance}; {1 - found.unexplained:.1%} of the variance of validation views is explained")
         return found
 
@@ -245,7 +245,7 @@ class Observations:
         return divide_pixels(self.views, self._mesh)
 
 
-class Room(Boundary):
+class Room(Background):
     """Near surroundings: a radiance field in all of space, rendered along the exit rays.
 
     The field is initialized with a fixed seed, so that results do not depend on random numbers drawn earlier.
@@ -286,32 +286,32 @@ class Room(Boundary):
         return rendered.radiance, rendered.depth
 
 
-def _learn(boundary: Boundary, pixels: Pixels, steps: int, batch: int, progress: Callable[[float], None]) -> None:
+def _learn(background: Background, pixels: Pixels, steps: int, batch: int, progress: Callable[[float], None]) -> None:
     batch = min(batch, max(1024, len(pixels) // 16))
     generator = torch.Generator().manual_seed(0)
     first, last = _RATES
-    optimizer = torch.optim.Adam(boundary.parameters(), first, eps=1e-15)
+    optimizer = torch.optim.Adam(background.parameters(), first, eps=1e-15)
     with torch.enable_grad():
         for step in range(steps):
             optimizer.param_groups[0]["lr"] = first * (last / first) ** (step / steps)
             drawn = pixels[torch.randint(len(pixels), (batch,), generator=generator)]
             exits = Exits.unbent(drawn.rays)
-            draws = (Draws(0, step, torch.arange(batch)),) if isinstance(boundary, Room) else ()
-            predicted = boundary(exits, *draws)
+            draws = (Draws(0, step, torch.arange(batch)),) if isinstance(background, Room) else ()
+            predicted = background(exits, *draws)
             # A photograph clips radiance at 1, so brighter predictions of clipped pixels are no error.
             seen = torch.where(drawn.radiance >= 1, predicted.clamp(max=1), predicted)
             optimizer.zero_grad()
             functional.mse_loss(seen, drawn.radiance).backward()
             optimizer.step()
-            if isinstance(boundary, Room):
-                boundary.sampler.update([boundary.field], Draws(0, step + 1, torch.arange(batch)))
+            if isinstance(background, Room):
+                background.sampler.update([background.field], Draws(0, step + 1, torch.arange(batch)))
             progress((step + 1) / steps)
-    boundary.eval().requires_grad_(False)
+    background.eval().requires_grad_(False)
 
 
 @torch.no_grad()
-def _unexplained(boundary: Boundary, pixels: Pixels) -> float:
-    error = boundary(Exits.unbent(pixels.rays)).clamp(max=1) - pixels.radiance
+def _unexplained(background: Background, pixels: Pixels) -> float:
+    error = background(Exits.unbent(pixels.rays)).clamp(max=1) - pixels.radiance
     return float(error.square().mean() / pixels.radiance.var(0).mean().clamp(min=_MIN_VARIANCE))
 
 

@@ -1,4 +1,4 @@
-"""Composition of configurations by Hydra, with checks, old names and limits for files."""
+"""Composition of configurations by Hydra, with checks and limits for files."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from hydra.plugins.config_source import ConfigResult
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, flag_override
 
-from nerfro.cli.old_names import rename_in_file, renamed_default, renamed_override
+from nerfro.cli.overrides import SHORT_NAMES, full_key
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import CONF_DIR, refuse_root, user_path
 from nerfro.core.trust import MAX_YAML_CHARACTERS, GuardedConfigLoader, require_bounded_yaml
@@ -77,7 +77,7 @@ class _ConfigLoader(GuardedConfigLoader):
 
     def load_sweep_config(self, master_config: DictConfig, sweep_overrides: list[str]) -> DictConfig:
         """Compose the configuration of a job; its `hydra.job.override_dirname` names what differs between jobs."""
-        overrides = [renamed_override(override) for override in sweep_overrides]
+        overrides = [full_key(override) for override in sweep_overrides]
         config = super().load_sweep_config(master_config, overrides)
         excluded = config.hydra.job.config.override_dirname.exclude_keys
         task = cast(list[str], OmegaConf.to_container(master_config.hydra.overrides.task, resolve=False))
@@ -90,8 +90,8 @@ class _ConfigLoader(GuardedConfigLoader):
         return config
 
 
-class RenamingFiles(FileConfigSource):
-    """Hydra's source of YAML files, with old names replaced."""
+class BoundedFiles(FileConfigSource):
+    """Hydra's source of YAML files, with bounded size and short names of settings."""
 
     def load_config(self, config_path: str) -> ConfigResult:
         file = Path(self.path, self._normalize_file_name(config_path))
@@ -105,10 +105,10 @@ class RenamingFiles(FileConfigSource):
         group = config_path.rpartition("/")[0]
         package = result.header.get("package") or group.replace("/", ".")
         config = cast(DictConfig, result.config)
-        rename_in_file(config, package, config_path)
-        if "defaults" in config:
-            config.defaults = [renamed_default(group, entry) for entry in config.defaults]
+        for short, full in SHORT_NAMES.items():
+            if package in ("", "_global_") and short in config:
+                OmegaConf.update(config, full, config.pop(short), force_add=True)
         return result
 
 
-RenamingFiles.__name__ = FileConfigSource.__name__  # Hydra allows one class for each scheme, and compares their names
+BoundedFiles.__name__ = FileConfigSource.__name__  # Hydra allows one class for each scheme, and compares their names

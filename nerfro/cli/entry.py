@@ -25,11 +25,10 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import MissingMandatoryValue
 
-from nerfro.cli.composition import RenamingFiles, composed_with
+from nerfro.cli.composition import BoundedFiles, composed_with
 from nerfro.cli.failures import errors_in_one_line, in_one_line
-from nerfro.cli.old_names import full_key, is_old_name, renamed_override
 from nerfro.cli.options import ADDED_GROUPS, Described, describe_command, recall, remember, usage
-from nerfro.cli.overrides import is_scene_file
+from nerfro.cli.overrides import full_key, is_scene_file
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import CONF_DIR
 from nerfro.core.trust import leave_current_directory
@@ -75,11 +74,11 @@ def entry_point(
             os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise, Hydra prints its own report and exits
             with composed_with(check_all):
                 ConfigStore.instance().store(name=f"{config_name}_schema", node=schema, provider="nerfro")
-                SourcesRegistry.instance().types["file"] = RenamingFiles
+                SourcesRegistry.instance().types["file"] = BoundedFiles
                 leave_current_directory()
                 discover()
                 _answer_questions(config_name, schema, config_dir)
-                sys.argv[1:] = [_quoted(renamed_override(argument), verbatim) for argument in sys.argv[1:]]
+                sys.argv[1:] = [_quoted(full_key(argument), verbatim) for argument in sys.argv[1:]]
                 if expand is not None:
                     sys.argv[1:] = expand(sys.argv[1:], [field.name for field in dataclasses.fields(schema)])
                 if config_name == "train":
@@ -241,10 +240,9 @@ def answer(described: Described, arguments: list[str]) -> None:
         sys.exit()
     unknown = any(argument.startswith(("--config", "-c", "hydra.searchpath")) for argument in arguments)
     if not unknown:  # other folders of configurations may have other groups
-        current = [text for text in arguments if not is_old_name(text)]
         if {"data", "medium"} & {*described.names.get("", ())}:
-            current = [text for text in current if not is_scene_file(text)]
-        described.require_known([full_key(text) for text in current])
+            arguments = [text for text in arguments if not is_scene_file(text)]
+        described.require_known([full_key(text) for text in arguments])
 
 
 def _refuse_flag(message: str) -> NoReturn:

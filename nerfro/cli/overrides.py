@@ -8,6 +8,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 
+# Short names of settings, on the command line and in YAML files.
+SHORT_NAMES = {"bodies": "medium.bodies"}
 _prints_hints = ContextVar("_prints_hints", default=True)
 
 
@@ -40,6 +42,11 @@ def print_next(label: str, command: str, options: Sequence[str]) -> None:
 def command_line(command: str, options: Sequence[str]) -> str:
     """Return the line that runs a command in a shell."""
     return shlex.join(["python", "-m", f"nerfro.{command}", *options])
+
+
+def full_key(override: str) -> str:
+    """Replace the short name of a setting by the full one."""
+    return re.sub(r"^([+~]*)(\w+)(?=[.=])", lambda key: key[1] + SHORT_NAMES.get(key[2], key[2]), override)
 
 
 def is_given(option: str, overrides: Iterable[str]) -> bool:

@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 import difflib
-import functools
-import operator
 import re
-import warnings
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 _SHOWN = 3
 _LONGEST_LINE = 1000  # characters of an error; the middle of longer ones is left out
@@ -42,68 +38,6 @@ def one_line(text: str) -> str:
     """Escape control characters, which names of files may contain, and shorten a line with long values of a file."""
     line = re.sub(r"[\x00-\x1f\x7f]", lambda character: repr(character[0])[1:-1], text)
     return line if len(line) <= _LONGEST_LINE else f"{line[: _LONGEST_LINE // 2]} ... {line[-_LONGEST_LINE // 4 :]}"
-
-
-def warn_of_old_name(old: str, new: str, stacklevel: int = 3) -> None:
-    """Warn that a Python name has changed; by default, the caller of the calling function."""
-    warnings.warn(f"{old} is called {new}; the next release removes the old name", stacklevel=stacklevel)
-
-
-def renamed_classes(module: str, **classes: type) -> Callable[[str], Any]:
-    """Return the function `__getattr__` of a module, which finds classes by their old names, with a warning."""
-
-    def find(name: str) -> Any:
-        if name not in classes:
-            raise AttributeError(f"module {module!r} has no attribute {name!r}")
-        warn_of_old_name(f"{module}.{name}", f"{module}.{classes[name].__name__}")
-        return classes[name]
-
-    return find
-
-
-def accept_old_methods(cls: type, names: Mapping[str, str]) -> None:
-    """Let methods that a class defines under one name, old or new, be used by both; the old one with a warning.
-
-    Args:
-        cls: a base class, or a class in `__init_subclass__` of its base class.
-        names: new names by old name.
-    """
-    for old, new in names.items():
-        former, present = cls.__dict__.get(old), cls.__dict__.get(new)
-        if former is not None and present is None:
-            warn_of_old_name(f"{cls.__name__}.{old}", new, stacklevel=4)
-            setattr(cls, new, former)
-        elif former is None and present is not None:
-            setattr(cls, old, _under_old_name(present, f"{cls.__name__}.{old}", new))
-
-
-def accept_old_fields(cls: Any, names: Mapping[str, str]) -> None:
-    """Let fields of a dataclass be read, and be passed to its constructor by keyword, under old names with a warning.
-
-    Args:
-        cls: a dataclass.
-        names: new names by old name.
-    """
-    construct = cls.__init__
-
-    @functools.wraps(construct)
-    def construct_renamed(self: Any, *values: Any, **named: Any) -> None:
-        for old in names.keys() & named.keys():
-            warn_of_old_name(f"{cls.__name__}.{old}", names[old])
-            named[names[old]] = named.pop(old)
-        construct(self, *values, **named)
-
-    cls.__init__ = construct_renamed
-    for old, new in names.items():
-        setattr(cls, old, property(_under_old_name(operator.attrgetter(new), f"{cls.__name__}.{old}", new)))
-
-
-def _under_old_name(method: Callable[..., Any], old: str, new: str) -> Callable[..., Any]:
-    def renamed(self: Any, *args: Any, **named: Any) -> Any:
-        warn_of_old_name(old, new)
-        return method(self, *args, **named)
-
-    return renamed
 
 
 def warn(message: str) -> None:

@@ -412,7 +412,7 @@ class Rendering:
         return replace(self, radiance=radiance, background_radiance=background_radiance, gain=of_path)
 
     @property
-    def boundary_fraction(self) -> Float[Tensor, "P 3"]:
+    def background_fraction(self) -> Float[Tensor, "P 3"]:
         """Fraction of the background radiance that reaches the camera along each polyline."""
         fraction = self.transmittance[:, None] * self.path.throughput
         return fraction * self.path.transmitted(self.path.far[:, None])[:, 0] if self.path.absorbs else fraction

@@ -9,7 +9,6 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from nerfro.cli.old_names import renamed_config
 from nerfro.core.errors import NerfroError
 from nerfro.core.trust import require_bounded_yaml
 from nerfro.files.reading import read_text
@@ -31,7 +30,7 @@ def foreign_config(text: str, origin: Path) -> DictConfig:
     interpolation = re.search(r".*\$\{.*", OmegaConf.to_yaml(config))
     if interpolation:
         raise NerfroError(f"{origin} contains an interpolation ({interpolation[0].strip()}); write the value instead")
-    return renamed_config(config, origin)
+    return config
 
 
 def read_foreign_config(path: Path) -> DictConfig:

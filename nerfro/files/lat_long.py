@@ -54,7 +54,7 @@ def load_lat_long(path: Path | str) -> Float[Tensor, "H 2*H 3"]:
     """
     path = Path(path)
     suffix = _format(path)
-    with reading(path, "the sky ", advice="write or copy it again", missing="correct boundary.image"):
+    with reading(path, "the sky ", advice="write or copy it again", missing="correct background.image"):
         if suffix in (".hdr", ".exr"):
             radiance = read_radiance(path)
         else:

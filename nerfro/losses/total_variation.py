@@ -43,7 +43,7 @@ class TotalVariation(Loss):
         index = torch.arange(_NUM_PAIRS, device=batch.rgb.device)
         numbers = batch.draws.uniform(index, 3, "total variation")
         first, second = direction_pairs(numbers, math.radians(self.angle))
-        rgb = scene.colour_space.to_srgb(scene.boundary(Exits(torch.cat([first, second]))))
+        rgb = scene.colour_space.to_srgb(scene.background(Exits(torch.cat([first, second]))))
         return (rgb[_NUM_PAIRS:] - rgb[:_NUM_PAIRS]).abs().mean()
 
 

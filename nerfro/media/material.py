@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
@@ -215,12 +215,6 @@ class Material(nn.Module):
             depth = (self._given_absorption * length).clamp(min=_ALMOST_CLEAR)
             self._absorption.copy_(depth + torch.log(-torch.expm1(-depth)))  # inverse of softplus
             self.absorption_length.fill_(length)
-
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
-        if isinstance(self._absorption, nn.Parameter):
-            # In checkpoints of earlier releases, softplus of the parameter is the absorption per world unit.
-            state_dict.setdefault(f"{prefix}absorption_length", torch.tensor(1.0))
-        super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def learned(self) -> dict[str, nn.Parameter]:
         """Return the parameters of the learned quantities, `ior` and `absorption`."""

@@ -14,26 +14,26 @@ class RefractiveModel(Renderer):
     """Render bent rays with one radiance field for each sampling level, and a background (paper, section 2).
 
     Args:
-        boundary_direction: direction of the background radiance: the `exit` direction of the path, or the direction of
-            the `last_coarse` sample, as in the authors' code.
+        background_direction: direction of the background radiance: the `exit` direction of the path, or the direction
+            of the `last_coarse` sample, as in the authors' code.
         colour: colour space in which fields and background return radiance and rays sum radiance: `linear`, or `srgb`
             as in the authors' code.
     """
 
-    empty_shows_boundary = True
+    empty_shows_background = True
 
     def __init__(
         self,
         components: Components,
-        boundary_direction: Literal["exit", "last_coarse"] = "exit",
+        background_direction: Literal["exit", "last_coarse"] = "exit",
         colour: Literal["linear", "srgb"] = "linear",
     ) -> None:
         super().__init__(components, components.point_sampler.num_levels, colour)
-        self.boundary_direction = boundary_direction
+        self.background_direction = background_direction
 
     def render_path(self, path: Path, batch: Batch | None = None) -> list[Rendering]:
         samples = self.sample(path, None, batch)
-        directions = None if self.boundary_direction == "exit" else samples.directions[:, -1]
+        directions = None if self.background_direction == "exit" else samples.directions[:, -1]
         background_radiance = self.background(path, batch, directions)
         renderings = [composite(samples, self.scene.fields[0](samples), background_radiance, path)]
         for field in self.scene.fields[1:]:

@@ -6,7 +6,7 @@ The settings `+experiment=paper_*` and the baselines `nerf` and `mipnerf` use th
 - `sampler/path=eikonal`: paths by the Eikonal equation; `integrator=euler` is the method of the paper.
 - `sampler/points=hierarchical`: coarse and fine samples.
 - `field=nerf`, and `field=mip_nerf` with `model=mip_nerf`: the networks of NeRF and mip-NeRF.
-- `boundary=skybox`: the network of the background, and `loss=smoothness`.
+- `background=skybox`: the network of the background, and `loss=smoothness`.
 
 Other losses and rendering are components of nerfro.
 """

@@ -95,7 +95,7 @@ class MipNerfModel(Renderer):
         colour: see `model=refractive`.
     """
 
-    empty_shows_boundary = True
+    empty_shows_background = True
 
     def __init__(self, components: Components, colour: Literal["linear", "srgb"] = "linear") -> None:
         super().__init__(components, 1, colour)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.boundaries.base import Boundary
+from nerfro.backgrounds.base import Background
 from nerfro.core.types import Exits
 from nerfro.paper.encoding import DIRECTION_DEGREE, positional_encoding
 from nerfro.paper.mlp import SkipMLP, glorot_linear, padded_sigmoid
@@ -13,8 +13,8 @@ from nerfro.registry.allowed import Depth, Width
 from nerfro.registry.registration import register
 
 
-@register("boundary", "skybox")
-class Skybox(Boundary):
+@register("background", "skybox")
+class Skybox(Background):
     """Represent the background by a 4x128 MLP of the encoded exit direction (paper, Eqn. 5, F_psi).
 
     The radiance is a sigmoid and at most 1, as in the authors' code. Bright lamps are therefore clipped.

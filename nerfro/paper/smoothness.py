@@ -30,7 +30,7 @@ class Smoothness(Loss):
 
     def forward(self, renderings: list[Rendering], batch: Batch, scene: Scene) -> Float[Tensor, ""]:
         return tile_roughness(
-            scene.colour_space.to_srgb(scene.boundary(Exits(batch.cameras.tile(self.tile_size, batch.draws))))
+            scene.colour_space.to_srgb(scene.background(Exits(batch.cameras.tile(self.tile_size, batch.draws))))
         )
 
 

@@ -13,13 +13,12 @@ from nerfro.capture.preprocess_options import MESH
 from nerfro.cli.overrides import as_overrides, is_given, not_given
 from nerfro.core.errors import NerfroError, warn
 from nerfro.evaluation.results import EXPOSED, FULL, read_metrics_json
-from nerfro.files.reading import read_json
 from nerfro.pipeline.hypotheses import Hypothesis, hypotheses
 from nerfro.pipeline.options import common_options
 from nerfro.pipeline.stage import Stage, is_older, move_aside
 from nerfro.poses import calibrated_data
 from nerfro.poses.collection import collect_photographs
-from nerfro.rendering.scene_file import OLD_SCENE, SCENE, SceneFile, read_scene_file
+from nerfro.rendering.scene_file import SCENE, SceneFile, read_scene_file
 from nerfro.silhouettes.overlaps import SHEET
 from nerfro.training.run_folder import CONFIG_FILE
 
@@ -48,9 +47,7 @@ def calibrate(config: DictConfig, data: list[str], out: Path) -> list[str]:
     options = [*as_overrides({"images": out / "images", "out": out}), "target=colmap", "overwrite=true"]
     options += [text.removeprefix("data.") for text in data if text.startswith("data.mask_labels=")]
     Stage("calibrate", [*options, *shlex.split(config.calibrate)], report, plot).run()
-    content = read_json(report, "delete the file to repeat the stage")
-    bounds = content.get("options", []) if isinstance(content, dict) else []  # bounds of the rays in earlier releases
-    return [*as_overrides({"data.root": out}), *bounds, *data]
+    return [*as_overrides({"data.root": out}), *data]
 
 
 def segment(config: DictConfig, options: list[str], root: Path) -> None:
@@ -69,10 +66,9 @@ def preprocess(config: DictConfig, options: list[str], root: Path, folder: Path)
     if "wall" not in config.medium and "shell_voxels" in config.medium and config.medium.get("bodies") is None:
         automatic.append("vessel=true")
     options = [*options, *not_given(automatic, given), *given]
-    old = (folder / OLD_SCENE).is_file() and not (folder / SCENE).is_file()  # written by an earlier release
-    scene = folder / (OLD_SCENE if old else SCENE)
+    scene = folder / SCENE
     Stage("preprocess", options, scene, folder / SHEET, inputs).run()
-    return folder / SCENE if (folder / SCENE).is_file() else scene
+    return scene
 
 
 def train(config: DictConfig, overrides: list[str], scene: Path, out: Path) -> None:

@@ -21,19 +21,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Optional, TypeVar, Union, get_args, get_origin
 
+from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
+from hydra.core.plugins import Plugins
 from hydra.errors import InstantiationException
+from hydra.plugins.search_path_plugin import SearchPathPlugin
 from hydra.utils import instantiate
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from nerfro.cli.old_names import MOVED_CLASSES
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import PLUGINS_DIR, PLUGINS_PACKAGE
 from nerfro.registry.allowed import Names, Range, check, checked
 
 KINDS = (
-    "model", "camera", "medium", "surface", "sampler/path", "sampler/points", "field", "boundary", "loss", "phase",
+    "model", "camera", "medium", "surface", "sampler/path", "sampler/points", "field", "background", "loss", "phase",
     "data", "callbacks", "metric",
 )  # fmt: skip
 
@@ -41,7 +43,7 @@ SEVERAL = ("loss", "phase", "callbacks")  # a run may have several plugins of th
 
 # Modules and packages with built-in plugins; `discover` imports all of them.
 _BUILT_IN = (
-    "camera", "camera.refined", "media", "media.surfaces", "samplers.paths", "samplers.points", "fields", "boundaries",
+    "camera", "camera.refined", "media", "media.surfaces", "samplers.paths", "samplers.points", "fields", "backgrounds",
     "losses", "models", "paper", "data", "data.formats", "evaluation.image_metrics", "evaluation.perceptual",
     "training.phases", "viewing.page", "exports",
 )  # fmt: skip
@@ -242,8 +244,7 @@ def plugin_of(node: DictConfig) -> Plugin:
         NerfroError: the class is not registered.
     """
     target = str(node.get("_target_"))
-    place = MOVED_CLASSES.get(target, target)
-    plugin = next((plugin for plugin in _plugins.values() if plugin.target == place), None)
+    plugin = next((plugin for plugin in _plugins.values() if plugin.target == target), None)
     if plugin is None:
         raise NerfroError(
             f"'{target}' is not registered; `python -m nerfro.plugins` lists the registered classes; "
@@ -325,9 +326,19 @@ def discover(plugins_dir: Path = PLUGINS_DIR) -> None:
             _import_all(f"nerfro.{package}")
         for entry_point in importlib.metadata.entry_points(group=ENTRY_POINTS):
             _import_plugin(entry_point.value, f"'{entry_point.name}' of an installed package ({entry_point.value})")
+        Plugins.instance().register(PluginConfigurations)
         _discovered.add("built-in")
     for folder in plugin_folders(plugins_dir):
         _import_folder(folder)
+
+
+class PluginConfigurations(SearchPathPlugin):
+    """Let Hydra search for options, such as experiments, in the folder `conf/` of each local plugin, too."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        for folder in plugin_folders():
+            for configurations in sorted(folder.glob("*/conf")):
+                search_path.append("nerfro", f"file://{configurations}")
 
 
 def plugin_folders(plugins_dir: Path = PLUGINS_DIR) -> list[Path]:

@@ -1,4 +1,4 @@
-"""Volume rendering with a boundary term."""
+"""Volume rendering with a background term."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from nerfro.boundaries.base import Boundary, background_radiance
+from nerfro.backgrounds.base import Background, background_radiance
 from nerfro.camera.base import CameraModel
 from nerfro.camera.given import GivenCamera
 from nerfro.core.rays import Rays
@@ -36,7 +36,7 @@ class Components:
         path_sampler: turns rays into paths.
         point_sampler: chooses samples on paths.
         make_field: makes a new radiance field; a model with several sampling levels has a field for each.
-        boundary: background radiance, from beyond the volume.
+        background: background radiance, from beyond the volume.
         camera: estimate of the training cameras.
         chunk_size: number of rays rendered at once in evaluation, which limits the memory.
     """
@@ -45,7 +45,7 @@ class Components:
     path_sampler: PathSampler
     point_sampler: PointSampler
     make_field: Callable[[], Field]
-    boundary: Boundary
+    background: Background
     camera: CameraModel = dataclasses.field(default_factory=GivenCamera)
     chunk_size: int = 8192
 
@@ -86,15 +86,15 @@ class Renderer(nn.Module, ABC):
     """
 
     # Whether straight paths outside of all fields show only the background, so that images need no samples there.
-    empty_shows_boundary: ClassVar[bool] = False
+    empty_shows_background: ClassVar[bool] = False
     # Whether every step has gradients of all parameters, as data-parallel training requires.
     trains_in_parallel: ClassVar[bool] = True
 
     def __init__(self, components: Components, num_fields: int, colour: Literal["linear", "srgb"] = "linear") -> None:
         super().__init__()
         fields = [components.make_field() for _ in range(num_fields)]
-        medium, boundary, camera = components.medium, components.boundary, components.camera
-        self.scene = Scene(medium, fields, boundary, camera, ColourSpace(colour))
+        medium, background, camera = components.medium, components.background, components.camera
+        self.scene = Scene(medium, fields, background, camera, ColourSpace(colour))
         self.path_sampler, self.point_sampler = components.path_sampler, components.point_sampler
         self.chunk_size = components.chunk_size
 
@@ -165,7 +165,7 @@ class Renderer(nn.Module, ABC):
         teaches = None
         if batch is not None:
             teaches = path.broadcast_to_polylines(batch.teaches_background[batch.ray_pixel])
-        return background_radiance(self.scene.boundary, path.exits(directions), teaches)
+        return background_radiance(self.scene.background, path.exits(directions), teaches)
 
     def trace(self, rays: Rays, path: Path | None = None) -> Path:
         """Trace rays, or add gradients and absorption to paths that were traced before."""
@@ -237,7 +237,7 @@ class Renderer(nn.Module, ABC):
         radiance, depth = torch.empty_like(rays.directions), path.main_polyline(path.far).clone()
         opacity = torch.zeros_like(depth)
         misses, rows = (~meets).nonzero()[:, 0], meets.nonzero()[:, 0]
-        radiance[misses] = self.scene.boundary(Exits.unbent(rays[misses])).to(radiance)
+        radiance[misses] = self.scene.background(Exits.unbent(rays[misses])).to(radiance)
         if len(rows):
             rendering = self.render_path(path.select_rays(rows))[-1]
             radiance[rows], depth[rows], opacity[rows] = (
@@ -247,7 +247,7 @@ class Renderer(nn.Module, ABC):
 
     def _may_meet(self, rays: Rays, path: Path) -> Bool[Tensor, "R"]:
         """Find the rays that may meet a field; the others are straight and show the background."""
-        meets = torch.full((len(rays),), not self.empty_shows_boundary, device=rays.near.device)
+        meets = torch.full((len(rays),), not self.empty_shows_background, device=rays.near.device)
         for field in self.scene.fields:
             box: Tensor | None = field.bounds  # type: ignore[assignment]
             if box is None:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import nn
 
-from nerfro.boundaries.base import Boundary
+from nerfro.backgrounds.base import Background
 from nerfro.camera.base import CameraModel
 from nerfro.camera.given import GivenCamera
 from nerfro.core.errors import NerfroError
@@ -22,7 +22,7 @@ class Scene(nn.Module):
     Args:
         medium: refractive index and absorption.
         fields: radiance fields inside the volume, coarsest sampling level first, or one field for all levels.
-        boundary: background radiance, from beyond the volume.
+        background: background radiance, from beyond the volume.
         camera: estimate of the training cameras; by default the cameras of the data set.
         colour_space: colour space of the radiance of fields and background.
 
@@ -34,13 +34,13 @@ class Scene(nn.Module):
         self,
         medium: Medium,
         fields: Sequence[Field],
-        boundary: Boundary,
+        background: Background,
         camera: CameraModel | None = None,
         colour_space: ColourSpace = ColourSpace.LINEAR,
     ) -> None:
         super().__init__()
         self.camera = GivenCamera() if camera is None else camera
-        self.medium, self.fields, self.boundary = medium, nn.ModuleList(fields), boundary
+        self.medium, self.fields, self.background = medium, nn.ModuleList(fields), background
         self.colour_space = colour_space
         if colour_space is ColourSpace.SRGB and self.camera.exposure is not None:
             raise NerfroError("camera.exposure=true needs linear radiance; take model.colour=linear")
@@ -50,7 +50,7 @@ class Scene(nn.Module):
         fields = ", ".join(type(field).__name__ for field in self.fields)
         num_parameters = sum(parameter.numel() for parameter in self.parameters())
         return (
-            f"Scene(medium={self.medium}, fields=[{fields}], boundary={type(self.boundary).__name__}, "
+            f"Scene(medium={self.medium}, fields=[{fields}], background={type(self.background).__name__}, "
             f"camera={type(self.camera).__name__}, {self.colour_space.value}, {num_parameters:,} parameters)"
         )
 
@@ -71,7 +71,7 @@ class Scene(nn.Module):
             `bodies.NAME.material.absorption` (see `Material`), `medium.*` (parameters of media without bodies),
             `cameras.exposure`, and further parameters of cameras.
         """
-        parts = {"fields": self.fields, "background": self.boundary}
+        parts = {"fields": self.fields, "background": self.background}
         found = {f"{part}.{name}": own for part, module in parts.items() for name, own in module.named_parameters()}
         return found | self.medium.parameters_by_name() | self.camera.parameters_by_name()
 

@@ -11,8 +11,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Optional, cast
 
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -26,7 +24,7 @@ from nerfro.media.bodies import BodySettings
 from nerfro.registry.allowed import Count, check_settings
 from nerfro.registry.registration import plugin_of
 
-SCENE, OLD_SCENE = "scene.json", "preprocess.json"  # names of the scene file in this release and in earlier ones
+SCENE = "scene.json"
 _ADVICE = "see docs/reference/file_formats.md, or run nerfro.preprocess again"
 
 
@@ -158,7 +156,7 @@ def take_bodies(medium: dict[str, Any]) -> dict[str, BodySettings]:
 
 
 def read_scene_file(path: Path) -> SceneFile:
-    """Read a scene file, or a `preprocess.json` of an earlier release.
+    """Read a scene file.
 
     Raises:
         NerfroError: the file is damaged, or a name or a value is not allowed.
@@ -168,8 +166,6 @@ def read_scene_file(path: Path) -> SceneFile:
         raise NerfroError(f"{path} is not a scene file; {_ADVICE}")
     if "${" in json.dumps(document):
         raise NerfroError(f"{path} contains an interpolation (${{...}}); write the value instead")
-    if "options" in document:
-        return _of_options(document, path)
     try:
         typed = cast(DictConfig, OmegaConf.merge(OmegaConf.structured(SceneFile), document))
         check_settings(typed, SceneFile)
@@ -187,41 +183,6 @@ def read_scene_file(path: Path) -> SceneFile:
     if folder == Path(os.path.abspath(path.parent)):  # no link
         folder = path.parent
     return scene._with_paths(lambda place: Path(os.path.normpath(folder / user_path(place))))
-
-
-def _of_options(document: Mapping[str, Any], path: Path) -> SceneFile:
-    """Read command-line options from a `preprocess.json`; paths are relative to the current directory."""
-    try:
-        values, doubtful, vessel = (_parsed(document.get(name, [])) for name in ("options", "doubtful", "vessel"))
-        data = {"type": "blender", "root": "embedded:torus"} | _node(values, "data")
-        medium = {"mesh": f"{data['root']}/mesh.ply"} | _node(values | doubtful, "medium")
-        vessel, near = _node(vessel, "medium"), document["near"]
-        vessel.pop("type", None)
-        return SceneFile(
-            data,
-            medium,
-            take_bodies(medium),
-            {name: value for name, value in vessel.items() if (name, value) not in medium.items()},
-            None if near is None else "near" if near else "far",
-            photograph=document["pixels"],
-            provenance=Provenance(doubts=["nerfro.preprocess has reported the reason"] if doubtful else []),
-        )
-    except (HydraException, KeyError, TypeError, ValueError) as error:
-        raise NerfroError(f"{path} is not a result of nerfro.preprocess; {_ADVICE}") from error
-
-
-def _parsed(options: Sequence[str]) -> dict[str, Any]:
-    """Read command-line overrides."""
-    parsed = OverridesParser.create().parse_overrides(list(options))
-    return {override.get_key_element(): override.value() for override in parsed}
-
-
-def _node(values: Mapping[str, Any], group: str) -> dict[str, Any]:
-    """Return the settings of a group, and its option as `type`."""
-    chosen = {"type": values[group]} if group in values else {}
-    return chosen | {
-        name.removeprefix(f"{group}."): each for name, each in values.items() if name.startswith(f"{group}.")
-    }
 
 
 def with_scene(arguments: Sequence[str], names: Collection[str]) -> list[str]:

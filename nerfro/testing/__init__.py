@@ -21,9 +21,9 @@ import numpy as np
 import torch
 from omegaconf import OmegaConf
 
-from nerfro.boundaries.base import Boundary
-from nerfro.boundaries.constant import ConstantBoundary
-from nerfro.boundaries.envmap import EnvironmentMap
+from nerfro.backgrounds.base import Background
+from nerfro.backgrounds.constant import ConstantBackground
+from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.camera.base import CameraModel
 from nerfro.core.cameras import Cameras
 from nerfro.core.draws import Draws
@@ -153,7 +153,7 @@ def example_run() -> TrainingRun:
     """Return a small model with a learned background, its batches and its optimizer; equal in every call."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        model = RefractiveModel(replace(example_components(), boundary=EnvironmentMap([8])))
+        model = RefractiveModel(replace(example_components(), background=EnvironmentMap([8])))
     batches = PixelBatches(example_views(), NUM_RAYS, "all_images")
     optimizer = torch.optim.Adam(model.parameters_by_name().values())
     return TrainingRun(model, batches, RayTracer(model), example_views(), optimizer, spent=0.0)
@@ -326,16 +326,16 @@ def _check_field(field: Field) -> None:
     _require_gradients(field)
 
 
-def _check_boundary(boundary: Boundary) -> None:
+def _check_background(background: Background) -> None:
     directions = torch.nn.functional.normalize(torch.randn(4, 5, 3), dim=-1)
-    radiance = boundary(Exits(directions))
+    radiance = background(Exits(directions))
     _require(radiance.shape == directions.shape, "forward keeps all leading axes: [..., 3] -> [..., 3]")
     _require(bool((radiance > -0.01).all()), "radiance is not negative")
     exits = example_path().exits()
-    _require(boundary(exits).shape == exits.directions.shape, "forward takes the exits of paths")
-    if any(parameter.requires_grad for parameter in boundary.parameters()):
+    _require(background(exits).shape == exits.directions.shape, "forward takes the exits of paths")
+    if any(parameter.requires_grad for parameter in background.parameters()):
         radiance.sum().backward()
-        _require_gradients(boundary)
+        _require_gradients(background)
 
 
 def _check_loss(loss: Loss) -> None:
@@ -443,7 +443,7 @@ _CONTRACTS: dict[str, tuple[type, Callable[[Any], None]]] = {
     "sampler/path": (PathSampler, _check_path_sampler),
     "sampler/points": (PointSampler, _check_point_sampler),
     "field": (Field, _check_field),
-    "boundary": (Boundary, _check_boundary),
+    "background": (Background, _check_background),
     "loss": (Loss, _check_loss),
     "model": (Renderer, _check_model),
     "data": (DataSource, _check_data),
@@ -462,7 +462,7 @@ def example_components() -> Components:
         make_field=lambda: HashGridField(
             num_levels=2, log2_table_size=8, width=16, initial_depth=1.0, precision="float32"
         ),
-        boundary=ConstantBoundary(),
+        background=ConstantBackground(),
     )
 
 

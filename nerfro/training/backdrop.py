@@ -34,7 +34,7 @@ def derive_backdrop(config: DictConfig, images: LazyImages | Float[Tensor, "V H 
     if loss.colour is not None:
         colour = torch.tensor(list(loss.colour))
         radiance = colour if config.model.get("colour") == "srgb" else to_linear(colour)
-        config.boundary = {"_target_": find("boundary", "constant").target, "rgb": radiance.tolist()}
+        config.background = {"_target_": find("background", "constant").target, "rgb": radiance.tolist()}
 
 
 def describe(config: DictConfig) -> str:

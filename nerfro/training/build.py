@@ -13,9 +13,8 @@ from omegaconf import DictConfig
 
 from nerfro.cli.entry import check_configuration
 from nerfro.cli.failures import in_one_line
-from nerfro.cli.old_names import renamed_override
 from nerfro.cli.options import describe_command
-from nerfro.cli.overrides import prints_hints
+from nerfro.cli.overrides import full_key, prints_hints
 from nerfro.core.errors import NerfroError, warn
 from nerfro.core.paths import CONF_DIR
 from nerfro.data.base import DataSource, Views
@@ -54,7 +53,7 @@ def build(experiment: str | None = None, overrides: Sequence[str] = ()) -> tuple
     discover()
     ConfigStore.instance().store(name="train_schema", node=TrainConfig, provider="nerfro")
     chosen = [] if experiment is None else [f"+experiment={experiment}"]
-    given = with_scene([*chosen, *map(renamed_override, overrides)], ["data", "medium"])
+    given = with_scene([*chosen, *map(full_key, overrides)], ["data", "medium"])
     try:
         with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
             config = compose("train", given)
@@ -130,4 +129,4 @@ def check_before_training(renderer: Renderer, data: RayDataModule, trainer: Trai
     require_reach(renderer, few, tracer, first)
     warn_of_thin_walls(renderer.path_sampler, renderer.scene.medium)
     device = trainer.strategy.root_device
-    return require_memory(renderer, first.rays, device, few.batch_size / batches.batch_size, batches.pixel_bytes)
+    return require_memory(renderer, first, device, few.batch_size / batches.batch_size, batches.pixel_bytes)

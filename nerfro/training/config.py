@@ -160,7 +160,7 @@ class AuthorsConfig:
     smoothing_size: Natural = 9  # taps of the smoothing kernel
     smoothing_sigma: Positive = 1.0  # standard deviation of the smoothing kernel, voxels
     num_steps: Count = 768  # number of Eikonal steps, N_c x N_e
-    boundary_weight: NotNegative = 0.025  # weight of the boundary regularizer
+    background_weight: NotNegative = 0.025  # weight of the background regularizer
     max_steps: Count = 200_000  # number of training steps
 
 
@@ -178,7 +178,7 @@ class TrainConfig:
     medium: Any = MISSING
     sampler: SamplerConfig = dataclasses.field(default_factory=SamplerConfig)  # path sampler and point sampler
     field: Any = MISSING
-    boundary: Any = MISSING
+    background: Any = MISSING
     model: Any = MISSING
     # Settings of each training loss, by the registered name of the loss.
     loss: dict[str, Any] = dataclasses.field(default_factory=dict)
@@ -251,14 +251,15 @@ def check_run(config: DictConfig) -> None:
     for plugin_type in ("loss", "phase"):
         build_each(plugin_type, config[plugin_type], known=False)
     OmegaConf.to_object(config.optimizer)  # checks groups of parameters
-    for node in (config.data, config.camera, config.sampler.points, config.field, config.boundary, config.model):
+    for node in (config.data, config.camera, config.sampler.points, config.field, config.background, config.model):
         check_node(node)
     if check_node(config.sampler.path).needs_medium:  # type: ignore[attr-defined]
         check_node(config.medium)
     require_contraction(config)
-    if config.boundary.get("image") and config.model.get("colour") == "srgb":
+    if config.background.get("image") and config.model.get("colour") == "srgb":
         raise NerfroError(
-            "boundary.image holds linear radiance, but fields and background have sRGB values with model.colour=srgb; "
+            "background.image holds linear radiance, but fields and background have sRGB values with "
+            "model.colour=srgb; "
             "take model.colour=linear"
         )
     if limit is None and config.trainer.max_steps < 0 and not (config.debug or config.trainer.fast_dev_run):
@@ -375,7 +376,7 @@ def build_model(config: DictConfig, training: Views | None = None) -> Renderer:
         path_sampler=path_sampler,
         point_sampler=build(config.sampler.points),
         make_field=lambda: build(config.field),
-        boundary=build(config.boundary),
+        background=build(config.background),
         camera=camera,
         chunk_size=config.evaluation.chunk_size,
     )

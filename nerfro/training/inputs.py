@@ -65,7 +65,7 @@ def require_same_inputs(checkpoint: Mapping[str, Any], path: Path, config: DictC
     """Refuse to resume a training whose surface files or cameras have changed.
 
     Args:
-        checkpoint: content of the checkpoint; those of earlier releases lack the description of the inputs.
+        checkpoint: content of the checkpoint.
         path: file of the checkpoint.
         config: configuration of the run.
         cameras: cameras of the training views.

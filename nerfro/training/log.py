@@ -139,12 +139,12 @@ def peak_memory(device: torch.device) -> int:
 @torch.inference_mode()
 def sky(scene: Scene) -> UInt8[np.ndarray, "H 2*H 3"]:
     """Render the background as a lat-long image (see files/lat_long.py)."""
-    was_training = scene.boundary.training
-    scene.boundary.eval()
+    was_training = scene.background.training
+    scene.background.eval()
     try:
-        return _to_8bit(scene.colour_space.to_srgb(scene.boundary(Exits(directions(_SKY_HEIGHT).to(scene.device)))))
+        return _to_8bit(scene.colour_space.to_srgb(scene.background(Exits(directions(_SKY_HEIGHT).to(scene.device)))))
     finally:
-        scene.boundary.train(was_training)
+        scene.background.train(was_training)
 
 
 def _middle_row(cameras: Cameras, view: int) -> Rays:

@@ -6,7 +6,7 @@ import math
 
 import torch
 
-from nerfro.boundaries.constant import ConstantBoundary
+from nerfro.backgrounds.constant import ConstantBackground
 from nerfro.core.errors import NerfroError, warn
 from nerfro.core.rays import Rays
 from nerfro.core.types import Batch
@@ -61,8 +61,8 @@ def require_reach(renderer: Renderer, batches: PixelBatches, tracer: RayTracer, 
             f"no ray of the training views meets {box}, and nothing is outside of it; check that unit, axes and place "
             f"of the object are those of the cameras, or {advice}"
         )
-    if missed > _FEW and isinstance(renderer.scene.boundary, ConstantBoundary):
-        warn(f"{missed:.0%} of the rays pass {box} and see boundary=constant alone, which learns nothing; {advice}")
+    if missed > _FEW and isinstance(renderer.scene.background, ConstantBackground):
+        warn(f"{missed:.0%} of the rays pass {box} and see background=constant alone, which learns nothing; {advice}")
 
 
 def _require_object(renderer: Renderer, rays: Rays) -> None:

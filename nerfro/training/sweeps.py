@@ -17,7 +17,6 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from nerfro.cli.failures import in_one_line
-from nerfro.cli.old_names import MOVED_CLASSES
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import resolve_path, scene_name
 from nerfro.data.image_files import IMAGE_SUFFIXES
@@ -90,11 +89,9 @@ def _require_same_cell(folder: Path, identity: Mapping[str, Any]) -> None:
         raise NerfroError(f"{folder} holds a run that is no cell of a sweep; {advice}")
     try:
         record = read_json(folder / CELL_FILE, advice)
-        recorded = {key: MOVED_CLASSES.get(str(value), value) for key, value in record["settings"].items()}
-        old, new = settings(recorded, RESULT), identity["settings"]
+        old, new = settings(record["settings"], RESULT), identity["settings"]
         same_data = record["data"] == identity["data"]
-        # Cells of earlier releases lack the hashes of the files of the medium.
-        changed = first_difference(record.get("files", identity["files"]), identity["files"])
+        changed = first_difference(record["files"], identity["files"])
     except (NerfroError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise NerfroError(f"{folder / CELL_FILE} is damaged; {advice}") from error
     key = first_difference(old, new)

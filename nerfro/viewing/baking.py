@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from nerfro.boundaries.base import Boundary
+from nerfro.backgrounds.base import Background
 from nerfro.core.errors import NerfroError
 from nerfro.core.light import to_srgb
 from nerfro.core.types import Exits
@@ -118,11 +118,11 @@ def _on_same_grid(medium: Solid) -> SdfGrid:
 
 
 @torch.inference_mode()
-def bake_sky(boundary: Boundary, device: torch.device) -> Baked:
+def bake_sky(background: Background, device: torch.device) -> Baked:
     """Evaluate the background radiance at the texels of a cube map, seen from the centre of the scene."""
-    size = boundary.face_resolution
+    size = background.face_resolution
     directions = cube_directions(size).to(device)
-    radiance = torch.cat([boundary(Exits(chunk)).float().cpu() for chunk in directions.split(_CHUNK)])
+    radiance = torch.cat([background(Exits(chunk)).float().cpu() for chunk in directions.split(_CHUNK)])
     upper, rest = packing.shared_exponent(radiance.view(6, size, size, 3).double().numpy())
     return Baked({"size": size}, {"sky": upper, "sky_exponent": rest})
 

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from nerfro.boundaries.envmap import EnvironmentMap
+from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.core.errors import NerfroError
 from nerfro.core.light import to_srgb
 from nerfro.core.types import FieldValues, Samples
@@ -40,7 +40,7 @@ def with_sky(renderer: Renderer, radiance: Float[Tensor, "H 2*H 3"]) -> Renderer
     # A face of the cube spans a quarter of the width of the image.
     sky, scene = EnvironmentMap([max(1, radiance.shape[1] // 4)]), renderer.scene
     sky.set_lat_long(to_srgb(radiance) if scene.colour_space is ColourSpace.SRGB else radiance)
-    return with_changed_scene(renderer, boundary=sky.to(scene.device).eval())
+    return with_changed_scene(renderer, background=sky.to(scene.device).eval())
 
 
 def with_indices(renderer: Renderer, ior: Float[Tensor, "*K"]) -> Renderer:

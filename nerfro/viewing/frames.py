@@ -77,11 +77,7 @@ def _remove_other_frames(folder: Path, files: Sequence[Path], suffix: str, finge
 def _recorded_requests(record: Path) -> dict[str, object]:
     """Return the fingerprints in a record by suffix of the frames; empty if the record is missing or damaged."""
     try:
-        content = read_json(record, "")
-        if "request" in content:  # of an earlier release, which wrote one suffix into a folder as a rule
-            suffixes = {file.suffix for file in record.parent.iterdir()} & {".png", ".exr"}
-            return dict.fromkeys(suffixes, content["request"]) if len(suffixes) == 1 else {}
-        return dict(content["requests"])
+        return dict(read_json(record, "")["requests"])
     except (NerfroError, KeyError, TypeError, ValueError, IndexError):
         return {}
 

@@ -60,7 +60,7 @@ def bake_parts(
     return {
         **parts,
         "volume": bake_volume(volume, renderer.scene.colour_space),
-        "sky": bake_sky(renderer.scene.boundary, renderer.scene.device),
+        "sky": bake_sky(renderer.scene.background, renderer.scene.device),
     }
 
 

@@ -130,7 +130,7 @@ class TrainedScene:
     @property
     def sky_height(self) -> int:
         """Number of rows of a lat-long image as fine as the background, at least 512."""
-        return max(_MIN_SKY_HEIGHT, 2 * self.renderer.scene.boundary.face_resolution)
+        return max(_MIN_SKY_HEIGHT, 2 * self.renderer.scene.background.face_resolution)
 
     def sky_of_height(self, height: int) -> Float[Tensor, "H 2*H 3"]:
         """Evaluate the background as a lat-long image with a given number of rows."""
@@ -141,7 +141,7 @@ class TrainedScene:
         """Evaluate the linear background radiance in unit directions, seen from the centre of the scene."""
         scene = self.renderer.scene
         chunks = directions.to(scene.device).split(self.renderer.chunk_size)
-        radiance = torch.cat([scene.boundary(Exits(chunk)) for chunk in chunks])
+        radiance = torch.cat([scene.background(Exits(chunk)) for chunk in chunks])
         return scene.colour_space.to_linear(radiance.float()).cpu()
 
     @property

@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.core.errors import accept_old_fields
 from nerfro.core.progress import track
 from nerfro.geometry.contraction import contraction_scale, expand
 from nerfro.registry.allowed import Range, check
@@ -35,9 +34,6 @@ class Volume:
     radiance: Float[Tensor, "X Y Z 3"]
     box: Float[Tensor, "2 3"]
     radius: float | None = None
-
-
-accept_old_fields(Volume, {"rgb": "radiance"})
 
 
 @torch.inference_mode()

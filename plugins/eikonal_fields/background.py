@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.boundaries.base import Boundary
+from nerfro.backgrounds.base import Background
 from nerfro.core.types import Exits, FieldValues, Samples
 from nerfro.fields.base import Field
 from nerfro.fields.selection import inside_box
@@ -39,7 +39,7 @@ class BackgroundGrids:
     def fit(
         cls,
         field: Field,
-        boundary: Boundary,
+        background: Background,
         box: Float[Tensor, "2 3"],
         hidden: Float[Tensor, "2 3"],
         resolution: int,
@@ -49,7 +49,7 @@ class BackgroundGrids:
         The colour of the field is the mean over the six axis directions.
 
         Args:
-            field, boundary: field and background model of the scene.
+            field, background: field and background model of the scene.
             box: box of the grid of the field, world units.
             hidden: box inside of which the grid is empty.
             resolution: vertices along each side.
@@ -61,7 +61,7 @@ class BackgroundGrids:
             radiance[index] = _mean_radiance(field, vertices[index])
         cube = torch.tensor([[-_SKY_SIDE] * 3, [_SKY_SIDE] * 3], device=box.device)
         directions = torch.nn.functional.normalize(_vertices(cube, resolution), dim=-1)
-        sky = torch.cat([boundary(Exits(chunk)).float() for chunk in directions.split(_POINTS_AT_ONCE)])
+        sky = torch.cat([background(Exits(chunk)).float() for chunk in directions.split(_POINTS_AT_ONCE)])
         sides = (resolution,) * 3
         return cls(radiance.view(*sides, 4), box, sky.view(*sides, 3))
 

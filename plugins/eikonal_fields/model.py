@@ -116,7 +116,7 @@ class EikonalFields(Renderer):
             (field,) = scene.fields
             self._sharp = BackgroundGrids.fit(
                 field,  # type: ignore[arg-type]
-                scene.boundary,
+                scene.background,
                 self.box,
                 scene.medium.box,
                 self.resolution,

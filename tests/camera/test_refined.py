@@ -11,7 +11,6 @@ from nerfro.camera.refined import pixel_units, refined
 from nerfro.camera.similarity import Similarity, motion_between, similarity
 from nerfro.core.cameras import Cameras
 from nerfro.core.lens import coefficients
-from nerfro.training.phases import cameras as phase
 
 NUM_VIEWS, SIZE = 8, 20
 
@@ -140,20 +139,3 @@ def test_gauge_freedom_has_seven_dimensions_in_any_world_unit(scale: float) -> N
     given = replace(given, camera_to_world=poses, near=scale * given.near, far=scale * given.far)
     weights = pixel_units.even_weights(pixel_units.pixel_motions(given, pixel_units.object_distances(given)))
     assert len(pixel_units.gauge_basis(poses, weights)) == 7
-
-
-def test_checkpoints_with_the_old_name_of_the_gauge_basis_are_read() -> None:
-    made, restored = part(cameras()), refined.RefinedCamera(lens=True).double()
-    stored = made.state_dict()
-    old = {name.replace("gauge_basis", "of_world"): tensor for name, tensor in stored.items()}
-    assert old.keys() != stored.keys()
-    restored.load_state_dict(old)
-    assert all(torch.equal(tensor, restored.state_dict()[name]) for name, tensor in stored.items())
-
-
-def test_priors_of_old_checkpoints_are_read() -> None:
-    vector, matrix = torch.arange(3.0), torch.eye(3)
-    for name in ("mean", "numbers"):
-        prior = phase._prior({name: vector, "information": matrix})
-        assert torch.equal(prior.mean, vector)
-        assert torch.equal(prior.information, matrix)

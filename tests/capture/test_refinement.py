@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfro.boundaries.base import Boundary
+from nerfro.backgrounds.base import Background
 from nerfro.capture import refinement
 from nerfro.capture.refinement import DescentStage, Refined, RefinementProblem, RefinementSettings, refine_surface
 from nerfro.capture.room_panorama import panorama_of
@@ -121,7 +121,7 @@ class PaintedShell(Room):
     RADIUS = 3.2
 
     def __init__(self) -> None:
-        Boundary.__init__(self)
+        Background.__init__(self)
 
     def seen(self, exits: Exits, draws: Draws | None = None) -> tuple[Tensor, Tensor]:
         assert exits.positions is not None

@@ -8,7 +8,7 @@ import torch
 import trimesh
 from torch import Tensor
 
-from nerfro.boundaries.base import Boundary
+from nerfro.backgrounds.base import Background
 from nerfro.capture.object_errors import unsupported_bodies
 from nerfro.capture.surroundings import Observations, Pixels, Surroundings
 from nerfro.capture.vessel_fit import fit_vessel
@@ -27,7 +27,7 @@ RADIUS, HEIGHT, NUM_PIXELS = 0.45, 1.0, 1000
 TOLERANCES = {"wall": 0.1, "foot": 0.25, "fillet": 0.25, "level": 0.02}
 
 
-class Sky(Boundary):
+class Sky(Background):
     def forward(self, exits: Exits) -> Tensor:
         return sky(exits.directions)
 

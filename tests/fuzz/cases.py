@@ -52,7 +52,7 @@ WEIRD_VALUES = [*WEIRD_NUMBERS, "null", "true", "false", "''", "x", "[]", "[1]",
 # What starts processes, listens, or has nothing to do with numbers.
 _LEFT_ALONE = ("trainer.devices", "trainer.num_nodes", "trainer.strategy", "trainer.accelerator", "trainer.max_time",
                "trainer.profiler", "compile", "logger", "name")  # fmt: skip
-GROUPS = ["field=nerf", "field=mip_nerf", "boundary=constant", "boundary=skybox", "boundary=near_field",
+GROUPS = ["field=nerf", "field=mip_nerf", "background=constant", "background=skybox", "background=near_field",
           "sampler/points=stratified", "sampler/points=hierarchical", "sampler/path=straight", "sampler/path=eikonal",
           "medium=voxel_grid", "medium=ball", "medium=vacuum", "camera=given", "data=opencv", "data=llff",
           "data=colmap", "data=nerfstudio", "data=idr", "data=refref", "model=mip_nerf",

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d
 
-from nerfro.boundaries.envmap import EnvironmentMap
+from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.core.light import to_srgb
 from nerfro.core.types import Batch, Rendering
-from nerfro.losses.boundary import BoundaryRegularizer
+from nerfro.losses.background import BackgroundRegularizer
 from nerfro.losses.photometric import Photometric
 from nerfro.losses.total_variation import TotalVariation, direction_pairs
 from nerfro.models.refractive import RefractiveModel
@@ -32,7 +32,7 @@ def model() -> Renderer:
 def gradient_norms(model: Renderer, value: Tensor) -> dict[str, float]:
     model.zero_grad()
     value.backward()
-    parts = {"coarse": model.scene.fields[0], "fine": model.scene.fields[1], "boundary": model.scene.boundary}
+    parts = {"coarse": model.scene.fields[0], "fine": model.scene.fields[1], "background": model.scene.background}
     return {
         name: sum(float(p.grad.abs().sum()) for p in part.parameters() if p.grad is not None)
         for name, part in parts.items()
@@ -47,13 +47,13 @@ def test_photometric_loss_is_the_mean_over_rays_and_channels_of_both_levels(mode
     torch.testing.assert_close(Photometric(coarse=0.1)([coarse, fine], batch, model.scene), torch.tensor(0.09 + 0.001))
 
 
-def test_photometric_loss_reaches_both_fields_and_the_boundary(model: Renderer) -> None:
+def test_photometric_loss_reaches_both_fields_and_the_background(model: Renderer) -> None:
     batch = example_batch()
     norms = gradient_norms(model, Photometric()(model(batch.rays), batch, model.scene))
     assert min(norms.values()) > 0
 
 
-def test_boundary_regularizer_matches_a_manual_computation(model: Renderer) -> None:
+def test_background_regularizer_matches_a_manual_computation(model: Renderer) -> None:
     batch = example_batch()
     transmittance = torch.linspace(0, 1, NUM_RAYS)
     rendering = replace(example_rendering(), transmittance=transmittance)
@@ -63,29 +63,29 @@ def test_boundary_regularizer_matches_a_manual_computation(model: Renderer) -> N
             count += 1
             passed = transmittance[ray] * rendering.background_radiance[ray]
             total += sum(abs(float(passed[c] - batch.rgb[ray, c])) for c in range(3))
-    value = BoundaryRegularizer()([rendering, rendering], batch, model.scene)
+    value = BackgroundRegularizer()([rendering, rendering], batch, model.scene)
     assert value.item() == pytest.approx(total / (count + 1), rel=1e-5)
 
 
-def test_boundary_regularizer_can_be_restricted_to_refracted_rays(model: Renderer) -> None:
+def test_background_regularizer_can_be_restricted_to_refracted_rays(model: Renderer) -> None:
     batch = example_batch()
     rendering = replace(example_rendering(), transmittance=torch.ones(NUM_RAYS))
     refracted = rendering.path.refracted
     assert 0 < refracted.sum() < NUM_RAYS
     error = (rendering.background_radiance - batch.rgb).abs().sum(-1)[refracted]
-    value = BoundaryRegularizer(refracted_only=True)([rendering], batch, model.scene)
+    value = BackgroundRegularizer(refracted_only=True)([rendering], batch, model.scene)
     torch.testing.assert_close(value, error.sum() / (len(error) + 1))
 
 
-def test_boundary_regularizer_has_gradients_only_for_the_fine_density(model: Renderer) -> None:
+def test_background_regularizer_has_gradients_only_for_the_fine_density(model: Renderer) -> None:
     with torch.no_grad():
         for field in model.scene.fields:
             field.mlp.density.bias.fill_(-3.0)  # thin enough for light to pass
     batch = example_batch()
     renderings = model(batch.rays)
     assert (renderings[-1].transmittance > 0.5).any()
-    norms = gradient_norms(model, BoundaryRegularizer()(renderings, batch, model.scene))
-    assert norms["coarse"] == norms["boundary"] == 0
+    norms = gradient_norms(model, BackgroundRegularizer()(renderings, batch, model.scene))
+    assert norms["coarse"] == norms["background"] == 0
     assert norms["fine"] > 0
     colour = model.scene.fields[1].mlp.rgb
     assert colour.weight.grad is None or (colour.weight.grad == 0).all()
@@ -100,11 +100,11 @@ def test_roughness_is_half_the_mean_square_of_two_convolutions() -> None:
     torch.testing.assert_close(tile_roughness(rgb), expected)
 
 
-def test_smoothness_has_gradients_only_for_the_boundary(model: Renderer) -> None:
+def test_smoothness_has_gradients_only_for_the_background(model: Renderer) -> None:
     batch = example_batch()
     norms = gradient_norms(model, Smoothness(tile_size=8)(model(batch.rays), batch, model.scene))
     assert norms["coarse"] == norms["fine"] == 0
-    assert norms["boundary"] > 0
+    assert norms["background"] > 0
 
 
 def test_weight_is_zero_before_the_start_then_grows_linearly_to_its_value() -> None:
@@ -128,8 +128,8 @@ def test_pairs_are_uniform_and_separated_by_the_angle() -> None:
     torch.testing.assert_close((first * second).sum(-1), torch.full((20_000,), math.cos(0.3)), rtol=0, atol=1e-5)
 
 
-def scene(boundary) -> Mock:
-    return Mock(spec=Scene, boundary=boundary, colour_space=ColourSpace.SRGB)
+def scene(background) -> Mock:
+    return Mock(spec=Scene, background=background, colour_space=ColourSpace.SRGB)
 
 
 def test_value_is_that_of_a_linear_sky() -> None:
@@ -179,19 +179,19 @@ def test_losses_compare_pixels_and_not_their_rays() -> None:
     torch.testing.assert_close(Photometric()([rendered], given, MODEL.scene), expected)
 
 
-def test_boundary_regularizer_uses_the_background_of_pixels() -> None:
+def test_background_regularizer_uses_the_background_of_pixels() -> None:
     given, passed = batch(), torch.tensor([0.9, 0.9, 0.2, 0.2, 0.9, 0.2, 0.9, 0.2])  # of the last pixel little
     rendered = rendering(torch.rand(8, 3), torch.rand(8, 3), passed)
     background = to_srgb(given.per_pixel(passed[:, None] * rendered.background_radiance))
     expected = (background - given.rgb).abs().sum(-1)[:2].sum() / (2 + 1)
-    torch.testing.assert_close(BoundaryRegularizer()([rendered], given, MODEL.scene), expected)
+    torch.testing.assert_close(BackgroundRegularizer()([rendered], given, MODEL.scene), expected)
 
 
-def test_boundary_regularizer_adds_no_density_in_front_of_overexposed_pixels() -> None:
+def test_background_regularizer_adds_no_density_in_front_of_overexposed_pixels() -> None:
     passed = torch.full((8,), 0.9, requires_grad=True)
     rendered = replace(rendering(torch.rand(8, 3), torch.full((8, 3), 2.0), passed), transmittance=passed)
     given = replace(batch(), rgb=torch.ones(3, 3))
-    value = BoundaryRegularizer()([rendered], given, MODEL.scene)
+    value = BackgroundRegularizer()([rendered], given, MODEL.scene)
     assert value.item() == 0
     assert not torch.autograd.grad(value, passed)[0].any()
 
@@ -200,7 +200,7 @@ def test_boundary_regularizer_adds_no_density_in_front_of_overexposed_pixels() -
 def test_background_learns_from_selected_rays_and_the_medium_from_all(absorbs: bool) -> None:
     sky = EnvironmentMap([4])
     torch.nn.init.normal_(sky.texels)
-    model = RefractiveModel(replace(example_components(), boundary=sky))
+    model = RefractiveModel(replace(example_components(), background=sky))
     directions = torch.nn.functional.normalize(torch.randn(8, 3), dim=-1).requires_grad_()
     absorption = torch.tensor([[0.0] * 3, [0.1, 0.2, 0.3]], requires_grad=True)
     path = example_path(8)

@@ -47,7 +47,7 @@ def test_white_content_before_white_becomes_empty() -> None:
     assert learned_opacity(torch.ones(3), Backdrop(WHITE)) < 0.05
 
 
-def test_content_as_white_as_the_boundary_becomes_opaque() -> None:
+def test_content_as_white_as_the_background_becomes_opaque() -> None:
     uncharged, charged = Opaque(), Opaque()
     uncharged.weight, charged.weight = 0.0, 0.1
     assert learned_opacity(torch.ones(3), uncharged, start=-5.0) < 0.05

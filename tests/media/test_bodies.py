@@ -113,11 +113,11 @@ def test_priority_or_order_decides_where_bodies_overlap(
     medium = _medium(**{name: settings[name] for name in order})
     rays = make_rays([[0.0, 0.0, 3.0]], [[0.0, 0.0, -1.0]], 0.5, 8.0)
     # On the axis light does not turn; the overlap reaches from z = 0.5 to -0.5.
-    boundary = 0.5 if owner == "b" else -0.5
+    background = 0.5 if owner == "b" else -0.5
     for path in (Snell()(rays, medium), trace_interfaces(rays, medium, 16).path):
         assert [medium.names[body - 1] for body in path.record.body[0, 1:3]] == ["a", "b"]
         torch.testing.assert_close(
-            path.positions[0, 1:4, 2], torch.tensor([1.5, boundary, -1.5]).double(), atol=2e-3, rtol=0
+            path.positions[0, 1:4, 2], torch.tensor([1.5, background, -1.5]).double(), atol=2e-3, rtol=0
         )
     n, _ = medium(torch.tensor([[0.0, 0.0, 0.0]]))
     assert float(n) == pytest.approx(settings[owner]["ior"], abs=1e-6)

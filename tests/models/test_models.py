@@ -1,4 +1,4 @@
-"""Composition of models: fields of each level, evaluation of the boundary, and rendering in chunks."""
+"""Composition of models: fields of each level, evaluation of the background, and rendering in chunks."""
 
 from dataclasses import replace
 
@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfro.boundaries.base import Boundary
+from nerfro.backgrounds.base import Background
 from nerfro.core.types import Exits
 from nerfro.models.refractive import RefractiveModel
 from nerfro.paper.mip_nerf import MipNerfModel
@@ -16,7 +16,7 @@ from nerfro.testing import example_rays
 from tests.paper import small_components
 
 
-class Compass(Boundary):
+class Compass(Background):
     """Radiance is the direction."""
 
     def forward(self, exits: Exits) -> Tensor:
@@ -34,8 +34,8 @@ def test_refractive_model_has_a_field_for_each_level_and_mip_nerf_one_for_all(pa
     assert len(RefractiveModel(replace(parts, point_sampler=Stratified(8))).scene.fields) == 1
 
 
-def test_boundary_is_evaluated_at_the_exit_or_at_the_last_coarse_sample(parts: Components) -> None:
-    rays, parts = example_rays(), replace(parts, boundary=Compass())
+def test_background_is_evaluated_at_the_exit_or_at_the_last_coarse_sample(parts: Components) -> None:
+    rays, parts = example_rays(), replace(parts, background=Compass())
     path = parts.path_sampler(rays, parts.medium)
     leaving = RefractiveModel(parts, "exit").eval()(rays)
     torch.testing.assert_close(leaving[-1].background_radiance, 0.5 + 0.5 * path.exit_directions)

@@ -3,9 +3,9 @@
 import torch
 from torch.nn.functional import normalize
 
-from nerfro.boundaries.base import Boundary
-from nerfro.boundaries.constant import ConstantBoundary
-from nerfro.boundaries.envmap import EnvironmentMap
+from nerfro.backgrounds.base import Background
+from nerfro.backgrounds.constant import ConstantBackground
+from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.core.draws import Draws
 from nerfro.core.types import Path
 from nerfro.fields.hash_grid import HashGridField
@@ -55,13 +55,13 @@ def photographs(num_views: int, seed: int) -> tuple[Path, torch.Tensor, torch.Te
 
 
 def rendered(
-    path: Path, sampler: DensityGridSampler, field: HashGridField, boundary: Boundary, draws: Draws | None = None
+    path: Path, sampler: DensityGridSampler, field: HashGridField, background: Background, draws: Draws | None = None
 ) -> torch.Tensor:
     samples = sampler(path, None, draws)
-    return composite(samples, field(samples), boundary(path.exits()), path).radiance
+    return composite(samples, field(samples), background(path.exits()), path).radiance
 
 
-def scores(space: dict, boundary: Boundary, num_steps: int = 150) -> list[float]:
+def scores(space: dict, background: Background, num_steps: int = 150) -> list[float]:
     """PSNR of unseen views: of all pixels, of those behind glass, of those that see the toy."""
     path, target, _ = photographs(24, 1)
     field = HashGridField(
@@ -69,25 +69,25 @@ def scores(space: dict, boundary: Boundary, num_steps: int = 150) -> list[float]
         direction_bands=1,
     )  # fmt: skip
     sampler = DensityGridSampler(24, 48, **space, near=0.3, resolution=32, update_every=4, decay=0.6)
-    parameters = [*field.parameters(), *boundary.parameters()]
+    parameters = [*field.parameters(), *background.parameters()]
     optimizer = torch.optim.Adam(parameters, eps=1e-15)
     for step in range(num_steps):
         draws = Draws(0, step, torch.arange(512))
         sampler.update([field], draws)
         optimizer.param_groups[0]["lr"] = 4e-2 * 0.1 ** (step / num_steps)
         chosen = torch.randint(len(target), (512,))
-        loss = (rendered(path[chosen], sampler, field, boundary, draws) - target[chosen]).square().mean()
+        loss = (rendered(path[chosen], sampler, field, background, draws) - target[chosen]).square().mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
     path, target, toy = photographs(3, 2)
     with torch.no_grad():
-        error = (rendered(path, sampler, field, boundary) - target).square().mean(-1)
+        error = (rendered(path, sampler, field, background) - target).square().mean(-1)
     return [float(-10 * torch.log10(e.mean())) for e in (error, error[path.refracted], error[toy])]
 
 
 def test_volume_of_all_space_learns_a_room_better_than_box_and_environment_map() -> None:
-    volume = scores(SPACE, ConstantBoundary([0.0, 0.0, 0.0]))
+    volume = scores(SPACE, ConstantBackground([0.0, 0.0, 0.0]))
     sky = scores({"box_min": [-0.85] * 3, "box_max": [0.85] * 3}, EnvironmentMap([4, 8, 16, 32]))
     assert volume[0] > sky[0] + 6
     assert volume[1] > sky[1] + 5, "behind the glass"

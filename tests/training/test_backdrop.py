@@ -66,7 +66,7 @@ def test_straight_rays_end_on_the_backdrop(
     assert ("plain backdrop (102, 102, 102)" in finished.out) == has_backdrop
     config = OmegaConf.load(run / "config.yaml")
     if has_backdrop:
-        assert config.boundary.rgb == pytest.approx([((GREY + 0.055) / 1.055) ** 2.4] * 3, rel=1e-4)
+        assert config.background.rgb == pytest.approx([((GREY + 0.055) / 1.055) ** 2.4] * 3, rel=1e-4)
         assert config.loss.backdrop.colour == pytest.approx([GREY] * 3)
     else:
-        assert "rgb" not in config.boundary
+        assert "rgb" not in config.background

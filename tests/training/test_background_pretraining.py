@@ -13,7 +13,7 @@ import torch
 from lightning.pytorch.callbacks import timer
 from torch import Tensor
 
-from nerfro.boundaries.envmap import EnvironmentMap
+from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.core.light import to_srgb
 from nerfro.core.types import Exits
 from nerfro.data.base import Views
@@ -48,7 +48,7 @@ def weights(train: Runner, tmp_path: Path) -> Callable[..., dict[str, Tensor]]:
 def test_only_the_background_is_fitted_before_the_first_step(weights: Callable[..., dict[str, Tensor]]) -> None:
     without, learned = weights("without", "phase.background.steps=0"), weights("with", "phase.background.steps=20")
     changed = {name for name, value in learned.items() if not torch.equal(value, without[name])}
-    assert changed == {"renderer.scene.boundary.texels"}
+    assert changed == {"renderer.scene.background.texels"}
 
 
 def run_of(module: TrainingModule, data: RayDataModule, views: Views) -> TrainingRun:
@@ -63,7 +63,7 @@ def test_directions_behind_the_object_are_learned_through_it(
     views = BlenderData(str(tiny_scene), near=2.0, far=6.0).load("train")
     run, phase = run_of(module, data, views), BackgroundSteps(steps=4, start=8)
     state, towards_the_ball = phase.begin(run), -torch.nn.functional.normalize(views.cameras.camera_to_world[:, :, 3])
-    sky, background = 0.5 + 0.4 * towards_the_ball, module.renderer.scene.boundary
+    sky, background = 0.5 + 0.4 * towards_the_ball, module.renderer.scene.background
 
     def error() -> float:
         return float((to_srgb(background(Exits(towards_the_ball))).detach() - sky).abs().max())
@@ -92,7 +92,7 @@ def test_fits_of_few_pixels_use_the_pixels_of_larger_fits(
         state = phase.begin(run)
         monkeypatch.setattr("nerfro.training.phases.background._MAX_FITTED_PIXELS", limit)
         assert all(phase.step(run, number, state) for number in range(2))
-        sky = module.renderer.scene.boundary(Exits(views.cameras.image_rays(0).directions)).detach()
+        sky = module.renderer.scene.background(Exits(views.cameras.image_rays(0).directions)).detach()
         of_limit[limit] = torch.cat(used).sort().values, state["weights"].sum(), to_srgb(sky)
         used.clear()
     (pixels, weight, sky), (pixels_of_all, weight_of_all, sky_of_all) = of_limit[64], of_limit[10**6]

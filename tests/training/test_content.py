@@ -81,16 +81,16 @@ def test_finest_texel_follows_the_pixel(
 ) -> None:
     discover()
     cameras = cameras_around(3, side, focal=1.4)
-    boundary = {"_target_": find("boundary", "envmap").target, "resolutions": given, "fitted_resolutions": None}
+    background = {"_target_": find("background", "envmap").target, "resolutions": given, "fitted_resolutions": None}
     config = OmegaConf.create({
-        "boundary": boundary,
+        "background": background,
         "content": {"space": "box"},
         "loss": {"total_variation": {"weight": 1.0, "angle": None}},
         "phase": {"background": {"steps": 10 if fits else 0}},
     })  # fmt: skip
     derive_angular_resolution(config, cameras)
-    assert max(config.boundary.resolutions) == descent
-    assert max([*config.boundary.resolutions, *(config.boundary.fitted_resolutions or ())]) == finest
+    assert max(config.background.resolutions) == descent
+    assert max([*config.background.resolutions, *(config.background.fitted_resolutions or ())]) == finest
     if given is None and side < 4000 and fits:
         pixel = 57.3 / (1.4 * side)
         assert 2**-0.5 < (90 / finest) / pixel < 2**0.5

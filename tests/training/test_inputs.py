@@ -34,7 +34,6 @@ def test_files_of_the_medium_and_cameras_are_compared_with_a_checkpoint(tmp_path
     checkpoint = {INPUTS: inputs_of(config, cameras)}
     path = tmp_path / "last.ckpt"
     require_same_inputs(checkpoint, path, config, cameras)
-    require_same_inputs({}, path, config, cameras)  # of an earlier release
     fewer = cameras.select([0, 1])
     refused("was trained on other photographs or cameras", require_same_inputs, checkpoint, path, config, fewer)
     dent(tmp_path / "inner.ply")

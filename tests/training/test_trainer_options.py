@@ -167,9 +167,9 @@ def test_unusual_precision_and_size_train(options: list[str], train: Runner, tmp
     ("options", "message"),
     [
         (["content.space=all"], "add field=volume sampler/points=volume"),
-        (["boundary.image=sky.exr", "model.colour=srgb"], "take model.colour=linear"),
+        (["background.image=sky.exr", "model.colour=srgb"], "take model.colour=linear"),
         (
-            [f"loss.{name}.weight=0" for name in ("photometric", "boundary", "smoothness", "total_variation")],
+            [f"loss.{name}.weight=0" for name in ("photometric", "background", "smoothness", "total_variation")],
             "no loss has a positive weight in step 0",
         ),
     ],

@@ -50,7 +50,7 @@ def learn(train: Runner) -> Runner:
         "sampler/path=straight",
         "field.log2_table_size=14",
         "field.finest_resolution=64",
-        "loss.boundary.weight=0",
+        "loss.background.weight=0",
     ]
     steps = ["trainer.max_steps=150", "evaluation.subdivision.side=1"]
     return functools.partial(train, *box, *quick, *parts, *steps)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from nerfro.boundaries.envmap import EnvironmentMap
+from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.core.types import FieldValues, Samples
 from nerfro.data.base import DataSource, Views
 from nerfro.fields.base import Field
@@ -66,7 +66,7 @@ def make_scene() -> TrainedScene:
         path_sampler=Snell(),
         point_sampler=Stratified(num_samples=256),
         make_field=SolidBall,
-        boundary=sky,
+        background=sky,
     )
     return TrainedScene(RefractiveModel(parts).eval(), Photographs())
 

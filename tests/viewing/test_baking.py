@@ -9,7 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
-from nerfro.boundaries.envmap import EnvironmentMap
+from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.core.types import Exits
 from nerfro.viewing.baking import bake_sky, cube_directions
 from nerfro.viewing.packing import pack, shared_exponent
@@ -39,13 +39,13 @@ def test_cube_map_directions_match_opengl() -> None:
         assert (face, s, t) == pytest.approx(expected, abs=1e-6)
 
 
-def test_baked_sky_matches_the_boundary() -> None:
-    boundary = EnvironmentMap([2, 8])
-    torch.nn.init.normal_(boundary.texels, std=3, generator=torch.Generator().manual_seed(0))
-    baked = bake_sky(boundary, torch.device("cpu"))
+def test_baked_sky_matches_the_background() -> None:
+    background = EnvironmentMap([2, 8])
+    torch.nn.init.normal_(background.texels, std=3, generator=torch.Generator().manual_seed(0))
+    baked = bake_sky(background, torch.device("cpu"))
     upper, rest = (baked.voxels[name].astype(int) for name in ("sky", "sky_exponent"))
     found = (upper * 2 + (rest >> [0, 1, 2] & 1)) * 2.0 ** ((rest >> 3) - 24)
-    radiance = boundary(Exits(cube_directions(8))).detach().view(6, 8, 8, 3).numpy()
+    radiance = background(Exits(cube_directions(8))).detach().view(6, 8, 8, 3).numpy()
     assert (np.abs(found - radiance) <= radiance.max(-1, keepdims=True) / 500).all()
 
 

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from PIL import Image
 
-from nerfro.boundaries.envmap import EnvironmentMap
+from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.core.cameras import Cameras
 from nerfro.core.light import to_linear
 from nerfro.core.paths import resolve_path
@@ -75,7 +75,7 @@ def one_ray(scene: TrainedScene, cameras: Cameras | None = None) -> Float[torch.
 def in_embedded_scene(scene: TrainedScene, medium: SdfGrid) -> TrainedScene:
     """The ball inside another medium, under the embedded scene's sky and seen by its cameras."""
     sky = EnvironmentMap([128], image=str(resolve_path("embedded:torus/sky.png")))
-    renderer = with_changed_scene(scene.renderer, medium=medium, boundary=sky)
+    renderer = with_changed_scene(scene.renderer, medium=medium, background=sky)
     return TrainedScene(renderer, BlenderData("embedded:torus", downscale=2))
 
 

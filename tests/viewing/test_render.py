@@ -1,7 +1,6 @@
 """`python -m nerfro.render`: its frames and films, resumption, and refused options."""
 
 import functools
-import json
 import math
 import sys
 from dataclasses import replace
@@ -105,9 +104,6 @@ def test_interrupted_rendering_is_resumed_and_not_mixed_with_another(render: Run
     np.testing.assert_array_equal(read("O/frame_0001.png"), whole)
     refused = render("path=arc", "frames=3", "azimuth=40", code=1).error
     assert "frame_0000.png belongs to another rendering; give another out=... or overwrite=true" in refused
-    fingerprint = json.loads(Path("O/frames.json").read_text())["requests"][".png"]
-    Path("O/frames.json").write_text(json.dumps({"request": fingerprint}))  # of an earlier release
-    assert "3 of 3 frames exist already" in render("path=arc", "frames=3").out
     for damaged in ("", "{}", "[]", "null"):  # as a record of unknown frames
         Path("O/frames.json").write_text(damaged)
         assert "belongs to another rendering" in render("path=arc", "frames=3", code=1).error

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int, Shaped
@@ -53,11 +52,6 @@ class _Motions(PerView):
         self.fix_gauge = fix_gauge
         for name in ("motion", "poses", "focal", "distortion", "units", "weights", "gauge_basis", "focal_unit"):
             self.register_buffer(name, torch.zeros(0))
-
-    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
-        if prefix + "of_world" in state_dict:  # old name, in checkpoints of earlier releases
-            state_dict[prefix + "gauge_basis"] = state_dict.pop(prefix + "of_world")
-        super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def begin(self, cameras: Cameras) -> None:
         poses = cameras.camera_to_world.double().cpu()

@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerfro.boundaries.envmap import EnvironmentMap, Observed
-from nerfro.core.errors import renamed_classes, warn
+from nerfro.backgrounds.envmap import EnvironmentMap, Observed
+from nerfro.core.errors import warn
 from nerfro.core.rays import Rays
 from nerfro.core.types import Exits
 from nerfro.fields.base import Field
@@ -34,7 +34,7 @@ _BACKGROUND = 0.7
 _CHUNK = 2**18
 # Turns between background and exposures in the first step.
 _TURNS = 10
-_WITH_MAP, _WITH_BOX = OnlyWith("boundary", ("envmap",)), OnlyWith("content.space", ("box",))
+_WITH_MAP, _WITH_BOX = OnlyWith("background", ("envmap",)), OnlyWith("content.space", ("box",))
 
 
 @register("phase", "background")
@@ -70,7 +70,7 @@ class BackgroundSteps(Phase):
 
     def begin(self, run: TrainingRun) -> dict[str, Any]:
         """Return the weights of the observations of each texel in the current pass."""
-        background = run.renderer.scene.boundary
+        background = run.renderer.scene.background
         if not isinstance(background, EnvironmentMap) or not background.texels.requires_grad:
             return {}
         if occupied_box(run.renderer) is None:
@@ -86,7 +86,7 @@ class BackgroundSteps(Phase):
 
     @torch.no_grad()
     def step(self, run: TrainingRun, number: int, state: dict[str, Any]) -> bool:
-        background, box = run.renderer.scene.boundary, occupied_box(run.renderer)
+        background, box = run.renderer.scene.background, occupied_box(run.renderer)
         if not state or not isinstance(background, EnvironmentMap) or box is None:
             return False
         number_of_pass, part = divmod(number, self.steps)
@@ -146,10 +146,10 @@ def _observe_through_object(run: TrainingRun, pixels: Int[Tensor, "Q"]) -> Obser
     steady = (widths < DIVERGENT).nonzero()[:, 0]
     path, pixels, view, widths = path.select_rays(steady), pixels[steady], view[steady], widths[steady]
     rendering = renderer.render_path(path)[-1]
-    fraction, exits = path.main_polyline(rendering.boundary_fraction), main_exits(path)
+    fraction, exits = path.main_polyline(rendering.background_fraction), main_exits(path)
     rgb = batches.photographed(pixels)
     difference = _photographed(run, rgb, view) - rendering.radiance
-    radiance = scene.boundary(Exits(exits)) + difference / fraction.clamp(min=_BACKGROUND)
+    radiance = scene.background(Exits(exits)) + difference / fraction.clamp(min=_BACKGROUND)
     widths = widths / batches.cameras.fx[view]
     observed = Observed(exits, radiance, rgb >= 1, fraction.square().mean(-1), widths)
     return observed[fraction.amin(-1) >= _BACKGROUND]
@@ -160,7 +160,7 @@ def _observe_beside_object(run: TrainingRun, pixels: Int[Tensor, "Q"], rays: Ray
     batches, scene = run.batches, run.renderer.scene
     view, rgb, exposure = batches.cameras.view_of(pixels), batches.photographed(pixels), scene.camera.exposure
     if exposure is not None and fits_gains:
-        exposure.fit(view, scene.boundary(Exits.unbent(rays)), scene.colour_space.to_radiance(rgb))
+        exposure.fit(view, scene.background(Exits.unbent(rays)), scene.colour_space.to_radiance(rgb))
     widths = 1 / batches.cameras.fx[view]
     return Observed(rays.directions, _photographed(run, rgb, view), rgb >= 1, torch.ones_like(widths), widths)
 
@@ -189,6 +189,3 @@ def occupied_box(renderer: Renderer) -> Float[Tensor, "2 3"] | None:
         boxes.append(renderer.scene.medium.content_box.to(renderer.scene.device))
     low, high = torch.stack(boxes, 1)
     return torch.stack([low.amin(0), high.amax(0)])
-
-
-__getattr__ = renamed_classes(__name__, Background=BackgroundSteps)

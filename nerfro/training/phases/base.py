@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from nerfro.core.errors import NerfroError, renamed_classes
+from nerfro.core.errors import NerfroError
 from nerfro.data.base import Views
 from nerfro.rendering import RayTracer, Renderer
 from nerfro.training.optimizer import require_matches
@@ -106,6 +106,3 @@ class Phase(ABC):
         Returns:
             True to continue with the next step later, False to end the phase.
         """
-
-
-__getattr__ = renamed_classes(__name__, Run=TrainingRun)

@@ -99,5 +99,5 @@ class CameraSteps(Phase):
 
 
 def _prior(state: dict[str, Tensor]) -> PriorInformation:
-    """Read a prior of the state of the phase; checkpoints of earlier releases call the mean `numbers`."""
-    return PriorInformation(state["mean"] if "mean" in state else state["numbers"], state["information"])
+    """Read a prior of the state of the phase."""
+    return PriorInformation(state["mean"], state["information"])

@@ -7,9 +7,9 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from nerfro.boundaries import cube_map
-from nerfro.boundaries import cube_map_cpu as kernels
-from nerfro.boundaries.envmap import EnvironmentMap, Observed
+from nerfro.backgrounds import cube_map
+from nerfro.backgrounds import cube_map_cpu as kernels
+from nerfro.backgrounds.envmap import EnvironmentMap, Observed
 from nerfro.core.light import to_srgb
 from nerfro.core.types import Exits
 from nerfro.files import lat_long
@@ -34,43 +34,43 @@ def test_environment_map_starts_grey() -> None:
 
 
 def test_fitted_texels_are_the_mean_of_all_rays_and_one_zero_residual() -> None:
-    boundary, generator = EnvironmentMap([4]), torch.Generator().manual_seed(0)
+    background, generator = EnvironmentMap([4]), torch.Generator().manual_seed(0)
     directions = cube_map.texel_directions(4)
     radiance, weights = torch.rand(3, 96, 3, generator=generator), torch.rand(3, 96, generator=generator)
     past = torch.zeros(96)
     for values, of_ray in zip(radiance, weights, strict=True):
-        past += boundary.fit(Observed(directions, values, values >= 1, of_ray, torch.zeros(96)), past)
+        past += background.fit(Observed(directions, values, values >= 1, of_ray, torch.zeros(96)), past)
     torch.testing.assert_close(past, weights.sum(0))
     raw = torch.log(torch.expm1(radiance.sqrt() * 2 * math.log(2)))  # of a texel that one ray has seen
     expected = (weights[..., None] * raw).sum(0) / (weights.sum(0) + 1)[:, None]
-    torch.testing.assert_close(boundary.texels.detach(), expected, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(background.texels.detach(), expected, rtol=1e-4, atol=1e-5)
 
 
 def test_wide_cones_do_not_change_fine_levels() -> None:
-    boundary, directions = EnvironmentMap([4, 8]), random_directions(50)
+    background, directions = EnvironmentMap([4, 8]), random_directions(50)
     width = torch.full((50,), 1.1 * math.radians(90 / 4))  # two texels of the fine level are 90 / 4 degrees wide
     sky = smooth_sky(directions)
-    boundary.fit(Observed(directions, sky, sky >= 1, torch.ones(50), width), torch.zeros(480))
-    coarse, fine = boundary.texels.split(boundary.levels.sizes)
+    background.fit(Observed(directions, sky, sky >= 1, torch.ones(50), width), torch.zeros(480))
+    coarse, fine = background.texels.split(background.levels.sizes)
     assert coarse.any()
     assert not fine.any()
 
 
 def test_saturated_radiance_is_a_lower_bound() -> None:
-    boundary, directions, none = EnvironmentMap([4]), cube_map.texel_directions(4), torch.zeros(96)
+    background, directions, none = EnvironmentMap([4]), cube_map.texel_directions(4), torch.zeros(96)
     for radiance in (4.0, 1.0):  # a lamp, and a photograph in which the lamp is saturated
         seen = torch.full((96, 3), radiance)
-        boundary.fit(Observed(directions, seen, seen == 1, torch.full((96,), 1e6), none), none)
-    torch.testing.assert_close(boundary(Exits(directions)).detach(), torch.full((96, 3), 4.0), rtol=1e-4, atol=0)
+        background.fit(Observed(directions, seen, seen == 1, torch.full((96,), 1e6), none), none)
+    torch.testing.assert_close(background(Exits(directions)).detach(), torch.full((96, 3), 4.0), rtol=1e-4, atol=0)
 
 
 @pytest.mark.parametrize("levels", [([4, 8, 16, 32], None), ([4, 8], [16, 32])])
 def test_fit_learns_a_sky_from_few_rays(levels: tuple[list[int], list[int] | None]) -> None:
-    boundary, directions, others = EnvironmentMap(*levels), random_directions(2000), random_directions(2000, 9)
+    background, directions, others = EnvironmentMap(*levels), random_directions(2000), random_directions(2000, 9)
     sky = smooth_sky(directions)
     observed = Observed(directions, sky, sky >= 1, torch.ones(2000), torch.zeros(2000))
-    boundary.fit(observed, torch.zeros(boundary.levels.num_texels))
-    error = (boundary(Exits(others)) - smooth_sky(others)).detach().square().mean().sqrt()
+    background.fit(observed, torch.zeros(background.levels.num_texels))
+    error = (background(Exits(others)) - smooth_sky(others)).detach().square().mean().sqrt()
     assert error < 0.02  # the standard deviation of the sky is 0.15
 
 
@@ -95,35 +95,35 @@ def test_sum_of_levels_learns_a_sky_from_few_rays() -> None:
     errors = []
     for resolutions in ([4, 8, 16, 32], [32]):
         torch.manual_seed(0)
-        boundary = EnvironmentMap(resolutions)
-        optimizer = torch.optim.Adam(boundary.parameters(), lr=0.02, eps=1e-15)
+        background = EnvironmentMap(resolutions)
+        optimizer = torch.optim.Adam(background.parameters(), lr=0.02, eps=1e-15)
         for step in range(300):
             optimizer.param_groups[0]["lr"] = 0.02 * 0.05 ** (step / 300)
             directions = torch.nn.functional.normalize(torch.randn(64, 3), dim=-1)
-            loss = (to_srgb(boundary(Exits(directions))) - smooth_sky(directions)).square().mean()
+            loss = (to_srgb(background(Exits(directions))) - smooth_sky(directions)).square().mean()
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
         unseen = random_directions(2000, seed=9)
-        errors.append(float((to_srgb(boundary(Exits(unseen))) - smooth_sky(unseen)).detach().square().mean().sqrt()))
+        errors.append(float((to_srgb(background(Exits(unseen))) - smooth_sky(unseen)).detach().square().mean().sqrt()))
     pyramid, single = errors
     assert pyramid < 0.01
     assert pyramid < 0.2 * single
 
 
 def test_gradient_of_directions_matches_autograd() -> None:
-    boundary = EnvironmentMap([1, 4, 8])
-    torch.nn.init.normal_(boundary.texels)
+    background = EnvironmentMap([1, 4, 8])
+    torch.nn.init.normal_(background.texels)
     directions = random_directions(200)
 
     def plain(d: torch.Tensor) -> torch.Tensor:
-        texels = boundary.texels.detach().double()
-        raw = cube_map.lookup(*cube_map.project(d), texels, boundary.padded, boundary.levels)
+        texels = background.texels.detach().double()
+        raw = cube_map.lookup(*cube_map.project(d), texels, background.padded, background.levels)
         return (F.softplus(raw) * 0.5 / math.log(2)).square()
 
     assert torch.autograd.gradcheck(plain, directions[:10].double().requires_grad_())
     gradients = []
-    for sky, d in ((lambda d: boundary(Exits(d)), directions), (plain, directions.double())):
+    for sky, d in ((lambda d: background(Exits(d)), directions), (plain, directions.double())):
         d = d.clone().requires_grad_()
         gradients.append(torch.autograd.grad((sky(d) * torch.tensor([1.0, -2.0, 3.0])).sum(), d)[0].double())
     torch.testing.assert_close(*gradients, rtol=1e-4, atol=1e-4)
@@ -144,9 +144,9 @@ def test_finer_image_is_averaged_and_not_sampled() -> None:
     # One-pixel stripes are far below the texture's resolution: every texel must become their mean.
     stripes = torch.zeros(256, 512, 3)
     stripes[:, ::2] = 0.8
-    boundary = EnvironmentMap([4])
-    boundary.set_lat_long(stripes)
-    colours = boundary(Exits(cube_map.texel_directions(4)))
+    background = EnvironmentMap([4])
+    background.set_lat_long(stripes)
+    colours = background(Exits(cube_map.texel_directions(4)))
     torch.testing.assert_close(colours, torch.full_like(colours, 0.4), rtol=0, atol=0.01)
 
 

@@ -1,8 +1,8 @@
-"""The paper's boundary, and the constant one."""
+"""The paper's background, and the constant one."""
 
 import torch
 
-from nerfro.boundaries.constant import ConstantBoundary
+from nerfro.backgrounds.constant import ConstantBackground
 from nerfro.core.types import Exits
 from nerfro.paper.skybox import Skybox
 
@@ -18,6 +18,6 @@ def test_published_skybox_has_its_layers() -> None:
     assert (sky.rgb.in_features, sky.rgb.out_features) == (128, 3)
 
 
-def test_constant_boundary_is_the_same_in_every_direction() -> None:
-    rgb = ConstantBoundary([0.1, 0.2, 0.3])(Exits(torch.randn(4, 5, 3)))
+def test_constant_background_is_the_same_in_every_direction() -> None:
+    rgb = ConstantBackground([0.1, 0.2, 0.3])(Exits(torch.randn(4, 5, 3)))
     assert torch.equal(rgb, torch.tensor([0.1, 0.2, 0.3]).expand(4, 5, 3))

@@ -1,4 +1,4 @@
-"""Template: a boundary of your own in one file. Use it with `boundary=gradient_sky`."""
+"""Template: a background of your own in one file. Use it with `background=gradient_sky`."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from nerfro.parts import Boundary, Exits, NerfroError, register
+from nerfro.parts import Background, Exits, NerfroError, register
 
 
-@register("boundary", "gradient_sky")
-class GradientSky(Boundary):
+@register("background", "gradient_sky")
+class GradientSky(Background):
     """Blend two learned radiances by the height of the direction.
 
     Args:

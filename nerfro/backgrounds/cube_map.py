@@ -4,7 +4,7 @@ Face 2 a + b is the side of the cube at the positive (b = 0) or negative (b = 1)
 coordinate of a face is the angle towards axis a + 1 (modulo 3), and the second the angle towards axis a + 2. All texels
 have the same width in angle, which keeps their solid angles within a factor of 1.4.
 
-`lookup` runs on GPUs, and is the reference implementation of the kernels in `nerfro.boundaries.cube_map_cpu`.
+`lookup` runs on GPUs, and is the reference implementation of the kernels in `nerfro.backgrounds.cube_map_cpu`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Compiled CPU kernels of the cube map lookup; `nerfro.boundaries.cube_map.lookup` is the reference.
+"""Compiled CPU kernels of the cube map lookup; `nerfro.backgrounds.cube_map.lookup` is the reference.
 
 Threads divide the directions in the forward pass and the levels in the backward pass, where no two threads may write to
 the same texel.
@@ -15,7 +15,7 @@ from numba import prange
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from nerfro.boundaries.cube_map import CubeLevels
+from nerfro.backgrounds.cube_map import CubeLevels
 from nerfro.kernels.arrays import arrays
 from nerfro.kernels.compilation import compiled, compiled_parallel
 from nerfro.kernels.threads import num_threads
@@ -30,7 +30,7 @@ def lookup(
     padded: Int[Tensor, " padded"],
     levels: CubeLevels,
 ) -> Float[Tensor, "P 3"]:
-    """Compute `nerfro.boundaries.cube_map.lookup` on the CPU."""
+    """Compute `nerfro.backgrounds.cube_map.lookup` on the CPU."""
     return _Lookup.apply(face, coordinates.contiguous(), texels, padded, levels)
 
 

@@ -1,4 +1,4 @@
-"""Boundary regularizer of the paper."""
+"""Background regularizer of the paper."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.core.distributed import rank_and_size, sum_over_processes
-from nerfro.core.errors import renamed_classes
 from nerfro.core.types import Batch, Rendering
 from nerfro.losses.base import Loss
 from nerfro.registry.registration import register
@@ -16,8 +15,8 @@ from nerfro.rendering import Scene
 _MIN_TRANSMITTANCE = 0.5
 
 
-@register("loss", "boundary")
-class BoundaryRegularizer(Loss):
+@register("loss", "background")
+class BackgroundRegularizer(Loss):
     """Penalize |T C'(d) - C| where the final transmittance T is above 1/2 (paper, Eqn. 8).
 
     The background should explain such pixels without the field, so the loss removes fog in front of the surface. Only
@@ -45,6 +44,3 @@ class BoundaryRegularizer(Loss):
         error = (predicted - target).abs().sum(-1)
         # Gradients are averaged over processes, so each process multiplies its sum by the number of processes.
         return (error * counted).sum() * rank_and_size()[1] / (sum_over_processes(counted.sum()) + 1)
-
-
-__getattr__ = renamed_classes(__name__, BoundaryRegulariser=BoundaryRegularizer)

@@ -12,7 +12,7 @@ from torch.func import functional_call
 from nerfro.core.types import Exits
 
 
-class Boundary(nn.Module, ABC):
+class Background(nn.Module, ABC):
     """Background radiance, C'(d) (paper, Eqn. 5): radiance that arrives from outside of the volume.
 
     It is in the colour space of the model: linear, or sRGB with `model.colour=srgb`.
@@ -36,20 +36,20 @@ class Boundary(nn.Module, ABC):
 
 
 def background_radiance(
-    boundary: Boundary, exits: Exits, teaches: Bool[Tensor, "P"] | None = None
+    background: Background, exits: Exits, teaches: Bool[Tensor, "P"] | None = None
 ) -> Float[Tensor, "P 3"]:
     """Evaluate the background radiance, with gradients of the parameters from selected exits only.
 
     Args:
-        boundary: the background.
+        background: the background.
         exits: last segments of polylines.
         teaches: exits from which the parameters learn; None for all. The exits themselves always have gradients.
     """
-    radiance = boundary(exits)
+    radiance = background(exits)
     if teaches is None or not radiance.requires_grad:
         return radiance
     fixed = radiance.detach()
     if exits.directions.requires_grad:
-        parameters = {name: parameter.detach() for name, parameter in boundary.named_parameters()}
-        fixed = functional_call(boundary, parameters, (exits,))
+        parameters = {name: parameter.detach() for name, parameter in background.named_parameters()}
+        fixed = functional_call(background, parameters, (exits,))
     return torch.where(teaches[:, None], radiance, fixed)

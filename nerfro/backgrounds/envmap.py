@@ -13,8 +13,8 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from nerfro.boundaries import cube_map
-from nerfro.boundaries.base import Boundary
+from nerfro.backgrounds import cube_map
+from nerfro.backgrounds.base import Background
 from nerfro.core.errors import NerfroError
 from nerfro.core.types import Exits
 from nerfro.files import lat_long
@@ -58,8 +58,8 @@ class Observed:
         return cls(*(torch.cat(values) for values in zip(*(vars(part).values() for part in parts), strict=True)))
 
 
-@register("boundary", "envmap")
-class EnvironmentMap(Boundary):
+@register("background", "envmap")
+class EnvironmentMap(Background):
     """Squared softplus of a sum of cube maps of increasing resolution.
 
     Coarse levels fill in directions that no ray has sampled. The map has no preferred axis. It is initialized
@@ -90,7 +90,7 @@ class EnvironmentMap(Boundary):
         super().__init__()
         resolutions = list(_RESOLUTIONS) if resolutions is None else resolutions
         if len(resolutions) == 0:
-            raise NerfroError("boundary=envmap: resolutions is empty; give one or more")
+            raise NerfroError("background=envmap: resolutions is empty; give one or more")
         fitted = [] if fitted_resolutions is None else fitted_resolutions
         self.levels = cube_map.CubeLevels((*resolutions, *fitted))
         self._groups = cube_map.CubeLevels(tuple(resolutions)), cube_map.CubeLevels(tuple(fitted))
@@ -134,7 +134,7 @@ class EnvironmentMap(Boundary):
     @staticmethod
     def _looked_up(face: Tensor, *arguments: Any) -> Float[Tensor, "P 3"]:
         if face.device.type == "cpu":
-            from nerfro.boundaries.cube_map_cpu import lookup  # compiled code, so only where it is used
+            from nerfro.backgrounds.cube_map_cpu import lookup  # compiled code, so only where it is used
         else:
             lookup = cube_map.lookup
         return lookup(face, *arguments)

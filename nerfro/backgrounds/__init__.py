@@ -1,0 +1,1 @@
+"""Background models: background radiance as a function of the exits of paths."""

@@ -1,1 +1,0 @@
-"""Boundary models: background radiance as a function of the exits of paths."""
