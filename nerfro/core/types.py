@@ -87,25 +87,11 @@ class OpticalRecord:
         """Select polylines."""
         return replace(self, **{name: getattr(self, name)[index] for name in _OF_ROWS})
 
-    def padded(self, num_vertices: int) -> OpticalRecord:
-        """Repeat the last vertices, so that all polylines have `num_vertices`."""
-        return replace(self, **{name: _padded(getattr(self, name), num_vertices) for name in _OF_VERTICES})
 
-    @classmethod
-    def joined(cls, records: Sequence[OpticalRecord]) -> OpticalRecord:
-        """Concatenate the polylines of records with the same number of vertices."""
-        rows: dict[str, Any] = {name: torch.cat([getattr(record, name) for record in records]) for name in _OF_ROWS}
-        return cls(**rows, absorption=max((record.absorption for record in records), key=len))
-
-
-# Fields of `OpticalRecord` with a column for each vertex, and with a row for each polyline.
-_OF_VERTICES = ("body", "surface_body", "far_side", "triangle")
-_OF_ROWS = (*_OF_VERTICES, "band")
-
-
-def _padded(values: Shaped[Tensor, "P S *C"], num_vertices: int) -> Shaped[Tensor, "P vertices *C"]:
-    missing = num_vertices - values.shape[1]
-    return values if missing == 0 else torch.cat([values, values[:, -1:].expand(-1, missing, *values.shape[2:])], 1)
+# Fields with a row for each polyline, of `Path` and of its record, and those that have a column for each vertex.
+_OF_PATHS = ("positions", "directions", "s", "refracted", "radii", "ray", "throughput")
+_OF_ROWS = ("body", "surface_body", "far_side", "triangle", "band")
+_OF_VERTICES = ("positions", "directions", "s", "body", "surface_body", "far_side", "triangle")
 
 
 @dataclass(frozen=True)
@@ -163,20 +149,23 @@ class Path:
 
         Either all paths have a record, or none.
         """
-        num_vertices = max(path.s.shape[1] for path in paths)
-        columns: dict[str, list[Tensor]] = {name: [] for name in _OF_PATHS}
-        num_rays, records = 0, []
+        num_vertices, num_rays = max([path.s.shape[1] for path in paths]), 0
+        columns: dict[str, list[Tensor]] = {name: [] for name in (*_OF_PATHS, *_OF_ROWS)}
         for path in paths:
-            for name in ("positions", "directions", "s"):
-                columns[name].append(_padded(getattr(path, name), num_vertices))
-            for name in ("refracted", "radii", "throughput"):
-                columns[name].append(getattr(path, name))
-            columns["ray"].append(path.ray + num_rays)
+            # Short rows repeat their last vertex.
+            vertices = torch.arange(num_vertices, device=path.s.device).clamp(max=path.s.shape[1] - 1)
+            for part, names in ((path, _OF_PATHS), (path.record, _OF_ROWS)):
+                for name in names if part is not None else ():
+                    values = getattr(part, name)
+                    columns[name].append(values[:, vertices] if name in _OF_VERTICES else values)
+            columns["ray"][-1] = path.ray + num_rays
             num_rays += path.num_rays
-            records += [] if path.record is None else [path.record.padded(num_vertices)]
-        together: dict[str, Any] = {name: torch.cat(values) for name, values in columns.items()}
-        record = OpticalRecord.joined(records) if records else None
-        return cls(**together, splits=any(path.splits for path in paths), record=record)
+        joined: dict[str, Any] = {name: torch.cat(values) for name, values in columns.items() if values}
+        record, records = None, [path.record for path in paths if path.record is not None]
+        if records:
+            absorption = max([record.absorption for record in records], key=len)
+            record = OpticalRecord(*[joined.pop(name) for name in _OF_ROWS], absorption)
+        return cls(**joined, splits=any([path.splits for path in paths]), record=record)
 
     def __repr__(self) -> str:
         polylines, vertices = self.s.shape
@@ -300,10 +289,6 @@ class Path:
         # searchsorted needs contiguous rows; `contiguous` is free for contiguous tensors.
         vertex = torch.searchsorted(self.s.detach().contiguous(), s.detach().contiguous(), side="left") - 1
         return vertex.clamp(min=0)
-
-
-# Fields of `Path` with a row for each polyline.
-_OF_PATHS = ("positions", "directions", "s", "refracted", "radii", "ray", "throughput")
 
 
 @dataclass(frozen=True)

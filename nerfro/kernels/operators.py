@@ -29,22 +29,17 @@ def operator(schema: str, reference: Callable[..., Any], on_cpu: Callable[..., A
     return getattr(torch.ops.nerfro, name).default
 
 
-def kernel(
-    schema: str, fake: Callable[..., Any], others: Callable[..., Any] | None = None
-) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+def kernel(schema: str, fake: Callable[..., Any]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Define an operator without gradients by a function of CPU tensors.
 
     Args:
         schema: name, arguments and results, see `operator`.
         fake: function of the same arguments that creates results of the right shapes and types without values.
-        others: implementation for other devices, if there is one.
     """
 
     def define(function: Callable[..., Any]) -> Callable[..., Any]:
         name = _define(schema)
         _LIBRARY.impl(name, function, "CPU")
-        if others is not None:
-            _LIBRARY.impl(name, others, "CompositeExplicitAutograd")
         torch.library.register_fake(f"nerfro::{name}", fake, lib=_LIBRARY)
         return getattr(torch.ops.nerfro, name).default
 

@@ -147,8 +147,7 @@ class TrainingModule(LightningModule):
         progress = self.renderer.begin_step(training_progress(self.trainer))
         factor = learning_rate_factor(self.global_step, progress, self.optimizer_config)
         for group in self.trainer.optimizers[0].param_groups:
-            waits = self.global_step < self.optimizer_config.group(group["name"]).start
-            group["lr"] = 0.0 if waits else group["initial_lr"] * factor
+            group["lr"] = 0.0 if self.global_step < group["start"] else group["initial_lr"] * factor
         # At the end of the previous step, the update would follow the checkpoint, and a resumed run would miss it.
         if self.global_step > 0:
             draws = replace(batch.draws, step=self.global_step)  # a repeated batch repeats its number
@@ -166,8 +165,10 @@ class TrainingModule(LightningModule):
     def configure_optimizers(self) -> torch.optim.Optimizer:
         groups = []
         for name, parameters in self.parameter_groups().items():
-            rate = self.optimizer_config.group(name).learning_rate or self.optimizer_config.learning_rate
-            groups.append({"params": parameters, "lr": rate, "initial_lr": rate, "name": name})
+            settings = self.optimizer_config.group(name)
+            rate = settings.learning_rate or self.optimizer_config.learning_rate
+            group = {"params": parameters, "lr": rate, "initial_lr": rate, "name": name, "start": settings.start}
+            groups.append(group)
         # Lightning cannot clip the gradients of a fused optimizer under mixed precision.
         fused = self._trainer is None or not self._trainer.gradient_clip_val
         return torch.optim.Adam(groups, eps=self.optimizer_config.adam_epsilon, fused=fused)

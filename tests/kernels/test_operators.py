@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -13,7 +14,12 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from nerfro.backgrounds import cube_map, cube_map_cpu
 from nerfro.fields import hash_encoding, hash_encoding_cpu, relu_mlp
 from nerfro.fields.spherical_harmonics_cpu import spherical_harmonics
+from nerfro.media.sdf_grid import SdfGrid
+from nerfro.samplers.paths import compiled
+from nerfro.testing import example_rays
+from tests.closed_forms import grid_points
 
+BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
 LEVELS = hash_encoding.grid_levels(num_levels=3, base_resolution=2, finest_resolution=8, log2_table_size=6)
 CUBE = cube_map.CubeLevels((1, 2))
 
@@ -40,6 +46,14 @@ def cube_lookup() -> tuple[Any, ...]:
 LEARNING = [hash_encode, harmonics, mlp, cube_lookup]
 
 
+def trace_snell() -> tuple[Any, ...]:
+    medium = SdfGrid.from_distances(grid_points(1.5, 20).norm(dim=-1)[None] - 0.8, BOX, [1.5], 0.01)
+    rays, solids = example_rays(6), medium.packed()
+    packed = [torch.from_numpy(values) for values in solids if isinstance(values, np.ndarray)]
+    settings = solids.nested, solids.shell, 16, 2, 0.02, False
+    return compiled._trace, rays.origins, rays.directions, rays.near, rays.far, packed, *settings
+
+
 def learned(values: Any) -> Any:
     """Let floating-point tensors require gradients."""
     if isinstance(values, list):
@@ -55,6 +69,11 @@ def test_operator_passes_the_checks_of_torch(case: Callable[[], tuple[Any, ...]]
     torch.library.opcheck(function, tuple(learned(values) for values in arguments))
 
 
+def test_tracing_passes_the_checks_of_torch() -> None:
+    function, *arguments = trace_snell()
+    torch.library.opcheck(function, tuple(arguments))
+
+
 @pytest.mark.parametrize("case", LEARNING)
 def test_operator_has_the_same_shapes_on_fake_tensors_and_in_compiled_code(
     case: Callable[[], tuple[Any, ...]],
@@ -65,8 +84,8 @@ def test_operator_has_the_same_shapes_on_fake_tensors_and_in_compiled_code(
         fake = function(*arguments)
     assert fake.shape == expected.shape
     assert fake.dtype == expected.dtype
-    compiled = torch.compile(lambda *given: function(*given) + 0, backend="aot_eager", fullgraph=True)
-    torch.testing.assert_close(compiled(*arguments), expected)
+    in_graph = torch.compile(lambda *given: function(*given) + 0, backend="aot_eager", fullgraph=True)
+    torch.testing.assert_close(in_graph(*arguments), expected)
 
 
 @pytest.mark.parametrize("case", LEARNING)
