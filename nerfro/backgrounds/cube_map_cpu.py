@@ -18,7 +18,6 @@ from torch.autograd.function import once_differentiable
 
 from nerfro.backgrounds import cube_map
 from nerfro.backgrounds.cube_map import CubeLevels
-from nerfro.kernels.arrays import arrays
 from nerfro.kernels.compilation import compiled, compiled_parallel
 from nerfro.kernels.operators import kernel, operator
 from nerfro.kernels.threads import num_threads
@@ -76,10 +75,10 @@ _ARGUMENTS = "Tensor face, Tensor coordinates, Tensor padded, Tensor texels"
     lambda face, coordinates, padded, texels, resolutions: texels.new_empty(len(face), 3),
 )
 def _sum_of_levels(
-    face: Tensor, coordinates: Tensor, padded: Tensor, texels: Tensor, resolutions: list[int]
-) -> Float[Tensor, "P 3"]:
-    total = texels.new_zeros(len(face), 3)
-    _forward(*arrays(face, coordinates, padded), *_layout(tuple(resolutions)), *arrays(texels, total))
+    face: np.ndarray, coordinates: np.ndarray, padded: np.ndarray, texels: np.ndarray, resolutions: list[int]
+) -> Float[np.ndarray, "P 3"]:
+    total = np.zeros((len(face), 3), texels.dtype)
+    _forward(face, coordinates, padded, *_layout(tuple(resolutions)), texels, total)
     return total
 
 
@@ -88,11 +87,11 @@ def _sum_of_levels(
     lambda face, coordinates, padded, texels, gradient, resolutions: torch.empty_like(coordinates),
 )
 def _gradient_of_coordinates(
-    face: Tensor, coordinates: Tensor, padded: Tensor, texels: Tensor, gradient: Tensor, resolutions: list[int]
-) -> Float[Tensor, "P 2"]:
-    of_coordinates = torch.empty_like(coordinates)
-    places = *arrays(face, coordinates, padded), *_layout(tuple(resolutions))
-    _backward_to_coordinates(*places, *arrays(texels, gradient, of_coordinates))
+    face: np.ndarray, coordinates: np.ndarray, padded: np.ndarray, texels: np.ndarray,
+    gradient: np.ndarray, resolutions: list[int],
+) -> Float[np.ndarray, "P 2"]:  # fmt: skip
+    of_coordinates, layout = np.empty_like(coordinates), _layout(tuple(resolutions))
+    _backward_to_coordinates(face, coordinates, padded, *layout, texels, gradient, of_coordinates)
     return of_coordinates
 
 
@@ -101,11 +100,11 @@ def _gradient_of_coordinates(
     lambda face, coordinates, padded, texels, gradient, resolutions: torch.empty_like(texels),
 )
 def _gradient_of_texels(
-    face: Tensor, coordinates: Tensor, padded: Tensor, texels: Tensor, gradient: Tensor, resolutions: list[int]
-) -> Float[Tensor, "T 3"]:
-    of_texels = torch.zeros_like(texels)
-    places = *arrays(face, coordinates, padded), *_layout(tuple(resolutions))
-    _backward(min(num_threads(), len(resolutions)), *places, *arrays(gradient, of_texels))
+    face: np.ndarray, coordinates: np.ndarray, padded: np.ndarray, texels: np.ndarray,
+    gradient: np.ndarray, resolutions: list[int],
+) -> Float[np.ndarray, "T 3"]:  # fmt: skip
+    of_texels, layout = np.zeros_like(texels), _layout(tuple(resolutions))
+    _backward(min(num_threads(), len(resolutions)), face, coordinates, padded, *layout, gradient, of_texels)
     return of_texels
 
 

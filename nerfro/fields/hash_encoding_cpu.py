@@ -22,7 +22,6 @@ from torch.autograd.function import once_differentiable
 
 from nerfro.fields import hash_encoding
 from nerfro.fields.hash_encoding import HASH_Y, HASH_Z, NUM_FEATURES, GridLevels
-from nerfro.kernels.arrays import arrays
 from nerfro.kernels.compilation import compiled, compiled_parallel
 from nerfro.kernels.operators import kernel, operator
 from nerfro.kernels.threads import num_threads, share
@@ -79,14 +78,16 @@ class _HashEncode(torch.autograd.Function):
     lambda positions, table, resolutions, sizes: positions.new_empty(positions.shape[1], NUM_FEATURES * len(sizes)),
 )
 def _encode(
-    positions: Float[Tensor, "3 points"], table: Float[Tensor, "T 2"], resolutions: list[int], sizes: list[int]
-) -> Float[Tensor, "points F"]:
-    num_points = positions.shape[1]
-    features = positions.new_empty(num_points, NUM_FEATURES * len(sizes))
-    (places, entries, results), layout = arrays(positions, table, features), _layout(resolutions, sizes)
+    positions: Float[np.ndarray, "3 points"],
+    table: Float[np.ndarray, "T 2"],
+    resolutions: list[int],
+    sizes: list[int],
+) -> Float[np.ndarray, "points F"]:
+    layout, num_points = _layout(tuple(resolutions), tuple(sizes)), positions.shape[1]
+    features = np.empty((num_points, NUM_FEATURES * len(sizes)), positions.dtype)
 
     def encode(part: int) -> None:
-        _forward(places, entries, *layout, (part * _PART, min((part + 1) * _PART, num_points)), results)
+        _forward(positions, table, *layout, (part * _PART, min((part + 1) * _PART, num_points)), features)
 
     share(encode, -(-num_points // _PART))
     return features
@@ -97,44 +98,37 @@ def _encode(
     lambda positions, table, gradient, resolutions, sizes: torch.empty_like(positions),
 )
 def _gradient_of_positions(
-    positions: Float[Tensor, "3 points"],
-    table: Float[Tensor, "T 2"],
-    gradient: Float[Tensor, "points F"],
+    positions: Float[np.ndarray, "3 points"],
+    table: Float[np.ndarray, "T 2"],
+    gradient: Float[np.ndarray, "points F"],
     resolutions: list[int],
     sizes: list[int],
-) -> Float[Tensor, "3 points"]:
-    of_positions = torch.empty_like(positions)
-    places, entries, upstream, results = arrays(positions, table, gradient, of_positions)
-    _backward_to_positions(places, entries, upstream, *_layout(resolutions, sizes), results)
+) -> Float[np.ndarray, "3 points"]:
+    of_positions = np.empty_like(positions)
+    _backward_to_positions(positions, table, gradient, *_layout(tuple(resolutions), tuple(sizes)), of_positions)
     return of_positions
 
 
 @kernel(
     "hash_encode_table(Tensor positions, Tensor table, Tensor gradient, int[] resolutions, int[] sizes) -> Tensor",
-    lambda positions, table, gradient, resolutions, sizes: table.new_empty(table.shape, dtype=torch.float32),
+    lambda positions, table, gradient, resolutions, sizes: torch.empty_like(table),
 )
 def _gradient_of_table(
-    positions: Float[Tensor, "3 points"],
-    table: Float[Tensor, "T 2"],
-    gradient: Float[Tensor, "points F"],
+    positions: Float[np.ndarray, "3 points"],
+    table: Float[np.ndarray, "T 2"],
+    gradient: Float[np.ndarray, "points F"],
     resolutions: list[int],
     sizes: list[int],
-) -> Float[Tensor, "T 2"]:
-    of_table = torch.zeros(table.shape, dtype=torch.float32)
-    (places, upstream, results), layout = arrays(positions, gradient, of_table), _layout(resolutions, sizes)
-    threads = num_threads()
+) -> Float[np.ndarray, "T 2"]:
+    of_table, layout, threads = np.zeros_like(table), _layout(tuple(resolutions), tuple(sizes)), num_threads()
     # Threads of Numba share the levels themselves.
     parts = _LEVEL_PARTS if threads == 1 else 1
-    share(lambda part: _backward(places, upstream, *layout, (part, parts, threads), results), parts)
+    share(lambda part: _backward(positions, gradient, *layout, (part, parts, threads), of_table), parts)
     return of_table
 
 
-def _layout(resolutions: list[int], sizes: list[int]) -> tuple[np.ndarray, ...]:
-    return _layout_arrays(tuple(resolutions), tuple(sizes))
-
-
 @lru_cache(maxsize=16)
-def _layout_arrays(resolutions: tuple[int, ...], sizes: tuple[int, ...]) -> tuple[np.ndarray, ...]:
+def _layout(resolutions: tuple[int, ...], sizes: tuple[int, ...]) -> tuple[np.ndarray, ...]:
     levels = GridLevels(resolutions, sizes)
     return np.array(resolutions), np.array(sizes), np.array(levels.offsets), np.array(levels.dense)
 

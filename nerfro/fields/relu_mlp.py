@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from nerfro.kernels.available import fast_bfloat16
-from nerfro.kernels.operators import kernel, operator
+from nerfro.kernels.operators import cpu_operator, operator
 from nerfro.kernels.threads import share
 
 # Rows of a product. oneDNN compiles and caches a program for each shape. Batches differ in the number of points, so
@@ -138,12 +138,14 @@ def _shapes(parts: list[Tensor], layers: list[Tensor]) -> list[Tensor]:
     return [parts[0].new_empty(_num_rows(parts), width, dtype=layers[0].dtype) for width in widths]
 
 
-@kernel("relu_mlp_forward(Tensor[] parts, Tensor[] layers) -> Tensor", lambda parts, layers: _shapes(parts, layers)[0])
+@cpu_operator(
+    "relu_mlp_forward(Tensor[] parts, Tensor[] layers) -> Tensor", lambda parts, layers: _shapes(parts, layers)[0]
+)
 def _evaluated(parts: list[Tensor], layers: list[Tensor]) -> Tensor:
     return _evaluate(parts, layers, False)[0]
 
 
-@kernel("relu_mlp_kept(Tensor[] parts, Tensor[] layers) -> Tensor[]", _shapes)
+@cpu_operator("relu_mlp_kept(Tensor[] parts, Tensor[] layers) -> Tensor[]", _shapes)
 def _evaluated_and_kept(parts: list[Tensor], layers: list[Tensor]) -> list[Tensor]:
     return _evaluate(parts, layers, True)
 
@@ -159,7 +161,7 @@ def _shapes_of_gradients(
     return of_parts + [torch.empty_like(layer, dtype=weight_type) for layer in layers if weights_learn]
 
 
-@kernel(
+@cpu_operator(
     "relu_mlp_backward(Tensor gradient, Tensor[] activations, Tensor[] layers, int[] widths, bool[] parts_learn, "
     "bool weights_learn, ScalarType weight_type) -> Tensor[]",
     _shapes_of_gradients,

@@ -12,7 +12,6 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from nerfro.fields import spherical_harmonics as reference
-from nerfro.kernels.arrays import arrays
 from nerfro.kernels.compilation import compiled_parallel
 from nerfro.kernels.operators import kernel, operator
 
@@ -50,9 +49,9 @@ spherical_harmonics = operator(
     "spherical_harmonics_forward(Tensor directions, int num_bands) -> Tensor",
     lambda directions, num_bands: directions.new_empty(len(directions), num_bands**2),
 )
-def _evaluate(directions: Float[Tensor, "directions 3"], num_bands: int) -> Float[Tensor, "directions bases"]:
-    values = directions.new_empty(len(directions), num_bands**2)
-    _harmonics(directions.detach().numpy(), num_bands, values.numpy())
+def _evaluate(directions: Float[np.ndarray, "directions 3"], num_bands: int) -> Float[np.ndarray, "directions bases"]:
+    values = np.empty((len(directions), num_bands**2), directions.dtype)
+    _harmonics(directions, num_bands, values)
     return values
 
 
@@ -61,10 +60,10 @@ def _evaluate(directions: Float[Tensor, "directions 3"], num_bands: int) -> Floa
     lambda directions, gradient, num_bands: torch.empty_like(directions),
 )
 def _gradient(
-    directions: Float[Tensor, "directions 3"], gradient: Float[Tensor, "directions bases"], num_bands: int
-) -> Float[Tensor, "directions 3"]:
-    of_directions = torch.zeros_like(directions)
-    _backward(*arrays(directions, gradient), num_bands, of_directions.numpy())
+    directions: Float[np.ndarray, "directions 3"], gradient: Float[np.ndarray, "directions bases"], num_bands: int
+) -> Float[np.ndarray, "directions 3"]:
+    of_directions = np.zeros_like(directions)
+    _backward(directions, gradient, num_bands, of_directions)
     return of_directions
 
 

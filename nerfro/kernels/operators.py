@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import torch
 
 _LIBRARY = torch.library.Library("nerfro", "FRAGMENT")
@@ -20,7 +21,7 @@ def operator(schema: str, reference: Callable[..., Any], on_cpu: Callable[..., A
     Args:
         schema: name, arguments and results in the notation of PyTorch, `name(Tensor x, int n) -> Tensor`.
         reference: differentiable implementation in PyTorch, for all devices but the CPU.
-        on_cpu: differentiable implementation by operators of `kernel`.
+        on_cpu: differentiable implementation by operators without gradients.
     """
     name = _define(schema)
     _LIBRARY.impl(name, reference, "CompositeImplicitAutograd")
@@ -30,12 +31,28 @@ def operator(schema: str, reference: Callable[..., Any], on_cpu: Callable[..., A
 
 
 def kernel(schema: str, fake: Callable[..., Any]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Define an operator without gradients by a function of CPU tensors.
+    """Define an operator without gradients by a function that takes and returns NumPy arrays.
 
     Args:
         schema: name, arguments and results, see `operator`.
-        fake: function of the same arguments that creates results of the right shapes and types without values.
+        fake: function of the arguments, as tensors, that creates results of the right shapes and types without values.
     """
+
+    def define(function: Callable[..., Any]) -> Callable[..., Any]:
+        def on_tensors(*arguments: Any) -> Any:
+            results = function(*[
+                values.detach().contiguous().numpy() if isinstance(values, torch.Tensor) else values
+                for values in arguments
+            ])  # fmt: skip
+            return torch.from_numpy(results) if isinstance(results, np.ndarray) else (*map(torch.from_numpy, results),)
+
+        return cpu_operator(schema, fake)(on_tensors)
+
+    return define
+
+
+def cpu_operator(schema: str, fake: Callable[..., Any]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Define an operator without gradients by a function of CPU tensors; the arguments are those of `kernel`."""
 
     def define(function: Callable[..., Any]) -> Callable[..., Any]:
         name = _define(schema)

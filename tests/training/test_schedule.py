@@ -44,7 +44,7 @@ class Counted(Phase):
 def steps(schedule: Schedule, first: int, last: int, callbacks: Sequence[Callback] = ()) -> dict[str, Any]:
     """Take some training steps without a model; returns the state of the schedule."""
     module = Mock(spec=LightningModule, renderer=Mock(spec=Renderer))
-    data = Mock(batches=Mock(spec=PixelBatches))
+    data = Mock(batches=Mock(spec=PixelBatches), tracer=Mock(spec=RayTracer))
     trainer = Mock(spec=Trainer, datamodule=data, lightning_module=module, optimizers=[Mock(spec=Adam)])
     trainer.configure_mock(global_step=first, max_steps=100, callbacks=list(callbacks))
     schedule.on_train_start(trainer, module)

@@ -69,9 +69,9 @@ def _shapes(
     _shapes,
 )
 def _trace(
-    origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, solids: list[Tensor], nested: bool, shell: float,
-    max_events: int, max_split_events: int, least_weight: float, main_only: bool,
-) -> tuple[Tensor, ...]:  # fmt: skip
+    origins: np.ndarray, directions: np.ndarray, near: np.ndarray, far: np.ndarray, solids: list[Tensor], nested: bool,
+    shell: float, max_events: int, max_split_events: int, least_weight: float, main_only: bool,
+) -> list[np.ndarray]:  # fmt: skip
     """Trace rays; returns ray, vertices and numbers of each polyline, see `TracedRows`.
 
     Args:
@@ -80,7 +80,7 @@ def _trace(
         nested, shell: numbers of `kernels.lookup.Solids`.
         max_events, max_split_events, least_weight, main_only: see `snell_cpu.Settings`.
     """
-    rays, bodies = arrays(origins, directions, near, far), arrays(*solids)
+    rays, bodies = (origins, directions, near, far), [values.numpy() for values in solids]
     packed = Solids(*bodies[:-2], nested, shell, *bodies[-2:])
     settings = Settings(max_events, max_split_events, least_weight, main_only)
     max_polylines = _MAX_POLYLINES if max_split_events and not main_only else 1
@@ -96,7 +96,7 @@ def _trace(
         joined = [np.concatenate(pair) for pair in pairs]
         order = np.argsort(joined[0], kind="stable")
         columns = [column[order] for column in joined]
-    return tuple(map(torch.from_numpy, columns))
+    return columns
 
 
 def _polylines(rows: TracedRows, counts: Int[np.ndarray, "R"], width: int) -> list[np.ndarray]:
