@@ -18,7 +18,7 @@ from nerfro.core.errors import NerfroError
 from nerfro.core.paths import user_path
 from nerfro.evaluation.error_sheets import write_error_sheet
 from nerfro.evaluation.folders import match_folders
-from nerfro.evaluation.metrics import prepared_metrics
+from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.request import EvaluateConfig, find_device, own_folder, record, require_one_task
 from nerfro.evaluation.results import RunMetrics
 from nerfro.evaluation.scoring import score_folders
@@ -52,7 +52,7 @@ def _evaluate_checkpoint(config: DictConfig) -> None:
     with own_folder(config, path.parent.parent / f"evaluate_{config.split}") as folder:
         scene = scene_of(checkpoint, trained, device)
         views = scene.views(config.split).checked()
-        metrics = prepared_metrics()
+        metrics = ImageMetrics()
         record(folder, config)
         result, treated = score_split(scene.renderer, views, metrics, folder, scene.subdivision, config.split)
         for index, view in enumerate(result.views):
@@ -80,7 +80,7 @@ def _evaluate_folder(config: DictConfig) -> None:
         pair.load(config.alpha)
     device = find_device(config.device)
     with own_folder(config, predictions / "scores") as folder:
-        metrics = prepared_metrics()
+        metrics = ImageMetrics()
         record(folder, config)
         result = score_folders(pairs, config.alpha, metrics, folder, device)
         write_scores(RunMetrics(result), f"{predictions} against {references}", folder)

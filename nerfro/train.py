@@ -18,7 +18,7 @@ from nerfro.cli.entry import entry_point
 from nerfro.cli.failures import EXIT_INTERRUPTED
 from nerfro.cli.overrides import prints_hints
 from nerfro.core.distributed import leave
-from nerfro.evaluation.metrics import prepared_metrics
+from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.results import RunMetrics, optimized
 from nerfro.evaluation.tables import write_scores
 from nerfro.evaluation.treatments import score_split
@@ -58,7 +58,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetr
     test = training if split is None else source.load(split).checked()
     test = test.select(range(len(test))[: config.trainer.limit_test_batches])
     subdivision = Subdivision(**config.evaluation.subdivision)
-    metrics = prepared_metrics()
+    metrics = ImageMetrics()
     module, datamodule = build_training(config, source, training)
     renderer = module.renderer
     num_steps = require_same_run(folder, checkpoint, config, module.parameter_groups(), training.cameras)

@@ -26,7 +26,7 @@ from nerfro.training.config import TrainConfig
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
 from nerfro.training.trainer import make_trainer
 from tests.conftest import Runner, weights_of
-from tests.processes import OFFLINE
+from tests.processes import ONE_THREAD
 
 # Gradients are sums in another order, so they differ in their last bits. Adam divides them by their size, and would
 # make whole steps of what rounding has left of zero.
@@ -84,7 +84,7 @@ def start(tmp_path: Path) -> Callable[..., subprocess.Popen[str]]:
     plugins = tmp_path / "watching_plugins"
     plugins.mkdir()
     (plugins / "watching.py").write_text(WATCHING_LOSS)
-    environment = os.environ | OFFLINE | {"NERFRO_PLUGINS": str(plugins), "TORCH_HOME": str(tmp_path / "torch")}
+    environment = os.environ | ONE_THREAD | {"NERFRO_PLUGINS": str(plugins), "TORCH_HOME": str(tmp_path / "torch")}
 
     def start(name: str, *overrides: str, launcher: Sequence[str] = (), **variables: str) -> subprocess.Popen[str]:
         command = [sys.executable, *launcher, "-m", "nerfro.train", *overrides, *TWO_PROCESSES]

@@ -1,15 +1,20 @@
 """Every import points down: from the commands through the packages to the core, types included."""
 
 import ast
+import inspect
+import math
 import re
 import sys
 from collections.abc import Iterator
+from dataclasses import FrozenInstanceError, fields
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
 from nerfro.core.paths import PACKAGE_DIR, PLUGINS_DIR
+from nerfro.core.provenance import AlgorithmSettings
+from nerfro.registry.registration import discover
 from tests.size import count_by_component, count_code_lines
 
 # From above to below: a package imports what follows it, and itself.
@@ -231,3 +236,16 @@ def test_only_its_class_writes_an_attribute() -> None:
     found = {module: outside_writes(ast.parse(file.read_text(encoding="utf-8"))) for module, file in files.items()}
     assert {module: writes for module, writes in found.items() if writes} == {}
     assert outside_writes(ast.parse("def f(body):\n    body.surface = None")) == ["body.surface"]
+
+
+def test_settings_of_algorithms_are_frozen_and_documented() -> None:
+    import nerfro.plugins  # noqa: F401 - imports the algorithms
+
+    discover()
+    assert "HullSettings" in AlgorithmSettings.classes
+    for settings in AlgorithmSettings.classes.values():
+        names = re.findall(r"^    (\w[\w, ]*):", inspect.getdoc(settings), re.M)
+        assert {field.name for field in fields(settings)} == {*", ".join(names).split(", ")}, settings
+        with pytest.raises(FrozenInstanceError):
+            setattr(settings(), names[0].split(", ")[0], None)
+        assert eval(repr(settings()), vars(sys.modules[settings.__module__]) | {"inf": math.inf}) == settings()

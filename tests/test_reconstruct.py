@@ -18,14 +18,11 @@ import tifffile
 import torch
 from PIL import ExifTags, Image
 
-import nerfro.reconstruct
-import nerfro.train
 from nerfro.capture import refinement
 from nerfro.cli.overrides import print_next, without_hints
 from nerfro.core.errors import NerfroError
 from nerfro.data import image_files
 from nerfro.data.masks import find_mask
-from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.files.images import save_png
 from nerfro.files.reading import open_image
 from nerfro.pipeline import stage
@@ -422,7 +419,6 @@ def test_posed_photographs_of_a_ball_become_a_scene(
     """All stages but that of poses; each gives the same result alone, and leaves nothing behind."""
     data, out = tmp_path / "ball", tmp_path / "out"
     save_with_masks(data)
-    monkeypatch.setattr(nerfro.train, "prepared_metrics", ImageMetrics)
     short = refinement.RefinementSettings((refinement.DescentStage(20, 1e-4, (3.0, 1.0)),), 1000)
     monkeypatch.setattr(refinement, "RefinementSettings", lambda: short)
     train = [*RECONSTRUCTION_TRAINING, "trainer.max_steps=2", "phase.background.steps=100"]

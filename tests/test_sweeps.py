@@ -20,7 +20,7 @@ from nerfro.training.config import TrainConfig
 from nerfro.training.sweeps import identity_of
 from tests.conftest import Runner, composed
 from tests.forked import Command
-from tests.processes import OFFLINE, python
+from tests.processes import ONE_THREAD, python
 
 SWEEPS = sorted(path.stem for path in (CONF_DIR / "sweep").glob("*.yaml"))
 
@@ -37,7 +37,7 @@ def start(tmp_path: Path, waiting_plugins: str, tiny_run: list[str]) -> Callable
     """Start a sweep with a loss that waits in a process, in tmp_path/sweep; what it prints goes to tmp_path/<name>."""
     options = [*tiny_run, "evaluation.every=0", "+loss.waiting.weight=1", f"hydra.sweep.dir={tmp_path / 'sweep'}"]
     options += ["trainer.max_steps=20", "checkpoint.every_steps=4", "checkpoint.every_seconds=null"]
-    environment = {**OFFLINE, "TORCH_HOME": str(tmp_path), "NERFRO_PLUGINS": waiting_plugins}
+    environment = {**ONE_THREAD, "TORCH_HOME": str(tmp_path), "NERFRO_PLUGINS": waiting_plugins}
     return lambda overrides, name: Command("train", ["-m", *options, *overrides], tmp_path / name, **environment)
 
 
@@ -226,7 +226,7 @@ def test_launchers_run_cells_in_other_processes(
     overrides = [f"medium.mesh={tmp_path / 'nowhere.ply'},{'${data.root}/mesh.ply'}", "trainer.max_steps=2"]
     overrides.append(f"hydra/launcher={launcher}")
     overrides += ["evaluation.every=0", f"hydra.sweep.dir={tmp_path / 'sweep'}"]
-    environment = {**OFFLINE, "TORCH_HOME": str(tmp_path)}
+    environment = {**ONE_THREAD, "TORCH_HOME": str(tmp_path)}
     done = python("-m", "nerfro.train", "-m", *tiny_run, *overrides, folder=tmp_path, **environment)
     log = done.stdout + done.stderr
     assert done.returncode == 1, log

@@ -32,8 +32,6 @@ from nerfro.silhouettes.upright import find_up
 
 MESH = "mesh.ply"
 INDEX, FIGURES = "index.json", "refinement.json"
-# Margin of the index grid around the object, as a fraction of the object's size.
-_MARGIN = 0.15
 _OF_HULL = ("resolution", "keep", "smoothing", "symmetry")
 
 
@@ -183,13 +181,14 @@ def surface_settings(
     settings: dict[str, object] = {}
     names = ("medium.box_min", "medium.box_max", "medium.bodies")  # each of several bodies has a box of its own
     if not any(is_given(name, request.overrides) for name in names):
-        centre, half_side = mesh.bounds.mean(0) + origin, (0.5 + _MARGIN) * float(np.ptp(mesh.bounds, axis=0).max())
+        # A margin of 15 % of the object's size.
+        centre, half_side = mesh.bounds.mean(0) + origin, 0.65 * float(np.ptp(mesh.bounds, axis=0).max())
         digits = max(0, num_decimals(half_side, 7))
         for name, corner in (("box_min", centre - half_side), ("box_max", centre + half_side)):
             settings[name] = [round(float(x), digits) for x in corner]
-    is_vessel = "wall" in request.config.medium
-    if is_vessel and not is_given("medium.up", request.overrides) and (found := find_up(cameras, mesh)) is not None:
-        up, reason = found
+    is_up_needed = "wall" in request.config.medium and not is_given("medium.up", request.overrides)
+    if is_up_needed and (estimate := find_up(cameras, mesh)) is not None:
+        up, reason = estimate
         settings["up"] = [round(float(x), 4) for x in up]
         print(f"up is {settings['up']}, {reason}; set medium.up= to change the direction")
     return settings
@@ -218,25 +217,25 @@ def index_settings(medium: DictConfig, names: Iterable[str], iors: Iterable[floa
     first, *inner = values = [round(float(ior), 4) for ior in iors]
     bodies = medium.get("bodies")
     if bodies is not None:
-        given = typing.cast(dict[str, dict[str, Any]], OmegaConf.to_container(bodies, resolve=True))
-        return {"bodies": {name: given[name] | {"ior": ior} for name, ior in zip(names, values, strict=True)}}
+        settings = typing.cast(dict[str, dict[str, Any]], OmegaConf.to_container(bodies, resolve=True))
+        return {"bodies": {name: settings[name] | {"ior": ior} for name, ior in zip(names, values, strict=True)}}
     return {"ior": first} | ({"inner_iors": inner} if inner else {})
 
 
-def write_scene(request: Request, found: SceneFile, cameras: Cameras, mesh: TriangleMesh) -> None:
+def write_scene(request: Request, estimated: SceneFile, cameras: Cameras, mesh: TriangleMesh) -> None:
     """Write the scene file, and print the result files and the next command.
 
     Args:
         request: options of the command.
-        found: estimated values; they have precedence over the options.
+        estimated: estimated values; they have precedence over the options.
         cameras: cameras of the photographs.
         mesh: the surface.
     """
-    config, chosen = request.config, HydraConfig.get().runtime.choices
-    medium = described(config.medium, chosen["medium"]) | found.medium
-    data = described(config.data, chosen["data"]) | {"root": str(config.data.root)} | _ray_bounds(cameras, mesh)
+    config, choices = request.config, HydraConfig.get().runtime.choices
+    medium = described(config.medium, choices["medium"]) | estimated.medium
+    data = described(config.data, choices["data"]) | {"root": str(config.data.root)} | _ray_bounds(cameras, mesh)
     size = [cameras.width, cameras.height]
-    scene = replace(found, data=data, bodies=take_bodies(medium), medium=medium, photograph=size)
+    scene = replace(estimated, data=data, bodies=take_bodies(medium), medium=medium, photograph=size)
     file = request.folder / SCENE
     scene.save(file)
     print(f"results: {', '.join(str(file) for file in request.files if file.exists())}")

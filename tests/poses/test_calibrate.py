@@ -130,11 +130,10 @@ def test_outlier_tags_are_removed() -> None:
     assert found.intrinsics.focal_deviation < 1
 
 
-def test_outliers_of_the_last_estimate_are_not_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_outliers_of_the_last_estimate_are_not_counted() -> None:
     detections, _ = detections_of(twelve_faces())
     detections["v2"].image_points[40:48] += [25, -40]
-    monkeypatch.setattr(calibration, "_MAX_ESTIMATES", 1)
-    found = calibrate(detections, SIZE, "pinhole")
+    found = calibrate(detections, SIZE, "pinhole", calibration.TagSettings(max_estimates=1))
     assert found.num_outliers == 0
     assert found.poses["v2"].num_observations == detections["v2"].num_tags
 

@@ -123,7 +123,9 @@ def test_features_on_and_near_the_object_are_ignored(tmp_path: Path) -> None:
     mask = np.zeros((60, 200), np.uint8)
     mask[20:40, 50:100] = 255
     Image.fromarray(mask).save(tmp_path / "mask_a.png")
-    structure_from_motion._write_ignored(tmp_path / "mask_a.png", tmp_path / "a.jpg.png")
+    structure_from_motion._write_ignored(
+        tmp_path / "mask_a.png", tmp_path / "a.jpg.png", structure_from_motion.SfmSettings()
+    )
     ignored = np.asarray(Image.open(tmp_path / "a.jpg.png")) == 0
     assert ignored[mask > 0].all()
     assert ignored[30, 48:102].all()  # 1 % of the width farther

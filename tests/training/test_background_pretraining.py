@@ -26,7 +26,7 @@ from nerfro.training.build import build
 from nerfro.training.callbacks import steps_by_phase
 from nerfro.training.data_module import RayDataModule
 from nerfro.training.module import TrainingModule
-from nerfro.training.phases.background import BackgroundSteps
+from nerfro.training.phases.background import BackgroundSettings, BackgroundSteps
 from nerfro.training.phases.base import TrainingRun
 from nerfro.training.pixel_batches import PixelBatches
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
@@ -90,7 +90,7 @@ def test_fits_of_few_pixels_use_the_pixels_of_larger_fits(
         run = run_of(module, data, views)
         phase = BackgroundSteps(steps=2)
         state = phase.begin(run)
-        monkeypatch.setattr("nerfro.training.phases.background._MAX_FITTED_PIXELS", limit)
+        phase.settings = BackgroundSettings(max_fitted_pixels=limit)
         assert all(phase.step(run, number, state) for number in range(2))
         sky = module.renderer.scene.background(Exits(views.cameras.image_rays(0).directions)).detach()
         of_limit[limit] = torch.cat(used).sort().values, state["weights"].sum(), to_srgb(sky)
