@@ -1,16 +1,29 @@
 # Public names of nerfro, which `lazy_loader` imports on first access.
 from .backgrounds.constant import ConstantBackground
 from .backgrounds.envmap import EnvironmentMap
+from .capture.preprocess import preprocess
 from .core.cameras import Cameras
 from .core.rays import Rays
 from .data.blender import BlenderData
+from .data.capture import Capture
 from .evaluation.collection import metrics
 from .fields.hash_grid import HashGridField
+from .geometry.space import Box, Contracted
 from .losses.photometric import Photometric
-from .media.sdf_grid import SdfGrid
-from .media.shapes import Ball
+from .masks.segment import segment
+from .media.bodies import Bodies, Body, GridSettings
+from .media.body_settings import make_bodies
+from .media.material import Material
+from .media.surface import MeshSurface
+from .media.surfaces.ball import BallSurface
 from .models.refractive import RefractiveModel
+from .pipeline.evaluate import evaluate
+from .pipeline.export import export
+from .pipeline.reconstruct import reconstruct
+from .pipeline.render import render
+from .poses.calibrate import calibrate
 from .rendering.renderer import Components
+from .rendering.scene_file import SceneFile
 from .samplers.paths.bend import bend, polylines
 from .samplers.paths.snell import Snell
 from .samplers.paths.straight import Straight
@@ -21,25 +34,35 @@ from .training.load import load
 from .training.module import TrainingModule
 from .training.optimizer import GroupConfig, OptimizerConfig
 from .training.pixel_batches import PixelBatches
+from .training.run import Run, train
 from .viewing.trained_scene import TrainedScene
 
 __version__: str
 __all__ = [
-    "Ball",
+    "BallSurface",
     "BlenderData",
+    "Bodies",
+    "Body",
+    "Box",
     "Cameras",
+    "Capture",
     "Components",
     "ConstantBackground",
+    "Contracted",
     "EnvironmentMap",
+    "GridSettings",
     "GroupConfig",
     "HashGridField",
+    "Material",
+    "MeshSurface",
     "OptimizerConfig",
     "Photometric",
     "PixelBatches",
     "RayDataModule",
     "Rays",
     "RefractiveModel",
-    "SdfGrid",
+    "Run",
+    "SceneFile",
     "Snell",
     "Straight",
     "Stratified",
@@ -48,7 +71,16 @@ __all__ = [
     "__version__",
     "bend",
     "build",
+    "calibrate",
+    "evaluate",
+    "export",
     "load",
+    "make_bodies",
     "metrics",
     "polylines",
+    "preprocess",
+    "reconstruct",
+    "render",
+    "segment",
+    "train",
 ]

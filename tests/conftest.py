@@ -216,11 +216,9 @@ def evaluate_here(unchecked: None, run_here: Runner) -> Runner:
 
 def train_in(folder: Path, *overrides: str) -> Path:
     """Train like `train_here`, for fixtures that several tests share; returns the folder of the run."""
-    import nerfro.train
-
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["nerfro.train", *overrides, f"hydra.run.dir={folder}"])
-        nerfro.train.main()
+        importlib.import_module("nerfro.train").main()
     return folder
 
 

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Annotated, Any, Optional
 
 import numpy as np
-from hydra.core.hydra_config import HydraConfig
 from jaxtyping import Float
 from omegaconf import MISSING, DictConfig, OmegaConf
 
-from nerfro.cli.overrides import as_overrides, is_given, print_hint, print_next
+from nerfro.cli.calls import Composition
+from nerfro.cli.overrides import is_given
 from nerfro.core.cameras import Cameras
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import EMBEDDED_PREFIX, resolve_path, user_path
@@ -22,10 +22,10 @@ from nerfro.data.frames import require_root
 from nerfro.files.atomic import refuse_existing
 from nerfro.geometry.mesh import TriangleMesh, load_mesh, local_origin, num_decimals
 from nerfro.media.base import Medium
-from nerfro.media.bodies import ordered_settings
+from nerfro.media.body_settings import expanded
 from nerfro.registry.allowed import Count, Natural, NotNegative, Range, corners_of_box, refuse_unused
 from nerfro.registry.registration import build
-from nerfro.rendering.scene_file import SCENE, SceneFile, described, take_bodies
+from nerfro.rendering.scene_file import SCENE, SceneFile, take_bodies
 from nerfro.silhouettes.overlaps import REPORT, SHEET
 from nerfro.silhouettes.revolution import Symmetry
 from nerfro.silhouettes.upright import find_up
@@ -78,15 +78,19 @@ class PreprocessConfig:
 
 @dataclass(frozen=True)
 class Request:
-    """Options and command line of `python -m nerfro.preprocess`.
+    """Composed options of `python -m nerfro.preprocess`."""
 
-    Attributes:
-        config: the options.
-        overrides: the command line.
-    """
+    composition: Composition
 
-    config: DictConfig
-    overrides: list[str]
+    @property
+    def config(self) -> DictConfig:
+        """The options, see `PreprocessConfig`."""
+        return self.composition.config
+
+    @property
+    def overrides(self) -> list[str]:
+        """The options that are given."""
+        return self.composition.overrides
 
     @property
     def folder(self) -> Path:
@@ -103,9 +107,11 @@ class Request:
     def searches_index(self) -> bool:
         """Whether to search the index. The materials of a vessel are known, and those of named bodies if one is."""
         medium = self.config.medium
+        if "wall" in medium:
+            return False
         if medium.get("bodies") is not None:
-            return not any(body.ior or body.material for _, body in ordered_settings(medium.bodies))
-        return not (is_given("medium.ior", self.overrides) or "wall" in medium)
+            return not any(body.ior or body.material for body in expanded({"bodies": medium.bodies}).values())
+        return not is_given("medium.ior", self.overrides)
 
     @property
     def files(self) -> list[Path]:
@@ -139,13 +145,13 @@ class Request:
         if config.box_min is not None:
             corners_of_box(config.box_min, config.box_max)
         if config.mesh is not None:
-            refuse_unused(config, PreprocessConfig, _OF_HULL, "with mesh=..., which replaces the hull")
+            refuse_unused(config, _OF_HULL, "with mesh=..., which replaces the hull")
         if config.refine and "shell_voxels" not in config.medium:
             raise NerfroError("refine=true needs a distance grid; set medium=object or medium=vessel")
         if config.vessel and ("shell_voxels" not in config.medium or "wall" in config.medium):
             raise NerfroError("vessel=true estimates the lengths of a vessel; set medium=object, or remove vessel=true")
         if (config.refine or config.vessel) and config.medium.get("bodies") is not None:
-            name, first = ordered_settings(config.medium.bodies)[0]
+            name, first = next(iter(expanded({"bodies": config.medium.bodies}).items()))
             if first.mesh or first.surface:
                 raise NerfroError(
                     "refine=true and vessel=true change the first body, which must have the surface that preprocess "
@@ -214,32 +220,30 @@ def build_medium(request: Request, settings: dict[str, object]) -> Medium:
 
 def index_settings(medium: DictConfig, names: Iterable[str], iors: Iterable[float]) -> dict[str, object]:
     """Return the settings of the medium for the indices of its bodies, given the names of the bodies."""
-    first, *inner = values = [round(float(ior), 4) for ior in iors]
-    bodies = medium.get("bodies")
-    if bodies is not None:
-        settings = typing.cast(dict[str, dict[str, Any]], OmegaConf.to_container(bodies, resolve=True))
-        return {"bodies": {name: settings[name] | {"ior": ior} for name, ior in zip(names, values, strict=True)}}
-    return {"ior": first} | ({"inner_iors": inner} if inner else {})
+    values = [round(float(ior), 4) for ior in iors]
+    if medium.get("bodies") is None:
+        return {"ior": values[0]}
+    bodies = typing.cast(dict[str, dict[str, Any]], OmegaConf.to_container(medium.bodies, resolve=True))
+    return {"bodies": {name: bodies[name] | {"ior": ior} for name, ior in zip(names, values, strict=True)}}
 
 
-def write_scene(request: Request, estimated: SceneFile, cameras: Cameras, mesh: TriangleMesh) -> None:
-    """Write the scene file, and print the result files and the next command.
+def write_scene(request: Request, estimated: SceneFile, cameras: Cameras, mesh: TriangleMesh) -> SceneFile:
+    """Write the scene file, and print the result files.
 
     Args:
         request: options of the command.
         estimated: estimated values; they have precedence over the options.
         cameras: cameras of the photographs.
         mesh: the surface.
+
+    Returns:
+        The content of the scene file.
     """
-    config, choices = request.config, HydraConfig.get().runtime.choices
-    medium = described(config.medium, choices["medium"]) | estimated.medium
-    data = described(config.data, choices["data"]) | {"root": str(config.data.root)} | _ray_bounds(cameras, mesh)
+    config, composition = request.config, request.composition
+    medium = composition.described("medium") | estimated.medium
+    data = composition.described("data") | {"root": str(config.data.root)} | _ray_bounds(cameras, mesh)
     size = [cameras.width, cameras.height]
     scene = replace(estimated, data=data, bodies=take_bodies(medium), medium=medium, photograph=size)
-    file = request.folder / SCENE
-    scene.save(file)
+    scene.save(request.folder / SCENE)
     print(f"results: {', '.join(str(file) for file in request.files if file.exists())}")
-    print_hint("for photographs in a room, add experiment=glass_room; for straight rays, experiment=straight")
-    print_next("train on it", "train", as_overrides({"scene": file}))
-    if scene.vessel:
-        print_next("train on the vessel", "train", as_overrides({"scene": file, "medium": "vessel"}))
+    return scene

@@ -53,7 +53,7 @@ class OpticalRecord:
     """Bodies and surfaces that the vertices of P polylines meet.
 
     Attributes:
-        body: body of the segment after each vertex (`Solid.deciding_body`), numbered from 1; 0 in air.
+        body: body of the segment after each vertex (`Bodies.deciding_body`), numbered from 1; 0 in air.
         surface_body: body on whose surface each vertex lies, numbered as `body`; 0 for vertices on no surface, such as
             both ends.
         far_side: body on the other side of the surface, numbered as `body`. Transmitted light enters the body,

@@ -20,9 +20,8 @@ from nerfro.core.paths import EMBEDDED_PREFIX, user_path
 from nerfro.core.provenance import AlgorithmSettings, command_line, versions
 from nerfro.files.atomic import write_atomically
 from nerfro.files.reading import read_json
-from nerfro.media.bodies import BodySettings
+from nerfro.media.body_settings import BodySettings, expanded
 from nerfro.registry.allowed import Count, check_settings
-from nerfro.registry.registration import plugin_of
 
 SCENE = "scene.json"
 _ADVICE = "see docs/reference/file_formats.md, or run nerfro.preprocess again"
@@ -73,15 +72,9 @@ class SceneFile:
 
     @property
     def short(self) -> dict[str, object] | None:
-        """Settings of the medium if every body has only mesh and index; None for other bodies."""
-        plain = [BodySettings(mesh=body.mesh, ior=body.ior) for body in self.bodies.values()]
-        if plain != list(self.bodies.values()) or any(body.ior is None for body in plain[1:]):
-            return None
-        outer, inner = plain[:1], plain[1:]
-        settings: dict[str, object] = {name: value for body in outer for name, value in _given(body).items()}
-        if inner:
-            settings |= {"inner_meshes": [body.mesh for body in inner], "inner_iors": [body.ior for body in inner]}
-        return settings
+        """Settings of the medium for at most one body that has only mesh and index; None for other bodies."""
+        settings = [_given(body) for body in self.bodies.values()] or [{}]
+        return settings[0] if len(settings) == 1 and settings[0].keys() <= {"mesh", "ior"} else None
 
     def settings(self, *, data_type: str | None = None, medium: str | None = None) -> dict[str, object]:
         """Return the settings of the groups `data` and `medium` by their full names.
@@ -104,6 +97,26 @@ class SceneFile:
         for group, values in (("data", data), ("medium", own)):
             chosen |= {f"{group}.{name}": value for name, value in values.items()}
         return chosen
+
+    def added_to(self, overrides: Sequence[str], names: Collection[str], source: str) -> list[str]:
+        """Add the settings of the scene to overrides, which have precedence.
+
+        Args:
+            overrides: overrides of a command.
+            names: names of the settings of the command; other settings of the scene have no effect.
+            source: name of the scene, for a warning.
+        """
+        options = {name: value for name, _, value in (text.partition("=") for text in overrides) if name in names}
+        settings = self.settings(data_type=options.get("data"), medium=options.get("medium"))
+        is_known = is_given("medium.ior", overrides) or options.get("medium") == "vessel"
+        if self.provenance.doubts and "medium" in names and not is_known:
+            warn(f"{source}: the photographs do not determine the index ({self.provenance.doubts[0]}); set medium.ior=")
+        settings = {n: value for n, value in settings.items() if n.partition(".")[0] in names and n not in options}
+        # After the flags of Hydra, and before all other overrides.
+        start = next(
+            (i for i, text in enumerate(overrides) if "=" in text and not text.startswith("-")), len(overrides)
+        )
+        return [*overrides[:start], *as_overrides(settings), *overrides[start:]]
 
     def save(self, path: Path) -> None:
         """Write the file, with the command of this process and the versions of packages."""
@@ -136,26 +149,9 @@ class SceneFile:
         return replace(self, data=self.data | {"root": place(str(self.data["root"]))}, bodies=bodies)
 
 
-def described(node: DictConfig, type_name: str) -> dict[str, Any]:
-    """Describe a component by its type and the settings with other values than the defaults of the class."""
-    defaults = {name: default for name, _, default in plugin_of(node).fields()}
-    values = cast(dict[str, Any], OmegaConf.to_container(node, resolve=True))
-    del values["_target_"]
-    return {"type": type_name} | {name: value for name, value in values.items() if value != defaults.get(name)}
-
-
 def take_bodies(medium: dict[str, Any]) -> dict[str, BodySettings]:
     """Remove the bodies from the settings of a medium, and return them."""
-    mesh, ior, inner, iors = (medium.pop(name, None) for name in ("mesh", "ior", "inner_meshes", "inner_iors"))
-    named = medium.pop("bodies", None)
-    if named is not None:
-        return {
-            name: BodySettings(**({} if "surface" in body else {"mesh": mesh}) | body) for name, body in named.items()
-        }
-    bodies = {"object": BodySettings(mesh=mesh, ior=ior)}
-    for number, (mesh, ior) in enumerate(zip(inner or [], iors or [], strict=True), 1):
-        bodies[f"inner_{number}"] = BodySettings(mesh=mesh, ior=ior)
-    return bodies
+    return expanded({name: medium.pop(name, None) for name in ("mesh", "ior", "bodies")})
 
 
 def read_scene_file(path: Path) -> SceneFile:
@@ -203,18 +199,9 @@ def with_scene(arguments: Sequence[str], names: Collection[str]) -> list[str]:
         return list(arguments)
     if len(files) > 1:
         raise NerfroError(f"{files[0]} and {files[1]} are both given; give one scene file")
-    others = [text for text in arguments if text not in files]
     path = user_path(files[0].partition("=")[2].strip("'\""))
     scene = read_scene_file(path)
-    chosen = {text.partition("=")[0]: text.partition("=")[2] for text in others if text.partition("=")[0] in names}
-    settings = scene.settings(data_type=chosen.get("data"), medium=chosen.get("medium"))
-    is_known = is_given("medium.ior", others) or chosen.get("medium") == "vessel"
-    if scene.provenance.doubts and "medium" in names and not is_known:
-        warn(f"{path}: the photographs do not determine the index ({scene.provenance.doubts[0]}); set medium.ior=")
-    kept = {name: value for name, value in settings.items() if name.partition(".")[0] in names and name not in chosen}
-    # After the flags of Hydra, and before all other overrides.
-    start = next((i for i, text in enumerate(others) if "=" in text and not text.startswith("-")), len(others))
-    return [*others[:start], *as_overrides(kept), *others[start:]]
+    return scene.added_to([text for text in arguments if text not in files], names, str(path))
 
 
 def _given(body: BodySettings | Provenance) -> dict[str, object]:

@@ -55,7 +55,7 @@ def require_reach(renderer: Renderer, batches: PixelBatches, tracer: RayTracer, 
         if missed < 1:
             break
     box = f"the field's box from {_rounded(bounds[0])} to {_rounded(bounds[1])}"
-    advice = "set content.box_min and content.box_max (or those of field) around what the cameras see"
+    advice = "set content.box_min and content.box_max around what the cameras see"
     if missed == 1:
         raise NerfroError(
             f"no ray of the training views meets {box}, and nothing is outside of it; check that unit, axes and place "

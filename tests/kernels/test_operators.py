@@ -14,10 +14,9 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from nerfro.backgrounds import cube_map, cube_map_cpu
 from nerfro.fields import hash_encoding, hash_encoding_cpu, relu_mlp
 from nerfro.fields.spherical_harmonics_cpu import spherical_harmonics
-from nerfro.media.sdf_grid import SdfGrid
 from nerfro.samplers.paths import compiled
 from nerfro.testing import example_rays
-from tests.closed_forms import grid_points
+from tests.closed_forms import grid_points, sampled
 
 BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
 LEVELS = hash_encoding.grid_levels(num_levels=3, base_resolution=2, finest_resolution=8, log2_table_size=6)
@@ -47,7 +46,7 @@ LEARNING = [hash_encode, harmonics, mlp, cube_lookup]
 
 
 def trace_snell() -> tuple[Any, ...]:
-    medium = SdfGrid.from_distances(grid_points(1.5, 20).norm(dim=-1)[None] - 0.8, BOX, [1.5], 0.01)
+    medium = sampled(grid_points(1.5, 20).norm(dim=-1)[None] - 0.8, BOX, [1.5], 0.01)
     rays, solids = example_rays(6), medium.packed()
     packed = [torch.from_numpy(values) for values in solids if isinstance(values, np.ndarray)]
     settings = solids.nested, solids.shell, 16, 2, 0.02, False

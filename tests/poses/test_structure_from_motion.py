@@ -226,5 +226,7 @@ def test_sequence_is_matched_densely_with_near_and_sparsely_with_far_frames() ->
 
 def test_pycolmap_does_not_change_the_handler_of_sigterm() -> None:
     program = "import signal; signal.signal(15, lambda *_: exit(130)); "
-    program += "import tests.poses.camera_calibration as made; made.require_pycolmap(); signal.raise_signal(15)"
+    program += (
+        "from nerfro.poses.structure_from_motion import require_pycolmap; require_pycolmap(); signal.raise_signal(15)"
+    )
     assert subprocess.run([sys.executable, "-c", program], stderr=subprocess.DEVNULL).returncode == 130

@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from nerfro.data.base import Views
-from nerfro.media.shapes import Ball
 from nerfro.models.refractive import RefractiveModel
 from nerfro.rendering import RayTracer
 from nerfro.samplers.paths.snell import Snell
@@ -16,6 +15,7 @@ from nerfro.samplers.subdivision import Subdivision
 from nerfro.testing import example_components
 from nerfro.training.pixel_batches import PixelBatches
 from tests.cameras_at import cameras_at, random_poses
+from tests.closed_forms import Ball
 from tests.conftest import refused
 
 NUM_VIEWS, HEIGHT, WIDTH = 5, 12, 16
