@@ -45,9 +45,9 @@ from nerfro.evaluation.results import read_metrics_json
 from nerfro.fields.hash_grid import HashGridField
 from nerfro.kernels.allocator import keep_freed_memory
 from nerfro.kernels.available import fast_bfloat16
+from nerfro.rendering import RayTracer
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.training.data_module import RayDataModule
-from nerfro.training.ray_batches import RayBatches
 from nerfro.training.trainer import lightning_precision
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -134,6 +134,10 @@ class Training:
         self.config = OmegaConf.create(checkpoint["nerfro_config"])
         self.renderer, self.batches = self.module.renderer, self.data.batches
         self.num_rays = self.batches.batch_size
+
+    def batch(self, step: int) -> Batch:
+        """Trace the batch of a step."""
+        return RayTracer(self.renderer, self.data.subdivision).trace(self.batches.draw(step))
 
     def run(self, num_steps: int, data: RayDataModule | None = None, callbacks: Sequence[pl.Callback] = ()) -> Steps:
         """Train for some steps with a new optimizer; the time of callbacks after a step counts for the next step."""
@@ -265,13 +269,14 @@ def parts_of_step(training: Training, steps: int, limits: Limits) -> dict[str, t
 
     Rays are traced in the training thread, because the profiler measures only this thread.
     """
-    model, data = training.renderer, TracedInStep(training.batches, None, 0)
+    model = training.renderer
+    data = TracedInStep(training.batches, subdivision=training.data.subdivision)
     training.run(3, data)
     with FlopCounterMode(display=False) as counter:
         training.run(1, data)
     whole = float(np.median(training.run(steps + 1, data).processor[1:]))
     with ExitStack() as stack:
-        label(stack, RayBatches, "batch", "tracing")
+        label(stack, RayTracer, "through", "tracing")
         label(stack, model.point_sampler, "choose_ahead", "samples")
         label(stack, model.point_sampler, "forward", "samples")
         with profile(activities=[ProfilerActivity.CPU], record_shapes=True) as measured:
@@ -296,7 +301,7 @@ def parts_of_step(training: Training, steps: int, limits: Limits) -> dict[str, t
     rounds = rounds or training.config.trainer.precision != "32-true"
     num_parameters = sum(own.numel() for own in training.module.parameters())
     rate = limits.products[torch.bfloat16 if rounds else torch.float32]
-    batch = training.batches.batch(0)
+    batch = training.batch(0)
     parts = {
         "tracing": (seconds("tracing"), len(batch.rays) * seconds_per_ray(training, batch.rays)),
         "matrix products": (seconds(*products), counter.get_total_flops() / rate),
@@ -345,10 +350,10 @@ class TracedInStep(RayDataModule):
 class ReadyBatches(TracedInStep):
     """Repeat the batches of the first steps, traced before training starts."""
 
-    def __init__(self, batches: RayBatches, num_steps: int) -> None:
-        super().__init__(batches, None, 0)
+    def __init__(self, training: Training, num_steps: int) -> None:
+        super().__init__(training.batches, subdivision=training.data.subdivision)
         with torch.no_grad():
-            self.ready = [batches.batch(step) for step in range(num_steps)]
+            self.ready = [training.batch(step) for step in range(num_steps)]
 
     def transfer_batch_to_device(self, batch: int, device: torch.device, dataloader_idx: int) -> Batch:
         return self.ready[batch]
@@ -360,12 +365,12 @@ def report_paths(turns: int, steps: int, options: list[str]) -> None:
     The methods alternate, and the median of the turns of each method counts. Processor time is of all threads.
     """
     training = Training("+experiment=refractive", *options)
-    batches = training.batches
-    ready = ReadyBatches(batches, steps)
+    batches, subdivision = training.batches, training.data.subdivision
+    ready = ReadyBatches(training, steps)
     methods: dict[str, Callable[[], RayDataModule]] = {
         "ready before training": lambda: ready,
-        "one step ahead (as trained)": lambda: RayDataModule(batches, None, 0),
-        "in the step": lambda: TracedInStep(batches, None, 0),
+        "one step ahead (as trained)": lambda: RayDataModule(batches, subdivision=subdivision),
+        "in the step": lambda: TracedInStep(batches, subdivision=subdivision),
     }
     seconds: dict[str, list[tuple[float, float]]] = {name: [] for name in methods}
     for turn in range(turns + 1):
@@ -404,7 +409,7 @@ def report_branches(turns: int, steps: int, options: list[str]) -> None:
     print("| default preset, branches | paths a training ray | ms a step | processor, ms | against one path |")
     print("|---|---|---|---|---|")
     for name, training in variants.items():
-        path = training.batches.batch(0).path
+        path = training.batch(0).path
         assert path is not None
         wall, processor = np.median(seconds[name], 0)
         paths = len(path.ray) / path.num_rays

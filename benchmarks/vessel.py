@@ -24,7 +24,7 @@ from tests.closed_forms import angle, make_rays
 # A drinking glass in millimetres.
 HEIGHT, RADIUS_BELOW, RADIUS_ABOVE, WALL, FOOT, LEVEL = 120.0, 30.0, 38.0, 2.5, 10.0, 80.0
 MILLIMETRES_PER_UNIT = 60.0  # of the world
-LIQUID = 3  # `path.body` of the liquid; wall and cavity are 1 and 2
+LIQUID = 3  # `path.record.body` of the liquid; wall and cavity are 1 and 2
 BOX = [[-1.2] * 3, [1.2] * 3]
 
 
@@ -48,7 +48,7 @@ def main() -> None:
         true = vessel()
         rays = rays_at(given.rays)
         reference_path = Snell()(rays, true)
-        wet = (reference_path.body == LIQUID).any(-1)
+        wet = (reference_path.record.body == LIQUID).any(-1)
         dry = reference_path.refracted & ~wet
         print(
             f"error of the exit direction: median in degrees, and share of more than a degree; of {int(wet.sum())} rays"

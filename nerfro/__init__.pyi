@@ -33,7 +33,7 @@ from .training.data_module import RayDataModule
 from .training.load import load
 from .training.module import TrainingModule
 from .training.optimizer import GroupConfig, OptimizerConfig
-from .training.ray_batches import RayBatches
+from .training.pixel_batches import PixelBatches
 from .training.run import Run, train
 from .viewing.trained_scene import TrainedScene
 
@@ -57,7 +57,7 @@ __all__ = [
     "MeshSurface",
     "OptimizerConfig",
     "Photometric",
-    "RayBatches",
+    "PixelBatches",
     "RayDataModule",
     "Rays",
     "RefractiveModel",

@@ -9,7 +9,7 @@ from nerfro.core.cameras import Cameras
 from nerfro.core.draws import Draws
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import resolve_path
-from nerfro.core.types import Batch, Exits, FieldValues, Path, Rays, Rendering, Samples
+from nerfro.core.types import Batch, Exits, FieldValues, OpticalRecord, Path, Rays, Rendering, Samples
 from nerfro.data.base import DataSource, Views
 from nerfro.evaluation.image_metrics import ImageMetric
 from nerfro.fields.base import Field
@@ -36,7 +36,7 @@ __all__ = [
     "EXPORTS", "Background", "Batch", "Bodies", "Body", "Box", "CameraModel", "Cameras", "Components", "Contracted",
     "Count", "DataSource", "Distance", "Draws", "Exits", "Export", "ExportConfig", "Field", "FieldValues", "Grid",
     "GridSettings", "ImageMetric", "Loss", "Material", "Medium", "MeshSurface", "Natural", "NerfroError",
-    "NotNegative", "Path", "PathSampler", "Phase", "PointSampler", "Positive", "Range", "Rays",
+    "NotNegative", "OpticalRecord", "Path", "PathSampler", "Phase", "PointSampler", "Positive", "Range", "Rays",
     "RefractiveModel", "Renderer", "Rendering", "Samples", "Scalars", "Scene", "Space", "Stratified", "Surface",
     "TrainedScene", "TrainingRun", "Unbounded", "Vectors", "Views", "invert_cdf", "load_arrays", "point_samples",
     "register", "resolve_path", "spread_uniform", "write_atomically",

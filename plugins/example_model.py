@@ -6,10 +6,9 @@ import dataclasses
 from typing import Any
 
 import torch
-from jaxtyping import Bool
-from torch import Tensor, nn
+from torch import nn
 
-from nerfro.parts import Draws, Path, Positive, RefractiveModel, Rendering, register
+from nerfro.parts import Batch, Path, Positive, RefractiveModel, Rendering, register
 
 
 @register("model", "haze")
@@ -26,11 +25,9 @@ class Haze(RefractiveModel):
         self.log_density = nn.Parameter(torch.tensor(density).log())
         self.colour = nn.Parameter(torch.zeros(3))
 
-    def render_path(
-        self, path: Path, draws: Draws | None = None, teaches_background: Bool[Tensor, "R"] | None = None
-    ) -> list[Rendering]:
+    def render_path(self, path: Path, batch: Batch | None = None) -> list[Rendering]:
         clear = torch.exp(-self.log_density.exp() * path.main_polyline(path.far - path.near))[:, None]
-        renderings = super().render_path(path, draws, teaches_background)
+        renderings = super().render_path(path, batch)
         return [
             dataclasses.replace(r, radiance=clear * r.radiance + (1 - clear) * self.colour.sigmoid())
             for r in renderings

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import torch
-
 from nerfro.parts import Count, Phase, TrainingRun, register
 
 _OTHER_PIXELS = 10**6  # numbers of batches that training steps do not use
@@ -27,11 +25,8 @@ class ExtraSteps(Phase):
         return training_step // self.every
 
     def step(self, run: TrainingRun, number: int, state: dict[str, Any]) -> bool:
-        renderer = run.renderer
-        with torch.no_grad():
-            batch = run.batches.for_rank(0, 1).batch(_OTHER_PIXELS + number)  # the same pixels in all processes
-        path = renderer.trace(renderer.scene.camera(batch.rays, batch.ray_view), batch.path)
-        radiance = batch.per_pixel(renderer.render_path(path, batch.draws)[-1].radiance)
-        error = renderer.scene.colour_space.to_srgb(radiance) - batch.rgb
+        batch = run.tracer.trace(run.batches.for_rank(0, 1).draw(_OTHER_PIXELS + number))  # equal in all processes
+        radiance = batch.per_pixel(run.renderer.render_batch(batch)[-1].radiance)
+        error = run.renderer.scene.colour_space.to_srgb(radiance) - batch.rgb
         run.descend(error.square().mean(), run.parameters(self.learn))
         return True

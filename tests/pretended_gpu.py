@@ -52,6 +52,9 @@ class PretendedGpu(TorchFunctionMode):
             raise RuntimeError(f"{name}: tensors on cuda:0 and on the CPU")
         if here and (name in _WAITING or elsewhere or _masks(name, args)):
             self._waited(name)
+        if here and getattr(func, "namespace", None) == "nerfro":
+            with self:  # the tensors dispatch as those of the CPU
+                return func.decompose(*args, **kwargs)  # type: ignore[attr-defined]
         if name in ("to", "cpu"):
             return self._to(*args, *(["cpu"] if name == "cpu" else []), **kwargs)
         if "device" in kwargs and kwargs["device"] is not None:

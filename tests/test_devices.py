@@ -8,11 +8,12 @@ from nerfro.evaluation.render_view import render_view
 from nerfro.kernels.constants import constant
 from nerfro.media.bodies import Bodies
 from nerfro.registry.registration import build
+from nerfro.rendering import RayTracer
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.training.config import build_medium, build_model
 from nerfro.training.derivation import derived
 from nerfro.training.module import TrainingModule
-from nerfro.training.ray_batches import RayBatches
+from nerfro.training.pixel_batches import PixelBatches
 from nerfro.viewing.baking import bake_surface
 from tests.conftest import composed
 from tests.pretended_gpu import GPU, OnGpu, PretendedGpu
@@ -66,9 +67,9 @@ def test_training_and_rendering_stay_on_the_gpu(
     with PretendedGpu() as gpu, warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*CUDA is not available.*")
         module.to(GPU)
-        batches, cameras = RayBatches(views, 8, config.batches.batching).to(GPU), views.cameras.to(GPU)
+        batches, cameras = PixelBatches(views, 8, config.batches.batching).to(GPU), views.cameras.to(GPU)
         gpu.waits.clear()
-        batch = batches.batch(STEP)
+        batch = RayTracer(renderer).trace(batches.draw(STEP))
         loss = module.training_step(batch, 0)["loss"]
         loss.backward()
         renderer.point_sampler.update(list(renderer.scene.fields), batch.draws)

@@ -19,6 +19,7 @@ from lightning.pytorch import LightningModule, Trainer
 from omegaconf import OmegaConf
 
 from nerfro.core.types import Batch
+from nerfro.rendering import RayTracer
 from nerfro.training.build import build
 from nerfro.training.callbacks import Checkpoints, SharedTimer, StopOnSignal, Throughput
 from nerfro.training.config import TrainConfig
@@ -197,8 +198,8 @@ def test_unsupported_settings_of_two_processes_are_refused_in_one_line(
 
 def test_every_parameter_has_a_gradient_if_no_ray_meets_the_object(tiny_default_run: list[str]) -> None:
     module, data = build(overrides=[*tiny_default_run, "medium.learn_ior=true", "trainer.max_steps=1"])
-    batch = data.batches.batch(0)
-    away = replace(batch, path=None, rays=replace(batch.rays, directions=-batch.rays.directions))
+    batch = RayTracer(module.renderer).trace(data.batches.draw(0))
+    away = replace(batch, path=None, samples=None, rays=replace(batch.rays, directions=-batch.rays.directions))
     module.trainer, module._is_logged_step = Mock(spec=Trainer, world_size=2, global_step=0), False
     module.training_step(away, 0)["loss"].backward()
     assert [name for name, parameter in module.named_parameters() if parameter.grad is None] == []

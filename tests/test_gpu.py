@@ -13,12 +13,12 @@ from torch.nn.utils import parameters_to_vector
 
 from nerfro.evaluation.render_view import render_view
 from nerfro.registry.registration import build
+from nerfro.rendering import RayTracer
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.training.config import build_medium, build_model
-from nerfro.training.data_module import traced
 from nerfro.training.derivation import derived
 from nerfro.training.module import TrainingModule
-from nerfro.training.ray_batches import RayBatches
+from nerfro.training.pixel_batches import PixelBatches
 from tests.conftest import composed
 from tests.test_experiments import EXPERIMENTS, SMALL, shrunk
 
@@ -39,8 +39,9 @@ def step_on(device: str, overrides: list[str]) -> tuple[float, Tensor, Tensor]:
     renderer.scene.begin(views.cameras)
     module = TrainingModule.of(renderer, config).to(device)
     module.log = lambda *values, **options: None  # type: ignore[method-assign]
-    batches = traced(RayBatches(views, 256, config.batches.batching), renderer, config).to(device)
-    loss = module.training_step(batches.batch(STEP), 0)["loss"]
+    pixels = PixelBatches(views, 256, config.batches.batching).to(device).draw(STEP)
+    batch = RayTracer(renderer, Subdivision(**config.batches.subdivision)).trace(pixels)
+    loss = module.training_step(batch, 0)["loss"]
     loss.backward()
     gradients = [p.grad if p.grad is not None else torch.zeros_like(p) for p in module.parameters()]
     rendered = render_view(renderer, views.cameras.to(device), 0, Subdivision()).radiance

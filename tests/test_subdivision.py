@@ -15,11 +15,12 @@ from nerfro.media.analytic import Vacuum
 from nerfro.models.refractive import RefractiveModel
 from nerfro.paper.hierarchical import Hierarchical
 from nerfro.paper.nerf import NerfField
+from nerfro.rendering import RayTracer
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.paths.straight import Straight
 from nerfro.samplers.subdivision import Subdivision, contrast, divergence, neighbour_rays, part_rays, pixel_rays
 from nerfro.testing import example_batch, example_components
-from nerfro.training.ray_batches import RayBatches
+from nerfro.training.pixel_batches import PixelBatches
 from tests.cameras_at import cameras_at, random_poses
 from tests.closed_forms import Ball, RoundedBox
 
@@ -44,11 +45,6 @@ def above() -> Cameras:
 @pytest.fixture
 def views(above: Cameras) -> Views:
     return Views(above, torch.rand(1, SIDE, SIDE, 3, generator=torch.Generator().manual_seed(1)), None, ["r_0"])
-
-
-def through_cube(rays, view):
-    assert len(view) == len(rays)
-    return Snell()(rays, CUBE)
 
 
 def diverging(cameras: Cameras, sampler, medium) -> torch.Tensor:
@@ -98,9 +94,13 @@ def test_divergence_behind_a_ball_matches_its_deviation(above: Cameras) -> None:
     np.testing.assert_allclose(angles.numpy(), expected, atol=0.01 * FOCAL)
 
 
-def batches_of(views: Views, subdivision: Subdivision, size: int = 64) -> RayBatches:
-    batches = RayBatches(views, size, "all_images", seed=3)
-    return batches.traced(through_cube, subdivision=subdivision)
+def through_cube(subdivision: Subdivision) -> RayTracer:
+    components = replace(example_components(), medium=CUBE, path_sampler=Snell())
+    return RayTracer(RefractiveModel(components), subdivision)
+
+
+def batch_of(views: Views, step: int, subdivision: Subdivision, size: int = 64) -> Batch:
+    return through_cube(subdivision).trace(PixelBatches(views, size, "all_images", seed=3).draw(step))
 
 
 def of_pixels(batch: Batch, divided: bool) -> torch.Tensor:
@@ -109,7 +109,7 @@ def of_pixels(batch: Batch, divided: bool) -> torch.Tensor:
 
 
 def test_pixels_whose_rays_diverge_have_a_ray_through_each_part(views: Views) -> None:
-    batch = batches_of(views, Subdivision(2, 8.0)).batch(7)
+    batch = batch_of(views, 7, Subdivision(2, 8.0))
     divided, whole = of_pixels(batch, True), of_pixels(batch, False)
     assert 0 < len(divided) < 64
     assert torch.equal(divided, (diverging(views.cameras, Snell(), CUBE)[batch.pixel_number] >= 8.0).nonzero()[:, 0])
@@ -127,7 +127,7 @@ def test_pixels_of_the_object_are_divided_for_their_contrast(views: Views) -> No
     images = torch.zeros(1, SIDE, SIDE, 3)
     images[:, :, 20:] = 0.5  # an edge down the photograph, beside the cube and through it
     fine = replace(views, images=images)
-    batch = batches_of(fine, Subdivision(2, 8.0, 0.1, contrast_start=1), 1000).batch(1)
+    batch = batch_of(fine, 1, Subdivision(2, 8.0, 0.1, contrast_start=1), 1000)
     angles = diverging(views.cameras, Snell(), CUBE)[batch.pixel_number]
     refracted = Snell()(pixel_rays(views.cameras, batch.pixel_number), CUBE).refracted
     edge = torch.isin(batch.pixel_number % SIDE, torch.tensor([19, 20]))
@@ -136,12 +136,12 @@ def test_pixels_of_the_object_are_divided_for_their_contrast(views: Views) -> No
     expected = (angles >= 8) | (edge & refracted)
     assert torch.equal(of_pixels(batch, True), expected.nonzero()[:, 0])
     assert torch.equal(batch.teaches_background, angles < 8)
-    before = batches_of(fine, Subdivision(2, 8.0, 0.1, contrast_start=1), 1000).batch(0)
+    before = batch_of(fine, 0, Subdivision(2, 8.0, 0.1, contrast_start=1), 1000)
     assert torch.equal(of_pixels(before, True), (~before.teaches_background).nonzero()[:, 0])
 
 
 def test_zero_divergence_divides_all_pixels_and_steady_pixels_train_the_background(views: Views) -> None:
-    batch = batches_of(views, Subdivision(2, 0.0), 1000).batch(1)
+    batch = batch_of(views, 1, Subdivision(2, 0.0), 1000)
     assert len(of_pixels(batch, False)) == 0
     angles = diverging(views.cameras, Snell(), CUBE)[batch.pixel_number]
     assert (angles >= 8).any()
@@ -164,13 +164,13 @@ def test_contrast_is_the_largest_step_to_a_neighbour(cameras: Cameras) -> None:
 
 def test_batches_and_renderings_do_not_depend_on_the_process_or_the_chunk(views: Views) -> None:
     """Each pixel has the same rays, paths, numbers and samples, whoever traces it and beside whichever others."""
-    batches = batches_of(views, Subdivision(2, 8.0, 0.2), 60)
-    whole = batches.batch(4)
+    batches, tracer = PixelBatches(views, 60, "all_images", seed=3), through_cube(Subdivision(2, 8.0, 0.2))
+    whole = tracer.trace(batches.draw(4))
     model = RefractiveModel(replace(example_components(), point_sampler=Hierarchical(8, 8)))
-    sampled = model.render_path(whole.path, whole.draws)[-1].samples.s
+    sampled = model.render_path(whole.path, whole)[-1].samples.s
     assert len(whole.draws.ray.unique()) == len(whole.rays) > 60
     for rank in range(3):
-        share, own = batches.for_rank(rank, 3).batch(4), torch.arange(20 * rank, 20 * (rank + 1))
+        share, own = tracer.trace(batches.for_rank(rank, 3).draw(4)), torch.arange(20 * rank, 20 * (rank + 1))
         for name in ("pixel_number", "rgb", "view", "teaches_background"):
             assert torch.equal(getattr(share, name), getattr(whole, name)[own])
         rows = torch.isin(whole.ray_pixel, own).nonzero()[:, 0]
@@ -178,7 +178,7 @@ def test_batches_and_renderings_do_not_depend_on_the_process_or_the_chunk(views:
         assert torch.equal(share.draws.ray, whole.draws.ray[rows])
         assert torch.equal(share.rays.directions, whole.rays.directions[rows])
         assert torch.equal(share.path.exit_directions, whole.path.exit_directions[rows])
-        torch.testing.assert_close(model.render_path(share.path, share.draws)[-1].samples.s, sampled[rows])
+        torch.testing.assert_close(model.render_path(share.path, share)[-1].samples.s, sampled[rows])
 
 
 def test_straight_rays_do_not_diverge_and_need_one_ray_per_pixel() -> None:

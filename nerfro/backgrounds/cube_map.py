@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Float, Int
@@ -25,22 +26,26 @@ class CubeLevels:
 
     resolutions: tuple[int, ...]  # texels along a face's side
 
-    @property
+    @cached_property
     def sizes(self) -> tuple[int, ...]:
         return tuple(6 * n * n for n in self.resolutions)
 
-    @property
+    @cached_property
     def padded_sizes(self) -> tuple[int, ...]:
         """Number of texels of each level with margins, see `padded_texels`."""
         return tuple(6 * (n + 2) ** 2 for n in self.resolutions)
 
-    @property
+    @cached_property
     def offsets(self) -> tuple[int, ...]:
         return tuple(sum(self.sizes[:level]) for level in range(len(self.resolutions)))
 
-    @property
+    @cached_property
     def num_texels(self) -> int:
         return sum(self.sizes)
+
+    @cached_property
+    def num_padded(self) -> int:
+        return sum(self.padded_sizes)
 
     def __len__(self) -> int:
         return len(self.resolutions)

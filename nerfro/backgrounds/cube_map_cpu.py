@@ -6,6 +6,7 @@ the same texel.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -15,9 +16,10 @@ from numba import prange
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from nerfro.backgrounds import cube_map
 from nerfro.backgrounds.cube_map import CubeLevels
-from nerfro.kernels.arrays import arrays
 from nerfro.kernels.compilation import compiled, compiled_parallel
+from nerfro.kernels.operators import kernel, operator
 from nerfro.kernels.threads import num_threads
 
 _ONE = np.float32(1)
@@ -30,43 +32,85 @@ def lookup(
     padded: Int[Tensor, " padded"],
     levels: CubeLevels,
 ) -> Float[Tensor, "P 3"]:
-    """Compute `nerfro.backgrounds.cube_map.lookup` on the CPU."""
-    return _Lookup.apply(face, coordinates.contiguous(), texels, padded, levels)
+    """Evaluate `nerfro.backgrounds.cube_map.lookup`, on the CPU by the kernels."""
+    return _lookup(face, coordinates, texels, padded, levels.resolutions)
+
+
+def _in_torch(face: Tensor, coordinates: Tensor, texels: Tensor, padded: Tensor, resolutions: list[int]) -> Tensor:
+    return cube_map.lookup(face, coordinates, texels, padded, CubeLevels(tuple(resolutions)))
+
+
+_lookup = operator(
+    "cube_lookup(Tensor face, Tensor coordinates, Tensor texels, Tensor padded, int[] resolutions) -> Tensor",
+    _in_torch,
+    lambda face, coordinates, *others: _Lookup.apply(face, coordinates.contiguous(), *others),
+)
 
 
 class _Lookup(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any,
-        face: Int[Tensor, "P"],
-        coordinates: Float[Tensor, "P 2"],
-        texels: Float[Tensor, "T 3"],
-        padded: Int[Tensor, " padded"],
-        levels: CubeLevels,
-    ) -> Float[Tensor, "P 3"]:
-        ctx.save_for_backward(face, coordinates, texels, padded)
-        ctx.levels = levels
-        total = torch.zeros(len(face), 3)
-        _forward(*_places(face, coordinates, padded, levels), *arrays(texels, total))
-        return total
+        ctx: Any, face: Tensor, coordinates: Tensor, texels: Tensor, padded: Tensor, resolutions: list[int]
+    ) -> Tensor:
+        ctx.save_for_backward(face, coordinates, padded, texels)
+        ctx.resolutions = resolutions
+        return _sum_of_levels(face, coordinates, padded, texels, resolutions)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Float[Tensor, "P 3"]) -> tuple:
-        face, coordinates, texels, padded = ctx.saved_tensors
-        places, threads = _places(face, coordinates, padded, ctx.levels), num_threads()
         of_coordinates = of_texels = None
         if ctx.needs_input_grad[1]:
-            of_coordinates = torch.empty_like(coordinates)
-            _backward_to_coordinates(*places, *arrays(texels, gradient, of_coordinates))
+            of_coordinates = _gradient_of_coordinates(*ctx.saved_tensors, gradient, ctx.resolutions)
         if ctx.needs_input_grad[2]:
-            of_texels = torch.zeros(texels.shape)
-            _backward(min(threads, len(ctx.levels)), *places, *arrays(gradient, of_texels))
+            of_texels = _gradient_of_texels(*ctx.saved_tensors, gradient, ctx.resolutions)
         return None, of_coordinates, of_texels, None, None
 
 
-def _places(face: Tensor, coordinates: Tensor, padded: Tensor, levels: CubeLevels) -> tuple[np.ndarray, ...]:
-    return *arrays(face, coordinates, padded), np.array(levels.resolutions), np.array(levels.offsets)
+_ARGUMENTS = "Tensor face, Tensor coordinates, Tensor padded, Tensor texels"
+
+
+@kernel(
+    f"cube_lookup_forward({_ARGUMENTS}, int[] resolutions) -> Tensor",
+    lambda face, coordinates, padded, texels, resolutions: texels.new_empty(len(face), 3),
+)
+def _sum_of_levels(
+    face: np.ndarray, coordinates: np.ndarray, padded: np.ndarray, texels: np.ndarray, resolutions: list[int]
+) -> Float[np.ndarray, "P 3"]:
+    total = np.zeros((len(face), 3), texels.dtype)
+    _forward(face, coordinates, padded, *_layout(tuple(resolutions)), texels, total)
+    return total
+
+
+@kernel(
+    f"cube_lookup_coordinates({_ARGUMENTS}, Tensor gradient, int[] resolutions) -> Tensor",
+    lambda face, coordinates, padded, texels, gradient, resolutions: torch.empty_like(coordinates),
+)
+def _gradient_of_coordinates(
+    face: np.ndarray, coordinates: np.ndarray, padded: np.ndarray, texels: np.ndarray,
+    gradient: np.ndarray, resolutions: list[int],
+) -> Float[np.ndarray, "P 2"]:  # fmt: skip
+    of_coordinates, layout = np.empty_like(coordinates), _layout(tuple(resolutions))
+    _backward_to_coordinates(face, coordinates, padded, *layout, texels, gradient, of_coordinates)
+    return of_coordinates
+
+
+@kernel(
+    f"cube_lookup_texels({_ARGUMENTS}, Tensor gradient, int[] resolutions) -> Tensor",
+    lambda face, coordinates, padded, texels, gradient, resolutions: torch.empty_like(texels),
+)
+def _gradient_of_texels(
+    face: np.ndarray, coordinates: np.ndarray, padded: np.ndarray, texels: np.ndarray,
+    gradient: np.ndarray, resolutions: list[int],
+) -> Float[np.ndarray, "T 3"]:  # fmt: skip
+    of_texels, layout = np.zeros_like(texels), _layout(tuple(resolutions))
+    _backward(min(num_threads(), len(resolutions)), face, coordinates, padded, *layout, gradient, of_texels)
+    return of_texels
+
+
+@lru_cache(maxsize=64)
+def _layout(resolutions: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    return np.array(resolutions), np.array(CubeLevels(resolutions).offsets)
 
 
 @compiled

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from nerfro.backgrounds import cube_map
 from nerfro.backgrounds.base import Background
+from nerfro.backgrounds.cube_map_cpu import lookup
 from nerfro.core.errors import NerfroError
 from nerfro.core.types import Exits
 from nerfro.data.base import Views
@@ -144,10 +145,10 @@ class EnvironmentMap(Background):
 
     def _raw_at(self, face: Int[Tensor, "P"], coordinates: Float[Tensor, "P 2"]) -> Float[Tensor, "P 3"]:
         raw = torch.zeros_like(coordinates[:, :1])
-        padded = self.padded.split([sum(levels.padded_sizes) for levels in self._groups])
+        padded = self.padded.split([levels.num_padded for levels in self._groups])
         for texels, of_group, levels in zip((self.texels, self.fitted_texels), padded, self._groups, strict=True):
             if len(levels) > 0:
-                raw = raw + self._looked_up(face, coordinates, texels, of_group, levels)
+                raw = raw + lookup(face, coordinates, texels, of_group, levels)
         return raw
 
     def texels_of_levels(self) -> list[tuple[Float[Tensor, "T 3"], Int[Tensor, " padded"]]]:
@@ -155,14 +156,6 @@ class EnvironmentMap(Background):
         groups = zip((self.texels, self.fitted_texels), self._groups, strict=True)
         texels = [values for group, levels in groups for values in group.split(levels.sizes)]
         return list(zip(texels, self.padded.split(self.levels.padded_sizes), strict=True))
-
-    @staticmethod
-    def _looked_up(face: Tensor, *arguments: Any) -> Float[Tensor, "P 3"]:
-        if face.device.type == "cpu":
-            from nerfro.backgrounds.cube_map_cpu import lookup  # compiled code, so only where it is used
-        else:
-            lookup = cube_map.lookup
-        return lookup(face, *arguments)
 
     @torch.no_grad()
     def fit(self, observed: Observed, past_weights: Float[Tensor, "T"]) -> Float[Tensor, "T"]:
@@ -193,14 +186,14 @@ class EnvironmentMap(Background):
             positions, level = (face, coordinates), cube_map.CubeLevels((n,))
             with torch.enable_grad():
                 change = torch.zeros_like(values, requires_grad=True)
-                changed = self._looked_up(*positions, change, of_level, level)
+                changed = lookup(*positions, change, of_level, level)
             sums, counts = (
                 torch.autograd.grad(changed, change, gradient, retain_graph=True)[0]
                 for gradient in (weights * residual, weights)
             )
             change = sums / (counts + earlier[:, None] + 1)
             values += change
-            residual -= self._looked_up(*positions, change, of_level, level)
+            residual -= lookup(*positions, change, of_level, level)
             total.append(counts[:, 0])
         return torch.cat(total)
 

@@ -31,12 +31,12 @@ class Rays:
         return self.origins.shape[0]
 
     def __getitem__(self, index: slice | Tensor) -> Rays:
-        return Rays(*(tensor[index] for tensor in vars(self).values()))
+        return Rays(self.origins[index], self.directions[index], self.radii[index], self.near[index], self.far[index])
 
     @classmethod
     def joined(cls, parts: Sequence[Rays]) -> Rays:
         """Concatenate rays."""
-        return cls(*(torch.cat(columns) for columns in zip(*(vars(part).values() for part in parts), strict=True)))
+        return cls(*map(torch.cat, zip(*[vars(part).values() for part in parts], strict=True)))
 
     def to(self, where_or_what: torch.device | str | torch.dtype) -> Rays:
         """Move the rays to a device, or convert to a precision."""

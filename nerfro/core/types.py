@@ -19,8 +19,8 @@ are defined where they are used. A name on its own begins with a space, which li
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -32,9 +32,66 @@ from nerfro.core.cameras import Cameras
 from nerfro.core.draws import Draws
 from nerfro.core.rays import Rays
 
-__all__ = ["WORLD_ORIGIN", "Batch", "Exits", "FieldValues", "Path", "Rays", "Rendering", "Samples"]
+__all__ = [
+    "WORLD_ORIGIN",
+    "Batch",
+    "Exits",
+    "FieldValues",
+    "OpticalRecord",
+    "Path",
+    "Pixels",
+    "Rays",
+    "Rendering",
+    "Samples",
+]
 
 WORLD_ORIGIN = np.zeros(3)
+
+
+@dataclass(frozen=True)
+class OpticalRecord:
+    """Bodies and surfaces that the vertices of P polylines meet.
+
+    Attributes:
+        body: body of the segment after each vertex (`Bodies.deciding_body`), numbered from 1; 0 in air.
+        surface_body: body on whose surface each vertex lies, numbered as `body`; 0 for vertices on no surface, such as
+            both ends.
+        far_side: body on the other side of the surface, numbered as `body`. Transmitted light enters the body,
+            reflected light does not. 0 for vertices on no surface.
+        triangle: triangle on which each vertex lies; -1 if the surface has no triangles.
+        band: number of the wavelength of the polyline in dispersive media; otherwise 0.
+        absorption: absorption coefficients of air and of each body for red, green and blue, per world unit; empty if
+            all media are clear.
+    """
+
+    body: Int[Tensor, "P S"]
+    surface_body: Int[Tensor, "P S"]
+    far_side: Int[Tensor, "P S"]
+    triangle: Int[Tensor, "P S"]
+    band: Int[Tensor, "P"]
+    absorption: Float[Tensor, "media 3"]
+
+    @classmethod
+    def of_bodies(
+        cls, body: Int[Tensor, "P S"], surface_body: Int[Tensor, "P S"], far_side: Int[Tensor, "P S"]
+    ) -> OpticalRecord:
+        """Create the record of clear bodies at one wavelength, whose surfaces have no triangles.
+
+        The class documents the arguments. The other fields are expanded constants, which take no memory.
+        """
+        zero = torch.zeros((), dtype=torch.int8, device=body.device)
+        absorption = torch.empty(0, 3, device=body.device)
+        return cls(body, surface_body, far_side, (zero - 1).expand(body.shape), zero.expand(len(body)), absorption)
+
+    def __getitem__(self, index: slice | Tensor) -> OpticalRecord:
+        """Select polylines."""
+        return replace(self, **{name: getattr(self, name)[index] for name in _OF_ROWS})
+
+
+# Fields with a row for each polyline, of `Path` and of its record, and those that have a column for each vertex.
+_OF_PATHS = ("positions", "directions", "s", "refracted", "radii", "ray", "throughput")
+_OF_ROWS = ("body", "surface_body", "far_side", "triangle", "band")
+_OF_VERTICES = ("positions", "directions", "s", "body", "surface_body", "far_side", "triangle")
 
 
 @dataclass(frozen=True)
@@ -56,21 +113,10 @@ class Path:
             or more if the ray leaves the object later.
         refracted: whether the polyline meets the medium (an index other than 1, or an absorbing body).
         radii: pixel cone radius at unit distance, from the rays.
-        splits: whether rays may have several polylines. If not, `ray` counts from 0 and `throughput` is 1 everywhere.
         ray: ray of each polyline, non-decreasing; every ray has at least one polyline.
         throughput: linear factor of the light of the polyline; the factors of a ray sum to at most 1.
-        body: body of the segment after each vertex (`Bodies.deciding_body`), numbered from 1; 0 in air, or if the index
-            varies continuously.
-        surface_body: body on whose surface each vertex lies, numbered as `body`; 0 for vertices on no sharp surface,
-            such as both ends.
-        across: body on the other side of the surface, numbered as `body`. Transmitted light enters the body, reflected
-            light does not. 0 for vertices on no surface.
-        triangle: triangle on which each vertex lies; -1 if the surface has no triangles.
-        absorption: absorption coefficients of air and of each body for red, green and blue, per world unit; empty if
-            all media are clear.
-        band: number of the wavelength of the polyline in dispersive media; otherwise 0.
-        samples: samples of the first sampling level, if they were chosen with the path; selected or joined polylines
-            have none.
+        splits: whether rays may have several polylines. If not, `ray` counts from 0 and `throughput` is 1 everywhere.
+        record: bodies and surfaces that the vertices meet; None in media without sharp surfaces.
     """
 
     positions: Float[Tensor, "P S 3"]
@@ -78,16 +124,10 @@ class Path:
     s: Float[Tensor, "P S"]
     refracted: Bool[Tensor, "P"]
     radii: Float[Tensor, "P"]
-    splits: bool
     ray: Int[Tensor, "P"]
     throughput: Float[Tensor, "P 3"]
-    body: Int[Tensor, "P S"]
-    surface_body: Int[Tensor, "P S"]
-    across: Int[Tensor, "P S"]
-    triangle: Int[Tensor, "P S"]
-    absorption: Float[Tensor, "media 3"]
-    band: Int[Tensor, "P"]
-    samples: Samples | None = None
+    splits: bool = False
+    record: OpticalRecord | None = None
 
     @classmethod
     def unbranched(
@@ -97,39 +137,35 @@ class Path:
         s: Float[Tensor, "R S"],
         refracted: Bool[Tensor, "R"],
         radii: Float[Tensor, "R"],
+        record: OpticalRecord | None = None,
     ) -> Path:
-        """Create a path of one polyline per ray, in clear media and without sharp surfaces.
-
-        The class documents the arguments. The other fields are expanded constants, which take no memory.
-        """
-        zero = torch.zeros((), dtype=torch.int8, device=s.device)
-        air, no_triangle = zero.expand(s.shape), (zero - 1).expand(s.shape)
-        return cls(
-            positions, directions, s, refracted, radii,
-            splits=False, ray=torch.arange(len(s), device=s.device), throughput=s.new_ones(()).expand(len(s), 3),
-            body=air, surface_body=air, across=air, triangle=no_triangle,
-            absorption=s.new_empty(0, 3), band=zero.expand(len(s)),
-        )  # fmt: skip
+        """Create a path of one polyline per ray. The class documents the arguments."""
+        ray, throughput = torch.arange(len(s), device=s.device), s.new_ones(()).expand(len(s), 3)
+        return cls(positions, directions, s, refracted, radii, ray, throughput, record=record)
 
     @classmethod
     def joined(cls, paths: Sequence[Path]) -> Path:
-        """Concatenate the polylines of paths; the rays of each path follow the rays of the previous path."""
-        num_vertices = max(path.s.shape[1] for path in paths)
-        columns: dict[str, list[Any]] = {field.name: [] for field in fields(cls)}
-        num_rays = 0
+        """Concatenate the polylines of paths; the rays of each path follow the rays of the previous path.
+
+        Either all paths have a record, or none.
+        """
+        num_vertices, num_rays = max([path.s.shape[1] for path in paths]), 0
+        columns: dict[str, list[Tensor]] = {name: [] for name in (*_OF_PATHS, *_OF_ROWS)}
         for path in paths:
-            for name, value in vars(path).items():
-                if name == "ray":
-                    value = value + num_rays
-                elif name in _OF_VERTICES:
-                    last = value[:, -1:].expand(-1, num_vertices - value.shape[1], *value.shape[2:])
-                    value = torch.cat([value, last], 1)
-                columns[name].append(value)
+            # Short rows repeat their last vertex.
+            vertices = torch.arange(num_vertices, device=path.s.device).clamp(max=path.s.shape[1] - 1)
+            for part, names in ((path, _OF_PATHS), (path.record, _OF_ROWS)):
+                for name in names if part is not None else ():
+                    values = getattr(part, name)
+                    columns[name].append(values[:, vertices] if name in _OF_VERTICES else values)
+            columns["ray"][-1] = path.ray + num_rays
             num_rays += path.num_rays
-        splits, absorption = any(columns.pop("splits")), max(columns.pop("absorption"), key=len)
-        columns.pop("samples")
-        together: dict[str, Any] = {name: torch.cat(values) for name, values in columns.items()}
-        return cls(splits=splits, absorption=absorption, **together)
+        joined: dict[str, Any] = {name: torch.cat(values) for name, values in columns.items() if values}
+        record, records = None, [path.record for path in paths if path.record is not None]
+        if records:
+            absorption = max([record.absorption for record in records], key=len)
+            record = OpticalRecord(*[joined.pop(name) for name in _OF_ROWS], absorption)
+        return cls(**joined, splits=any([path.splits for path in paths]), record=record)
 
     def __repr__(self) -> str:
         polylines, vertices = self.s.shape
@@ -140,7 +176,7 @@ class Path:
     @property
     def absorbs(self) -> bool:
         """Whether the path may cross absorbing bodies."""
-        return len(self.absorption) > 0
+        return self.record is not None and len(self.record.absorption) > 0
 
     @property
     def num_rays(self) -> int:
@@ -166,14 +202,16 @@ class Path:
 
     def transmitted(self, s: Float[Tensor, "P N"]) -> Float[Tensor, "P N 3"]:
         """Compute the transmittance of absorbing bodies between the camera and arc lengths `s` (Beer-Lambert law)."""
+        assert self.record is not None
+        absorption, body = self.record.absorption, self.record.body
         vertex, lengths = self._vertex_before(s), self.s.diff(dim=1)
         since = s - self.s.gather(1, vertex)
         depth = s.new_zeros(*s.shape, 3)
-        for number in range(1, len(self.absorption)):
-            within = (self.body == number).to(s)
+        for number in range(1, len(absorption)):
+            within = (body == number).to(s)
             before = torch.nn.functional.pad((within[:, :-1] * lengths).cumsum(1), (1, 0))
             length = before.gather(1, vertex) + within.gather(1, vertex) * since
-            depth = depth + length[..., None] * self.absorption[number]
+            depth = depth + length[..., None] * absorption[number]
         return torch.exp(-depth)
 
     def exits(self, directions: Float[Tensor, "P 3"] | None = None) -> Exits:
@@ -204,9 +242,9 @@ class Path:
 
     def __getitem__(self, index: slice | Tensor) -> Path:
         """Select polylines; each becomes the only polyline of a new ray."""
-        rows = {name: value[index] for name, value in vars(self).items() if name not in _OF_PATHS}
+        rows = {name: getattr(self, name)[index] for name in _OF_PATHS}
         rows["ray"] = torch.arange(len(rows["s"]), device=self.s.device)
-        return replace(self, samples=None, **rows)
+        return Path(**rows, splits=self.splits, record=None if self.record is None else self.record[index])
 
     def select_rays(self, rows: Int[Tensor, " selected"]) -> Path:
         """Select rays with all their polylines."""
@@ -215,8 +253,8 @@ class Path:
         counts = torch.bincount(self.ray, minlength=self.num_rays)
         first, num = (counts.cumsum(0) - counts)[rows], counts[rows]
         ray = torch.arange(len(rows), device=rows.device).repeat_interleave(num)
-        place = torch.arange(len(ray), device=rows.device) - (num.cumsum(0) - num)[ray]
-        return replace(self[first[ray] + place], ray=ray)
+        branch = torch.arange(len(ray), device=rows.device) - (num.cumsum(0) - num)[ray]
+        return replace(self[first[ray] + branch], ray=ray)
 
     def span(self, box: Float[Tensor, "2 3"]) -> tuple[Float[Tensor, "P"], Float[Tensor, "P"]]:
         """Return the arc lengths of the first entry into a box and of the last exit.
@@ -251,11 +289,6 @@ class Path:
         # searchsorted needs contiguous rows; `contiguous` is free for contiguous tensors.
         vertex = torch.searchsorted(self.s.detach().contiguous(), s.detach().contiguous(), side="left") - 1
         return vertex.clamp(min=0)
-
-
-# Fields of `Path` with a column for each vertex, and fields without rows.
-_OF_VERTICES = frozenset({"positions", "directions", "s", "body", "surface_body", "across", "triangle"})
-_OF_PATHS = frozenset({"splits", "absorption", "samples"})
 
 
 @dataclass(frozen=True)
@@ -313,6 +346,11 @@ class Samples:
         s, edges = s.detach(), edges.detach()
         positions, directions = path.at(s)
         return cls(positions, directions, s, edges, path.radii)
+
+    def on(self, path: Path) -> Samples:
+        """Return the samples with the positions and directions of a path, and their gradients."""
+        positions, directions = path.at(self.s)
+        return replace(self, positions=positions, directions=directions)
 
     @property
     def deltas(self) -> Float[Tensor, "P N"]:
@@ -387,6 +425,29 @@ class Rendering:
 
 
 @dataclass(frozen=True)
+class Pixels:
+    """Q training pixels of one step.
+
+    Attributes:
+        number: number of each pixel in the data set, view * H * W + row * W + column.
+        view: number of the training view of each pixel.
+        rgb: colour of each pixel in its photograph, sRGB in [0, 1].
+        draws: random numbers of the step, with an index for each pixel.
+        cameras: all training cameras.
+        window: all training cameras, cropped to the window of the first steps (`batches.precrop_steps`).
+        photographed: function that returns the colours of pixels by number.
+    """
+
+    number: Int[Tensor, "Q"]
+    view: Int[Tensor, "Q"]
+    rgb: Float[Tensor, "Q 3"]
+    draws: Draws
+    cameras: Cameras
+    window: Cameras
+    photographed: Callable[[Int[Tensor, "P"]], Float[Tensor, "P 3"]]
+
+
+@dataclass(frozen=True)
 class Batch:
     """Training pixels and the rays through them: R rays through Q pixels, at least one through each.
 
@@ -394,7 +455,7 @@ class Batch:
     `mean()`. With several processes, the mean is correct because each process has the same number of pixels.
 
     Attributes:
-        rays: rays of the cameras of the data set.
+        rays: rays of the estimated cameras, with gradients if the cameras learn.
         ray_pixel: pixel of each ray, as an index from 0 to Q - 1.
         pixel_number: number of each pixel in the data set, view * H * W + row * W + column.
         view: number of the training view of each pixel.
@@ -404,6 +465,7 @@ class Batch:
             that need further directions.
         draws: random numbers of the step, with an index for each ray.
         path: paths of the rays without gradients; None before tracing.
+        samples: samples of the first sampling level, if they were chosen with the paths.
     """
 
     rays: Rays
@@ -415,6 +477,7 @@ class Batch:
     cameras: Cameras
     draws: Draws
     path: Path | None = None
+    samples: Samples | None = None
 
     @property
     def ray_view(self) -> Int[Tensor, "R"]:

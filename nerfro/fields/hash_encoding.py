@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Float, Int
@@ -33,13 +34,17 @@ class GridLevels:
 
     resolutions: tuple[int, ...]  # cells along the side of the unit cube
     sizes: tuple[int, ...]  # entries of each level; a power of two for hashed levels
-    offsets: tuple[int, ...]  # first entry of each level
 
-    @property
+    @cached_property
+    def offsets(self) -> tuple[int, ...]:
+        """First entry of each level."""
+        return tuple(sum(self.sizes[:level]) for level in range(len(self.sizes)))
+
+    @cached_property
     def num_entries(self) -> int:
-        return self.offsets[-1] + self.sizes[-1]
+        return sum(self.sizes)
 
-    @property
+    @cached_property
     def dense(self) -> tuple[bool, ...]:
         return tuple((n + 1) ** 3 <= size for n, size in zip(self.resolutions, self.sizes, strict=True))
 
@@ -54,8 +59,7 @@ def grid_levels(num_levels: int, base_resolution: int, finest_resolution: int, l
     # The small addend prevents the last level from being rounded down to one cell less than requested.
     resolutions = [math.floor(base_resolution * math.exp(level * growth) + 1e-6) for level in range(num_levels)]
     sizes = [min((n + 1) ** 3, 2**log2_table_size) for n in resolutions]
-    offsets = [sum(sizes[:level]) for level in range(num_levels)]
-    return GridLevels(tuple(resolutions), tuple(sizes), tuple(offsets))
+    return GridLevels(tuple(resolutions), tuple(sizes))
 
 
 def hash_encode(

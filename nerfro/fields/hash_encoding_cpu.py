@@ -10,6 +10,7 @@ loops into vector instructions, in contrast to loops that fetch table entries.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -19,9 +20,10 @@ from numba import prange
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from nerfro.fields import hash_encoding
 from nerfro.fields.hash_encoding import HASH_Y, HASH_Z, NUM_FEATURES, GridLevels
-from nerfro.kernels.arrays import arrays
 from nerfro.kernels.compilation import compiled, compiled_parallel
+from nerfro.kernels.operators import kernel, operator
 from nerfro.kernels.threads import num_threads, share
 
 _BLOCK = 512
@@ -35,47 +37,100 @@ _UINT, _Y, _Z = np.uint32, np.uint32(HASH_Y), np.uint32(HASH_Z)
 def hash_encode(
     positions: Float[Tensor, "points 3"], table: Float[Tensor, "T 2"], levels: GridLevels
 ) -> Float[Tensor, "points F"]:
-    """Evaluate `nerfro.fields.hash_encoding.hash_encode` on the CPU."""
-    return _HashEncode.apply(positions.float().t().contiguous(), table, levels)
+    """Evaluate `nerfro.fields.hash_encoding.hash_encode`, on the CPU by the kernels."""
+    return _hash_encode(positions, table, levels.resolutions, levels.sizes)
+
+
+def _in_torch(positions: Tensor, table: Tensor, resolutions: list[int], sizes: list[int]) -> Tensor:
+    return hash_encoding.hash_encode(positions, table, GridLevels(tuple(resolutions), tuple(sizes)))
+
+
+def _on_cpu(positions: Tensor, table: Tensor, resolutions: list[int], sizes: list[int]) -> Tensor:
+    return _HashEncode.apply(positions.float().t().contiguous(), table, resolutions, sizes)
+
+
+_hash_encode = operator(
+    "hash_encode(Tensor positions, Tensor table, int[] resolutions, int[] sizes) -> Tensor", _in_torch, _on_cpu
+)
 
 
 class _HashEncode(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: Any, positions: Float[Tensor, "3 points"], table: Float[Tensor, "T 2"], levels: GridLevels
-    ) -> Float[Tensor, "points F"]:
+    def forward(ctx: Any, positions: Tensor, table: Tensor, resolutions: list[int], sizes: list[int]) -> Tensor:
         ctx.save_for_backward(positions, table)
-        ctx.levels = levels
-        features = positions.new_empty(positions.shape[1], NUM_FEATURES * len(levels))
-        (places, entries), layout, num_points = arrays(positions, table), _layout(levels), positions.shape[1]
-
-        def encode(part: int) -> None:
-            span = part * _PART, min((part + 1) * _PART, num_points)
-            _forward(places, entries, *layout, span, features.numpy())
-
-        share(encode, -(-num_points // _PART))
-        return features
+        ctx.levels = resolutions, sizes
+        return _encode(positions, table, resolutions, sizes)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Float[Tensor, "points F"]) -> tuple[Tensor | None, Tensor | None, None]:
+    def backward(ctx: Any, gradient: Float[Tensor, "points F"]) -> tuple[Tensor | None, Tensor | None, None, None]:
         positions, table = ctx.saved_tensors
-        places, entries, upstream = arrays(positions, table, gradient)
-        layout, threads = _layout(ctx.levels), num_threads()
         of_positions = of_table = None
         if ctx.needs_input_grad[0]:
-            of_positions = torch.empty_like(positions)
-            _backward_to_positions(places, entries, upstream, *layout, of_positions.numpy())
+            of_positions = _gradient_of_positions(positions, table, gradient, *ctx.levels)
         if ctx.needs_input_grad[1]:
-            of_table = torch.zeros(table.shape)
-            # Threads of Numba share the levels themselves.
-            parts = _LEVEL_PARTS if threads == 1 else 1
-            share(lambda part: _backward(places, upstream, *layout, (part, parts, threads), of_table.numpy()), parts)
-        return of_positions, of_table, None
+            of_table = _gradient_of_table(positions, table, gradient, *ctx.levels)
+        return of_positions, of_table, None, None
 
 
-def _layout(levels: GridLevels) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    return np.array(levels.resolutions), np.array(levels.sizes), np.array(levels.offsets), np.array(levels.dense)
+@kernel(
+    "hash_encode_forward(Tensor positions, Tensor table, int[] resolutions, int[] sizes) -> Tensor",
+    lambda positions, table, resolutions, sizes: positions.new_empty(positions.shape[1], NUM_FEATURES * len(sizes)),
+)
+def _encode(
+    positions: Float[np.ndarray, "3 points"],
+    table: Float[np.ndarray, "T 2"],
+    resolutions: list[int],
+    sizes: list[int],
+) -> Float[np.ndarray, "points F"]:
+    layout, num_points = _layout(tuple(resolutions), tuple(sizes)), positions.shape[1]
+    features = np.empty((num_points, NUM_FEATURES * len(sizes)), positions.dtype)
+
+    def encode(part: int) -> None:
+        _forward(positions, table, *layout, (part * _PART, min((part + 1) * _PART, num_points)), features)
+
+    share(encode, -(-num_points // _PART))
+    return features
+
+
+@kernel(
+    "hash_encode_positions(Tensor positions, Tensor table, Tensor gradient, int[] resolutions, int[] sizes) -> Tensor",
+    lambda positions, table, gradient, resolutions, sizes: torch.empty_like(positions),
+)
+def _gradient_of_positions(
+    positions: Float[np.ndarray, "3 points"],
+    table: Float[np.ndarray, "T 2"],
+    gradient: Float[np.ndarray, "points F"],
+    resolutions: list[int],
+    sizes: list[int],
+) -> Float[np.ndarray, "3 points"]:
+    of_positions = np.empty_like(positions)
+    _backward_to_positions(positions, table, gradient, *_layout(tuple(resolutions), tuple(sizes)), of_positions)
+    return of_positions
+
+
+@kernel(
+    "hash_encode_table(Tensor positions, Tensor table, Tensor gradient, int[] resolutions, int[] sizes) -> Tensor",
+    lambda positions, table, gradient, resolutions, sizes: torch.empty_like(table),
+)
+def _gradient_of_table(
+    positions: Float[np.ndarray, "3 points"],
+    table: Float[np.ndarray, "T 2"],
+    gradient: Float[np.ndarray, "points F"],
+    resolutions: list[int],
+    sizes: list[int],
+) -> Float[np.ndarray, "T 2"]:
+    of_table, layout, threads = np.zeros_like(table), _layout(tuple(resolutions), tuple(sizes)), num_threads()
+    # Threads of Numba share the levels themselves.
+    parts = _LEVEL_PARTS if threads == 1 else 1
+    share(lambda part: _backward(positions, gradient, *layout, (part, parts, threads), of_table), parts)
+    return of_table
+
+
+@lru_cache(maxsize=16)
+def _layout(resolutions: tuple[int, ...], sizes: tuple[int, ...]) -> tuple[np.ndarray, ...]:
+    levels = GridLevels(resolutions, sizes)
+    return np.array(resolutions), np.array(sizes), np.array(levels.offsets), np.array(levels.dense)
 
 
 @compiled

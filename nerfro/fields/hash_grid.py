@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 import torch
@@ -16,12 +15,14 @@ from nerfro.core.cameras import Cameras
 from nerfro.core.types import FieldValues, Samples
 from nerfro.data.base import Views
 from nerfro.fields import hash_encoding
-from nerfro.fields import spherical_harmonics as harmonics
 from nerfro.fields.base import Field
+from nerfro.fields.hash_encoding_cpu import hash_encode
 from nerfro.fields.networks import radiance
+from nerfro.fields.relu_mlp import ReluMLP
 from nerfro.fields.selection import evaluate_selected
+from nerfro.fields.spherical_harmonics import MAX_BANDS
+from nerfro.fields.spherical_harmonics_cpu import spherical_harmonics
 from nerfro.geometry.space import Space
-from nerfro.kernels.available import fast_bfloat16
 from nerfro.registry.allowed import Depth, Positive, Range, Width
 from nerfro.registry.registration import register
 
@@ -74,7 +75,7 @@ class HashGridField(Field):
         finest_resolution: Annotated[int, Range(at_least=_COARSEST_RESOLUTION)] | None = 256,
         log2_table_size: Annotated[int, Range(at_least=4, at_most=24)] = 15,
         width: Width = 64,
-        direction_bands: Annotated[int, Range(at_least=1, at_most=harmonics.MAX_BANDS)] = 4,
+        direction_bands: Annotated[int, Range(at_least=1, at_most=MAX_BANDS)] = 4,
         initial_depth: Positive = 0.1,
         shortcut: bool = True,
         precision: Literal["bfloat16", "float32"] | None = None,
@@ -83,14 +84,14 @@ class HashGridField(Field):
         self.space = space
         self.register_buffer("observed", space.observed())
         self.initial_density = initial_depth / space.side
-        self.direction_bands, self.shortcut, self.precision = direction_bands, shortcut, precision
+        self.direction_bands, self.shortcut = direction_bands, shortcut
         finest_resolution = 256 if finest_resolution is None else finest_resolution
         self.levels = hash_encoding.grid_levels(num_levels, _COARSEST_RESOLUTION, finest_resolution, log2_table_size)
         self.table = nn.Parameter(torch.empty(self.levels.num_entries, hash_encoding.NUM_FEATURES))
         nn.init.uniform_(self.table, -1e-4, 1e-4)
-        num_harmonics = harmonics.spherical_harmonics(torch.zeros(1, 3), direction_bands).shape[-1]
-        self.density_mlp = _mlp(hash_encoding.NUM_FEATURES * num_levels, width, 1, _GEOMETRY_FEATURES)
-        self.colour_mlp = _mlp(_GEOMETRY_FEATURES + num_harmonics, width, 2, 3)
+        num_features = hash_encoding.NUM_FEATURES * num_levels
+        self.density_mlp = ReluMLP(num_features, width, _GEOMETRY_FEATURES, precision=precision)
+        self.colour_mlp = ReluMLP(_GEOMETRY_FEATURES + direction_bands**2, width, width, 3, precision=precision)
 
     @classmethod
     def derive(cls, settings: DictConfig, views: Views, space: Space) -> dict[str, Any]:
@@ -123,15 +124,15 @@ class HashGridField(Field):
         self, positions: Float[Tensor, "points 3"], directions: Float[Tensor, "points 3"]
     ) -> tuple[Float[Tensor, " points"], Float[Tensor, "points 3"]]:
         """Evaluate density (per unit of contracted length) and colour at contracted positions."""
-        geometry = self.apply_mlp(self.density_mlp, self.encode(positions))
-        raw = self.apply_mlp(self.colour_mlp, geometry, self.encode_directions(directions))
+        geometry = self.density_mlp(self.encode(positions))
+        raw = self.colour_mlp(geometry, spherical_harmonics(directions, self.direction_bands))
         if self.shortcut:
             raw = raw + geometry[:, 1:4]
         return self._to_density(geometry), radiance(raw)
 
     def density(self, positions: Float[Tensor, "points 3"]) -> Float[Tensor, " points"]:
         contracted = self.space.contract(positions)
-        density = self._to_density(self.apply_mlp(self.density_mlp, self.encode(contracted)))
+        density = self._to_density(self.density_mlp(self.encode(contracted)))
         density, inside = self._world_density(density, positions, contracted), self.space.inside(positions)
         return density if inside is None else torch.where(inside, density, 0.0)
 
@@ -159,41 +160,5 @@ class HashGridField(Field):
         return self.initial_density * torch.exp(geometry[:, 0].float().clamp(max=_MAX_EXPONENT))
 
     def encode(self, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points F"]:
-        """Encode contracted positions in single precision, on the CPU by a compiled kernel."""
-        unit = self._unit(positions)
-        if unit.device.type == "cpu":
-            from nerfro.fields.hash_encoding_cpu import hash_encode  # compiled, hence imported late
-        else:
-            hash_encode = hash_encoding.hash_encode
-        return hash_encode(unit, self.table, self.levels)
-
-    def encode_directions(self, directions: Float[Tensor, "points 3"]) -> Float[Tensor, "points bases"]:
-        """Encode directions by spherical harmonics, on the CPU by a compiled kernel."""
-        if directions.device.type == "cpu":
-            from nerfro.fields.spherical_harmonics_cpu import spherical_harmonics
-        else:
-            spherical_harmonics = harmonics.spherical_harmonics
-        return spherical_harmonics(directions, self.direction_bands)
-
-    def apply_mlp(self, mlp: nn.Sequential, *inputs: Float[Tensor, "points _"]) -> Float[Tensor, "points O"]:
-        """Apply an MLP to concatenated inputs in the precision of the field, on the CPU by `relu_mlp`."""
-        device = inputs[0].device.type
-        rounds = fast_bfloat16(device) if self.precision is None else self.precision == "bfloat16"
-        if device == "cpu":
-            from nerfro.fields.relu_mlp import relu_mlp
-
-            weights = [layer.weight for layer in mlp if isinstance(layer, nn.Linear)]
-            return relu_mlp(list(inputs), weights, torch.bfloat16 if rounds else torch.float32)
-        with torch.autocast(device, torch.bfloat16, enabled=rounds):
-            return mlp(torch.cat([part.to(inputs[0].dtype) for part in inputs], dim=-1))
-
-
-def _mlp(num_inputs: int, width: int, num_hidden: int, num_outputs: int) -> nn.Sequential:
-    """Create ReLU layers without biases and with Glorot-uniform weights."""
-    widths = [num_inputs, *[width] * num_hidden, num_outputs]
-    layers: list[nn.Module] = []
-    for inputs, outputs in pairwise(widths):
-        linear = nn.Linear(inputs, outputs, bias=False)
-        nn.init.xavier_uniform_(linear.weight)
-        layers += [linear, nn.ReLU()]
-    return nn.Sequential(*layers[:-1])
+        """Encode contracted positions in single precision."""
+        return hash_encode(self._unit(positions), self.table, self.levels)

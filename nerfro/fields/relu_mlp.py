@@ -1,4 +1,4 @@
-"""A narrow ReLU MLP on the CPU with a hand-written gradient; the reference is a `torch.nn.Sequential`.
+"""A narrow ReLU MLP, on the CPU with a hand-written gradient; the reference is a `torch.nn.Sequential`.
 
 A layer of 64 units performs few operations per number, so that memory bandwidth limits the speed. Therefore neither
 gradients nor activations are copied: ReLU and its gradient work in place, and only inputs that learn get gradients.
@@ -6,14 +6,18 @@ gradients nor activations are copied: ReLU and its gradient work in place, and o
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from nerfro.kernels.available import fast_bfloat16
+from nerfro.kernels.operators import cpu_operator, operator
 from nerfro.kernels.threads import share
 
 # Rows of a product. oneDNN compiles and caches a program for each shape. Batches differ in the number of points, so
@@ -21,91 +25,175 @@ from nerfro.kernels.threads import share
 _BLOCK, _STEP = 8192, 2048
 
 
-def relu_mlp(
-    inputs: Float[Tensor, "points I"] | list[Float[Tensor, "points _"]], weights: list[Tensor], dtype: torch.dtype
-) -> Float[Tensor, "points O"]:
-    """Apply linear layers without biases, with ReLU between the layers.
+class ReluMLP(nn.Sequential):
+    """Linear layers without biases, with Glorot-uniform weights and ReLU between the layers.
 
     Args:
-        inputs: one or several inputs, which are concatenated.
-        weights: matrix [outputs, inputs] of each layer.
-        dtype: number format of the matrix products.
+        widths: numbers of inputs, of units of each hidden layer, and of outputs.
+        precision: number format of the matrix products. None selects bfloat16 if the device has units for bfloat16,
+            else float32.
     """
-    parts = [inputs] if isinstance(inputs, Tensor) else inputs
+
+    def __init__(self, *widths: int, precision: Literal["bfloat16", "float32"] | None = None) -> None:
+        layers: list[nn.Module] = []
+        for num_inputs, num_outputs in pairwise(widths):
+            linear = nn.Linear(num_inputs, num_outputs, bias=False)
+            nn.init.xavier_uniform_(linear.weight)
+            layers += [linear, nn.ReLU()]
+        super().__init__(*layers[:-1])
+        self.precision = precision
+
+    def forward(self, *inputs: Float[Tensor, "points _"]) -> Float[Tensor, "points O"]:
+        """Apply the layers to one or several inputs, which are concatenated."""
+        rounds = fast_bfloat16(inputs[0].device.type) if self.precision is None else self.precision == "bfloat16"
+        return relu_mlp(list(inputs), [self[i].weight for i in range(0, len(self), 2)], rounds)
+
+
+def _in_torch(inputs: list[Tensor], weights: list[Tensor], rounds: bool) -> Tensor:
+    with torch.autocast(inputs[0].device.type, torch.bfloat16, enabled=rounds):
+        values = torch.cat([part.to(inputs[0].dtype) for part in inputs], dim=-1)
+        for weight in weights[:-1]:
+            values = F.relu(F.linear(values, weight))
+        return F.linear(values, weights[-1])
+
+
+def _on_cpu(inputs: list[Tensor], weights: list[Tensor], rounds: bool) -> Tensor:
     with torch.autocast("cpu", enabled=False):
-        return _ReluMLP.apply(dtype, len(parts), *parts, *weights)
+        return _ReluMLP.apply(torch.bfloat16 if rounds else torch.float32, len(inputs), *inputs, *weights)
+
+
+# Applies linear layers without biases to inputs [points, _], which are concatenated, with ReLU between the layers.
+# Weights are matrices [outputs, inputs], and `rounds` selects bfloat16 for the matrix products.
+relu_mlp = operator("relu_mlp(Tensor[] inputs, Tensor[] weights, bool rounds) -> Tensor", _in_torch, _on_cpu)
 
 
 class _ReluMLP(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, dtype: torch.dtype, num_parts: int, *tensors: Tensor) -> Float[Tensor, "points O"]:
+    def forward(ctx: Any, dtype: torch.dtype, num_parts: int, *tensors: Tensor) -> Tensor:
         parts, weights = tensors[:num_parts], tensors[num_parts:]
         layers = [weight.to(dtype) for weight in weights]
-        num_points, learns = len(parts[0]), any(ctx.needs_input_grad)
-        num_rows = -(-num_points // _STEP) * _STEP
-        # Without gradients, all blocks share the memory of one block, which stays in the CPU's cache.
-        kept = num_rows if learns else min(num_rows, _BLOCK)
-        activations = [parts[0].new_zeros(kept, sum(part.shape[1] for part in parts), dtype=dtype)]
-        activations += [parts[0].new_empty(kept, len(layer), dtype=dtype) for layer in layers[:-1]]
-        result = parts[0].new_empty(num_rows, len(layers[-1]), dtype=dtype)
-
-        def evaluate(number: int) -> None:
-            first = number * _BLOCK
-            of_block = result[first : first + _BLOCK]
-            joined, *hidden = (a.narrow(0, first if learns else 0, len(of_block)) for a in activations)
-            start, size = 0, min(num_points - first, _BLOCK)
-            for part in parts:
-                joined[:size, start : start + part.shape[1]] = part[first : first + size]
-                start += part.shape[1]
-            for rows, layer, product in zip([joined, *hidden], layers, [*hidden, of_block], strict=True):
-                torch.mm(rows, layer.t(), out=product)
-                if product is not of_block:
-                    _comparable(product).relu_()
-
-        num_blocks = -(-num_rows // _BLOCK)
-        if learns:
-            share(evaluate, num_blocks)
-            ctx.save_for_backward(*activations, *layers)
-        else:
-            for number in range(num_blocks):
-                evaluate(number)
         ctx.parts, ctx.weight_dtype = [(part.shape[1], part.dtype) for part in parts], weights[0].dtype
-        return result[:num_points]
+        if not any(ctx.needs_input_grad):
+            return _evaluated(parts, layers)[: len(parts[0])]
+        result, *activations = _evaluated_and_kept(parts, layers)
+        ctx.save_for_backward(*activations, *layers)
+        return result[: len(parts[0])]
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Float[Tensor, "points O"]) -> tuple[Tensor | None, ...]:
         num_layers = len(ctx.saved_tensors) // 2
         activations, layers = ctx.saved_tensors[:num_layers], ctx.saved_tensors[num_layers:]
-        num_points, wanted, num_blocks = len(gradient), ctx.needs_input_grad[2:], -(-len(activations[0]) // _BLOCK)
-        weights_learn = any(wanted[len(ctx.parts) :])
-        inputs = layers[0].split([width for width, _ in ctx.parts], 1)
+        wanted, widths = ctx.needs_input_grad[2:], [width for width, _ in ctx.parts]
+        parts_learn, weights_learn = wanted[: len(widths)], any(wanted[len(widths) :])
+        gradients = _differentiated(gradient, activations, layers, widths, parts_learn, weights_learn, ctx.weight_dtype)
         of_parts = [
-            gradient.new_empty(num_points, width, dtype=dtype) if wanted[i] else None
-            for i, (width, dtype) in enumerate(ctx.parts)
+            of_part.to(dtype) if learns else None
+            for of_part, (_, dtype), learns in zip(gradients, ctx.parts, parts_learn, strict=False)
         ]
-
-        def differentiate(number: int) -> list[Tensor]:
-            rows = [values[number * _BLOCK : (number + 1) * _BLOCK] for values in activations]
-            points = slice(number * _BLOCK, min((number + 1) * _BLOCK, num_points))
-            of_block = F.pad(gradient[points], (0, 0, 0, len(rows[0]) - (points.stop - points.start)))
-            of_weights = []
-            for i in reversed(range(num_layers)):
-                if weights_learn:
-                    of_weights.append(_product_of_columns(of_block, rows[i]).to(ctx.weight_dtype))
-                if i > 0:
-                    of_block = of_block @ layers[i]
-                    bits = _comparable(of_block)
-                    torch.ops.aten.threshold_backward.grad_input(bits, _comparable(rows[i]), 0, grad_input=bits)
-            for of_part, columns in zip(of_parts, inputs, strict=True):
-                if of_part is not None:
-                    of_part[points] = (of_block @ columns)[: points.stop - points.start]
-            return of_weights[::-1]
-
-        of_blocks = share(differentiate, max(1, num_blocks))
         if not weights_learn:
             return None, None, *of_parts, *[None] * num_layers
-        return None, None, *of_parts, *(torch.stack(of_layer).sum(0) for of_layer in zip(*of_blocks, strict=True))
+        return None, None, *of_parts, *gradients[len(widths) :]
+
+
+def _evaluate(parts: Sequence[Tensor], layers: Sequence[Tensor], keep: bool) -> list[Tensor]:
+    """Return the result and the inputs of all layers, with rows of zeros that pad the points.
+
+    Without `keep`, all blocks share the memory of the inputs of one block, which stays in the CPU's cache.
+    """
+    num_points, num_rows = len(parts[0]), _num_rows(parts)
+    kept = num_rows if keep else min(num_rows, _BLOCK)
+    activations = [parts[0].new_zeros(kept, sum(part.shape[1] for part in parts), dtype=layers[0].dtype)]
+    activations += [parts[0].new_empty(kept, len(layer), dtype=layer.dtype) for layer in layers[:-1]]
+    result = parts[0].new_empty(num_rows, len(layers[-1]), dtype=layers[-1].dtype)
+
+    def evaluate(number: int) -> None:
+        first = number * _BLOCK
+        of_block = result[first : first + _BLOCK]
+        joined, *hidden = (a.narrow(0, first if keep else 0, len(of_block)) for a in activations)
+        start, size = 0, min(num_points - first, _BLOCK)
+        for part in parts:
+            joined[:size, start : start + part.shape[1]] = part[first : first + size]
+            start += part.shape[1]
+        for rows, layer, product in zip([joined, *hidden], layers, [*hidden, of_block], strict=True):
+            torch.mm(rows, layer.t(), out=product)
+            if product is not of_block:
+                _comparable(product).relu_()
+
+    num_blocks = -(-num_rows // _BLOCK)
+    if keep:
+        share(evaluate, num_blocks)
+    else:
+        for number in range(num_blocks):
+            evaluate(number)
+    return [result, *activations]
+
+
+def _num_rows(parts: Sequence[Tensor]) -> int:
+    return -(-len(parts[0]) // _STEP) * _STEP
+
+
+def _shapes(parts: list[Tensor], layers: list[Tensor]) -> list[Tensor]:
+    widths = [len(layers[-1]), sum(part.shape[1] for part in parts), *(len(layer) for layer in layers[:-1])]
+    return [parts[0].new_empty(_num_rows(parts), width, dtype=layers[0].dtype) for width in widths]
+
+
+@cpu_operator(
+    "relu_mlp_forward(Tensor[] parts, Tensor[] layers) -> Tensor", lambda parts, layers: _shapes(parts, layers)[0]
+)
+def _evaluated(parts: list[Tensor], layers: list[Tensor]) -> Tensor:
+    return _evaluate(parts, layers, False)[0]
+
+
+@cpu_operator("relu_mlp_kept(Tensor[] parts, Tensor[] layers) -> Tensor[]", _shapes)
+def _evaluated_and_kept(parts: list[Tensor], layers: list[Tensor]) -> list[Tensor]:
+    return _evaluate(parts, layers, True)
+
+
+def _shapes_of_gradients(
+    gradient: Tensor, activations: list[Tensor], layers: list[Tensor], widths: list[int],
+    parts_learn: list[bool], weights_learn: bool, weight_type: torch.dtype,
+) -> list[Tensor]:  # fmt: skip
+    of_parts = [
+        gradient.new_empty(len(gradient), width if learns else 0)
+        for width, learns in zip(widths, parts_learn, strict=True)
+    ]
+    return of_parts + [torch.empty_like(layer, dtype=weight_type) for layer in layers if weights_learn]
+
+
+@cpu_operator(
+    "relu_mlp_backward(Tensor gradient, Tensor[] activations, Tensor[] layers, int[] widths, bool[] parts_learn, "
+    "bool weights_learn, ScalarType weight_type) -> Tensor[]",
+    _shapes_of_gradients,
+)
+def _differentiated(
+    gradient: Tensor, activations: list[Tensor], layers: list[Tensor], widths: list[int],
+    parts_learn: list[bool], weights_learn: bool, weight_type: torch.dtype,
+) -> list[Tensor]:  # fmt: skip
+    """Return the gradients of the parts, which are empty for parts that do not learn, and those of the weights."""
+    num_points, num_layers, num_blocks = len(gradient), len(layers), -(-len(activations[0]) // _BLOCK)
+    inputs = layers[0].split(widths, 1)
+    of_parts = _shapes_of_gradients(gradient, [], [], widths, parts_learn, False, weight_type)
+
+    def differentiate(number: int) -> list[Tensor]:
+        rows = [values[number * _BLOCK : (number + 1) * _BLOCK] for values in activations]
+        points = slice(number * _BLOCK, min((number + 1) * _BLOCK, num_points))
+        of_block = F.pad(gradient[points], (0, 0, 0, len(rows[0]) - (points.stop - points.start)))
+        of_weights = []
+        for i in reversed(range(num_layers)):
+            if weights_learn:
+                of_weights.append(_product_of_columns(of_block, rows[i]).to(weight_type))
+            if i > 0:
+                of_block = of_block @ layers[i]
+                bits = _comparable(of_block)
+                torch.ops.aten.threshold_backward.grad_input(bits, _comparable(rows[i]), 0, grad_input=bits)
+        for of_part, columns, learns in zip(of_parts, inputs, parts_learn, strict=True):
+            if learns:
+                of_part[points] = (of_block @ columns)[: points.stop - points.start]
+        return of_weights[::-1]
+
+    of_blocks = share(differentiate, max(1, num_blocks))
+    return of_parts + [torch.stack(of_layer).sum(0) for of_layer in zip(*of_blocks, strict=True)]
 
 
 def _comparable(values: Tensor) -> Tensor:

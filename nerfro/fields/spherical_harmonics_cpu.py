@@ -11,7 +11,9 @@ from numba import prange
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from nerfro.fields import spherical_harmonics as reference
 from nerfro.kernels.compilation import compiled_parallel
+from nerfro.kernels.operators import kernel, operator
 
 # The reference's factors, by degree.
 _C0, _C1 = np.float32(0.28209479177387814), np.float32(0.4886025119029199)
@@ -23,29 +25,46 @@ _ONE, _TWO, _THREE, _FIVE, _SIX = np.float32(1), np.float32(2), np.float32(3), n
 _TEN, _FIFTEEN = np.float32(10), np.float32(15)
 
 
-def spherical_harmonics(directions: Float[Tensor, "directions 3"], num_bands: int) -> Float[Tensor, "directions bases"]:
-    """Evaluate `nerfro.fields.spherical_harmonics.spherical_harmonics` on the CPU."""
-    return _Harmonics.apply(directions.float().contiguous(), num_bands)
-
-
 class _Harmonics(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: Any, directions: Float[Tensor, "directions 3"], num_bands: int
-    ) -> Float[Tensor, "directions bases"]:
+    def forward(ctx: Any, directions: Tensor, num_bands: int) -> Tensor:
         ctx.save_for_backward(directions)
         ctx.num_bands = num_bands
-        values = torch.empty(len(directions), num_bands**2)
-        _harmonics(directions.detach().numpy(), num_bands, values.numpy())
-        return values
+        return _evaluate(directions, num_bands)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Float[Tensor, "directions bases"]) -> tuple[Float[Tensor, "directions 3"], None]:
-        (directions,) = ctx.saved_tensors
-        of_directions = torch.zeros_like(directions)
-        _backward(directions.detach().numpy(), gradient.contiguous().numpy(), ctx.num_bands, of_directions.numpy())
-        return of_directions, None
+        return _gradient(*ctx.saved_tensors, gradient, ctx.num_bands), None
+
+
+spherical_harmonics = operator(
+    "spherical_harmonics(Tensor directions, int num_bands) -> Tensor",
+    reference.spherical_harmonics,
+    lambda directions, num_bands: _Harmonics.apply(directions.float().contiguous(), num_bands),
+)
+
+
+@kernel(
+    "spherical_harmonics_forward(Tensor directions, int num_bands) -> Tensor",
+    lambda directions, num_bands: directions.new_empty(len(directions), num_bands**2),
+)
+def _evaluate(directions: Float[np.ndarray, "directions 3"], num_bands: int) -> Float[np.ndarray, "directions bases"]:
+    values = np.empty((len(directions), num_bands**2), directions.dtype)
+    _harmonics(directions, num_bands, values)
+    return values
+
+
+@kernel(
+    "spherical_harmonics_backward(Tensor directions, Tensor gradient, int num_bands) -> Tensor",
+    lambda directions, gradient, num_bands: torch.empty_like(directions),
+)
+def _gradient(
+    directions: Float[np.ndarray, "directions 3"], gradient: Float[np.ndarray, "directions bases"], num_bands: int
+) -> Float[np.ndarray, "directions 3"]:
+    of_directions = np.zeros_like(directions)
+    _backward(directions, gradient, num_bands, of_directions)
+    return of_directions
 
 
 @compiled_parallel

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import re
 from collections.abc import Iterator
@@ -63,6 +64,7 @@ def number_in(file: Path, pattern: str, unit: int = 1, default: float = 0) -> fl
     return default if match is None else int(match[1]) * unit
 
 
+@functools.cache
 def fast_bfloat16(device: str) -> bool:
     """Return whether matrix products in bfloat16 are faster than in float32 on a device: `cpu`, `cuda`, ...
 

@@ -17,10 +17,11 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+import torch
 
 from nerfro.core.errors import warn
 from nerfro.core.paths import cache_dir
-from nerfro.kernels.threads import num_threads, parallel_threads
+from nerfro.kernels.threads import parallel_threads
 
 _KERNEL_BYTES = 2**24  # free disk space for the machine code of a kernel
 Function = TypeVar("Function", bound=Callable)
@@ -50,7 +51,7 @@ def compiled_parallel(function: Function) -> Function:
 
     @functools.wraps(function)
     def run(*arguments: Any) -> Any:
-        if num_threads() == 1:
+        if 1 in (torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS):  # type: ignore[attr-defined]
             return serial(*arguments)
         with parallel_threads():
             return parallel(*arguments)

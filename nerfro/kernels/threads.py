@@ -31,6 +31,9 @@ def share(task: Callable[[int], Result], number: int) -> list[Result]:
     Returns:
         Results in the order of the numbers.
     """
+    if number == 1:
+        with torch.no_grad():
+            return [task(0)]
     results: dict[int, Result] = {}
     numbers = iter(range(number))
 
@@ -41,7 +44,7 @@ def share(task: Callable[[int], Result], number: int) -> list[Result]:
             for i in numbers:
                 results[i] = task(i)
 
-    begun = [thread.submit(work) for thread in HELPERS if number > 1]
+    begun = [thread.submit(work) for thread in HELPERS]
     try:
         work()
     finally:

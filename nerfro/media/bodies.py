@@ -253,9 +253,10 @@ class Bodies(Medium):
 
     def with_absorption(self, path: Path) -> Path:
         of_bodies = self.absorption
-        if of_bodies is None:
+        if of_bodies is None or path.record is None:
             return path
-        return replace(path, absorption=torch.cat([torch.zeros_like(of_bodies[:1]), of_bodies]).to(path.s))
+        absorption = torch.cat([torch.zeros_like(of_bodies[:1]), of_bodies]).to(path.s)
+        return replace(path, record=replace(path.record, absorption=absorption))
 
     def parameters_by_name(self) -> dict[str, nn.Parameter]:
         others = super().parameters_by_name()

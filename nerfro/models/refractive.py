@@ -4,11 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from jaxtyping import Bool
-from torch import Tensor
-
-from nerfro.core.draws import Draws
-from nerfro.core.types import Path, Rendering
+from nerfro.core.types import Batch, Path, Rendering
 from nerfro.registry.registration import register
 from nerfro.rendering import Components, Renderer, composite
 
@@ -18,8 +14,8 @@ class RefractiveModel(Renderer):
     """Render bent rays with one radiance field for each sampling level, and a background (paper, section 2).
 
     Args:
-        background_direction: direction of the background radiance: the `exit` direction of the path, or the direction of
-            the `last_coarse` sample, as in the authors' code.
+        background_direction: direction of the background radiance: the `exit` direction of the path, or that of the
+            `last_coarse` sample, as in the authors' code.
         colour: colour space in which fields and background return radiance and rays sum radiance: `linear`, or `srgb`
             as in the authors' code.
     """
@@ -35,14 +31,12 @@ class RefractiveModel(Renderer):
         super().__init__(components, components.point_sampler.num_levels, colour)
         self.background_direction = background_direction
 
-    def render_path(
-        self, path: Path, draws: Draws | None = None, teaches_background: Bool[Tensor, "R"] | None = None
-    ) -> list[Rendering]:
-        samples = self.point_sampler(path, None, draws)
+    def render_path(self, path: Path, batch: Batch | None = None) -> list[Rendering]:
+        samples = self.sample(path, None, batch)
         directions = None if self.background_direction == "exit" else samples.directions[:, -1]
-        background_radiance = self.background(path, teaches_background, directions)
+        background_radiance = self.background(path, batch, directions)
         renderings = [composite(samples, self.scene.fields[0](samples), background_radiance, path)]
         for field in self.scene.fields[1:]:
-            samples = self.point_sampler(path, renderings[-1], draws)
+            samples = self.sample(path, renderings[-1], batch)
             renderings.append(composite(samples, field(samples), background_radiance, path))
         return renderings

@@ -15,6 +15,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from nerfro.kernels.operators import operator
+
 # oneDNN compiles and caches a program for each number of rows, so numbers that vary from step to step are left to MKL.
 _ROWS = 512
 
@@ -34,20 +36,31 @@ def linear(
 
     Large inputs are multiplied by oneDNN on processors with AVX-512.
     """
+    return (_in_torch if torch.compiler.is_compiling() else _linear)(weight, bias, list(inputs))
+
+
+def _in_torch(weight: Tensor, bias: Tensor, inputs: list[Tensor]) -> Tensor:
     first, *others = inputs
-    if torch.compiler.is_compiling() or not _suits_onednn(first):
-        joined = torch.cat([first, *(other.to(first.dtype) for other in others)], -1) if others else first
-        return nn.functional.linear(joined, weight, bias)
+    joined = torch.cat([first, *(other.to(first.dtype) for other in others)], -1) if others else first
+    return nn.functional.linear(joined, weight, bias)
+
+
+def _on_cpu(weight: Tensor, bias: Tensor, inputs: list[Tensor]) -> Tensor:
+    first = inputs[0]
+    if not _suits_onednn(first):
+        return _in_torch(weight, bias, inputs)
     result = _Linear.apply(weight, bias, *(part.reshape(-1, part.shape[-1]) for part in inputs))
     # PyTorch would copy a view before an operator in place.
     return result if first.ndim == 2 else result.view(*first.shape[:-1], len(weight))
 
 
+_linear = operator("linear(Tensor weight, Tensor bias, Tensor[] inputs) -> Tensor", _in_torch, _on_cpu)
+
+
 def _suits_onednn(x: Float[Tensor, "*batch I"]) -> bool:
     num_rows = math.prod(x.shape[:-1])
     return (
-        x.device.type == "cpu"
-        and x.dtype == torch.float32
+        x.dtype == torch.float32
         and not torch.is_autocast_enabled("cpu")
         and num_rows > 0
         and num_rows % _ROWS == 0

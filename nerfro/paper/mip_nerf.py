@@ -8,11 +8,10 @@ from __future__ import annotations
 
 from typing import Literal
 
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.core.draws import Draws
-from nerfro.core.types import FieldValues, Path, Rendering, Samples
+from nerfro.core.types import Batch, FieldValues, Path, Rendering, Samples
 from nerfro.geometry.space import Space
 from nerfro.paper.encoding import DIRECTION_DEGREE, integrated_positional_encoding, positional_encoding
 from nerfro.paper.mlp import RadianceMLP, in_blocks
@@ -96,13 +95,11 @@ class MipNerfModel(Renderer):
     def __init__(self, components: Components, colour: Literal["linear", "srgb"] = "linear") -> None:
         super().__init__(components, 1, colour)
 
-    def render_path(
-        self, path: Path, draws: Draws | None = None, teaches_background: Bool[Tensor, "R"] | None = None
-    ) -> list[Rendering]:
-        background_radiance = self.background(path, teaches_background)
+    def render_path(self, path: Path, batch: Batch | None = None) -> list[Rendering]:
+        background_radiance = self.background(path, batch)
         (field,) = self.scene.fields
         renderings: list[Rendering] = []
         for _ in range(self.point_sampler.num_levels):
-            samples = self.point_sampler(path, renderings[-1] if renderings else None, draws)
+            samples = self.sample(path, renderings[-1] if renderings else None, batch)
             renderings.append(composite(samples, field(samples), background_radiance, path))
         return renderings

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
 from typing import Annotated
 
 import numpy as np
@@ -17,7 +16,7 @@ from nerfro.geometry.interpolation import neighbours, smooth, trilinear
 from nerfro.geometry.mesh import local_origin, require_inside
 from nerfro.geometry.occupancy import occupancy_fraction
 from nerfro.geometry.signed_distance import distance_to_set
-from nerfro.kernels.arrays import arrays, input_arrays
+from nerfro.kernels.arrays import input_arrays
 from nerfro.kernels.available import require_bytes
 from nerfro.kernels.constants import constant
 from nerfro.media.base import Medium, Scalars, Vectors
@@ -54,6 +53,7 @@ class VoxelGrid(Medium):
     # Lower bound of the distance to the next cell with grad n != 0, for any point of each cell, world units.
     clearance_grid: Float[Tensor, "x y z"]
     occupancy: Float[Tensor, "X Y Z"]  # fraction inside the mesh, before smoothing
+    _on_host: tuple[Tensor, list[np.ndarray]] | None = None
 
     def __init__(
         self,
@@ -133,13 +133,10 @@ class VoxelGrid(Medium):
     @property
     def host_arrays(self) -> list[np.ndarray]:
         """Table and clearance grid in the memory of the host."""
-        on_cpu = self.table.device.type == "cpu"
-        return arrays(self.table, self.clearance_grid) if on_cpu else self._copied
-
-    @cached_property
-    def _copied(self) -> list[np.ndarray]:
-        # The arrays of 256^3 vertices have 340 MB, so a copy for each batch would be slow.
-        return input_arrays(self.table, self.clearance_grid)
+        # The arrays of 256^3 vertices have 340 MB, so a copy from a GPU for each batch would be slow.
+        if self._on_host is None or self._on_host[0] is not self.table:
+            self._on_host = self.table, input_arrays(self.table, self.clearance_grid)
+        return self._on_host[1]
 
     @property
     def spacing(self) -> Float[Tensor, "3"]:

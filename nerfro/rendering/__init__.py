@@ -2,7 +2,8 @@
 
 from nerfro.rendering.colour_space import ColourSpace
 from nerfro.rendering.compositing import composite
+from nerfro.rendering.ray_tracer import RayTracer
 from nerfro.rendering.renderer import Components, RenderedRays, Renderer
 from nerfro.rendering.scene import Scene
 
-__all__ = ["ColourSpace", "Components", "RenderedRays", "Renderer", "Scene", "composite"]
+__all__ = ["ColourSpace", "Components", "RayTracer", "RenderedRays", "Renderer", "Scene", "composite"]

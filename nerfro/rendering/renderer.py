@@ -15,9 +15,8 @@ from torch import Tensor, nn
 from nerfro.backgrounds.base import Background, background_radiance
 from nerfro.camera.base import CameraModel
 from nerfro.camera.given import GivenCamera
-from nerfro.core.draws import Draws
 from nerfro.core.rays import Rays
-from nerfro.core.types import Exits, Path, Rendering
+from nerfro.core.types import Batch, Exits, Path, Rendering, Samples
 from nerfro.data.component import Component
 from nerfro.fields.base import Field
 from nerfro.geometry.interpolation import intersect_box
@@ -104,15 +103,12 @@ class Renderer(Component, nn.Module, ABC):
         self.chunk_size = components.chunk_size
 
     @abstractmethod
-    def render_path(
-        self, path: Path, draws: Draws | None = None, teaches_background: Bool[Tensor, "R"] | None = None
-    ) -> list[Rendering]:
-        """Render paths: sample them, query the scene's fields and background, and composite.
+    def render_path(self, path: Path, batch: Batch | None = None) -> list[Rendering]:
+        """Render paths: sample them, query the scene's fields and background, and composite; see `sample`.
 
         Args:
             path: P polylines of R rays.
-            draws: random numbers of a training step; None in evaluation, which is deterministic.
-            teaches_background: rays from which the background learns; None for all. See `background`.
+            batch: batch of a training step with these rays; None in evaluation, which is deterministic.
 
         Returns:
             One rendering for each sampling level, the finest one last.
@@ -134,27 +130,45 @@ class Renderer(Component, nn.Module, ABC):
         own = {name: value for name, value in self.named_parameters() if not name.startswith("scene.")}
         return self.scene.parameters_by_name() | own
 
-    def forward(self, rays: Rays, draws: Draws | None = None) -> list[Rendering]:
+    def forward(self, rays: Rays) -> list[Rendering]:
         """Trace rays and render their paths, one rendering for each sampling level."""
-        return self.render_path(self.trace(rays), draws)
+        return self.render_path(self.trace(rays))
+
+    def render_batch(self, batch: Batch) -> list[Rendering]:
+        """Render the rays of a training step, with the exposures of their photographs."""
+        renderings = self.render_path(self.trace(batch.rays, batch.path), batch)
+        gains = self.scene.camera.gains(batch.ray_view)
+        return renderings if gains is None else [rendering.exposed(gains) for rendering in renderings]
+
+    def sample(self, path: Path, previous: Rendering | None = None, batch: Batch | None = None) -> Samples:
+        """Choose the samples of a level, unless they were chosen with the paths of the batch.
+
+        Args:
+            path: P polylines of R rays.
+            previous: rendering of the previous level; None at the first level.
+            batch: batch of a training step with these rays; None in evaluation.
+        """
+        if batch is None or batch.samples is None or previous is not None:
+            return self.point_sampler(path, previous, None if batch is None else batch.draws)
+        return batch.samples.on(path) if path.positions.requires_grad else batch.samples
 
     def background(
-        self,
-        path: Path,
-        teaches_background: Bool[Tensor, "R"] | None = None,
-        directions: Float[Tensor, "P 3"] | None = None,
+        self, path: Path, batch: Batch | None = None, directions: Float[Tensor, "P 3"] | None = None
     ) -> Float[Tensor, "P 3"]:
         """Evaluate the background radiance in the exit directions of polylines, or in other `directions`.
 
         Args:
             path: P polylines of R rays.
-            teaches_background: rays from which the background learns; None for all.
+            batch: batch of a training step with these rays, which selects the rays from which the background learns;
+                None for all.
             directions: unit directions that replace the exit directions.
 
         Returns:
             Background radiance of each polyline, in the colour space of the scene.
         """
-        teaches = None if teaches_background is None else path.broadcast_to_polylines(teaches_background)
+        teaches = None
+        if batch is not None:
+            teaches = path.broadcast_to_polylines(batch.teaches_background[batch.ray_pixel])
         return background_radiance(self.scene.background, path.exits(directions), teaches)
 
     def trace(self, rays: Rays, path: Path | None = None) -> Path:

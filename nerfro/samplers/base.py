@@ -96,13 +96,13 @@ class PointSampler(Component, nn.Module, ABC):
             Samples in ascending arc length; `Samples.along` looks up positions and directions on the path.
         """
 
-    def choose_ahead(self, path: Path, draws: Draws) -> Path:
-        """Return a traced path with the samples of its first level, or the path itself to sample it in the step.
+    def choose_ahead(self, path: Path, draws: Draws) -> Samples | None:
+        """Return the samples of the first level of a traced path, or None to choose them in the step.
 
         A thread may choose the samples of the next step during a step, so they may depend on the state that
         `update` updates, but on no learned parameter.
         """
-        return path
+        return None
 
     def update(self, fields: Sequence[Field], draws: Draws) -> None:
         """Update the state of the sampler before a training step, except the first.

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Optional
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from nerfro.core.cameras import Cameras
@@ -19,12 +19,9 @@ from nerfro.core.rays import Rays
 from nerfro.core.types import Path
 from nerfro.registry.allowed import Natural, NotNegative, Positive, Side, checked
 
-Trace = Callable[[Rays, Int[Tensor, "R"]], Path]  # traces rays of views
-TraceExits = Callable[[Rays, Int[Tensor, "R"]], Float[Tensor, "R 3"]]  # traces their exit directions alone
-
-# Offset to the neighbouring ray along both axes, in pixels: one pixel along the diagonal, so that edges along rows and
-# columns are detected equally.
-_TO_NEIGHBOUR = math.sqrt(0.5)
+# Position of the neighbouring ray in a pixel along both axes: one pixel along the diagonal from the centre, so that
+# edges along rows and columns are detected equally.
+NEIGHBOUR = 0.5 + math.sqrt(0.5)
 # Smallest angle between the exit directions of neighbouring rays, in pixel angles, for which a pixel shows a mean over
 # distant directions.
 DIVERGENT = 8.0
@@ -62,69 +59,6 @@ class SubdivisionChanges:
     contrast: Optional[Positive] = None  # noqa: UP045 - minimum difference of a channel for which pixels are divided
 
 
-@dataclass(frozen=True)
-class PixelRays:
-    """Rays through pixels, one or several for each; rays of undivided pixels come first.
-
-    Attributes:
-        rays: R rays.
-        path: path of each ray; None without tracing.
-        ray_pixel: pixel of each ray, as an index of the given pixels.
-        part: number of the ray within the pixel.
-        diverges: pixels whose neighbouring rays diverge by at least `DIVERGENT` pixel angles; none if no pixel may be
-            divided.
-    """
-
-    rays: Rays
-    path: Path | None
-    ray_pixel: Int[Tensor, "R"]
-    part: Int[Tensor, "R"]
-    diverges: Bool[Tensor, "Q"]
-
-
-def subdivide(
-    cameras: Cameras,
-    pixels: Int[Tensor, "Q"],
-    subdivision: Subdivision,
-    trace: Trace | None,
-    trace_exits: TraceExits | None,
-    contrasts: Callable[[Int[Tensor, " subset"]], Float[Tensor, " subset"]] | None,
-) -> PixelRays:
-    """Trace rays through pixels, several for pixels that one ray does not represent.
-
-    Args:
-        cameras: cameras of all views.
-        pixels: numbers of the pixels.
-        subdivision: criteria for the division of pixels.
-        trace: traces rays, given the view of each ray; None disables tracing and division.
-        trace_exits: traces the exit direction of each ray's main polyline; None uses `trace`.
-        contrasts: contrast of the pixels in given rows of `pixels`; None disables the criterion.
-    """
-    view, num_parts = cameras.view_of(pixels), subdivision.side**2
-    rays = pixel_rays(cameras, pixels)
-    path = None if trace is None else trace(rays, view)
-    if trace is None or path is None or num_parts == 1:
-        every = torch.arange(len(pixels), device=pixels.device)
-        return PixelRays(rays, path, every, torch.zeros_like(every), torch.zeros_like(every, dtype=torch.bool))
-    trace_exits = trace_exits or (lambda rays, view: main_exits(trace(rays, view)))
-    exits, neighbours = main_exits(path), trace_exits(neighbour_rays(cameras, pixels), view)
-    angle = divergence(cameras, pixels, exits, neighbours)
-    divided = angle >= subdivision.divergence
-    if contrasts is not None and subdivision.contrast is not None:
-        rows = (path.main_polyline(path.refracted) & ~divided).nonzero()[:, 0]
-        divided = divided.index_put((rows,), contrasts(rows) >= subdivision.contrast)
-    whole, parted = (~divided).nonzero()[:, 0], divided.nonzero()[:, 0]
-    parts, pixel = part_rays(cameras, pixels[parted], subdivision.side), parted.repeat_interleave(num_parts)
-    part = torch.arange(num_parts, device=pixels.device).repeat(len(parted))
-    return PixelRays(
-        rays=Rays.joined([rays[whole], parts]),
-        path=Path.joined([path.select_rays(whole), trace(parts, view[pixel])]),
-        ray_pixel=torch.cat([whole, pixel]),
-        part=torch.cat([torch.zeros_like(whole), part]),
-        diverges=angle >= DIVERGENT,
-    )
-
-
 def pixel_rays(
     cameras: Cameras, pixels: Int[Tensor, "R"], place: Float[Tensor, "R 2"] | Float[Tensor, "2"] | None = None
 ) -> Rays:
@@ -143,7 +77,7 @@ def part_rays(cameras: Cameras, pixels: Int[Tensor, "Q"], side: int) -> Rays:
 
 def neighbour_rays(cameras: Cameras, pixels: Int[Tensor, "R"]) -> Rays:
     """Make the neighbours of the rays of `pixel_rays`, one pixel along the diagonal."""
-    return pixel_rays(cameras, pixels, torch.full((2,), 0.5 + _TO_NEIGHBOUR, device=pixels.device))
+    return pixel_rays(cameras, pixels, torch.full((2,), NEIGHBOUR, device=pixels.device))
 
 
 def main_exits(path: Path) -> Float[Tensor, "R 3"]:

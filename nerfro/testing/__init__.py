@@ -42,13 +42,13 @@ from nerfro.media.surface import Grid, Surface
 from nerfro.media.surfaces.ball import BallSurface
 from nerfro.models.refractive import RefractiveModel
 from nerfro.registry.registration import Plugin, build
-from nerfro.rendering import Components, Renderer, composite
+from nerfro.rendering import Components, RayTracer, Renderer, composite
 from nerfro.samplers.base import PathSampler, PointSampler
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.paths.straight import Straight
 from nerfro.samplers.points.stratified import Stratified, point_samples
 from nerfro.training.phases.base import Phase, TrainingRun
-from nerfro.training.ray_batches import RayBatches
+from nerfro.training.pixel_batches import PixelBatches
 from nerfro.viewing.exports import ExportConfig, export_of
 from nerfro.viewing.trained_scene import TrainedScene
 
@@ -170,9 +170,9 @@ def example_run() -> TrainingRun:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         model = RefractiveModel(replace(example_components(), background=EnvironmentMap([8])))
-    batches = RayBatches(example_views(), NUM_RAYS, "all_images")
+    batches = PixelBatches(example_views(), NUM_RAYS, "all_images")
     optimizer = torch.optim.Adam(model.parameters_by_name().values())
-    return TrainingRun(model, batches, example_views(), optimizer, spent=0.0)
+    return TrainingRun(model, batches, RayTracer(model), example_views(), optimizer, spent=0.0)
 
 
 class _ExampleData(DataSource):

@@ -7,17 +7,17 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
-from lightning.pytorch import seed_everything
+from lightning.pytorch import Trainer, seed_everything
 from omegaconf import DictConfig
 
 from nerfro.cli.calls import Composition, composed
 from nerfro.cli.overrides import as_overrides
 from nerfro.core.errors import NerfroError, warn
 from nerfro.data.base import DataSource, Views
-from nerfro.rendering import Renderer
+from nerfro.rendering import RayTracer, Renderer
 from nerfro.rendering.scene_file import SceneFile, with_scene
 from nerfro.samplers.paths.thin_walls import warn_of_thin_walls
+from nerfro.samplers.subdivision import Subdivision
 from nerfro.training.config import (
     TrainConfig,
     build_data,
@@ -27,12 +27,12 @@ from nerfro.training.config import (
     check_run,
     resolve_trainer_options,
 )
-from nerfro.training.data_module import RayDataModule, traced
+from nerfro.training.data_module import RayDataModule
 from nerfro.training.derivation import derived
 from nerfro.training.effects import settings_without_effect
 from nerfro.training.memory import require_memory
 from nerfro.training.module import TrainingModule
-from nerfro.training.ray_batches import RayBatches
+from nerfro.training.pixel_batches import PixelBatches
 from nerfro.training.reach import CHECKED_RAYS, require_reach
 from nerfro.training.schedule import Schedule
 
@@ -124,7 +124,6 @@ class Training:
 def _build(config: DictConfig, source: DataSource, training: Views) -> tuple[DictConfig, TrainingModule, RayDataModule]:
     """Build the module and the data of a run, and derive its missing settings."""
     validation = source.load("val").checked() if config.evaluation.every > 0 and "val" in source.splits else None
-    batches = RayBatches.of(training, config)
     medium = build_medium(config)
     config = derived(config, medium, training)
     renderer = build_model(config, medium)
@@ -135,25 +134,29 @@ def _build(config: DictConfig, source: DataSource, training: Views) -> tuple[Dic
             f"{source.origin.tolist()}; a medium with an origin of its own must call its mesh file `mesh`"
         )
     data = RayDataModule(
-        traced(batches, renderer, config), validation, config.evaluation.every, config.trainer.overfit_batches
-    )
+        PixelBatches.of(training, config), validation, config.evaluation.every, config.trainer.overfit_batches,
+        Subdivision(**config.batches.subdivision),
+    )  # fmt: skip
     schedule = Schedule(build_each("phase", config.phase), training)
     return config, TrainingModule.of(renderer, config, [schedule], training.cameras), data
 
 
-def check_before_training(renderer: Renderer, batches: RayBatches, device: torch.device) -> str:
+def check_before_training(renderer: Renderer, data: RayDataModule, trainer: Trainer) -> str:
     """Refuse a run whose rays miss the field, or that needs more memory than is free; warn of thin walls.
 
     Args:
         renderer: the model.
-        batches: batches of this process.
-        device: training device.
+        data: data of the training.
+        trainer: Trainer of this process.
 
     Returns:
         The estimated memory in one line.
     """
-    few = batches.smaller(CHECKED_RAYS)
-    first = few.batch(0)
-    require_reach(renderer, few, first)
+    # The pixels are not kept, because the data module moves the pixels to the training device.
+    batches = data.batches_of(trainer)
+    few, tracer = batches.smaller(CHECKED_RAYS), RayTracer(renderer, data.subdivision)
+    first = tracer.trace(few.draw(0))
+    require_reach(renderer, few, tracer, first)
     warn_of_thin_walls(renderer.path_sampler, renderer.scene.medium)
-    return require_memory(renderer, first.rays, device, few.batch_size / batches.batch_size, batches.pixel_bytes)
+    device = trainer.strategy.root_device
+    return require_memory(renderer, first, device, few.batch_size / batches.batch_size, batches.pixel_bytes)

@@ -6,22 +6,20 @@ import itertools
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import replace
 from typing import Generic, TypeVar, cast
 
 import torch
 from jaxtyping import Float
 from lightning.pytorch import LightningDataModule, Trainer
-from omegaconf import DictConfig
 from torch import Tensor, nn
 
 from nerfro.core.types import Batch
 from nerfro.data.base import Views
 from nerfro.kernels.threads import HELPERS
-from nerfro.rendering import Renderer
+from nerfro.rendering import RayTracer, Renderer
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.training.module import TrainingModule
-from nerfro.training.ray_batches import RayBatches
+from nerfro.training.pixel_batches import PixelBatches
 from nerfro.training.validation import ValidationPixels
 
 # Number of validations for each validation image, so that the curve has more points; each costs a few steps.
@@ -47,13 +45,30 @@ class RayDataModule(LightningDataModule):
     its step begins, or one step ahead if no learned parameter bends paths. The rays of a
     batch are traced before the phases of its step: after a step of `phase=cameras`, one batch has paths of the previous
     cameras.
+
+    Args:
+        batches: pixels of each step.
+        validation: validation views; None for no validation.
+        every: number of steps between two validation images; 0 for never.
+        overfit_batches: number of batches that are repeated; 0 for new batches in all steps.
+        subdivision: criteria for several rays through a pixel; None for one ray.
+
+    Attributes:
+        tracer: traces the rays of the batches, once training begins.
     """
 
+    tracer: RayTracer
+
     def __init__(
-        self, batches: RayBatches, validation: Views | None = None, every: int = 0, overfit_batches: int = 0
+        self,
+        batches: PixelBatches,
+        validation: Views | None = None,
+        every: int = 0,
+        overfit_batches: int = 0,
+        subdivision: Subdivision | None = None,
     ) -> None:
         super().__init__()
-        self._overfit_batches = overfit_batches
+        self._overfit_batches, self.subdivision = overfit_batches, subdivision
         self.batches, self.validation, self.every = batches, validation, every
         self.validation_pixels = None if validation is None else ValidationPixels.of(validation)
         self._ahead: Prefetcher | None = None
@@ -62,13 +77,14 @@ class RayDataModule(LightningDataModule):
         assert self.trainer is not None  # attached by Lightning
         device, module = self.trainer.strategy.root_device, cast(TrainingModule, self.trainer.lightning_module)
         self.batches = self.batches_of(self.trainer).to(device, cast(torch.dtype, module.dtype))
+        self.tracer = RayTracer(module.renderer, self.subdivision)
         self.end_thread()
         if can_prefetch(module.renderer):
             self._ahead = Prefetcher(self._batch, spare_core=not multiplies_large_matrices(module.renderer))
         # Lightning calls this method after restoring a checkpoint, so a resumed run continues with the next batch.
         return itertools.count(self.trainer.global_step)
 
-    def batches_of(self, trainer: Trainer) -> RayBatches:
+    def batches_of(self, trainer: Trainer) -> PixelBatches:
         """Return the part of the batches that belongs to the process of a Trainer."""
         return self.batches.for_rank(trainer.global_rank, trainer.world_size)
 
@@ -80,24 +96,18 @@ class RayDataModule(LightningDataModule):
         assert self.trainer is not None
         assert self.validation_pixels is not None
         return self.validation_pixels.psnr(
-            cast(TrainingModule, self.trainer.lightning_module).renderer, self.batches.subdivision
+            cast(TrainingModule, self.trainer.lightning_module).renderer, self.subdivision
         )
 
     def transfer_batch_to_device(self, batch: int, device: torch.device, dataloader_idx: int) -> Batch | int:
         assert self.trainer is not None
         if not self.trainer.training:
             return batch  # the number of a validation view, or none
-        with torch.no_grad():
-            return self._batch(batch) if self._ahead is None else self._ahead(batch)
+        return self._batch(batch) if self._ahead is None else self._ahead(batch)
 
     def _batch(self, step: int) -> Batch:
-        """Make the batch of a step, and choose the samples on its paths."""
-        assert self.trainer is not None
-        batch = self.batches.batch(step % self._overfit_batches if self._overfit_batches else step)
-        if batch.path is None:
-            return batch
-        sampler = cast(TrainingModule, self.trainer.lightning_module).renderer.point_sampler
-        return replace(batch, path=sampler.choose_ahead(batch.path, batch.draws))
+        """Make the batch of a step."""
+        return self.tracer.trace(self.batches.draw(step % self._overfit_batches if self._overfit_batches else step))
 
     def teardown(self, stage: str) -> None:
         self.end_thread()
@@ -177,16 +187,6 @@ def can_prefetch(renderer: Renderer) -> bool:
     """Return whether a thread can trace the rays of the next step: no parameter changes paths, and a core is free."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return cores > 1 and not renderer.paths_learn and renderer.path_sampler.releases_gil(renderer.scene.medium)
-
-
-def traced(batches: RayBatches, renderer: Renderer, config: DictConfig) -> RayBatches:
-    """Return the batches with traced paths, and with several rays in subdivided pixels."""
-    subdivision = Subdivision(**config.batches.subdivision)
-    return batches.traced(
-        lambda rays, view: renderer.path_sampler(renderer.scene.camera(rays, view), renderer.scene.medium),
-        lambda rays, view: renderer.exit_directions(renderer.scene.camera(rays, view)),
-        subdivision if renderer.path_sampler.needs_medium else None,  # straight rays do not diverge
-    )
 
 
 def validation_interval(every: int) -> int:

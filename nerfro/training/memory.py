@@ -10,7 +10,7 @@ from torch import Tensor
 
 from nerfro.core.draws import Draws
 from nerfro.core.errors import NerfroError
-from nerfro.core.rays import Rays
+from nerfro.core.types import Batch
 from nerfro.kernels.available import available_bytes, number_in
 from nerfro.rendering import Renderer
 
@@ -22,7 +22,7 @@ _LATER_BYTES = 250e6
 
 
 def require_memory(
-    renderer: Renderer, rays: Rays, device: torch.device, share: float = 1.0, pixel_bytes: int = 0
+    renderer: Renderer, batch: Batch, device: torch.device, share: float = 1.0, pixel_bytes: int = 0
 ) -> str:
     """Estimate the peak memory of a run, and refuse runs without enough memory.
 
@@ -31,9 +31,9 @@ def require_memory(
 
     Args:
         renderer: moved to `device`, because the implementations for different devices keep different tensors.
-        rays: rays of a part of a training batch.
+        batch: part of a training batch.
         device: training device.
-        share: fraction of the rays of a batch that `rays` are.
+        share: fraction of the rays of a training batch that are in `batch`.
         pixel_bytes: size of the training pixels, which are copied to a GPU. On the CPU they are already in memory.
 
     Returns:
@@ -43,10 +43,9 @@ def require_memory(
         NerfroError: the run needs more memory than is free.
     """
     renderer.to(device)
-    probed = rays[:: max(len(rays) // _PROBED_RAYS, 1)].to(device)
-    kept = _kept_bytes(renderer, probed)
+    kept = _kept_bytes(renderer, batch, device)
     learned = sum(p.nbytes for p in renderer.parameters() if p.requires_grad)
-    num_rays = len(rays) / share
+    num_rays = len(batch.rays) / share
     # Gradients and the two moments of Adam, in addition to the weights.
     step = 3 * learned + kept * max(_STEP * num_rays, _EVALUATION * renderer.chunk_size)
     # A checkpoint is built in main memory before it is written: the state, and the moments.
@@ -72,7 +71,7 @@ def _require(needed: float, free: float, where: str, advice: str) -> None:
         )
 
 
-def _kept_bytes(renderer: Renderer, rays: Rays) -> float:
+def _kept_bytes(renderer: Renderer, batch: Batch, device: torch.device) -> float:
     """Count the bytes per ray saved by autograd for the backward pass, without parameters and buffers."""
     of_model = {tensor.untyped_storage().data_ptr() for tensor in (*renderer.parameters(), *renderer.buffers())}
     kept: dict[int, int] = {}
@@ -83,8 +82,11 @@ def _kept_bytes(renderer: Renderer, rays: Rays) -> float:
             kept[storage.data_ptr()] = storage.nbytes()
         return tensor
 
-    draws = Draws(0, 0, torch.arange(len(rays), device=rays.near.device))
+    rays = batch.rays[:: max(len(batch.rays) // _PROBED_RAYS, 1)].to(device)
+    every = torch.arange(len(rays), device=device)
+    no_view, draws = torch.zeros_like(every), Draws(0, 0, every)
+    probed = Batch(rays, every, every, no_view, torch.zeros_like(rays.origins), every >= 0, batch.cameras, draws)
     with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
-        renderings = renderer(rays, draws)  # saved tensors stay alive, so that no address occurs twice
+        renderings = renderer.render_batch(probed)  # saved tensors stay alive, so that no address occurs twice
         del renderings
     return sum(kept.values()) / len(rays)

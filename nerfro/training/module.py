@@ -22,6 +22,7 @@ from nerfro.registry.registration import discover
 from nerfro.rendering import Renderer, Scene
 from nerfro.training.config import build_each
 from nerfro.training.inputs import INPUTS, inputs_of
+from nerfro.training.objective import Objective, ObjectiveValue
 from nerfro.training.optimizer import OptimizerConfig, learning_rate_factor
 from nerfro.training.run_folder import load_checkpoint, restore
 
@@ -50,7 +51,7 @@ class TrainingModule(LightningModule):
         super().__init__()
         self._callbacks, self._configuration, self._inputs = list(callbacks), configuration, inputs
         self.renderer = renderer
-        self.losses = nn.ModuleDict(dict(losses))
+        self.objective = Objective(losses)
         self.optimizer_config = optimizer
         self._is_logged_step = True
 
@@ -107,46 +108,36 @@ class TrainingModule(LightningModule):
 
     def training_step(self, batch: Batch, batch_index: int) -> dict[str, Tensor]:
         """Compute the loss of a batch, and the mean squared error of its pixels (sRGB)."""
-        camera, colour_space = self.scene.camera, self.scene.colour_space
-        with self._full_precision():
-            rays = camera(batch.rays, batch.ray_view)
-        path = self.renderer.trace(rays, batch.path)
-        renderings = self.renderer.render_path(path, batch.draws, batch.teaches_background[batch.ray_pixel])
-        if (gains := camera.gains(batch.ray_view)) is not None:
-            renderings = [rendering.exposed(gains) for rendering in renderings]
-        total = torch.zeros((), device=self.device)
-        for name, loss in self.losses.items():
-            weight = loss.weight_at(self.global_step)  # type: ignore[operator]
-            self.log(f"weight/{name}", weight)
-            if weight > 0:
-                value = loss(renderings, batch, self.scene)
-                if value.ndim > 0:
-                    raise NerfroError(f"loss={name} returned shape {list(value.shape)}; a loss is a scalar")
-                self.log(f"loss/{name}", value)
-                total = total + weight * value
-        if not total.requires_grad:
-            raise NerfroError(
-                f"no loss has a positive weight in step {self.global_step}, so there is nothing to learn; raise a "
-                "weight (loss.photometric.weight=1), or start a loss earlier"
-            )
-        if self._trainer is not None and self.trainer.world_size > 1:
-            # Processes wait for each other's gradients of all parameters, also of those that a batch does not use.
-            learned = [parameter.sum().to(total) for parameter in self.parameters() if parameter.requires_grad]
-            total = total + 0 * torch.stack(learned).sum()
-        shown = colour_space.to_display(batch.per_pixel(renderings[-1].radiance.detach()))
-        error = (shown - batch.rgb).square().mean()
-        self.log("train/psnr", -10 * torch.log10(error))
-        self.log("loss/total", total)
-        for name, measurement in self.scene.measurements().items():
-            self.log(f"scene/{name}", measurement)
-        return {"loss": total, "squared_error": error}
+        value = self.objective(self.renderer.render_batch(batch), batch, self.scene, self.global_step)
+        self._log_step(value)
+        return {"loss": self._with_all_parameters(value.total), "squared_error": value.squared_error}
+
+    def _with_all_parameters(self, total: Tensor) -> Tensor:
+        """Let the loss depend on all parameters if there are several processes.
+
+        They wait for each other's gradients of all parameters, also of those that a batch does not use.
+        """
+        if self._trainer is None or self.trainer.world_size == 1:
+            return total
+        learned = [parameter.sum().to(total) for parameter in self.parameters() if parameter.requires_grad]
+        return total + 0 * torch.stack(learned).sum()
+
+    def _log_step(self, value: ObjectiveValue) -> None:
+        """Log a step, but only in steps with output, because logging takes a tenth of the time of a step."""
+        if not self._is_logged_step:
+            return
+        self.log_dict({f"weight/{name}": weight for name, weight in value.weights.items()})
+        self.log_dict({f"loss/{name}": loss for name, loss in value.losses.items()})
+        self.log("train/psnr", -10 * torch.log10(value.squared_error))
+        self.log("loss/total", value.total)
+        self.log_dict({f"scene/{name}": measurement for name, measurement in self.scene.measurements().items()})
 
     def _full_precision(self) -> torch.autocast:
         """Turn mixed precision off for rays, because rounded directions would miss their pixels."""
         return torch.autocast(self.device.type, enabled=False)
 
     def log(self, *args: Any, **kwargs: Any) -> None:
-        """Log a value, but only in training steps with output, because logging takes a tenth of the time of a step."""
+        """Log a value, but only in training steps with output; see `_log_step`."""
         if self._is_logged_step or not self.trainer.training:
             super().log(*args, **kwargs)
 
@@ -156,8 +147,7 @@ class TrainingModule(LightningModule):
         progress = self.renderer.begin_step(training_progress(self.trainer))
         factor = learning_rate_factor(self.global_step, progress, self.optimizer_config)
         for group in self.trainer.optimizers[0].param_groups:
-            waits = self.global_step < self.optimizer_config.group(group["name"]).start
-            group["lr"] = 0.0 if waits else group["initial_lr"] * factor
+            group["lr"] = 0.0 if self.global_step < group["start"] else group["initial_lr"] * factor
         # At the end of the previous step, the update would follow the checkpoint, and a resumed run would miss it.
         if self.global_step > 0:
             draws = replace(batch.draws, step=self.global_step)  # a repeated batch repeats its number
@@ -175,8 +165,10 @@ class TrainingModule(LightningModule):
     def configure_optimizers(self) -> torch.optim.Optimizer:
         groups = []
         for name, parameters in self.parameter_groups().items():
-            rate = self.optimizer_config.group(name).learning_rate or self.optimizer_config.learning_rate
-            groups.append({"params": parameters, "lr": rate, "initial_lr": rate, "name": name})
+            settings = self.optimizer_config.group(name)
+            rate = settings.learning_rate or self.optimizer_config.learning_rate
+            group = {"params": parameters, "lr": rate, "initial_lr": rate, "name": name, "start": settings.start}
+            groups.append(group)
         # Lightning cannot clip the gradients of a fused optimizer under mixed precision.
         fused = self._trainer is None or not self._trainer.gradient_clip_val
         return torch.optim.Adam(groups, eps=self.optimizer_config.adam_epsilon, fused=fused)

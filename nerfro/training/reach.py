@@ -12,8 +12,8 @@ from nerfro.core.rays import Rays
 from nerfro.core.types import Batch
 from nerfro.fields.base import Field
 from nerfro.geometry.interpolation import intersect_box
-from nerfro.rendering import Renderer
-from nerfro.training.ray_batches import RayBatches
+from nerfro.rendering import RayTracer, Renderer
+from nerfro.training.pixel_batches import PixelBatches
 
 # Fraction of rays that may miss the field without a warning if the background does not learn.
 _FEW = 0.1
@@ -25,14 +25,15 @@ _MIN_STEPS, _MAX_STEPS = 16, 1024
 
 
 @torch.no_grad()
-def require_reach(renderer: Renderer, batches: RayBatches, first: Batch) -> None:
+def require_reach(renderer: Renderer, batches: PixelBatches, tracer: RayTracer, first: Batch) -> None:
     """Refuse a field that no ray meets; warn if many rays miss the field and see a constant background.
 
     A small batch, or one photograph, may miss the field by chance, so batches are checked until a ray meets the field.
 
     Args:
         renderer: the model.
-        batches: batches of the training.
+        batches: pixels of the training.
+        tracer: traces their rays.
         first: batch of step 0.
 
     Raises:
@@ -46,7 +47,7 @@ def require_reach(renderer: Renderer, batches: RayBatches, first: Batch) -> None
     missed = 1.0
     num_steps = min(max(_MIN_STEPS, math.ceil(CHECKED_RAYS / batches.batch_size)), _MAX_STEPS)
     for step in range(num_steps):
-        batch = first if step == 0 else batches.batch(step)
+        batch = first if step == 0 else tracer.trace(batches.draw(step))
         _require_object(renderer, batch.rays)
         path = renderer.trace(batch.rays, batch.path)
         enters, leaves = path.span(bounds.to(path.s))

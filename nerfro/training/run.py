@@ -89,8 +89,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetr
     callbacks = [interruption, Viewer(config, training.source, test)]
     trainer = make_trainer(config, folder, throughput, callbacks, num_steps)
     require_match(renderer.scene.medium, training.views)
-    # These batches are not kept, because the data module moves the pixels to the training device.
-    memory = check_before_training(renderer, training.data.batches_of(trainer), trainer.strategy.root_device)
+    memory = check_before_training(renderer, training.data, trainer)
     if trainer.is_global_zero:
         begin(folder, config, renderer, has_steps=not 0 <= trainer.max_steps <= num_steps)
         print(memory, flush=True)

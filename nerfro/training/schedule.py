@@ -74,5 +74,7 @@ class Schedule(Callback):
             begun["ended"] = True
 
     def _run(self, trainer: Trainer) -> TrainingRun:
-        module, batches = cast(TrainingModule, trainer.lightning_module), trainer.datamodule.batches  # type: ignore[attr-defined]
-        return TrainingRun(module.renderer, batches, self._views, trainer.optimizers[0], training_progress(trainer))
+        renderer = cast(TrainingModule, trainer.lightning_module).renderer
+        data = trainer.datamodule  # type: ignore[attr-defined]
+        progress = training_progress(trainer)
+        return TrainingRun(renderer, data.batches, data.tracer, self._views, trainer.optimizers[0], progress)

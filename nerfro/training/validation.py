@@ -18,8 +18,9 @@ from nerfro.camera.exposure import fit_gain
 from nerfro.core.cameras import Cameras
 from nerfro.core.types import Batch, mean_per_pixel
 from nerfro.data.base import Views
-from nerfro.rendering import Renderer
-from nerfro.samplers.subdivision import PixelRays, Subdivision, contrast, subdivide
+from nerfro.rendering import RayTracer, Renderer
+from nerfro.rendering.ray_tracer import PixelRays
+from nerfro.samplers.subdivision import Subdivision, contrast
 from nerfro.training.module import TrainingModule
 
 # Number of validation pixels, and largest number of their views.
@@ -63,30 +64,25 @@ class ValidationPixels:
             contrasts.append(contrast(image.__getitem__, views.cameras, drawn))
         return cls(views.cameras, *map(torch.cat, (indices, colours, contrasts)))
 
-    def rays(self, renderer: Renderer, subdivision: Subdivision) -> PixelRays:
+    def rays(self, renderer: Renderer, subdivision: Subdivision | None) -> PixelRays:
         """Return rays through the pixels, subdivided as in training."""
-        contrasts = self.contrasts.to(renderer.scene.device)
-        return subdivide(
-            self.cameras.to(renderer.scene.device),
-            self.index.to(renderer.scene.device),
-            subdivision,
-            lambda rays, view: renderer.path_sampler(rays, renderer.scene.medium),
-            lambda rays, view: renderer.exit_directions(rays),
-            lambda rows: contrasts[rows],
-        )
+        device = renderer.scene.device
+        tracer, contrasts = RayTracer(renderer, subdivision), self.contrasts.to(device)
+        return tracer.through(self.cameras.to(device), self.index.to(device), lambda rows: contrasts[rows])
 
-    def psnr(self, renderer: Renderer, subdivision: Subdivision) -> Float[Tensor, ""]:
+    def psnr(self, renderer: Renderer, subdivision: Subdivision | None) -> Float[Tensor, ""]:
         """Compute the PSNR of the rendered pixels in dB; learned exposures are replaced by fitted gains of each view.
 
         Args:
             renderer: model.
-            subdivision: which pixels get several rays.
+            subdivision: which pixels get several rays; None for no pixel.
         """
-        found, rgb = self.rays(renderer, subdivision), self.rgb.to(renderer.scene.device)
+        device = renderer.scene.device
+        found, rgb = self.rays(renderer, subdivision), self.rgb.to(device)
         radiance = mean_per_pixel(renderer.radiance(found.rays), found.ray_pixel, len(rgb))
         if renderer.scene.camera.exposure is None:
             return _psnr(renderer.scene.colour_space.to_display(radiance), rgb)
-        views = self.cameras.view_of(self.index.to(renderer.scene.device))
+        views = self.cameras.view_of(self.index.to(device))
         gains, colour_space = torch.ones_like(radiance), renderer.scene.colour_space
         for view in views.unique():
             gains[views == view] = fit_gain(colour_space.to_srgb, radiance[views == view], rgb[views == view])

@@ -10,9 +10,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerfro.core.draws import Draws
 from nerfro.core.errors import NerfroError
-from nerfro.core.types import FieldValues, Path, Rays, Rendering, Samples
+from nerfro.core.types import Batch, FieldValues, Path, Rays, Rendering, Samples
 from nerfro.fields.base import Field
 from nerfro.geometry.space import inside_box
 from nerfro.registry.allowed import Count, Positive, Range, Share
@@ -129,14 +128,13 @@ class EikonalFields(Renderer):
         with torch.set_grad_enabled(stage == TrainingStage.INDEX and torch.is_grad_enabled()):
             return self.path_sampler(rays, self.scene.medium)
 
-    def render_path(
-        self, path: Path, draws: Draws | None = None, teaches_background: Bool[Tensor, "R"] | None = None
-    ) -> list[Rendering]:
+    def render_path(self, path: Path, batch: Batch | None = None) -> list[Rendering]:
         stage = TrainingStage(int(self.stage))
-        samples = self.point_sampler(path, None, draws)
+        # Samples of the batch would lie on the path of the batch, which is not that of `trace`.
+        samples = self.point_sampler(path, None, None if batch is None else batch.draws)
         (field,) = self.scene.fields
         if stage == TrainingStage.SCENE:
-            return [composite(samples, field(samples), self.background(path, teaches_background), path)]
+            return [composite(samples, field(samples), self.background(path, batch), path)]
         outside = ~inside_box(samples.positions.detach(), *self.scene.medium.box)
         if stage == TrainingStage.INDEX and self.training:
             assert self._blurred is not None  # made at the start of the step

@@ -11,7 +11,7 @@ import nerfro
 from nerfro.data.base import Views
 from nerfro.data.blender import BlenderData
 from nerfro.data.validation_views import WithValidationViews, spread
-from nerfro.training.ray_batches import RayBatches
+from nerfro.training.pixel_batches import PixelBatches
 from tests.conftest import Runner
 
 
@@ -48,13 +48,13 @@ def test_held_out_views_become_the_val_split(tiny_scene: Path) -> None:
 
 def test_training_never_draws_validation_views(train: Runner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: list[Views] = []
-    make = RayBatches.__init__
+    make = PixelBatches.__init__
 
-    def spied(self: RayBatches, views: Views, *given: Any) -> None:
+    def spied(self: PixelBatches, views: Views, *given: Any) -> None:
         drawn.append(views)
         make(self, views, *given)
 
-    monkeypatch.setattr(RayBatches, "__init__", spied)
+    monkeypatch.setattr(PixelBatches, "__init__", spied)
     train("trainer.max_steps=2", "evaluation.every=0", "batches.num_validation_views=1")
     val = nerfro.load(tmp_path / "run", device="cpu").views("val")
     assert [len(views) for views in drawn] == [2]

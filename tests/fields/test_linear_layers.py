@@ -32,7 +32,7 @@ def test_layers_equal_sequential_forward_and_backward(widths: tuple[int, ...], d
     inputs = torch.randn(300, widths[0], requires_grad=True)
     with torch.autocast("cpu", torch.bfloat16, enabled=dtype == torch.bfloat16):
         expected = mlp(inputs)
-    result = relu_mlp(inputs, weights(mlp), dtype)
+    result = relu_mlp([inputs], weights(mlp), dtype == torch.bfloat16)
     assert result.dtype == dtype
     torch.testing.assert_close(result, expected)
     tolerance = 1e-2 if dtype == torch.bfloat16 else 1e-5
@@ -42,7 +42,7 @@ def test_layers_equal_sequential_forward_and_backward(widths: tuple[int, ...], d
 def test_concatenated_inputs_of_which_one_has_gradients() -> None:
     mlp = layers(9, 8, 3)
     first, second = torch.randn(20, 5, requires_grad=True), torch.randn(20, 4)
-    result = relu_mlp([first, second], weights(mlp), torch.float32)
+    result = relu_mlp([first, second], weights(mlp), False)
     expected = mlp(torch.cat([first, second], dim=-1))
     torch.testing.assert_close(result, expected)
     require_equal_gradients(result, expected, [first], atol=1e-5)
@@ -56,12 +56,12 @@ def test_blocks_equal_sequential_with_one_and_two_threads(monkeypatch: pytest.Mo
         result = model(inputs)
         return [result, *torch.autograd.grad(result.sin().sum(), [inputs, *weights(mlp)])]
 
-    alone = evaluated(lambda x: relu_mlp(x, weights(mlp), torch.float32))
+    alone = evaluated(lambda x: relu_mlp([x], weights(mlp), False))
     for mine, theirs in zip(alone, evaluated(mlp), strict=True):
         torch.testing.assert_close(mine, theirs, rtol=1e-4, atol=1e-4)
     with ThreadPoolExecutor(1) as helper:
         monkeypatch.setattr(threads, "HELPERS", [helper])
-        helped = evaluated(lambda x: relu_mlp(x, weights(mlp), torch.float32))
+        helped = evaluated(lambda x: relu_mlp([x], weights(mlp), False))
     assert all(torch.equal(mine, theirs) for mine, theirs in zip(alone, helped, strict=True))
 
 

@@ -205,13 +205,13 @@ def test_background_learns_from_selected_rays_and_the_medium_from_all(absorbs: b
     absorption = torch.tensor([[0.0] * 3, [0.1, 0.2, 0.3]], requires_grad=True)
     path = example_path(8)
     path = replace(path, directions=torch.cat([path.directions[:, :-1], directions[:, None]], 1))
-    path = replace(path, absorption=absorption) if absorbs else path
+    path = replace(path, record=replace(path.record, absorption=absorption)) if absorbs else path
     teaches = PIXEL != 1
 
     def gradients(held: Tensor) -> list[Tensor]:
         """By the sky and by what bends and tints the rays; by the rays in a sum of two renderings."""
         weights = torch.linspace(0.5, 1.5, 8)[:, None]
-        seen = model.render_path(path, None, held)[-1].radiance
+        seen = model.render_path(path, replace(example_batch(8), teaches_background=held))[-1].radiance
         learned = [sky.texels, directions, *([absorption] if absorbs else [])]
         return list(torch.autograd.grad((weights * seen.square()).sum(), learned))
 

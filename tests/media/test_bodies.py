@@ -82,7 +82,7 @@ def test_light_passes_from_one_touching_body_to_the_other(gap: float, upper_firs
     if gap <= 0:  # triangles are where they are
         paths.append(Snell("mesh")(rays, medium))
     for path in paths:
-        assert path.body[0, :3].tolist() == [0, *numbers]
+        assert path.record.body[0, :3].tolist() == [0, *numbers]
         assert angle(path.directions[0, 2], expected) < 0.01
 
 
@@ -96,7 +96,7 @@ def test_gap_is_air_from_both_sides_if_the_smaller_body_resolves_it(tmp_path: Pa
     directions = torch.tensor([[0.1, 0.0, -0.99499], [-0.1, 0.0, 0.99499]])
     origins = torch.tensor([[-0.1, 0.0, 1.0], [0.5, 0.0, -5.0]])
     path = Snell()(make_rays(origins, directions, 0.0, 9.0), medium)
-    assert path.body[:, :6].tolist() == [[0, 1, 0, 2, 0, 0], [0, 2, 0, 1, 0, 0]]
+    assert path.record.body[:, :6].tolist() == [[0, 1, 0, 2, 0, 0], [0, 2, 0, 1, 0, 0]]
 
 
 @pytest.mark.parametrize(
@@ -116,7 +116,7 @@ def test_priority_or_order_decides_where_bodies_overlap(
     # On the axis light does not turn; the overlap reaches from z = 0.5 to -0.5.
     background = 0.5 if owner == "b" else -0.5
     for path in (Snell()(rays, medium), trace_interfaces(rays, medium, 16).path):
-        assert [medium.names[body - 1] for body in path.body[0, 1:3]] == ["a", "b"]
+        assert [medium.names[body - 1] for body in path.record.body[0, 1:3]] == ["a", "b"]
         torch.testing.assert_close(
             path.positions[0, 1:4, 2], torch.tensor([1.5, background, -1.5]).double(), atol=2e-3, rtol=0
         )

@@ -93,7 +93,7 @@ def test_light_enters_an_opening_freely_and_meets_water_glass_and_air(tmp_path: 
     d = torch.nn.functional.normalize(torch.tensor([[0.06, 0.02, -1.0]], dtype=torch.float64), dim=-1)
     trace = Snell().trace(make_rays(-2.5 * d, d, 0.5, 9.0), _glass(tmp_path))
     assert trace.num_events.item() == 3
-    assert trace.path.body[0, :4].tolist() == [0, 3, 1, 0]
+    assert trace.path.record.body[0, :4].tolist() == [0, 3, 1, 0]
     # Level, foot and bottom are parallel planes.
     assert angle(trace.path.exit_directions, d).item() < 0.02
     torch.testing.assert_close(
@@ -128,8 +128,8 @@ def test_paths_through_a_glass_have_gradients_by_its_indices(tmp_path: Path) -> 
     for body in (0, 2):
         change = step * torch.nn.functional.one_hot(torch.tensor(body), 3)
         low, high = (sampler(rays, vessel.with_indices(vessel.iors + sign * change)) for sign in (-1, 1))
-        same = (low.body.shape == path.body.shape == high.body.shape) and bool(
-            (low.body == path.body).all() and (high.body == path.body).all()
+        same = (low.record.body.shape == path.record.body.shape == high.record.body.shape) and bool(
+            (low.record.body == path.record.body).all() and (high.record.body == path.record.body).all()
         )
         assert same
         expected = ((high.exit_directions - low.exit_directions) * weights).sum() / (2 * step)
@@ -170,7 +170,7 @@ def test_tint_and_dispersion_are_those_of_wall_and_liquid(tmp_path: Path) -> Non
     rays = make_rays([[0.1, 0.0, 3.0]], [[0, 0.0, -1]], 0.5, 9.0)
     for trace in (Snell().trace(rays, dyed), trace_interfaces(rays, dyed, 16)):
         # The wall, clear air, the liquid, the wall again, and the air outside.
-        assert trace.path.body[0, :6].tolist() == [0, 1, 0, 3, 1, 0]
+        assert trace.path.record.body[0, :6].tolist() == [0, 1, 0, 3, 1, 0]
         assert not trace.num_events.any()
     learning = spherical_vessel(tmp_path, level=0.9, resolution=40, learn_absorption=True)
     assert (learning.absorption[1] == 0).all()

@@ -103,7 +103,8 @@ def test_compiled_branches_match_the_reference(iors: list[float], monkeypatch: p
     monkeypatch.setattr(compiled, "_MAX_POLYLINES", 2)
     monkeypatch.setattr(compiled, "_MAX_VERTICES", 5)
     again = sampler.trace(rays, medium)
-    for name in ("ray", "positions", "directions", "s", "body", "throughput", "radii"):
+    assert torch.equal(again.path.record.body, fast.path.record.body)
+    for name in ("ray", "positions", "directions", "s", "throughput", "radii"):
         assert torch.equal(getattr(again.path, name), getattr(fast.path, name))
     assert torch.equal(again.num_events, fast.num_events)
     path, num_events, exceeded = trace_interfaces(rays, medium.double(), 16, sampler.branching)
@@ -255,11 +256,11 @@ def test_gradients_at_touching_bodies_belong_to_the_intersected_body(what: str) 
     found = torch.autograd.functional.jvp(refined, zero, torch.ones_like(zero))[1]
     h = 1e-8
     after, before = traced(h), traced(-h)
-    assert torch.equal(after.surface_body, before.surface_body)
+    assert torch.equal(after.record.surface_body, before.record.surface_body)
     expected = (values(after) - values(before)) / (2 * h)
     error = (found - expected).norm(dim=-1) / (1 + expected.norm(dim=-1))
     steady = smallest_cosine(path, moved(zero)) > 0.15
-    reflected = (path.surface_body == 2) & (path.body == path.body.roll(1, 1))
+    reflected = (path.record.surface_body == 2) & (path.record.body == path.record.body.roll(1, 1))
     assert (steady & reflected.any(-1)).sum() > 50
     assert error[steady].max() < 1e-2
 

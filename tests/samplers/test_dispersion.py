@@ -42,7 +42,7 @@ def test_angles_of_the_primary_rainbow_match_closed_form(wavelength: float, degr
     medium = Ball(0.8, WATER[0], abbe=WATER[1]).double()
     sampler = Snell(branches="all", least_weight=1e-3, wavelengths=[wavelength, 500, 500])
     trace = sampler.trace(beam(0.8 * i.sin()), medium)
-    bow = trace.path.exit_directions[(trace.num_events == 3) & (trace.path.band == 0)]
+    bow = trace.path.exit_directions[(trace.num_events == 3) & (trace.path.record.band == 0)]
     # It returns to where the light came from, 180 degrees less the deviation.
     back = torch.atan2(bow[:, 1].abs(), -bow[:, 0])
     torch.testing.assert_close(back, 4 * torch.asin(i.sin() / n) - 2 * i, atol=1e-9, rtol=0)
@@ -62,7 +62,7 @@ def test_dispersion_of_a_prism_matches_closed_form(tmp_path: FilePath) -> None:
     wavelengths = [700.0, 610.0, 550.0, 500.0, 450.0, 400.0]
     path = Snell("mesh", wavelengths=wavelengths)(make_rays(target - 2 * direction, direction, 0.5, 9.0), medium)
     measured = torch.deg2rad(angle(path.exit_directions, torch.tensor(direction))).tolist()
-    assert path.band.tolist() == [0, 1, 2, 3, 4, 5]
+    assert path.record.band.tolist() == [0, 1, 2, 3, 4, 5]
     for found, wavelength in zip(measured, wavelengths, strict=True):
         index, s = cauchy(n, abbe, wavelength), math.sin(i)
         expected = i + math.asin(math.sin(apex) * math.sqrt(index**2 - s**2) - math.cos(apex) * s) - apex
@@ -83,7 +83,7 @@ def test_every_band_is_traced_as_a_ray_of_its_colour(branches: str) -> None:
     assert (torch.bincount(path.ray)[~path.main_polyline(path.refracted)] == 1).all()
     for band, wavelength in enumerate(sampler.wavelengths):
         single = sampler(rays, RoundedBox(ior=cauchy(1.52, 30, wavelength)).double())
-        mine = path[(path.band == band) & path.refracted]
+        mine = path[(path.record.band == band) & path.refracted]
         alone = single[single.refracted]
         torch.testing.assert_close(mine.exit_directions, alone.exit_directions, atol=1e-9, rtol=0)
         torch.testing.assert_close(mine.throughput[:, band], alone.throughput[:, 0], atol=1e-9, rtol=0)

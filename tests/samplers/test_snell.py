@@ -270,7 +270,7 @@ def test_winding_of_an_open_mesh_does_not_decide_where_rays_begin(tmp_path: File
     dome.export(tmp_path / "dome.ply")
     medium = make_bodies(str(tmp_path / "dome.ply"), 1.5, resolution=48, accept_open_mesh=True, cache=False)
     rays = _rays([[0.0, 0.0, 1.0], [0.1, 0.0, 0.3]], [[0.0, 0.6, -0.8], [0.6, 0.0, 0.8]], near=0.0)
-    assert Snell("mesh")(rays, medium).body[:, 0].tolist() == [0, 1]
+    assert Snell("mesh")(rays, medium).record.body[:, 0].tolist() == [0, 1]
 
 
 @pytest.mark.parametrize("num_plates", [2, 3])

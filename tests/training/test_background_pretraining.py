@@ -16,15 +16,19 @@ from torch import Tensor
 from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.core.light import to_srgb
 from nerfro.core.types import Exits
+from nerfro.data.base import Views
 from nerfro.data.blender import BlenderData
 from nerfro.evaluation.results import read_metrics_json
 from nerfro.fields.base import Field
 from nerfro.fields.hash_grid import HashGridField
+from nerfro.rendering import RayTracer
 from nerfro.training.build import build
 from nerfro.training.callbacks import steps_by_phase
+from nerfro.training.data_module import RayDataModule
+from nerfro.training.module import TrainingModule
 from nerfro.training.phases.background import BackgroundSettings, BackgroundSteps
 from nerfro.training.phases.base import TrainingRun
-from nerfro.training.ray_batches import RayBatches
+from nerfro.training.pixel_batches import PixelBatches
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
 from tests.conftest import Runner, weights_of
 
@@ -47,13 +51,17 @@ def test_only_the_background_is_fitted_before_the_first_step(weights: Callable[.
     assert changed == {"renderer.scene.background.texels"}
 
 
+def run_of(module: TrainingModule, data: RayDataModule, views: Views) -> TrainingRun:
+    optimizer = torch.optim.Adam(module.parameters())
+    return TrainingRun(module.renderer, data.batches, RayTracer(module.renderer), views, optimizer, 0.0)
+
+
 def test_directions_behind_the_object_are_learned_through_it(
     tiny_scene: Path, tiny_default_run: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     module, data = build(overrides=[*tiny_default_run, "medium.ior=1.0001", "trainer.max_steps=1"])
     views = BlenderData(str(tiny_scene), near=2.0, far=6.0).load("train")
-    optimizer = torch.optim.Adam(module.parameters())
-    run, phase = TrainingRun(module.renderer, data.batches, views, optimizer, 0.0), BackgroundSteps(steps=4, start=8)
+    run, phase = run_of(module, data, views), BackgroundSteps(steps=4, start=8)
     state, towards_the_ball = phase.begin(run), -torch.nn.functional.normalize(views.cameras.camera_to_world[:, :, 3])
     sky, background = 0.5 + 0.4 * towards_the_ball, module.renderer.scene.background
 
@@ -73,13 +81,13 @@ def test_directions_behind_the_object_are_learned_through_it(
 def test_fits_of_few_pixels_use_the_pixels_of_larger_fits(
     tiny_scene: Path, tiny_default_run: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    used, rows = [], RayBatches.rows
-    monkeypatch.setattr(RayBatches, "rows", lambda *given: used.append(rows(*given)) or used[-1])
+    used, rows = [], PixelBatches.rows
+    monkeypatch.setattr(PixelBatches, "rows", lambda *given: used.append(rows(*given)) or used[-1])
     of_limit = {}
     for limit in (10**6, 64):
         module, data = build(overrides=[*tiny_default_run, "trainer.max_steps=1"])
         views = BlenderData(str(tiny_scene), near=2.0, far=6.0).load("train")
-        run = TrainingRun(module.renderer, data.batches, views, torch.optim.Adam(module.parameters()), 0.0)
+        run = run_of(module, data, views)
         phase = BackgroundSteps(steps=2)
         state = phase.begin(run)
         phase.settings = BackgroundSettings(max_fitted_pixels=limit)
@@ -99,7 +107,7 @@ def test_rays_that_split_into_colours_do_not_show_the_background(
     flint = "medium.bodies={object: {ior: 1.5, abbe: 30}}"
     module, data = build(overrides=[*tiny_default_run, flint, "trainer.max_steps=1"])
     views = BlenderData(str(tiny_scene), near=2.0, far=6.0).load("train")
-    run = TrainingRun(module.renderer, data.batches, views, torch.optim.Adam(module.parameters()), 0.0)
+    run = run_of(module, data, views)
     phase = BackgroundSteps(steps=2, start=8)
     state = phase.begin(run)
     monkeypatch.setattr(module.renderer, "trace", lambda *given: pytest.fail("rays through the object are traced"))
@@ -124,9 +132,9 @@ def test_pretraining_takes_a_bounded_share_of_the_time(
 def test_signal_interrupts_pretraining_and_a_resumed_run_completes_it(
     weights: Callable[..., dict[str, Tensor]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    options, drawn, rows = ("phase.background.steps=20", "trainer.max_steps=2"), [], RayBatches.rows
+    options, drawn, rows = ("phase.background.steps=20", "trainer.max_steps=2"), [], PixelBatches.rows
 
-    def signalled(self: RayBatches, *given: Any) -> Any:
+    def signalled(self: PixelBatches, *given: Any) -> Any:
         drawn.append(given[0])
         if drawn[-1] == 7:
             os.kill(os.getpid(), signal.SIGINT)
@@ -134,7 +142,7 @@ def test_signal_interrupts_pretraining_and_a_resumed_run_completes_it(
 
     undisturbed = weights("undisturbed", *options)
     with monkeypatch.context() as context:
-        context.setattr(RayBatches, "rows", signalled)
+        context.setattr(PixelBatches, "rows", signalled)
         with pytest.raises(AssertionError, match="interrupted after step 0 and saved"):
             weights("run", *options)
     assert drawn == list(range(8))

@@ -17,12 +17,12 @@ from nerfro.data.blender import BlenderData
 from nerfro.data.pixel_store import PixelStore
 from nerfro.media.bodies import Bodies
 from nerfro.paper.eikonal import Eikonal
-from nerfro.rendering import Renderer, Scene
+from nerfro.rendering import RayTracer, Renderer, Scene
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.training.data_module import Prefetcher, RayDataModule, can_prefetch, multiplies_large_matrices
 from nerfro.training.module import TrainingModule
-from nerfro.training.ray_batches import RayBatches
+from nerfro.training.pixel_batches import PixelBatches
 from tests.closed_forms import grid_points, random_rays, sampled
 from tests.conftest import Runner, weights_of
 from tests.pretended_gpu import GPU, PretendedGpu
@@ -61,8 +61,9 @@ def test_prefetched_paths_equal_those_of_the_step_in_any_order(ahead, ball: Bodi
     for step in (0, 1, 2, 7, 8, 3):
         expected, got = make(step), one(step)
         one.begin_next()
-        for name in ("positions", "directions", "s", "exit_directions", "body"):
+        for name in ("positions", "directions", "s", "exit_directions"):
             assert torch.equal(getattr(got, name), getattr(expected, name))
+        assert torch.equal(got.record.body, expected.record.body)
 
 
 def test_next_batch_is_made_during_the_step(ahead) -> None:
@@ -148,12 +149,13 @@ def test_batch_is_made_when_its_step_begins_if_paths_learn(
     """Lightning fetches one step early, so what it fetches must not be the batch."""
     monkeypatch.setattr("os.sched_getaffinity", lambda pid: {0, 1}, raising=False)
     made: list[int] = []
-    batch = Mock(spec=Batch, path=None)
-    batches: Any = Mock(spec=RayBatches, batch=lambda step: made.append(step) or batch)
+    batch = Mock(spec=Batch)
+    batches: Any = Mock(spec=PixelBatches, draw=lambda step: made.append(step))
     batches.for_rank = lambda rank, size: batches
     batches.to = lambda device, dtype: batches
     batches.release_memory = lambda: None
-    data = RayDataModule(batches, None, 0)
+    monkeypatch.setattr(RayTracer, "trace", lambda tracer, pixels: batch)
+    data = RayDataModule(batches)
     scene = Mock(spec=Scene, medium=ball)
     renderer = Mock(spec=Renderer, path_sampler=Snell(), scene=scene, paths_learn=learns, modules=list)
     module = Mock(spec=TrainingModule, renderer=renderer, dtype=torch.float32)

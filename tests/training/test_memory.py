@@ -19,7 +19,7 @@ from nerfro.paper.nerf import NerfField
 from nerfro.rendering import Components, Renderer
 from nerfro.samplers.paths.straight import Straight
 from nerfro.samplers.points.stratified import Stratified
-from nerfro.testing import example_rays
+from nerfro.testing import example_batch
 from nerfro.training import memory
 from nerfro.training.memory import require_memory
 from tests.conftest import refused
@@ -35,24 +35,25 @@ def model_of(width: int, background: Background | None = None) -> Renderer:
 
 
 def test_saved_tensors_are_counted_and_grow_with_the_network() -> None:
-    rays, samples = example_rays(), 8
-    kept = [memory._kept_bytes(model_of(width), rays) for width in (64, 256)]
+    batch, samples, device = example_batch(), 8, torch.device("cpu")
+    kept = [memory._kept_bytes(model_of(width), batch, device) for width in (64, 256)]
     # Each of eight layers keeps its activations of 4 bytes.
     assert kept[1] - kept[0] == pytest.approx(8 * samples * (256 - 64) * 4, rel=0.5)
-    assert memory._kept_bytes(model_of(64), rays[:4]) == pytest.approx(kept[0], rel=0.1)
+    assert memory._kept_bytes(model_of(64), example_batch(4), device) == pytest.approx(kept[0], rel=0.1)
 
 
 def test_tables_of_a_fine_background_are_not_counted_for_each_ray() -> None:
-    coarse, fine = (memory._kept_bytes(model_of(16, EnvironmentMap([4, n])), example_rays()) for n in (8, 256))
+    skies, device = (EnvironmentMap([4, 8]), EnvironmentMap([4, 256])), torch.device("cpu")
+    coarse, fine = (memory._kept_bytes(model_of(16, sky), example_batch(), device) for sky in skies)
     assert fine == pytest.approx(coarse, rel=0.1)
 
 
 def test_run_that_exceeds_the_memory_is_refused_with_advice(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(memory, "available_bytes", lambda: 1e6)
     message = r"needs about \d.* kB are for each ray: take a smaller batches\.size"
-    refused(message, require_memory, model_of(16), example_rays(), torch.device("cpu"))
+    refused(message, require_memory, model_of(16), example_batch(), torch.device("cpu"))
     monkeypatch.setattr(memory, "available_bytes", lambda: math.inf)
-    assert "memory: about" in require_memory(model_of(16), example_rays(), torch.device("cpu"))
+    assert "memory: about" in require_memory(model_of(16), example_batch(), torch.device("cpu"))
 
 
 @pytest.mark.parametrize(
@@ -83,7 +84,7 @@ def needed_gigabytes(model: Renderer, monkeypatch: pytest.MonkeyPatch) -> float:
     resident = 1e9 + sum(parameter.nbytes for parameter in model.parameters())
     monkeypatch.setattr(memory, "number_in", lambda *_: resident)
     pattern = r"about ([\d.]+) GB"
-    message = refused(pattern, require_memory, model, example_rays(), torch.device("cpu"))
+    message = refused(pattern, require_memory, model, example_batch(), torch.device("cpu"))
     return float(re.search(pattern, message)[1])  # type: ignore[index]
 
 
@@ -99,7 +100,7 @@ def test_memory_of_a_gpu_is_estimated_with_the_pixels(monkeypatch: pytest.Monkey
     model, free = model_of(16), 1e9
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (free, free))
     with PretendedGpu():
-        assert "memory: about 0.0 GB of 1.0 GB" in require_memory(model, example_rays(), GPU)
+        assert "memory: about 0.0 GB of 1.0 GB" in require_memory(model, example_batch(), GPU)
         with pytest.raises(NerfroError, match=r"needs about 2\.\d GB of cuda memory and 1\.0 GB are free"):
-            require_memory(model, example_rays(), GPU, pixel_bytes=int(2e9))
+            require_memory(model, example_batch(), GPU, pixel_bytes=int(2e9))
     assert all(isinstance(parameter, OnGpu) for parameter in model.parameters())

@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ from torch import Tensor
 from nerfro.evaluation.request import find_device
 from nerfro.fields import relu_mlp
 from nerfro.fields.hash_grid import HashGridField
+from nerfro.kernels.available import fast_bfloat16
 from nerfro.testing import example_space
 from nerfro.training.trainer import lightning_precision, training_accelerator
 
@@ -37,16 +39,18 @@ def test_accelerator_auto_trains_on_the_cpu_and_reports_an_unused_gpu(
 
 
 @pytest.fixture(params=[True, False])
-def has_units(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bool:
+def has_units(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[bool]:
     monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: request.param)
-    return bool(request.param)
+    fast_bfloat16.cache_clear()
+    yield bool(request.param)
+    fast_bfloat16.cache_clear()
 
 
 def test_field_uses_bfloat16_if_the_machine_supports_it(has_units: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     used: list[torch.dtype] = []
 
-    def spy(inputs: list[Tensor], weights: list[Tensor], dtype: torch.dtype) -> Tensor:
-        used.append(dtype)
+    def spy(inputs: list[Tensor], weights: list[Tensor], rounds: bool) -> Tensor:
+        used.append(torch.bfloat16 if rounds else torch.float32)
         return inputs[0].new_zeros(len(inputs[0]), len(weights[-1]))
 
     monkeypatch.setattr(relu_mlp, "relu_mlp", spy)

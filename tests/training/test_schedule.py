@@ -15,10 +15,10 @@ from torch.optim import Adam
 
 from nerfro.core.errors import NerfroError
 from nerfro.data.base import Views
-from nerfro.rendering import Renderer
+from nerfro.rendering import RayTracer, Renderer
 from nerfro.training.callbacks import Throughput, steps_by_phase
 from nerfro.training.phases.base import Phase, TrainingRun
-from nerfro.training.ray_batches import RayBatches
+from nerfro.training.pixel_batches import PixelBatches
 from nerfro.training.schedule import Schedule
 from tests.conftest import refused
 
@@ -44,7 +44,7 @@ class Counted(Phase):
 def steps(schedule: Schedule, first: int, last: int, callbacks: Sequence[Callback] = ()) -> dict[str, Any]:
     """Take some training steps without a model; returns the state of the schedule."""
     module = Mock(spec=LightningModule, renderer=Mock(spec=Renderer))
-    data = Mock(batches=Mock(spec=RayBatches))
+    data = Mock(batches=Mock(spec=PixelBatches), tracer=Mock(spec=RayTracer))
     trainer = Mock(spec=Trainer, datamodule=data, lightning_module=module, optimizers=[Mock(spec=Adam)])
     trainer.configure_mock(global_step=first, max_steps=100, callbacks=list(callbacks))
     schedule.on_train_start(trainer, module)
@@ -68,7 +68,7 @@ def test_step_without_a_result_is_refused() -> None:
 
 def test_step_without_parameters_is_refused() -> None:
     renderer = Mock(spec=Renderer, parameters_by_name=lambda: {"background.colour": nn.Parameter(torch.zeros(()))})
-    run = TrainingRun(renderer, Mock(spec=RayBatches), Mock(spec=Views), Mock(spec=Adam), 0.0)
+    run = TrainingRun(renderer, Mock(spec=PixelBatches), Mock(spec=RayTracer), Mock(spec=Views), Mock(spec=Adam), 0.0)
     with pytest.raises(NerfroError, match=r"backgroud\.\* matches no learned .* choose from background\.colour"):
         run.parameters(["background.*", "backgroud.*"])
     refused("changes no parameter", run.descend, torch.zeros(()), run.parameters(["cameras.*"]))
@@ -109,8 +109,7 @@ def test_step_of_a_phase_changes_only_its_parameters() -> None:
     (moved + other).sum().backward()
     optimizer.step()  # Lightning keeps the gradients until the next training step
     before = other.item()
-    TrainingRun(Mock(spec=Renderer), Mock(spec=RayBatches), Mock(spec=Views), optimizer, 0.0).descend(
-        moved.square().sum(), [moved]
-    )
+    parts = (Mock(spec=part) for part in (Renderer, PixelBatches, RayTracer, Views))
+    TrainingRun(*parts, optimizer, 0.0).descend(moved.square().sum(), [moved])
     assert other.item() == before
     assert moved.item() < before

@@ -20,7 +20,7 @@ from nerfro.registry.registration import build, find, register
 from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.testing import check
 from nerfro.training.config import TrainConfig, TrainerConfig, clock_time, resolve_trainer_options
-from nerfro.training.ray_batches import RayBatches
+from nerfro.training.pixel_batches import PixelBatches
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
 from nerfro.training.trainer import _OWN
 from tests.conftest import Runner, refused, weights_of
@@ -192,13 +192,13 @@ def test_training_ends_with_the_table_of_means_and_the_files(train: Runner, tmp_
 
 
 def test_overfitting_repeats_batches(train: Runner, monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn, batch, updated = [], RayBatches.batch, []
+    drawn, batch, updated = [], PixelBatches.batch, []
 
-    def recorded(self: RayBatches, step: int) -> Any:
+    def recorded(self: PixelBatches, step: int) -> Any:
         drawn.append(step)
         return batch(self, step)
 
-    monkeypatch.setattr(RayBatches, "batch", recorded)
+    monkeypatch.setattr(PixelBatches, "batch", recorded)
     monkeypatch.setattr(DensityGridSampler, "update", lambda self, fields, draws: updated.append(draws.step))
     finished = train("trainer.max_steps=6", "trainer.overfit_batches=2", "evaluation.every=0")
     assert set(drawn) <= {0, 1, 2}  # the thread that traces ahead draws one more

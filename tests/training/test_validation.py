@@ -17,11 +17,12 @@ from nerfro.core.light import to_srgb
 from nerfro.core.types import Rays, mean_per_pixel
 from nerfro.data.base import Views
 from nerfro.data.blender import BlenderData
-from nerfro.rendering import ColourSpace, Renderer, Scene
+from nerfro.rendering import ColourSpace, RayTracer, Renderer, Scene
 from nerfro.samplers.paths.snell import Snell
+from nerfro.samplers.points.stratified import Stratified
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.training.data_module import NO_IMAGE, RayDataModule, RotatingView, validation_interval
-from nerfro.training.ray_batches import RayBatches
+from nerfro.training.pixel_batches import PixelBatches
 from nerfro.training.validation import OverfittingWarning, ValidationPixels
 from tests.closed_forms import Ball
 from tests.conftest import Runner, repaint
@@ -115,9 +116,11 @@ def bending() -> Any:
     ball, sampler = Ball(0.6, 1.5), Snell()
     return Mock(
         spec=Renderer,
-        scene=Mock(spec=Scene, device=torch.device("cpu"), medium=ball, colour_space=ColourSpace.LINEAR),
+        scene=Mock(
+            Scene, device=torch.device("cpu"), medium=ball, colour_space=ColourSpace.LINEAR, camera=GivenCamera()
+        ),
         path_sampler=sampler,
-        exit_directions=lambda rays: sampler.trace_main(rays, ball).exit_directions,
+        point_sampler=Stratified(),
     )
 
 
@@ -125,9 +128,8 @@ def bending() -> Any:
 def test_validation_pixels_have_the_rays_of_training(contrast: float | None, tiny_scene: Path) -> None:
     views = BlenderData(str(tiny_scene), near=2.0, far=6.0).load("val")
     model = bending()
-    batches = RayBatches(views, 256, "single_image")
-    trace = lambda rays, view: model.path_sampler(rays, model.scene.medium)  # noqa: E731
-    batch = batches.traced(trace, subdivision=Subdivision(2, 8.0, contrast)).batch(0)
+    batches = PixelBatches(views, 256, "single_image")
+    batch = RayTracer(model, Subdivision(2, 8.0, contrast)).trace(batches.draw(0))
     watched = ValidationPixels.of(views)
     found = watched.rays(model, Subdivision(2, 8.0, contrast))
     trained = rays_of_pixels(batch.rays, batch.pixel_number[batch.ray_pixel])
@@ -165,7 +167,7 @@ def test_validations_are_five_times_as_frequent_as_images(every: int, looks: int
     assert validation_interval(every) == looks
     if not every:
         return
-    module = RayDataModule(Mock(spec=RayBatches), BlenderData(str(tiny_scene), near=2.0, far=6.0).load("val"), every)
+    module = RayDataModule(Mock(spec=PixelBatches), BlenderData(str(tiny_scene), near=2.0, far=6.0).load("val"), every)
     shown = {}
     for step in range(looks, 10 * every + 1, looks):
         module.trainer = Mock(spec=Trainer, global_step=step)  # type: ignore[assignment]

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from nerfro.core.types import Path, Rays
+from nerfro.core.types import OpticalRecord, Path, Rays
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.kernels.tolerances import BEYOND_BOX
 
@@ -44,11 +44,11 @@ class SnellTrace(NamedTuple):
 
 
 class Crossed(NamedTuple):
-    """Bodies and surface of vertices, see `Path`. The default is a vertex in air."""
+    """Bodies and surface of vertices, see `OpticalRecord`. The default is a vertex in air."""
 
     body: Int[Tensor, "A"] | int = 0
     surface: Int[Tensor, "A"] | int = 0
-    across: Int[Tensor, "A"] | int = 0
+    far_side: Int[Tensor, "A"] | int = 0
     triangle: Int[Tensor, "A"] | int = -1
 
 
@@ -115,14 +115,14 @@ class PolylineBuilder:
         vertices = self._vertices.gather(1, index.expand(-1, -1, 7)).to(like)
         crossed = self._crossed.gather(1, index.expand(-1, -1, self._crossed.shape[-1])).to(like.device)
         *numbers, triangle = crossed.unbind(-1)
-        body, surface, across = (values.to(torch.int8) for values in numbers)
+        record = OpticalRecord.of_bodies(*(values.to(torch.int8) for values in numbers))
+        record = replace(record, triangle=triangle)
         if ray is not None:
             ray = ray.to(like.device)
         radii = rays.radii if ray is None else rays.radii[ray]
         path = Path.unbranched(
-            vertices[..., :3], vertices[..., 3:6], vertices[..., 6], refracted.to(like.device), radii
+            vertices[..., :3], vertices[..., 3:6], vertices[..., 6], refracted.to(like.device), radii, record
         )
-        path = replace(path, body=body, surface_body=surface, across=across, triangle=triangle)
         if ray is None or weight is None:
             return path
         return replace(path, splits=True, ray=ray, throughput=weight.to(like)[:, None].expand(-1, 3))

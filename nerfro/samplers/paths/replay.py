@@ -58,12 +58,14 @@ def smallest_cosine(path: Path, medium: Medium) -> Float[Tensor, "P"]:
     First derivatives of a path are reliable if the cosine is above 0.15. Below, the ray grazes a surface or is near the
     critical angle, and the derivatives grow without bound. Surfaces at which the index does not change do not count.
     """
+    if path.record is None:
+        return torch.ones_like(path.s[:, 0])
     with torch.no_grad():
-        n = indices_of(medium, path.s)[path.body.long()]
+        n = indices_of(medium, path.s)[path.record.body.long()]
         before, after = path.directions[:, :-1], path.directions[:, 1:]
         normals = turning_normals(before, after, n[:, :-1], n[:, 1:])
         cosines = torch.minimum((normals * before).sum(-1).abs(), (normals * after).sum(-1).abs())
-        return torch.where((path.surface_body[:, 1:] > 0) & normals.any(-1), cosines, 1.0).amin(-1)
+        return torch.where((path.record.surface_body[:, 1:] > 0) & normals.any(-1), cosines, 1.0).amin(-1)
 
 
 def indices_of(medium: Medium, like: Tensor) -> Float[Tensor, " media"]:
@@ -83,6 +85,8 @@ def replay(path: Path, rays: Rays, medium: Medium, intersect: Intersect, branchi
     Each event is an intersection with the recorded surface, and refraction or reflection as in the trace. Derivatives
     are taken at the traced vertices, and all values are equal to the traced values.
     """
+    record = path.record
+    assert record is not None
     x, d, s = start_of(path, rays)
     num_paths, num_vertices = path.s.shape
     rows, column = torch.arange(num_paths, device=s.device), torch.zeros_like(path.ray)
@@ -90,19 +94,19 @@ def replay(path: Path, rays: Rays, medium: Medium, intersect: Intersect, branchi
     indices = indices_of(medium, path.s)
     weight, num_events = torch.ones_like(s), torch.zeros_like(path.ray)
     for i in range(1, num_vertices - 1):
-        rows = (path.surface_body[:, i] > 0).nonzero().squeeze(1)
+        rows = (record.surface_body[:, i] > 0).nonzero().squeeze(1)
         if not len(rows):
             break
         old_x, old_d, old_s = (with_gradient(values[rows, i - 1], replayed[rows]) for values, replayed in (
             (path.positions, x), (path.directions, d), (path.s, s)))  # fmt: skip
-        before, after, across = (numbers[rows].long() for numbers in (
-            path.body[:, i - 1], path.body[:, i], path.across[:, i]))  # fmt: skip
-        reflected = after != across
+        before, after, far_side = (numbers[rows].long() for numbers in (
+            record.body[:, i - 1], record.body[:, i], record.far_side[:, i]))  # fmt: skip
+        reflected = after != far_side
         length, normal = intersect(rows, i, old_x, old_d, path.s[rows, i] - path.s[rows, i - 1])
-        outgoing, _ = refract(old_d, normal, indices[before], indices[across], reflected)
+        outgoing, _ = refract(old_d, normal, indices[before], indices[far_side], reflected)
         if (num_events[rows] < branching.max_split_events).any():
-            visible = indices[before] != indices[across]
-            share = torch.where(visible, reflectance(old_d, normal, indices[before], indices[across]), 0.0)
+            visible = indices[before] != indices[far_side]
+            share = torch.where(visible, reflectance(old_d, normal, indices[before], indices[far_side]), 0.0)
             splits, _ = branching.decide(weight[rows].detach(), share.detach(), num_events[rows])
             num_events[rows] += visible
             factor = torch.where(splits, torch.where(reflected, share, 1 - share), 1.0)
@@ -154,7 +158,7 @@ def intersect_solid(medium: Bodies, surface: Int[Tensor, "P S"]) -> Intersect:
 
     Args:
         medium: traced bodies.
-        surface: body on whose surface each vertex lies, `Path.surface_body`.
+        surface: body on whose surface each vertex lies, `OpticalRecord.surface_body`.
     """
 
     def intersect(rows: Tensor, column: int, x: Tensor, d: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:

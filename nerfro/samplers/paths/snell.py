@@ -59,7 +59,8 @@ class Tracer(ABC):
 
     def intersect(self, path: Path) -> Intersect:
         """Return the intersection of rays with the recorded surfaces of a path."""
-        return intersect_solid(self.medium, path.surface_body)
+        assert path.record is not None
+        return intersect_solid(self.medium, path.record.surface_body)
 
     def at_wavelengths(self, wavelengths: Sequence[float]) -> Sequence[Tracer]:
         """Return one tracer for each wavelength; the tracer itself if the medium has no dispersion."""
@@ -88,7 +89,8 @@ class TriangleTracer(Tracer):
         return _trace_triangles(rays, self.medium, max_events, branching)
 
     def intersect(self, path: Path) -> Intersect:
-        return intersect_triangles(self.medium.triangles, path.triangle)
+        assert path.record is not None
+        return intersect_triangles(self.medium.triangles, path.record.triangle)
 
 
 class ReferenceTracer(Tracer):
@@ -224,7 +226,9 @@ def _traced_in_bands(rays: Rays, tracers: Sequence[Tracer], max_events: int, bra
     colours = torch.where(path.refracted[:, None], colours, 1.0)
     ray = torch.cat(of_rays)
     order = ray.argsort(stable=True)
-    path = replace(path, throughput=path.throughput * colours, band=band, splits=True)
+    assert path.record is not None
+    record = replace(path.record, band=band)
+    path = replace(path, throughput=path.throughput * colours, splits=True, record=record)
     path = replace(path[order], ray=ray[order])
     num_events, exceeded = (
         torch.cat([getattr(traced, name) for traced in traces])[order] for name in ("num_events", "exceeded")
@@ -234,7 +238,8 @@ def _traced_in_bands(rays: Rays, tracers: Sequence[Tracer], max_events: int, bra
 
 def _replay_in_bands(path: Path, rays: Rays, tracers: Sequence[Tracer], branching: Branching) -> Path:
     """Replay the polylines of each band at its wavelength; see `_traced_in_bands` for the arguments."""
-    rows = [(path.band == band).nonzero()[:, 0] for band in range(len(tracers))]
+    assert path.record is not None
+    rows = [(path.record.band == band).nonzero()[:, 0] for band in range(len(tracers))]
     replayed = [
         tracer.replay(path[some], rays[path.ray[some]], branching) for some, tracer in zip(rows, tracers, strict=True)
     ]

@@ -28,7 +28,8 @@ def _bent_normals(path: Path, medium: Medium) -> Float[Tensor, "P 3"]:
     """Compute the normals of polylines that intersect the medium."""
     rows = torch.arange(len(path.s), device=path.s.device)
     before, after = path.directions[:, :-1], path.directions[:, 1:]
-    n = indices_of(medium, path.s).detach()[path.body.long()]
+    body = torch.zeros_like(path.s).long() if path.record is None else path.record.body.long()
+    n = indices_of(medium, path.s).detach()[body]
     events = (before != after).any(-1) | (n[:, :-1] != n[:, 1:])
     first = events.byte().argmax(-1)
     arriving = before[rows, first]

@@ -81,19 +81,12 @@ class DensityGridSampler(PointSampler):
         self.register_buffer("inside", space.cells(resolution), persistent=False)
 
     def forward(self, path: Path, previous: Rendering | None, draws: Draws | None = None) -> Samples:
-        samples = self._chosen(path, draws) if path.samples is None else path.samples
+        samples = self.choose_ahead(path, draws)
         # The kernel returns positions without gradients, which only some paths have.
-        if not path.positions.requires_grad:
-            return samples
-        along = Samples.along(path, samples.s, samples.edges)
-        contracted_edges = samples.contracted_edges
-        return replace(along, occupied=samples.occupied, lengths=samples.lengths, contracted_edges=contracted_edges)
-
-    def choose_ahead(self, path: Path, draws: Draws) -> Path:
-        return replace(path, samples=self._chosen(path, draws))
+        return samples.on(path) if path.positions.requires_grad else samples
 
     @torch.no_grad()
-    def _chosen(self, path: Path, draws: Draws | None) -> Samples:
+    def choose_ahead(self, path: Path, draws: Draws | None) -> Samples:
         samples = (self.draw_compiled if path.s.device.type == "cpu" else self.draw)(path, draws)
         return samples if draws is None else replace(samples, occupied=self._queried(path, samples))
 

@@ -14,9 +14,9 @@ from torch import Tensor, nn
 
 from nerfro.core.errors import NerfroError
 from nerfro.data.base import Views
-from nerfro.rendering import Renderer
+from nerfro.rendering import RayTracer, Renderer
 from nerfro.training.optimizer import require_matches
-from nerfro.training.ray_batches import RayBatches
+from nerfro.training.pixel_batches import PixelBatches
 
 
 @dataclass(frozen=True)
@@ -26,13 +26,15 @@ class TrainingRun:
     Attributes:
         renderer: the model.
         batches: pixels of the training views.
+        tracer: traces the rays through pixels; `tracer.trace(batches.draw(number))` is the batch of a training step.
         views: training views.
         optimizer: optimizer of the training, with moments that all phases share.
         spent: spent fraction of `trainer.max_time` or `trainer.max_steps`.
     """
 
     renderer: Renderer
-    batches: RayBatches
+    batches: PixelBatches
+    tracer: RayTracer
     views: Views
     optimizer: torch.optim.Optimizer
     spent: float

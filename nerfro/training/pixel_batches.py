@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterable
-from dataclasses import replace
 from typing import Annotated, Literal
 
 import numpy as np
@@ -17,20 +16,19 @@ from nerfro.core.cameras import Cameras, Window, central_window
 from nerfro.core.distributed import share_of
 from nerfro.core.draws import Draws
 from nerfro.core.errors import NerfroError, warn
-from nerfro.core.types import Batch
+from nerfro.core.types import Pixels
 from nerfro.data.base import Views
 from nerfro.data.pixel_store import PixelStore
 from nerfro.registry.allowed import Count, Natural, Range, checked
-from nerfro.samplers.subdivision import PixelRays, Subdivision, Trace, TraceExits, contrast, subdivide
 
 Batching = Literal["single_image", "all_images"]
 
 
 @checked("batches")
-class RayBatches:
+class PixelBatches:
     """Random training pixels of each step, which depend only on the seed and the step.
 
-    Therefore a resumed run has the same batches as an undisturbed run. Only usable pixels are drawn. See
+    Therefore a resumed run has the same pixels as an undisturbed run. Only usable pixels are drawn. See
     `training.config.BatchesConfig` for the options.
     """
 
@@ -49,12 +47,10 @@ class RayBatches:
         self.batch_size, self.batching, self.seed = batch_size, batching, seed
         self.precrop_steps = precrop_steps
         self._share = slice(batch_size)
-        self.subdivision = Subdivision()
-        self._trace: Trace | None = None
-        self._trace_exits: TraceExits | None = None
         cameras = views.cameras
         self._cameras = cameras
         self._pixels = PixelStore(views.images)
+        self._full = central_window(cameras.height, cameras.width, 1.0)
         self._crop = central_window(cameras.height, cameras.width, precrop_fraction if precrop_steps > 0 else 1.0)
         if batching == "single_image" and batch_size > self._crop.height * self._crop.width:
             raise NerfroError(
@@ -62,7 +58,7 @@ class RayBatches:
                 f"{' offers while precropped' if precrop_steps > 0 else ' has'}; take a smaller one, or all_images"
             )
         self._usable: dict[Window, _Usable] | None = None
-        windows = {self._crop, central_window(cameras.height, cameras.width, 1.0)}
+        windows = {self._crop, self._full}
         if views.usable is not None:
             usable = views.usable
             self._usable = {window: _Usable((view == 1 for view in usable), len(views), window) for window in windows}
@@ -75,14 +71,14 @@ class RayBatches:
             self._of_object = {window: _of_object(views, batching, window) for window in windows}
 
     @classmethod
-    def of(cls, views: Views, config: DictConfig) -> RayBatches:
-        """Make the batches of a run from its configuration, see `TrainConfig`."""
+    def of(cls, views: Views, config: DictConfig) -> PixelBatches:
+        """Make the pixels of a run from its configuration, see `TrainConfig`."""
         options = config.batches
         precrop, fraction = (options.precrop_steps, options.precrop_fraction), options.object_fraction
         return cls(views, options.size, options.batching, config.seed, *precrop, fraction)
 
-    def to(self, device: torch.device | str, dtype: torch.dtype | None = None) -> RayBatches:
-        """Return the same sequence on another device, with rays in another precision."""
+    def to(self, device: torch.device | str, dtype: torch.dtype | None = None) -> PixelBatches:
+        """Return the same sequence on another device, with cameras in another precision."""
         moved = copy.copy(self)
         moved._cameras, moved._pixels = self._cameras.to(device, dtype), self._pixels.to(device)
         return moved
@@ -92,26 +88,11 @@ class RayBatches:
         """Size of the colours of all training pixels in memory."""
         return self._pixels.nbytes
 
-    def traced(
-        self, trace: Trace, trace_exits: TraceExits | None = None, subdivision: Subdivision | None = None
-    ) -> RayBatches:
-        """Return the sequence with traced paths, and several rays in pixels that `subdivision` divides.
-
-        Args:
-            trace: function that traces rays, given the view of each ray.
-            trace_exits: function that traces only exit directions of main polylines; None to use `trace`.
-            subdivision: rule for the subdivision of pixels; None for no subdivision.
-        """
-        traced = copy.copy(self)
-        traced._trace, traced._trace_exits = trace, trace_exits
-        traced.subdivision = subdivision or Subdivision()
-        return traced
-
     def release_memory(self) -> None:
         """Release the memory of mapped pixels, which are read again on demand."""
         self._pixels.release_memory()
 
-    def for_rank(self, rank: int, size: int) -> RayBatches:
+    def for_rank(self, rank: int, size: int) -> PixelBatches:
         """Return the batches of process `rank` of `size` processes, each with an equal part of the pixels."""
         if self.batch_size % size:
             raise NerfroError(
@@ -121,7 +102,7 @@ class RayBatches:
         shared._share = share_of(self.batch_size, rank, size)
         return shared
 
-    def smaller(self, most: int) -> RayBatches:
+    def smaller(self, most: int) -> PixelBatches:
         """Return the sequence with at most `most` pixels per step."""
         few = copy.copy(self)
         few.batch_size = min(most, self.batch_size)
@@ -129,37 +110,25 @@ class RayBatches:
         few._share = slice(*ends)
         return few
 
-    def batch(self, step: int) -> Batch:
-        """Make the batch of a step, a function of seed and step with the same pixels on every device."""
+    def draw(self, step: int) -> Pixels:
+        """Draw the pixels of a step, a function of seed and step that is equal on every device."""
         cameras = self._cameras
         height, width = cameras.height, cameras.width
-        window = central_window(height, width, 1.0) if step >= self.precrop_steps else self._crop
-        generator = np.random.default_rng([self.seed, step])
-        view, pixel = self._draw(generator, window)
+        window = self._full if step >= self.precrop_steps else self._crop
+        view, pixel = self._draw(np.random.default_rng([self.seed, step]), window)
         row, column = window.top + pixel // window.width, window.left + pixel % window.width
         # Only the pixel numbers are copied to the device.
-        pixels = self._to_device(((view * height + row) * width + column)[self._share])
+        number = self._to_device(((view * height + row) * width + column)[self._share])
         slot = torch.arange(self.batch_size, device=cameras.device)[self._share]
-        draws = Draws(self.seed, step, slot)
-        found = self._rays(pixels, step)
-        return Batch(
-            rays=found.rays,
-            ray_pixel=found.ray_pixel,
-            pixel_number=pixels,
-            view=cameras.view_of(pixels),
-            rgb=self._pixels[pixels],
-            teaches_background=~found.diverges,
-            cameras=cameras.crop(window),
-            draws=replace(draws, ray=slot[found.ray_pixel] * self.subdivision.side**2 + found.part),
-            path=found.path,
+        return Pixels(
+            number=number,
+            view=cameras.view_of(number),
+            rgb=self._pixels[number],
+            draws=Draws(self.seed, step, slot),
+            cameras=cameras,
+            window=cameras if window == self._full else cameras.crop(window),
+            photographed=self.photographed,
         )
-
-    def _rays(self, pixels: Int[Tensor, "Q"], step: int) -> PixelRays:
-        """Create rays through pixels, with paths if a trace function is set."""
-        contrasts = None
-        if step >= self.subdivision.contrast_start:
-            contrasts = lambda rows: contrast(self.photographed, self._cameras, pixels[rows])  # noqa: E731
-        return subdivide(self._cameras, pixels, self.subdivision, self._trace, self._trace_exits, contrasts)
 
     @property
     def num_pixels(self) -> int:
@@ -172,7 +141,7 @@ class RayBatches:
         Rows are counted through all views. If masks exclude pixels, a row has the next usable pixels.
         """
         cameras = self._cameras
-        width, window = cameras.width, central_window(cameras.height, cameras.width, 1.0)
+        width, window = cameras.width, self._full
         usable = None if self._usable is None else self._usable[window]
         total = self.num_pixels if usable is None else int(usable.starts[-1])
         first = np.arange(part * width, total, num_parts * width)
@@ -191,7 +160,7 @@ class RayBatches:
         if self._usable is None:
             within = generator.integers(size, size=shape)
         else:
-            usable = self._usable[central_window(cameras.height, cameras.width, 1.0)]
+            usable = self._usable[self._full]
             counts = np.diff(usable.starts)[:, None]
             drawn = generator.integers(np.maximum(counts, 1), size=shape) + usable.starts[:-1, None]
             _, within = usable.find(np.minimum(drawn, usable.starts[-1] - 1).ravel())
