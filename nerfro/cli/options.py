@@ -209,7 +209,7 @@ def plugin_options(plugin: Plugin, prefix: str, values: DictConfig | None = None
         values: configuration that replaces the defaults.
     """
     explained: dict[str, str] = {}
-    for base in plugin.cls.__mro__:
+    for base in getattr(plugin.cls, "__mro__", (plugin.cls,)):
         for documented in (vars(base).get("__init__"), base):
             explained = google_docstring(inspect.cleandoc(documented.__doc__ or ""))[1] | explained
     given = {} if values is None else _plain(values)

@@ -18,8 +18,8 @@ class RefractiveModel(Renderer):
     """Render bent rays with one radiance field for each sampling level, and a background (paper, section 2).
 
     Args:
-        background_direction: direction of the background radiance: the `exit` direction of the path, or the direction
-            of the `last_coarse` sample, as in the authors' code.
+        background_direction: direction of the background radiance: the `exit` direction of the path, or the direction of
+            the `last_coarse` sample, as in the authors' code.
         colour: colour space in which fields and background return radiance and rays sum radiance: `linear`, or `srgb`
             as in the authors' code.
     """

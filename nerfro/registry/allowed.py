@@ -1,6 +1,6 @@
 """Allowed values of parameters and settings, declared by annotations such as `Annotated[int, Range(at_least=1)]`.
 
-Numbers must be finite, except with the annotation `AnyNumber`. Choices of text in configuration dataclasses have the
+Numbers must be finite. Choices of text in configuration dataclasses have the
 form `Annotated[str, Literal["a", "b"]]`, because OmegaConf does not support `Literal`.
 """
 
@@ -95,7 +95,6 @@ class OnlyWith:
 
 _FURTHEST = 10**7  # world units, as in georeferenced data
 
-AnyNumber = Annotated[float, None]  # including infinity and NaN
 Count = Annotated[int, Range(at_least=1)]
 NumRays = Annotated[int, Range(at_least=1, at_most=2**22)]  # computed in one chunk
 Side = Annotated[int, Range(at_least=1, at_most=32)]  # number of rays along each side of a pixel
@@ -111,24 +110,28 @@ Coordinate = Annotated[float, Range(at_least=-_FURTHEST, at_most=_FURTHEST)]  # 
 Distance = Annotated[float, Range(at_least=0, at_most=_FURTHEST)]  # world units
 
 
-def checked(where: str) -> Callable[[type[Class]], type[Class]]:
-    """Decorate a class with a constructor that checks all arguments against the annotations.
+def checked(where: str) -> Callable[[Class], Class]:
+    """Decorate a class or a function so that its constructor or call checks all arguments against the annotations.
 
     Args:
-        where: start of the error message, such as `medium=ball`.
+        where: start of the error message, such as `medium=vacuum`.
     """
 
-    def wrap(cls: type[Class]) -> type[Class]:
-        constructor = cls.__init__  # type: ignore[misc]
-        signature, hints = inspect.signature(constructor), get_type_hints(constructor, include_extras=True)
+    def guarded(function: Any) -> Any:
+        signature, hints = inspect.signature(function), get_type_hints(function, include_extras=True)
 
-        @functools.wraps(constructor)
-        def init(self: Any, *arguments: Any, **named: Any) -> None:
-            check(f"{where}: ", hints, signature.bind(self, *arguments, **named).arguments)
-            constructor(self, *arguments, **named)
+        @functools.wraps(function)
+        def call(*arguments: Any, **named: Any) -> Any:
+            check(f"{where}: ", hints, signature.bind(*arguments, **named).arguments)
+            return function(*arguments, **named)
 
-        cls.__init__ = init  # type: ignore[misc,method-assign]
-        return cls
+        return call
+
+    def wrap(target: Class) -> Class:
+        if not isinstance(target, type):
+            return guarded(target)
+        target.__init__ = guarded(target.__init__)  # type: ignore[misc]
+        return target
 
     return wrap
 
@@ -213,20 +216,18 @@ def refuse_unused(options: object, names: Iterable[str], reason: str) -> None:
             raise NerfroError(f"{name}={settings[name]} has no effect {reason}; remove it")
 
 
-def corners_of_box(
-    box_min: Sequence[float], box_max: Sequence[float], bounded: bool = True
-) -> Float[np.ndarray, "2 3"]:
+def corners_of_box(box_min: Sequence[float], box_max: Sequence[float]) -> Float[np.ndarray, "2 3"]:
     """Return the corners of a box as an array.
 
     Args:
         box_min, box_max: lower and upper corner, world units.
-        bounded: refuse corners farther than 10^7 units from the origin.
 
     Raises:
-        NerfroError: a corner does not have three numbers, or the lower corner is not below the upper one.
+        NerfroError: a corner does not have three numbers or is farther than 10^7 units from the origin, or the lower
+            corner is not below the upper one.
     """
     box = np.array([box_min, box_max], np.float64) if len(box_min) == len(box_max) == 3 else np.zeros((2, 3))
-    if not (box[1] > box[0]).all() or (bounded and not (np.abs(box) <= _FURTHEST).all()):
+    if not (box[1] > box[0]).all() or not (np.abs(box) <= _FURTHEST).all():
         raise NerfroError(
             f"box_min={list(box_min)}, box_max={list(box_max)} is not a box; give three numbers each, min below max, "
             f"and none beyond {_FURTHEST}"

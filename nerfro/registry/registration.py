@@ -71,7 +71,7 @@ class Plugin:
     Attributes:
         kind: plugin type and configuration group, such as `sampler/path`.
         name: name of the option in the group, such as `eikonal`.
-        cls: the class.
+        cls: the class, or a function that returns an instance.
         config: dataclass of the configurable parameters, with `_target_`.
         hints: annotations of the configurable parameters with allowed values, see `nerfro.registry.allowed`.
         parts: other constructor parameters; the caller of `build` passes the values.
@@ -79,7 +79,7 @@ class Plugin:
 
     kind: str
     name: str
-    cls: type
+    cls: Any
     config: type
     hints: Mapping[str, Any]
     parts: frozenset[str]
@@ -113,12 +113,12 @@ CHECKS: dict[str, Callable[[str, type], None]] = {}
 _discovered: set[str] = set()
 
 
-def register(kind: str, name: str) -> Callable[[type[Part]], type[Part]]:
-    """Register a class as option `name` of a plugin type; used as a decorator.
+def register(kind: str, name: str) -> Callable[[Part], Part]:
+    """Register a class, or a function that returns an instance, as option `name` of a plugin type.
 
-    The signature of the constructor becomes the configuration. Parameters annotated with int, float, bool, str, their
-    optional, list and dict forms or `Literal` are configuration. The caller of `build` passes all other parameters.
-    Values outside the annotated ranges are refused (`nerfro.registry.allowed`).
+    The signature of the constructor or function becomes the configuration. Parameters annotated with int, float, bool,
+    str, their optional, list and dict forms or `Literal` are configuration. The caller of `build` passes all other
+    parameters. Values outside the annotated ranges are refused (`nerfro.registry.allowed`).
 
     Args:
         kind: plugin type, one of `KINDS`.
@@ -129,14 +129,14 @@ def register(kind: str, name: str) -> Callable[[type[Part]], type[Part]]:
     """
     _require_kind(kind)
 
-    def wrap(cls: type[Part]) -> type[Part]:
+    def wrap(cls: Part) -> Part:
         add(kind, name, cls)
         return checked(f"{kind}={name}")(cls)
 
     return wrap
 
 
-def add(kind: str, name: str, cls: type) -> None:
+def add(kind: str, name: str, cls: Any) -> None:
     """Register a class of another package under a name; see `register`."""
     _require_kind(kind)
     taken = _plugins.get((kind, name))
@@ -196,20 +196,14 @@ def build(node: object, **parts: object) -> Any:
 
 
 def check_node(node: object) -> type:
-    """Check the configuration node of a plugin, except for unresolved interpolations, and return the plugin class.
+    """Check the configuration node of a plugin, and return the plugin class.
 
     Raises:
         NerfroError: as `build`.
     """
     node = _settings_of(node)
     plugin = plugin_of(node)
-    keys = [str(key) for key in node]
-    if not any(OmegaConf.is_interpolation(node, key) for key in keys):
-        configure(plugin, node)
-    else:
-        unknown = [key for key in keys if OmegaConf.is_interpolation(node, key) or OmegaConf.is_missing(node, key)]
-        known = {key: node[key] for key in keys if key not in unknown}
-        check(f"{plugin.kind}={plugin.name}: ", plugin.hints, known)
+    configure(plugin, node)
     return plugin.cls
 
 
@@ -263,7 +257,7 @@ def create(plugin: Plugin, node: DictConfig | Mapping[str, object], **parts: obj
     return made
 
 
-def _settings(cls: type) -> tuple[str, ...]:
+def _settings(cls: Any) -> tuple[str, ...]:
     """Names of configurable class attributes, such as the weight of a loss."""
     return getattr(cls, "SETTINGS", ())
 
@@ -387,7 +381,7 @@ def _import_plugin(module: str, where: str) -> None:
         raise NerfroError(f"plugin {where} cannot be imported: {type(error).__name__}: {error}") from error
 
 
-def _make_plugin(kind: str, name: str, cls: type) -> Plugin:
+def _make_plugin(kind: str, name: str, cls: Any) -> Plugin:
     fields: list[tuple[str, Any, Any]] = []
     parts: set[str] = set()
     allowing: dict[str, Any] = {}
@@ -412,12 +406,16 @@ def _make_plugin(kind: str, name: str, cls: type) -> Plugin:
     return Plugin(kind, name, cls, config, allowing, frozenset(parts))
 
 
-def _parameters(cls: type) -> list[tuple[inspect.Parameter, Any, Any]]:
-    """Return the parameters of a constructor with the types, without and with `Annotated`.
+def _parameters(cls: Any) -> list[tuple[inspect.Parameter, Any, Any]]:
+    """Return the parameters of a constructor or function with the types, without and with `Annotated`.
 
     A constructor with `**options` also has the parameters of the base class constructor.
     """
     found: dict[str, tuple[inspect.Parameter, Any, Any]] = {}
+    if not isinstance(cls, type):
+        hints, annotations = (typing.get_type_hints(cls, include_extras=extras) for extras in (False, True))
+        signature = inspect.signature(cls)
+        return [(own, hints.get(name), annotations.get(name)) for name, own in signature.parameters.items()]
     for base in inspect.getmro(cls):
         # Classes without their own constructor have no configuration; the signature of nn.Module is generic. The class
         # is compared by name, because this module must not import torch.
