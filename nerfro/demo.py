@@ -13,7 +13,6 @@ import re
 import sys
 from datetime import datetime
 from pathlib import Path
-from typing import TextIO
 
 import nerfro.cli.startup
 from nerfro.cli.failures import errors_in_one_line
@@ -35,7 +34,7 @@ def main() -> None:
         print("nerfro: starting; the first start compiles kernels, up to a minute", file=sys.stderr, flush=True)
         leave_current_directory()
         folder = Path("outputs", f"demo_{datetime.now():%Y-%m-%d_%H-%M-%S}").resolve()
-        with contextlib.redirect_stdout(_Addresses(sys.stdout)):
+        with contextlib.redirect_stdout(_Addresses()):
             # The package imports the functions on access, after the line above.
             run = nerfro.train(overrides=[*_OPTIONS, *sys.argv[1:]], out=folder)
             page = nerfro.export(run, "page", folder / "page.html")
@@ -47,9 +46,9 @@ def main() -> None:
 class _Addresses(io.StringIO):
     """Output of which only the address of the page is shown; errors and progress are on standard error."""
 
-    def __init__(self, shown: TextIO) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self._shown = shown
+        self._shown = sys.stdout
 
     def write(self, text: str) -> int:
         address = re.search(r"http://\S+", text)

@@ -138,7 +138,7 @@ def test_demo_opens_the_page_and_prints_the_score_in_one_line(
     address, last = done.out.splitlines()
     assert address == "nerfro: the page: http://localhost:1"
     assert last.startswith("PSNR 31.3 dB on 1 photographs that were not trained on; page: ")
-    assert run_here("demo", "seed=7", code=1).error == "nerfro: error: no seven"
+    assert run_here("demo", "seed=7", code=1).err.endswith("nerfro: error: no seven\n")
 
 
 def test_pages_open_in_graphical_browsers_and_are_printed_over_ssh(

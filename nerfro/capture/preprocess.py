@@ -42,8 +42,8 @@ def preprocess(capture: Capture, overrides: Sequence[str] = (), **settings: obje
     Raises:
         NerfroError: options contradict each other, the masks determine no surface, or files exist.
     """
-    given = [*capture.overrides, *as_overrides(settings), *overrides]
-    with composed("preprocess", PreprocessConfig, given, with_scene) as composition:
+    arguments = [*capture.overrides, *as_overrides(settings), *overrides]
+    with composed("preprocess", PreprocessConfig, arguments, with_scene) as composition:
         return preprocess_composed(Request(composition))
 
 

@@ -15,6 +15,7 @@ from typing import Any, TypeVar, cast
 
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
@@ -149,12 +150,16 @@ def composed(
     ConfigStore.instance().store(name=f"{command}_schema", node=schema, provider="nerfro")
     arguments = expand([*map(full_key, overrides)], [field.name for field in dataclasses.fields(schema)])
     arguments = [*map(added, arguments)] if command == "train" else arguments
+    outer = GlobalHydra.instance().hydra
+    GlobalHydra.instance().hydra = None  # of a command that calls this function
     try:
         with composed_with(check_all), initialize_config_dir(str(CONF_DIR), version_base="1.3"):
             job = compose(command, arguments, return_hydra_config=True)
     except HydraException as error:
         describe_command(command, schema, CONF_DIR).require_known(arguments)
         raise NerfroError(in_one_line(error)) from error
+    finally:
+        GlobalHydra.instance().hydra = outer
     with open_dict(job):
         job.hydra.runtime.output_dir = job.hydra.run.dir
     config = copy.deepcopy(job)

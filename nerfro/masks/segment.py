@@ -42,8 +42,8 @@ def segment(capture: Capture, overrides: Sequence[str] = (), **settings: object)
     Raises:
         NerfroError: the data set is part of nerfro, there is nothing to start from, or the views disagree.
     """
-    given = [*capture.overrides, *as_overrides(settings), *overrides]
-    with composed("mask", MaskConfig, given, with_scene) as composition:
+    arguments = [*capture.overrides, *as_overrides(settings), *overrides]
+    with composed("mask", MaskConfig, arguments, with_scene) as composition:
         return segment_composed(composition)
 
 
@@ -67,9 +67,9 @@ def _mask(config: DictConfig, source: DataSource) -> None:
     task = MaskTask.load(source, config, outlines)
     if config.view:
 
-        def save(outlines: dict[str, list], found: Segmentation) -> str:
+        def save(outlines: dict[str, list], segmentation: Segmentation) -> str:
             write_atomically(drawn, json.dumps(outlines) + "\n")
-            return f"{task.save(outlines, found)}; the outlines are in {drawn}"
+            return f"{task.save(outlines, segmentation)}; the outlines are in {drawn}"
 
         page = OutlinePage(task.images, task.frames, outlines, task.segment, save)
         page.serve(source.root.name, config.host, config.port, config.open)
@@ -77,6 +77,6 @@ def _mask(config: DictConfig, source: DataSource) -> None:
         missing = len(task.frames) - len(task.kept) - len(outlines)
         print(f"{len(task.kept)} existing masks, {len(outlines)} outlines; segmenting {missing} further views")
         with progress_bar("segmenting", missing) as progress:
-            found = task.segment(outlines, progress.update)
-        print(task.save(outlines, found))
+            segmentation = task.segment(outlines, progress.update)
+        print(task.save(outlines, segmentation))
         print("correct wrong masks in a paint program; or delete them, outline one of these views, and repeat")

@@ -58,8 +58,8 @@ def reconstruct(overrides: Sequence[str] = (), **settings: object) -> Run:
     Raises:
         NerfroError: options are missing or contradict each other, or a stage failed.
     """
-    given = [*as_overrides(settings), *overrides]
-    with composed("reconstruct", ReconstructConfig, given, with_scene) as composition:
+    arguments = [*as_overrides(settings), *overrides]
+    with composed("reconstruct", ReconstructConfig, arguments, with_scene) as composition:
         return reconstruct_composed(composition)
 
 
@@ -112,12 +112,12 @@ def _preprocess(composition: Composition, capture: Capture, folder: Path) -> Sce
     """Reconstruct surface and index in a folder."""
     root, medium = resolve_path(capture.root), composition.config.medium
     inputs = [*root.glob("transforms*.json"), *capture.masks]
-    given = shlex.split(composition.config.preprocess)
+    own = shlex.split(composition.config.preprocess)
     automatic = [*as_overrides({"out": folder}), "refine=true", "wrong_masks=null", "overwrite=true"]
-    automatic += [] if is_given("mesh", given) else ["symmetry=auto"]
+    automatic += [] if is_given("mesh", own) else ["symmetry=auto"]
     if "wall" not in medium and "shell_voxels" in medium and medium.get("bodies") is None:
         automatic.append("vessel=true")
-    options = [*of_groups(("medium",), composition.overrides), *not_given(automatic, given), *given]
+    options = [*of_groups(("medium",), composition.overrides), *not_given(automatic, own), *own]
     stage = Stage("preprocess", [*capture.overrides, *options], folder / SCENE, folder / SHEET, inputs)
     return stage.run(lambda: preprocess(capture, options), lambda: read_scene_file(folder / SCENE))
 

@@ -195,8 +195,8 @@ def build(node: object, **parts: object) -> Any:
     return create(plugin, node, **{name: parts[name] for name in plugin.parts if name in parts})
 
 
-def check_node(node: object) -> type:
-    """Check the configuration node of a plugin, and return the plugin class.
+def check_node(node: object) -> Any:
+    """Check the configuration node of a plugin, and return the class or function of the plugin.
 
     Raises:
         NerfroError: as `build`.

@@ -91,12 +91,12 @@ class SceneFile:
         own |= {"bodies": {name: _given(body) for name, body in self.bodies.items()}} if short is None else short
         if medium == "vessel":
             own |= self.vessel
-        chosen: dict[str, object] = {"data": data.pop("type")}
+        settings: dict[str, object] = {"data": data.pop("type")}
         if (medium or medium_type) != "object":  # `object` is the choice of most experiments; others have their own
-            chosen["medium"] = medium or medium_type
+            settings["medium"] = medium or medium_type
         for group, values in (("data", data), ("medium", own)):
-            chosen |= {f"{group}.{name}": value for name, value in values.items()}
-        return chosen
+            settings |= {f"{group}.{name}": value for name, value in values.items()}
+        return settings
 
     def added_to(self, overrides: Sequence[str], names: Collection[str], source: str) -> list[str]:
         """Add the settings of the scene to overrides, which have precedence.
@@ -121,7 +121,7 @@ class SceneFile:
     def save(self, path: Path) -> None:
         """Write the file, with the command of this process and the versions of packages."""
         folder = os.path.realpath(path.parent)
-        scene = self._with_paths(lambda place: Path(os.path.relpath(os.path.realpath(user_path(place)), folder)))
+        scene = self._with_paths(lambda path: Path(os.path.relpath(os.path.realpath(user_path(path)), folder)))
         installed = {name: version for name, version in versions().items() if version is not None}
         algorithms = list(AlgorithmSettings.used.values())
         origin = replace(self.provenance, command=command_line(), versions=installed, algorithms=algorithms)
@@ -133,20 +133,20 @@ class SceneFile:
     def _with_paths(self, convert: Callable[[str], Path]) -> SceneFile:
         """Return a copy with other places of data set and meshes; embedded data stays."""
 
-        def place(given: str | None) -> str | None:
-            return given if given is None or given.startswith(EMBEDDED_PREFIX) else convert(given).as_posix()
+        def moved(path: str | None) -> str | None:
+            return path if path is None or path.startswith(EMBEDDED_PREFIX) else convert(path).as_posix()
 
-        def placed(surface: Any) -> Any:
+        def moved_surface(surface: Any) -> Any:
             if not isinstance(surface, Mapping):
                 return surface
-            named = {key: place(value) for key, value in surface.items() if key == "file" and isinstance(value, str)}
-            return {key: placed(value) for key, value in surface.items()} | named
+            named = {key: moved(value) for key, value in surface.items() if key == "file" and isinstance(value, str)}
+            return {key: moved_surface(value) for key, value in surface.items()} | named
 
         bodies = {
-            name: replace(body, mesh=place(body.mesh), surface=placed(body.surface))
+            name: replace(body, mesh=moved(body.mesh), surface=moved_surface(body.surface))
             for name, body in self.bodies.items()
         }
-        return replace(self, data=self.data | {"root": place(str(self.data["root"]))}, bodies=bodies)
+        return replace(self, data=self.data | {"root": moved(str(self.data["root"]))}, bodies=bodies)
 
 
 def take_bodies(medium: dict[str, Any]) -> dict[str, BodySettings]:
@@ -181,7 +181,7 @@ def read_scene_file(path: Path) -> SceneFile:
     folder = Path(os.path.realpath(path.parent))
     if folder == Path(os.path.abspath(path.parent)):  # no link
         folder = path.parent
-    return scene._with_paths(lambda place: Path(os.path.normpath(folder / user_path(place))))
+    return scene._with_paths(lambda path: Path(os.path.normpath(folder / user_path(path))))
 
 
 def with_scene(arguments: Sequence[str], names: Collection[str]) -> list[str]:

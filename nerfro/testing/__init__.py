@@ -20,7 +20,6 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from omegaconf import OmegaConf
 
 from nerfro.backgrounds.base import Background
 from nerfro.backgrounds.constant import ConstantBackground
@@ -204,9 +203,9 @@ def check_export(name: str) -> None:
     scene = TrainedScene(example_run().renderer.eval(), _ExampleData())
     with tempfile.TemporaryDirectory() as folder:
         out = FilePath(folder, f"scene{endings[0]}")
-        config = OmegaConf.structured(ExportConfig(checkpoint="-", what=name, out=str(out)))
+        options = ExportConfig(checkpoint="-", what=name, out=str(out))
         with _named(f"what={name}"):
-            text = export.write(scene, out, config)
+            text = export.write(scene, out, options)
         _require(isinstance(text, str) and text != "", "write returns a description of the file, which is printed")
         _require(out.is_file(), "write writes the file `out`")
         others = {file.name for file in FilePath(folder).iterdir()} - {file.name for file in export.files(out)}

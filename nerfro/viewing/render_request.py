@@ -83,10 +83,10 @@ class Shots:
 
 def check_request(options: RenderConfig) -> None:
     """Check that the options are consistent, before anything is loaded."""
-    given = [name for name in ("path", "views", "position") if getattr(options, name) is not None]
-    if len(given) != 1:
+    selectors = [name for name in ("path", "views", "position") if getattr(options, name) is not None]
+    if len(selectors) != 1:
         raise NerfroError(
-            f"{len(given)} options select the cameras ({', '.join(given)}); give exactly one of path=orbit, "
+            f"{len(selectors)} options select the cameras ({', '.join(selectors)}); give exactly one of path=orbit, "
             "path=FILE.json, views=test, and position=[X,Y,Z]"
         )
     for name in ("position", "target"):
@@ -144,14 +144,14 @@ def _local(point: Sequence[float], scene: TrainedScene) -> Float[Tensor, "3"]:
     return (torch.tensor(list(point), dtype=torch.float64) - torch.from_numpy(scene.source.origin)).float()
 
 
-def _views(given: str, scene: TrainedScene) -> Shots:
-    split, _, number = given.partition(":")
+def _views(selection: str, scene: TrainedScene) -> Shots:
+    split, _, number = selection.partition(":")
     cameras = scene.cameras(split)
     names = _numbered(split, len(cameras), 3)
     if not number:
         return Shots(cameras, names, False)
     if not number.isdecimal() or int(number) >= len(cameras):
-        raise NerfroError(f"views={given}: {split} has views 0 to {len(cameras) - 1}; give one of these numbers")
+        raise NerfroError(f"views={selection}: {split} has views 0 to {len(cameras) - 1}; give one of these numbers")
     return Shots(cameras.select([int(number)]), [names[int(number)]], False)
 
 
@@ -193,12 +193,12 @@ def _resized(cameras: Cameras, width: int, height: int) -> Cameras:
 
 def _size(options: RenderConfig, width: int, height: int) -> tuple[int, int]:
     """Return width and height in pixels."""
-    given = options.resolution
-    sides = list(given) if isinstance(given, list) else [given]
-    if given is None:
+    resolution = options.resolution
+    sides = list(resolution) if isinstance(resolution, list) else [resolution]
+    if resolution is None:
         return width, height
     if not all(isinstance(side, int) and side > 0 for side in sides) or len(sides) > 2:
-        raise NerfroError(f"resolution={given} is not allowed; give the width in pixels, or [width,height]")
+        raise NerfroError(f"resolution={resolution} is not allowed; give the width in pixels, or [width,height]")
     return sides[0], sides[1] if len(sides) == 2 else max(1, round(sides[0] * height / width))
 
 
