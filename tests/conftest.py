@@ -293,6 +293,7 @@ def tiny_run(tiny_scene: Path) -> list[str]:
         "sampler/path=eikonal",
         "sampler/points=hierarchical",
         "field=nerf",
+        "content.space=unbounded",
         "background=skybox",
         "sampler.path.integrator=euler",
         "loss.background.weight=0.025",

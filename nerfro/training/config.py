@@ -267,7 +267,8 @@ def check_run(config: DictConfig) -> None:
     require_box(config)
     if config.background.get("image") and config.model.get("colour") == "srgb":
         raise NerfroError(
-            "background.image holds linear radiance, but fields and background have sRGB values with model.colour=srgb; "
+            "background.image holds linear radiance, but fields and background have sRGB values with "
+            "model.colour=srgb; "
             "take model.colour=linear"
         )
     if limit is None and config.trainer.max_steps < 0 and not (config.debug or config.trainer.fast_dev_run):
