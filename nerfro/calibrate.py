@@ -10,15 +10,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Literal, Optional
 
+from annotated_types import Ge, Le
 from omegaconf import DictConfig
 
 import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
 from nerfro.cli.entry import entry_point
 from nerfro.data.frames import Every
 from nerfro.poses import command
-from nerfro.registry.allowed import Count, Natural, Positive, Range
+from nerfro.registry.allowed import Count, Natural, Positive
 
-Squares = Annotated[int, Range(at_least=1, at_most=100)]  # along a side of a board
+Squares = Annotated[int, Ge(1), Le(100)]  # along a side of a board
 
 
 @dataclass

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Any, Optional
 
+from annotated_types import Ge, Le
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import MISSING, DictConfig
 
@@ -17,7 +18,6 @@ import nerfro.cli.startup  # noqa: F401 - before the other imports, which take s
 from nerfro.cli.entry import entry_point
 from nerfro.cli.overrides import is_given, of_groups, print_next
 from nerfro.masks import command
-from nerfro.registry.allowed import Range
 from nerfro.rendering.scene_file import with_scene
 
 
@@ -49,7 +49,7 @@ class MaskConfig:
     overwrite: bool = False
     view: bool = False
     host: str = "localhost"
-    port: Annotated[int, Range(at_least=0, at_most=65535)] = 8008
+    port: Annotated[int, Ge(0), Le(65535)] = 8008
     open: bool = True
 
 

@@ -3,6 +3,8 @@
 A plugin begins with one import, such as `from nerfro.parts import Loss, register`; see docs/guides/plugins.md.
 """
 
+from annotated_types import Ge, Gt, Le, Lt
+
 from nerfro.backgrounds.base import Background
 from nerfro.camera.base import CameraModel
 from nerfro.core.cameras import Cameras
@@ -19,7 +21,7 @@ from nerfro.losses.base import Loss
 from nerfro.media.base import Medium, Scalars, Vectors
 from nerfro.media.surface import Grid, Surface
 from nerfro.models.refractive import RefractiveModel
-from nerfro.registry.allowed import Count, Distance, Natural, NotNegative, Positive, Range
+from nerfro.registry.allowed import Count, Distance, Natural, NotNegative, Positive
 from nerfro.registry.registration import register
 from nerfro.rendering import Components, Renderer, Scene
 from nerfro.samplers.base import PathSampler, PointSampler
@@ -31,9 +33,9 @@ from nerfro.viewing.trained_scene import TrainedScene
 
 __all__ = [
     "EXPORTS", "Background", "Batch", "CameraModel", "Cameras", "Components", "Count", "DataSource", "Distance",
-    "Draws", "Exits", "Export", "Field", "FieldValues", "Grid", "ImageMetric", "Loss", "Medium", "Natural",
-    "NerfroError", "NotNegative", "Path", "PathSampler", "Phase", "PointSampler", "Positive", "Range", "Rays",
-    "RefractiveModel", "Renderer", "Rendering", "Samples", "Scalars", "Scene", "Stratified", "Surface",
+    "Draws", "Exits", "Export", "Field", "FieldValues", "Ge", "Grid", "Gt", "ImageMetric", "Le", "Loss", "Lt",
+    "Medium", "Natural", "NerfroError", "NotNegative", "Path", "PathSampler", "Phase", "PointSampler", "Positive",
+    "Rays", "RefractiveModel", "Renderer", "Rendering", "Samples", "Scalars", "Scene", "Stratified", "Surface",
     "TrainedScene", "TrainingRun", "Vectors", "Views", "invert_cdf", "load_arrays", "point_samples", "register",
     "resolve_path", "spread_uniform", "write_atomically",
 ]  # fmt: skip

@@ -13,11 +13,11 @@ import signal
 from dataclasses import dataclass
 from typing import Annotated, Optional
 
+from annotated_types import Ge, Le
 from omegaconf import MISSING, DictConfig
 
 import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
 from nerfro.cli.entry import entry_point
-from nerfro.registry.allowed import Range
 from nerfro.training.load import load
 from nerfro.viewing.page import make_page
 from nerfro.viewing.server import PageServer, open_page
@@ -30,9 +30,9 @@ class ViewConfig:
 
     checkpoint: str = MISSING  # run folder, or a checkpoint in it
     host: str = "localhost"  # address of the server; 0.0.0.0 accepts connections from other machines
-    port: Annotated[int, Range(at_least=0, at_most=65535)] = 8008  # 0 for any free port
+    port: Annotated[int, Ge(0), Le(65535)] = 8008  # 0 for any free port
     open: bool = True  # whether to open a browser
-    resolution: Annotated[int, Range(at_least=2)] = RESOLUTION  # grid vertices along the longest side of the volume
+    resolution: Annotated[int, Ge(2)] = RESOLUTION  # grid vertices along the longest side of the volume
     root: Optional[str] = None  # folder of the data, if it has moved since training
     device: str = "auto"  # `cpu` or `cuda`; `auto` means the CPU
 

@@ -4,18 +4,19 @@ import math
 from typing import Annotated, Literal
 
 import pytest
+from annotated_types import Gt, Le
 
-from nerfro.registry.allowed import AnyNumber, Count, Positive, Range, checked, corners_of_box
+from nerfro.registry.allowed import AnyNumber, Count, Positive, corners_of_box, validated
 from nerfro.registry.registration import create, discover, find
 from tests.conftest import refused
 
 
-@checked("component")
+@validated("component")
 class Component:
     def __init__(
         self,
         count: Count,
-        rate: Annotated[float, Range(more_than=0, at_most=2)] = 1.0,
+        rate: Annotated[float, Gt(0), Le(2)] = 1.0,
         radius: Positive | None = None,
         sizes: list[Count] = (),  # type: ignore[assignment]
         mode: Literal["fast", "exact"] = "fast",

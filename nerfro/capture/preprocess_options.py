@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Optional
 
 import numpy as np
+from annotated_types import Ge, Le
 from hydra.core.hydra_config import HydraConfig
 from jaxtyping import Float
 from omegaconf import MISSING, DictConfig, OmegaConf
@@ -23,7 +24,7 @@ from nerfro.files.atomic import refuse_existing
 from nerfro.geometry.mesh import TriangleMesh, load_mesh, local_origin, num_decimals
 from nerfro.media.base import Medium
 from nerfro.media.bodies import ordered_settings
-from nerfro.registry.allowed import Count, Natural, NotNegative, Range, corners_of_box, refuse_unused
+from nerfro.registry.allowed import Count, Natural, NotNegative, corners_of_box, refuse_unused
 from nerfro.registry.registration import build
 from nerfro.rendering.scene_file import SCENE, SceneFile, described, take_bodies
 from nerfro.silhouettes.overlaps import REPORT, SHEET
@@ -67,7 +68,7 @@ class PreprocessConfig:
     mesh: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
     room: Optional[bool] = None  # noqa: UP045
     out: Optional[str] = None  # noqa: UP045
-    resolution: Annotated[int, Range(at_least=16, at_most=1024)] = 96
+    resolution: Annotated[int, Ge(16), Le(1024)] = 96
     box_min: Optional[list[float]] = None  # noqa: UP045
     box_max: Optional[list[float]] = None  # noqa: UP045
     wrong_masks: Optional[Natural] = 0  # noqa: UP045

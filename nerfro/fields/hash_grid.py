@@ -8,6 +8,7 @@ from itertools import pairwise
 from typing import Annotated, Literal
 
 import torch
+from annotated_types import Ge, Le
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
@@ -21,7 +22,7 @@ from nerfro.fields.observed_space import NUM_CELLS, observed_cells
 from nerfro.fields.selection import evaluate_selected, inside_box
 from nerfro.geometry.contraction import contract, contracted_box, contraction_scale
 from nerfro.kernels.available import fast_bfloat16
-from nerfro.registry.allowed import Depth, Positive, Range, Width, corners_of_box
+from nerfro.registry.allowed import Depth, Positive, Width, corners_of_box
 from nerfro.registry.registration import register
 
 # Number of features that the density network passes to the colour network.
@@ -69,10 +70,10 @@ class HashGridField(Field):
         box_max: Sequence[float] = (1.0, 1.0, 1.0),
         radius: Positive | None = None,
         num_levels: Depth = 12,
-        finest_resolution: Annotated[int, Range(at_least=_COARSEST_RESOLUTION)] = 256,
-        log2_table_size: Annotated[int, Range(at_least=4, at_most=24)] = 15,
+        finest_resolution: Annotated[int, Ge(_COARSEST_RESOLUTION)] = 256,
+        log2_table_size: Annotated[int, Ge(4), Le(24)] = 15,
         width: Width = 64,
-        direction_bands: Annotated[int, Range(at_least=1, at_most=harmonics.MAX_BANDS)] = 4,
+        direction_bands: Annotated[int, Ge(1), Le(harmonics.MAX_BANDS)] = 4,
         initial_depth: Positive = 0.1,
         shortcut: bool = True,
         precision: Literal["bfloat16", "float32"] | None = None,

@@ -18,7 +18,7 @@ from nerfro.kernels.constants import constant
 from nerfro.kernels.tolerances import MIN_COSINE, SAFE_SHARE, STEPS_PER_SHELL
 from nerfro.media.base import Medium, Scalars, Vectors
 from nerfro.media.material import Material, materials_of
-from nerfro.registry.allowed import NotNegative, Positive, checked
+from nerfro.registry.allowed import NotNegative, Positive, validated
 
 _COLOURS = ("red", "green", "blue")
 # Paths record bodies as 8-bit integers.
@@ -27,7 +27,7 @@ _MAX_BODIES = 127
 Self = TypeVar("Self", bound="Solid")  # typing has it from Python 3.11 on
 
 
-@checked("medium")
+@validated("medium")
 class Solid(Medium):
     """Bodies of constant index, bounded by the zero levels of signed distances; the last body at a point decides.
 

@@ -7,6 +7,7 @@ from math import inf
 from typing import Annotated
 
 import torch
+from annotated_types import Ge, Le
 from jaxtyping import Float
 from torch import Tensor
 
@@ -15,7 +16,7 @@ from nerfro.fields.base import Field
 from nerfro.fields.selection import evaluate_selected, inside_box
 from nerfro.paper.encoding import DIRECTION_DEGREE, positional_encoding
 from nerfro.paper.mlp import RadianceMLP, in_blocks
-from nerfro.registry.allowed import AnyNumber, Depth, Positive, Range, Width, corners_of_box
+from nerfro.registry.allowed import AnyNumber, Depth, Positive, Width, corners_of_box
 from nerfro.registry.registration import register
 
 
@@ -60,7 +61,7 @@ class NerfField(FieldInBox):
         depth: Depth = 8,
         skip: int = 5,
         view_width: Width = 128,
-        position_degree: Annotated[int, Range(at_least=0, at_most=64)] = 10,
+        position_degree: Annotated[int, Ge(0), Le(64)] = 10,
         box_min: list[AnyNumber] = (-inf, -inf, -inf),  # type: ignore[assignment]
         box_max: list[AnyNumber] = (inf, inf, inf),  # type: ignore[assignment]
         unit: Positive | None = 1.0,

@@ -8,11 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Optional
 
+from annotated_types import Ge, Le
 from omegaconf import MISSING, DictConfig
 
 from nerfro.cli.overrides import as_overrides, is_given
 from nerfro.core.errors import NerfroError
-from nerfro.registry.allowed import Count, Natural, Range
+from nerfro.registry.allowed import Count, Natural
 
 
 @dataclass
@@ -45,7 +46,7 @@ class ReconstructConfig:
     medium: Any = MISSING
     images: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
     video: Optional[str] = None  # noqa: UP045
-    frames: Annotated[int, Range(at_least=3, at_most=1000)] = 60
+    frames: Annotated[int, Ge(3), Le(1000)] = 60
     masks: Optional[str] = None  # noqa: UP045
     outlines: Any = None
     out: Optional[str] = None  # noqa: UP045

@@ -32,7 +32,7 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import PLUGINS_DIR, PLUGINS_PACKAGE
-from nerfro.registry.allowed import Names, Range, check, checked
+from nerfro.registry.allowed import Names, check
 
 KINDS = (
     "model", "camera", "medium", "surface", "sampler/path", "sampler/points", "field", "background", "loss", "phase",

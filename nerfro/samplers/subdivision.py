@@ -17,7 +17,7 @@ from torch import Tensor
 from nerfro.core.cameras import Cameras
 from nerfro.core.rays import Rays
 from nerfro.core.types import Path
-from nerfro.registry.allowed import Natural, NotNegative, Positive, Side, checked
+from nerfro.registry.allowed import Natural, NotNegative, Positive, Side, validated
 
 Trace = Callable[[Rays, Int[Tensor, "R"]], Path]  # traces rays of views
 TraceExits = Callable[[Rays, Int[Tensor, "R"]], Float[Tensor, "R 3"]]  # traces their exit directions alone
@@ -30,7 +30,7 @@ _TO_NEIGHBOUR = math.sqrt(0.5)
 DIVERGENT = 8.0
 
 
-@checked("subdivision")
+@validated("subdivision")
 @dataclass
 class Subdivision:
     """Selection of pixels with several rays, and the number of rays.

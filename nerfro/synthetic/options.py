@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated, Optional
 
+from annotated_types import Ge, Le
 from omegaconf import MISSING
 
-from nerfro.registry.allowed import Count, Names, Natural, NotNegative, Positive, Range
+from nerfro.registry.allowed import Count, Names, Natural, NotNegative, Positive
 from nerfro.synthetic.scenes import SCENES
 
 SceneName = Annotated[str, Names(lambda: SCENES)]
@@ -28,7 +29,7 @@ class SynthesizeConfig:
 
     scene: SceneName = MISSING
     out: str = MISSING
-    resolution: Annotated[int, Range(at_least=8, at_most=16384)] = MISSING
+    resolution: Annotated[int, Ge(8), Le(16384)] = MISSING
     spp: Count = MISSING
     test_spp: Count = MISSING
     views: ViewCounts = field(default_factory=ViewCounts)
@@ -38,7 +39,7 @@ class SynthesizeConfig:
     absorption: list[NotNegative] = MISSING
     ior: Optional[Positive] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
     seed: Natural = MISSING
-    sky_height: Annotated[int, Range(at_least=16, at_most=16384)] = MISSING
+    sky_height: Annotated[int, Ge(16), Le(16384)] = MISSING
     extras: bool = MISSING
     variant: str = MISSING
     overwrite: bool = MISSING

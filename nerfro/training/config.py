@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Optional, cast, get_args
 
 import torch
+from annotated_types import Ge, Gt, Le
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -29,7 +30,6 @@ from nerfro.registry.allowed import (
     NumRays,
     OnlyWith,
     Positive,
-    Range,
     Refused,
     Resolution,
     check_settings,
@@ -62,12 +62,12 @@ class BatchesConfig:
     # Whether the pixels of a step come from one image or from all images.
     batching: Annotated[str, Literal["single_image", "all_images"]] = "single_image"
     # Fraction of the pixels of a step that is drawn only from the object, according to the masks.
-    object_fraction: Annotated[float, Range(at_least=0, at_most=1)] = 0.0
+    object_fraction: Annotated[float, Ge(0), Le(1)] = 0.0
     # Number of training views, spread over the positions of the cameras, that are used for validation instead.
     num_validation_views: Natural = 0
     precrop_steps: Natural = 0  # number of first steps that see only the central window of the images
     # Relative side of the window.
-    precrop_fraction: Annotated[float, Range(more_than=0, at_most=1), OnlyWith("precrop_steps")] = 0.5
+    precrop_fraction: Annotated[float, Gt(0), Le(1), OnlyWith("precrop_steps")] = 0.5
     # Which pixels get several rays, in training and in validation.
     subdivision: Subdivision = dataclasses.field(default_factory=lambda: Subdivision(divergence=8.0))
 
@@ -89,7 +89,7 @@ class EvaluationConfig:
 class CheckpointConfig:
     """Interval between checkpoints: in seconds or in steps. Only the latest checkpoint is kept."""
 
-    every_seconds: Optional[Annotated[float, Range(more_than=0, at_most=10**9)]] = 60.0  # noqa: UP045 - between two checkpoints
+    every_seconds: Optional[Annotated[float, Gt(0), Le(10**9)]] = 60.0  # noqa: UP045 - between two checkpoints
     every_steps: Optional[Count] = None  # noqa: UP045 - training steps between two checkpoints
 
 
@@ -105,7 +105,7 @@ class TrainerConfig:
     devices: Any = 1
     num_nodes: Optional[Count] = None  # noqa: UP045
     strategy: Any = "auto"
-    max_steps: Annotated[int, Range(at_least=-1, at_most=10**9)] = -1  # -1 trains until max_time
+    max_steps: Annotated[int, Ge(-1), Le(10**9)] = -1  # -1 trains until max_time
     max_time: Any = None  # such as 90s, 5m, 1.5h, 2d, or DD:HH:MM:SS
     # `fastest` selects bf16-mixed if the machine has bfloat16 units, else 32-true.
     precision: Annotated[str, Literal["32-true", "fastest", "16-mixed", "bf16-mixed", "64-true"]] = "32-true"
@@ -169,9 +169,7 @@ class TrainConfig:
     """Root of the configuration of `python -m nerfro.train`, composed from conf/train.yaml."""
 
     name: str = "refractive"  # name of the experiment and of the run folder
-    seed: Annotated[int, Range(at_least=0, at_most=2**32 - 1)] = (
-        0  # seed of the initialization and of all random numbers
-    )
+    seed: Annotated[int, Ge(0), Le(2**32 - 1)] = 0  # seed of the initialization and of all random numbers
     # One plugin of each type.
     data: Any = MISSING
     camera: Any = MISSING
@@ -200,7 +198,7 @@ class TrainConfig:
     # Checkpoint to resume from, or `last` for the newest checkpoint of this experiment.
     ckpt_path: Optional[str] = None  # noqa: UP045
     viewer: bool = False  # serve an interactive page of the model during training, to browsers on this machine
-    viewer_port: Annotated[int, Range(at_least=0, at_most=65535)] = 8008  # port of the page; 0 selects a free port
+    viewer_port: Annotated[int, Ge(0), Le(65535)] = 8008  # port of the page; 0 selects a free port
     # Backend of torch.compile for the networks, such as inductor or cudagraphs on a GPU; None does not compile them.
     # Compilation takes a minute or more at the start.
     compile: Optional[str] = None  # noqa: UP045

@@ -12,7 +12,7 @@ from typing import Annotated, Optional
 from torch import nn
 
 from nerfro.core.errors import NerfroError
-from nerfro.registry.allowed import Natural, NotNegative, OnlyWith, Positive, checked
+from nerfro.registry.allowed import Natural, NotNegative, OnlyWith, Positive, validated
 
 # Patterns that have no effect in a scene without these parameters.
 OPTIONAL_PATTERNS = (
@@ -22,7 +22,7 @@ OPTIONAL_PATTERNS = (
 COMMON = "common"
 
 
-@checked("optimizer.groups")
+@validated("optimizer.groups")
 @dataclass
 class GroupConfig:
     """Settings of all parameters whose names match a pattern."""
@@ -31,7 +31,7 @@ class GroupConfig:
     start: Natural = 0  # step at which the parameters begin to learn
 
 
-@checked("optimizer")
+@validated("optimizer")
 @dataclass
 class OptimizerConfig:
     """Adam with a log-linear learning rate and a sine warm-up (authors' code; mip-NeRF, section 4).

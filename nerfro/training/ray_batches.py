@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 import torch
+from annotated_types import Ge, Le
 from jaxtyping import Bool, Float, Int, UInt8
 from omegaconf import DictConfig
 from torch import Tensor
@@ -20,13 +21,13 @@ from nerfro.core.errors import NerfroError, warn
 from nerfro.core.types import Batch
 from nerfro.data.base import Views
 from nerfro.data.pixel_store import PixelStore
-from nerfro.registry.allowed import Count, Natural, Range, checked
+from nerfro.registry.allowed import Count, Natural, validated
 from nerfro.samplers.subdivision import PixelRays, Subdivision, Trace, TraceExits, contrast, subdivide
 
 Batching = Literal["single_image", "all_images"]
 
 
-@checked("batches")
+@validated("batches")
 class RayBatches:
     """Random training pixels of each step, which depend only on the seed and the step.
 
@@ -42,7 +43,7 @@ class RayBatches:
         seed: Natural = 0,
         precrop_steps: Natural = 0,
         precrop_fraction: float = 0.5,
-        object_fraction: Annotated[float, Range(at_least=0, at_most=1)] = 0.0,
+        object_fraction: Annotated[float, Ge(0), Le(1)] = 0.0,
     ) -> None:
         if len(views) == 0:
             raise NerfroError("there are no training images; give at least one")

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal, Optional
 
 import torch
+from annotated_types import Ge, Gt, Le, Lt
 from jaxtyping import Float
 from omegaconf import MISSING, DictConfig, ListConfig
 from torch import Tensor
@@ -21,13 +22,13 @@ from nerfro.core.lens import distort, fold_radius
 from nerfro.core.paths import user_path
 from nerfro.core.variants import variant
 from nerfro.data.lenses import Lens, check_lenses
-from nerfro.registry.allowed import Count, Positive, Range, refuse_unused
+from nerfro.registry.allowed import Count, Positive, refuse_unused
 from nerfro.samplers.subdivision import SubdivisionChanges
 from nerfro.viewing.camera_files import read_cameras
 from nerfro.viewing.camera_paths import PATHS, CaptureGeometry, OrbitPosition, path_cameras
 from nerfro.viewing.trained_scene import TrainedScene
 
-Angle = Annotated[float, Range(more_than=0, less_than=180)]
+Angle = Annotated[float, Gt(0), Lt(180)]
 _OF_PATHS = ("frames", "azimuth", "elevation", "distance")  # options of paths around the object
 FilmFormat = Annotated[str, Literal["mp4", "gif"]]
 
@@ -41,7 +42,7 @@ class RenderConfig:
     frames: Count = 120  # number of frames of the film
     seconds: Positive = 5.0  # duration of the film
     azimuth: float = 0.0  # start of the path, degrees around the object
-    elevation: Annotated[float, Range(at_least=-90, at_most=90)] = 10.0  # start of the path, degrees above the object
+    elevation: Annotated[float, Ge(-90), Le(90)] = 10.0  # start of the path, degrees above the object
     # Distance from the centre of the object at the start, world units; by default that of the photographs.
     distance: Optional[Positive] = None
     views: Optional[str] = None  # cameras of a split of the data, such as `test`, or one of them, such as `test:3`

@@ -6,12 +6,13 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import torch
+from annotated_types import Ge
 from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.core.progress import track
 from nerfro.geometry.contraction import contraction_scale, expand
-from nerfro.registry.allowed import Range, check
+from nerfro.registry.allowed import check
 from nerfro.viewing.trained_scene import TrainedScene
 
 RESOLUTION = 128
@@ -56,7 +57,7 @@ def sample_field(
     Raises:
         NerfroError: the resolution is below 2.
     """
-    check("", {"resolution": Annotated[int, Range(at_least=2)]}, {"resolution": resolution})
+    check("", {"resolution": Annotated[int, Ge(2)]}, {"resolution": resolution})
     if box is None:
         box = scene.bounds if scene.content is None else scene.content
     field, device = scene.field, scene.renderer.scene.device

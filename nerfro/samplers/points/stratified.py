@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import torch
+from annotated_types import Ge, Le, Lt
 from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.core.draws import Draws
 from nerfro.core.errors import NerfroError
 from nerfro.core.types import Path, Rendering, Samples
-from nerfro.registry.allowed import Range
 from nerfro.registry.registration import register
 from nerfro.samplers.base import PointSampler
 
@@ -40,10 +40,10 @@ class Stratified(PointSampler):
 
     def __init__(
         self,
-        num_samples: Annotated[int, Range(at_least=2, at_most=8192)] = 64,
+        num_samples: Annotated[int, Ge(2), Le(8192)] = 64,
         draw: Literal["arc_length", "vertices"] = "arc_length",
         cast: Literal["points", "cones"] = "points",
-        offset: Annotated[float, Range(at_least=0, less_than=1)] = 0.5,
+        offset: Annotated[float, Ge(0), Lt(1)] = 0.5,
         box_min: Sequence[float] = (),
         box_max: Sequence[float] = (),
     ) -> None:
