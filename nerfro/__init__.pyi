@@ -1,16 +1,25 @@
 # Public names of nerfro, which `lazy_loader` imports on first access.
 from .backgrounds.constant import ConstantBackground
 from .backgrounds.envmap import EnvironmentMap
+from .capture.preprocess import preprocess
 from .core.cameras import Cameras
 from .core.rays import Rays
 from .data.blender import BlenderData
+from .data.capture import Capture
 from .evaluation.collection import metrics
 from .fields.hash_grid import HashGridField
 from .losses.photometric import Photometric
+from .masks.segment import segment
 from .media.sdf_grid import SdfGrid
 from .media.shapes import Ball
 from .models.refractive import RefractiveModel
+from .pipeline.evaluate import evaluate
+from .pipeline.export import export
+from .pipeline.reconstruct import reconstruct
+from .pipeline.render import render
+from .poses.calibrate import calibrate
 from .rendering.renderer import Components
+from .rendering.scene_file import SceneFile
 from .samplers.paths.bend import bend, polylines
 from .samplers.paths.snell import Snell
 from .samplers.paths.straight import Straight
@@ -21,6 +30,7 @@ from .training.load import load
 from .training.module import TrainingModule
 from .training.optimizer import GroupConfig, OptimizerConfig
 from .training.ray_batches import RayBatches
+from .training.run import Run, train
 from .viewing.trained_scene import TrainedScene
 
 __version__: str
@@ -28,6 +38,7 @@ __all__ = [
     "Ball",
     "BlenderData",
     "Cameras",
+    "Capture",
     "Components",
     "ConstantBackground",
     "EnvironmentMap",
@@ -39,6 +50,8 @@ __all__ = [
     "RayDataModule",
     "Rays",
     "RefractiveModel",
+    "Run",
+    "SceneFile",
     "SdfGrid",
     "Snell",
     "Straight",
@@ -48,7 +61,15 @@ __all__ = [
     "__version__",
     "bend",
     "build",
+    "calibrate",
+    "evaluate",
+    "export",
     "load",
     "metrics",
     "polylines",
+    "preprocess",
+    "reconstruct",
+    "render",
+    "segment",
+    "train",
 ]

@@ -7,59 +7,22 @@ Examples:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated, Any, Optional
-
-from annotated_types import Ge, Le
-from hydra.core.hydra_config import HydraConfig
-from omegaconf import MISSING, DictConfig
+from omegaconf import DictConfig
 
 import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
+from nerfro.cli.calls import Composition
 from nerfro.cli.entry import entry_point
-from nerfro.cli.overrides import is_given, of_groups, print_next
-from nerfro.masks import command
+from nerfro.cli.overrides import print_next
+from nerfro.masks.options import MaskConfig
+from nerfro.masks.segment import segment_composed
 from nerfro.rendering.scene_file import with_scene
-
-
-@dataclass
-class MaskConfig:
-    """Options of `python -m nerfro.mask`.
-
-    Attributes:
-        data: data set (options of the group `data`); the views of all splits get masks.
-        outlines: by image name, a box [left, top, right, bottom] around the object, or a polygon [[column, row], ...],
-            which is the mask, in pixels; or a JSON file with such a mapping.
-        sam2: folder of a Segment Anything 2 network in the format of transformers, which follows the object from the
-            outlines and existing masks through the photographs in the order of their names; needs the extra `sam2`.
-        hull_only: project the visual hull of at least three existing masks into all other views, without segmentation
-            by colour.
-        overwrite: replace existing masks, starting from the outlines alone. Otherwise existing masks are kept and used,
-            except projections of a hull, which are made again.
-        view: serve a page on which you draw outlines in two to five views and see the projections of the hull in all
-            others; saving writes `outlines.json` to the data folder, and the masks.
-        host: address of the server of this page; 0.0.0.0 accepts connections from other machines.
-        port: port of the server; 0 for any free port.
-        open: open a browser.
-    """
-
-    data: Any = MISSING
-    outlines: Any = None
-    sam2: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
-    hull_only: bool = False
-    overwrite: bool = False
-    view: bool = False
-    host: str = "localhost"
-    port: Annotated[int, Ge(0), Le(65535)] = 8008
-    open: bool = True
 
 
 @entry_point("mask", MaskConfig, expand=with_scene)
 def main(config: DictConfig) -> None:
-    """Segment the outlined views, then all other views, and write the missing masks."""
-    command.run(config)
-    given = of_groups(("data",), HydraConfig.get().overrides.task)
-    given = given if is_given("data", given) else ["data=opencv", *given]
-    print_next("next", "preprocess", given)
+    """Segment the outlined views, then all other views, write the missing masks, and print the next command."""
+    capture = segment_composed(Composition.of_job(config))
+    print_next("next", "preprocess", capture.overrides)
 
 
 if __name__ == "__main__":

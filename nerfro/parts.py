@@ -28,13 +28,13 @@ from nerfro.samplers.base import PathSampler, PointSampler
 from nerfro.samplers.points.stepfun import invert_cdf, spread_uniform
 from nerfro.samplers.points.stratified import Stratified, point_samples
 from nerfro.training.phases.base import Phase, TrainingRun
-from nerfro.viewing.exports import EXPORTS, Export
+from nerfro.viewing.exports import EXPORTS, Export, ExportConfig
 from nerfro.viewing.trained_scene import TrainedScene
 
 __all__ = [
     "EXPORTS", "Background", "Batch", "CameraModel", "Cameras", "Components", "Count", "DataSource", "Distance",
-    "Draws", "Exits", "Export", "Field", "FieldValues", "Ge", "Grid", "Gt", "ImageMetric", "Le", "Loss", "Lt",
-    "Medium", "Natural", "NerfroError", "NotNegative", "Path", "PathSampler", "Phase", "PointSampler", "Positive",
+    "Draws", "Exits", "Export", "ExportConfig", "Field", "FieldValues", "Ge", "Grid", "Gt", "ImageMetric", "Le", "Loss",
+    "Lt", "Medium", "Natural", "NerfroError", "NotNegative", "Path", "PathSampler", "Phase", "PointSampler", "Positive",
     "Rays", "RefractiveModel", "Renderer", "Rendering", "Samples", "Scalars", "Scene", "Stratified", "Surface",
     "TrainedScene", "TrainingRun", "Vectors", "Views", "invert_cdf", "load_arrays", "point_samples", "register",
     "resolve_path", "spread_uniform", "write_atomically",

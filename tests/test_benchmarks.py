@@ -17,12 +17,13 @@ import torch
 import trimesh
 from lightning.pytorch.callbacks import timer
 
-import nerfro.train
+import nerfro
 from benchmarks.capture import align_to_truth
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.files.images import save_png
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.poses.video import extract_frames
+from nerfro.train import main
 from tests import ball_photographs
 from tests.cameras_at import upright_cameras
 from tests.conftest import refused
@@ -55,13 +56,13 @@ def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> R
             return processes(command, **options)
         with monkeypatch.context() as patch:
             patch.setattr(sys, "argv", ["train", *(part for part in command if "=" in part)])
-            nerfro.train.main()
+            main()
         return None
 
     def run_script(name: str, *arguments: object) -> list[str]:
         monkeypatch.syspath_prepend(str(FOLDER))
         monkeypatch.setattr(subprocess, "run", train_here)
-        monkeypatch.setattr(nerfro.train, "prepared_metrics", ImageMetrics)
+        monkeypatch.setattr("nerfro.training.run.prepared_metrics", ImageMetrics)
         monkeypatch.setattr(sys, "argv", [name, *map(str, arguments)])
         # Benchmarks replace these.
         for module, attribute in ((timer, "time"), (ball_photographs, "SIZE")):

@@ -17,7 +17,7 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
-from nerfro.cli.entry import _added, _quoted
+from nerfro.cli.entry import _quoted, added
 from nerfro.cli.options import Described, describe_command, usage
 from nerfro.cli.overrides import full_key, is_scene_file
 from nerfro.core.errors import NerfroError
@@ -95,7 +95,7 @@ def require_valid(command: str, options: list[str]) -> None:
     options = [re.sub(r"^([^=]+=[^,[{]+),[^]}]*$", r"\1", option) for option in options if "(" not in option]
     options = [_quoted(option, verbatim) for option in options if not option.lstrip("+").startswith("hydra")]
     described(command, len(plugins())).require_known(options)
-    options = list(map(_added, options)) if command == "train" else options
+    options = list(map(added, options)) if command == "train" else options
     choices, settings = [], []
     for override in OverridesParser.create().parse_overrides(options):
         key = override.key_or_group
@@ -144,9 +144,9 @@ def test_help_lists_plugins() -> None:
     names: dict[str, list[str]] = {"export": list(EXPORTS), "synthesize": list(SCENES)}
     names["train"] = [plugin.name for plugin in plugins()]
     names["trace"] = [plugin.name for kind in ("medium", "surface", "sampler/path") for plugin in plugins(kind)]
-    for command, added in names.items():
+    for command, plugin_names in names.items():
         page = described(command, len(plugins()))
-        assert set(added) <= set(re.findall(r"\w+", page.help)), command
+        assert set(plugin_names) <= set(re.findall(r"\w+", page.help)), command
     with pytest.raises(NerfroError, match=r"write \+loss\.opaque\.weight=0\.1"):
         described("train", len(plugins())).require_known(["loss=opaque"])
 

@@ -18,20 +18,26 @@ import tifffile
 import torch
 from PIL import ExifTags, Image
 
-import nerfro.reconstruct
-import nerfro.train
 from nerfro.capture import refinement
-from nerfro.cli.overrides import print_next, without_hints
+from nerfro.cli.calls import changed_settings
+from nerfro.cli.overrides import as_overrides
 from nerfro.core.errors import NerfroError
 from nerfro.data import image_files
+from nerfro.data.capture import Capture
 from nerfro.data.masks import find_mask
 from nerfro.evaluation.metrics import ImageMetrics
+from nerfro.evaluation.results import read_metrics_json
 from nerfro.files.images import save_png
 from nerfro.files.reading import open_image
-from nerfro.pipeline import stage
+from nerfro.pipeline import reconstruct as chain
 from nerfro.pipeline.hypotheses import Hypothesis
 from nerfro.pipeline.stage import terminated_in_one_line
 from nerfro.poses import collection
+from nerfro.poses.options import CalibrateConfig
+from nerfro.rendering.scene_file import SceneFile, read_scene_file
+from nerfro.report.summary import SummaryConfig
+from nerfro.training.run import Run
+from nerfro.viewing.exports import ExportConfig
 from tests.ball_photographs import RECONSTRUCTION, RECONSTRUCTION_TRAINING, save_with_masks
 from tests.conftest import Runner, refused, weights_of
 
@@ -163,11 +169,11 @@ def test_photographs_of_a_phone_become_upright_and_keep_their_masks(suffix: str,
 
 
 class Pretended:
-    """Commands that do nothing but write their results, a second after each other by their files' times.
+    """Stages that do nothing but write their results, a second after each other by their files' times.
 
     Attributes:
-        ran: name of each command with its options.
-        ends: how commands end that do not reach their end, by name.
+        ran: name of each stage with the options of its command.
+        ends: how stages end that do not reach their end, by name.
     """
 
     def __init__(self, out: Path) -> None:
@@ -190,21 +196,26 @@ class Pretended:
         self._now += 1
         os.utime(path, (self._now, self._now))
 
-    def __call__(self, name: str, options: list[str]) -> None:
+    def begin(self, name: str, options: list[str]) -> bool:
+        """Record a stage; returns whether it reaches its end."""
         self.ran.append((name, options))
-        if name == "train":
-            folder = options[-1 - (options[-1] == "ckpt_path=last")].removeprefix(f"hydra.run.dir={self.out}/")
-            self.write(f"{folder}/config.yaml")
-        if name in self.ends:
-            if (end := self.ends[name]) is not None:
-                raise end
-            return
-        if name == "calibrate":
+        if self.ends.get(name) is not None:
+            raise self.ends[name]
+        return name not in self.ends
+
+    def calibrate(self, options: CalibrateConfig) -> Capture:
+        if self.begin("calibrate", as_overrides(changed_settings(options))):
             self.write("transforms_train.json")
             self.write("calibration.json", {})
-        if name == "mask":
+        return Capture(options.out)
+
+    def segment(self, capture: Capture, overrides: list[str]) -> Capture:
+        if self.begin("mask", [*capture.overrides, *overrides]):
             self.write("masks.png")
-        if name == "preprocess":
+        return capture
+
+    def preprocess(self, capture: Capture, overrides: list[str]) -> SceneFile:
+        if self.begin("preprocess", [*capture.overrides, *overrides]):
             bodies = {"object": {"mesh": "mesh.ply", "ior": 1.4}}
             self.write("surface/mesh.ply")
             self.write("surface/scene.json", {
@@ -212,28 +223,40 @@ class Pretended:
                 "vessel": {"wall": 0.01}, "surroundings": self.surroundings, "photograph": [512, 384],
                 "provenance": {"doubts": self.doubts, "unsupported": self.unsupported},
             })  # fmt: skip
-        if name == "train":
+        file = self.out / "surface" / "scene.json"
+        return read_scene_file(file) if file.is_file() else SceneFile()
+
+    def train_scene(self, scene: SceneFile, options: list[str]) -> Run:
+        folder = options[-1 - (options[-1] == "ckpt_path=last")].removeprefix(f"hydra.run.dir={self.out}/")
+        self.write(f"{folder}/config.yaml")
+        if self.begin("train", options):
             psnr = next(self.psnr[text.split("=")[1]] for text in options if text.startswith("+experiment="))
             view = {"name": "val_000", "psnr": psnr, "regions": {"mask": {"psnr": psnr - 2}}}
             self.write(
                 f"{folder}/metrics.json", {"views": [view], "steps": 1, "train_seconds": 1, "rays_per_second": 1}
             )
-        if name == "summary":
+        return Run(self.out / folder, read_metrics_json(self.out / folder / "metrics.json"))
+
+    def summarize(self, options: SummaryConfig) -> None:
+        if self.begin("summary", as_overrides(changed_settings(options))):
             self.write("report/report.html")
-        if name == "export":
+
+    def export(self, options: ExportConfig) -> None:
+        if self.begin("export", as_overrides(changed_settings(options))):
             self.write("page.html")
 
 
 @pytest.fixture
 def pretended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pretended:
     made = Pretended(tmp_path / "out")
-    monkeypatch.setattr(stage, "call", made)
+    for name in ("calibrate", "segment", "preprocess", "train_scene", "summarize", "export"):
+        monkeypatch.setattr(chain, name, getattr(made, name))
     return made
 
 
 @pytest.fixture
 def reconstruct(run_here: Runner, pretended: Pretended, photos: Path) -> Runner:
-    """Runner the photographs and their masks by pretended commands."""
+    """Reconstruct the photographs and their masks by pretended stages."""
     given = f"images={photos}", f"masks={photos.parent / 'silhouettes'}", f"out={pretended.out}"
     return functools.partial(run_here, "reconstruct", *given)
 
@@ -250,21 +273,21 @@ def test_photographs_pass_every_stage_once(reconstruct: Runner, pretended: Prete
     assert links == [f"{folder}/IMG_{i}.png" for folder in ("images", "masks") for i in range(3)]
     calibrate, preprocess, straight, solid, vessel, train, *_ = (options for _, options in pretended.ran)
     assert "target=colmap" in calibrate
-    data = ["data=opencv", f"data.root={pretended.out}", "data.far=9"]
+    data = ["data=opencv", f"data.root={pretended.out}", "data.far=9.0"]
     assert preprocess[:4] == [*data, "medium.resolution=64"]
     assert preprocess[-1] == "keep=1"
     scene = f"scene={pretended.out / 'surface' / 'scene.json'}"
-    assert train == ["+experiment=unknown", scene, "camera.exposure=true", "data.downscale=2",
+    assert train == ["+experiment=unknown", "camera.exposure=true", "data.downscale=2",
                      "trainer.max_steps=3", "logger=none", f"hydra.run.dir={pretended.out / 'run'}"]  # fmt: skip
-    assert f"python -m nerfro.train {' '.join(train)}" in done.out
+    assert f"python -m nerfro.train {scene} {' '.join(train)}" in done.out
     trials = {"straight_rays": straight, "solid_body": solid, "vessel": vessel}
     for folder, trial in trials.items():
         assert {"evaluation.split=val", "trainer.max_time=null", "camera.exposure=true"} <= set(trial)
         assert trial[-1] == f"hydra.run.dir={pretended.out / 'trials' / folder}"
-    assert straight[:2] == ["+experiment=straight", scene]
-    assert solid[:4] == train[:4]
+    assert straight[0] == "+experiment=straight"
+    assert solid[:3] == train[:3]
     assert len({option.partition("=")[0] for option in solid}) == len(solid)  # no option is given twice
-    assert vessel[:3] == ["+experiment=glass", "medium=vessel", scene]
+    assert vessel[:2] == ["+experiment=glass", "medium=vessel"]
     again = reconstruct("data.far=9")
     assert pretended.names == ALL
     assert again.out.count(" is kept (delete the file to repeat the stage)") == len(ALL)
@@ -324,16 +347,8 @@ def test_bodies_that_the_pixels_do_not_support_are_not_tried(
     assert f"+experiment={chosen}" in train
 
 
-def test_stages_print_no_next_command(capsys: pytest.CaptureFixture[str]) -> None:
-    print_next("next", "mask", [])
-    with without_hints():
-        print_next("next", "preprocess", [])
-    assert capsys.readouterr().out == "next: python -m nerfro.mask\n"
-
-
-@pytest.mark.parametrize("end", [SystemExit(130), KeyboardInterrupt()])  # from training, and from any other stage
-def test_interrupted_training_is_resumed(end: BaseException, reconstruct: Runner, pretended: Pretended) -> None:
-    pretended.ends["train"] = end
+def test_interrupted_training_is_resumed(reconstruct: Runner, pretended: Pretended) -> None:
+    pretended.ends["train"] = KeyboardInterrupt()
     stopped = reconstruct("trial_steps=0", code=130)
     assert stopped.err == "nerfro: interrupted; train is incomplete; repeat the same command to continue\n"
     pretended.ends.clear()
@@ -370,7 +385,7 @@ def test_scene_file_selects_the_experiment(run_here: Runner, pretended: Pretende
     run_here("reconstruct", *asked[:2], *asked[3:], f"out={pretended.out}")
     assert pretended.names[1:] == ["preprocess", "train", "train", "train", "summary", "export"]
     assert pretended.ran[1][1][:4] == ["data=blender", f"data.root={tiny_scene}", "medium=vessel", "medium.wall=0.1"]
-    assert pretended.ran[4][1][:2] == ["+experiment=glass_room", f"scene={pretended.out / 'surface' / 'scene.json'}"]
+    assert pretended.ran[4][1][0] == "+experiment=glass_room"
 
 
 @pytest.mark.parametrize(
@@ -422,7 +437,7 @@ def test_posed_photographs_of_a_ball_become_a_scene(
     """All stages but that of poses; each gives the same result alone, and leaves nothing behind."""
     data, out = tmp_path / "ball", tmp_path / "out"
     save_with_masks(data)
-    monkeypatch.setattr(nerfro.train, "prepared_metrics", ImageMetrics)
+    monkeypatch.setattr("nerfro.training.run.prepared_metrics", ImageMetrics)
     short = refinement.RefinementSettings((refinement.DescentStage(20, 1e-4, (3.0, 1.0)),), 1000)
     monkeypatch.setattr(refinement, "RefinementSettings", lambda: short)
     train = [*RECONSTRUCTION_TRAINING, "trainer.max_steps=2", "phase.background.steps=100"]

@@ -10,11 +10,11 @@ from typing import Annotated, Any, Optional
 
 import numpy as np
 from annotated_types import Ge, Le
-from hydra.core.hydra_config import HydraConfig
 from jaxtyping import Float
 from omegaconf import MISSING, DictConfig, OmegaConf
 
-from nerfro.cli.overrides import as_overrides, is_given, print_hint, print_next
+from nerfro.cli.calls import Composition
+from nerfro.cli.overrides import is_given
 from nerfro.core.cameras import Cameras
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import EMBEDDED_PREFIX, resolve_path, user_path
@@ -26,7 +26,7 @@ from nerfro.media.base import Medium
 from nerfro.media.bodies import ordered_settings
 from nerfro.registry.allowed import Count, Natural, NotNegative, corners_of_box, refuse_unused
 from nerfro.registry.registration import build
-from nerfro.rendering.scene_file import SCENE, SceneFile, described, take_bodies
+from nerfro.rendering.scene_file import SCENE, SceneFile, take_bodies
 from nerfro.silhouettes.overlaps import REPORT, SHEET
 from nerfro.silhouettes.revolution import Symmetry
 from nerfro.silhouettes.upright import find_up
@@ -81,15 +81,19 @@ class PreprocessConfig:
 
 @dataclass(frozen=True)
 class Request:
-    """Options and command line of `python -m nerfro.preprocess`.
+    """Composed options of `python -m nerfro.preprocess`."""
 
-    Attributes:
-        config: the options.
-        overrides: the command line.
-    """
+    composition: Composition
 
-    config: DictConfig
-    overrides: list[str]
+    @property
+    def config(self) -> DictConfig:
+        """The options, see `PreprocessConfig`."""
+        return self.composition.config
+
+    @property
+    def overrides(self) -> list[str]:
+        """The options that are given."""
+        return self.composition.overrides
 
     @property
     def folder(self) -> Path:
@@ -142,7 +146,7 @@ class Request:
         if config.box_min is not None:
             corners_of_box(config.box_min, config.box_max)
         if config.mesh is not None:
-            refuse_unused(config, PreprocessConfig, _OF_HULL, "with mesh=..., which replaces the hull")
+            refuse_unused(config, _OF_HULL, "with mesh=..., which replaces the hull")
         if config.refine and "shell_voxels" not in config.medium:
             raise NerfroError("refine=true needs a distance grid; set medium=object or medium=vessel")
         if config.vessel and ("shell_voxels" not in config.medium or "wall" in config.medium):
@@ -224,24 +228,23 @@ def index_settings(medium: DictConfig, names: Iterable[str], iors: Iterable[floa
     return {"ior": first} | ({"inner_iors": inner} if inner else {})
 
 
-def write_scene(request: Request, found: SceneFile, cameras: Cameras, mesh: TriangleMesh) -> None:
-    """Write the scene file, and print the result files and the next command.
+def write_scene(request: Request, estimated: SceneFile, cameras: Cameras, mesh: TriangleMesh) -> SceneFile:
+    """Write the scene file, and print the result files.
 
     Args:
         request: options of the command.
-        found: estimated values; they have precedence over the options.
+        estimated: estimated values; they have precedence over the options.
         cameras: cameras of the photographs.
         mesh: the surface.
+
+    Returns:
+        The content of the scene file.
     """
-    config, chosen = request.config, HydraConfig.get().runtime.choices
-    medium = described(config.medium, chosen["medium"]) | found.medium
-    data = described(config.data, chosen["data"]) | {"root": str(config.data.root)} | _ray_bounds(cameras, mesh)
+    config, composition = request.config, request.composition
+    medium = composition.described("medium") | estimated.medium
+    data = composition.described("data") | {"root": str(config.data.root)} | _ray_bounds(cameras, mesh)
     size = [cameras.width, cameras.height]
-    scene = replace(found, data=data, bodies=take_bodies(medium), medium=medium, photograph=size)
-    file = request.folder / SCENE
-    scene.save(file)
+    scene = replace(estimated, data=data, bodies=take_bodies(medium), medium=medium, photograph=size)
+    scene.save(request.folder / SCENE)
     print(f"results: {', '.join(str(file) for file in request.files if file.exists())}")
-    print_hint("for photographs in a room, add experiment=glass_room; for straight rays, experiment=straight")
-    print_next("train on it", "train", as_overrides({"scene": file}))
-    if scene.vessel:
-        print_next("train on the vessel", "train", as_overrides({"scene": file, "medium": "vessel"}))
+    return scene

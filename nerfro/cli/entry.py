@@ -9,7 +9,6 @@ import importlib
 import os
 import sys
 from collections.abc import Callable, Iterator
-from importlib.util import find_spec
 from pathlib import Path
 from typing import NoReturn
 
@@ -18,7 +17,6 @@ import hydra._internal.hydra
 from hydra._internal.sources_registry import SourcesRegistry
 from hydra._internal.utils import get_args_parser
 from hydra.core.config_store import ConfigStore
-from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
@@ -36,7 +34,6 @@ from nerfro.registry.allowed import check_names, check_settings
 from nerfro.registry.registration import discover
 
 _HELP = {"-h", "--help"}
-_STAGES: dict[str, Callable[[], None]] = {}  # start of each imported command as a part of another command
 
 
 def entry_point(
@@ -82,7 +79,7 @@ def entry_point(
                 if expand is not None:
                     sys.argv[1:] = expand(sys.argv[1:], [field.name for field in dataclasses.fields(schema)])
                 if config_name == "train":
-                    sys.argv[1:] = map(_added, sys.argv[1:])
+                    sys.argv[1:] = map(added, sys.argv[1:])
                 job = _job(task, config_name, failures)
                 with _run_folder():
                     hydra.main(version_base="1.3", config_path=str(config_dir), config_name=config_name)(job)()
@@ -94,30 +91,9 @@ def entry_point(
             with errors_in_one_line():
                 start()
 
-        _STAGES[config_name] = start
         return run
 
     return decorate
-
-
-def call(command: str, arguments: list[str]) -> None:
-    """Run a command as a part of this program. Meanwhile it is the main program for records and for Lightning.
-
-    Args:
-        command: name of the command.
-        arguments: its command line.
-
-    Raises:
-        Exception: any error of the command.
-    """
-    importlib.import_module(f"nerfro.{command}")
-    program, main, composed = sys.argv, sys.modules["__main__"], GlobalHydra.instance()
-    spec, outer = main.__spec__, composed.hydra
-    sys.argv, main.__spec__, composed.hydra = [command, *arguments], find_spec(f"nerfro.{command}"), None
-    try:
-        _STAGES[command]()
-    finally:
-        sys.argv, main.__spec__, composed.hydra = program, spec, outer
 
 
 def _answer_questions(config_name: str, schema: type, config_dir: Path) -> None:
@@ -257,6 +233,6 @@ def _quoted(argument: str, keys: tuple[str, ...]) -> str:
     return f"{key}='{value}'"
 
 
-def _added(argument: str) -> str:
+def added(argument: str) -> str:
     """Add the plus sign with which Hydra selects an option of a group without a default, as in `experiment=glass`."""
     return f"+{argument}" if argument.partition("=")[0] in ADDED_GROUPS else argument

@@ -4,39 +4,15 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Iterable, Mapping, Sequence
 
 # Short names of settings, on the command line and in YAML files.
 SHORT_NAMES = {"bodies": "medium.bodies"}
-_prints_hints = ContextVar("_prints_hints", default=True)
-
-
-@contextmanager
-def without_hints() -> Iterator[None]:
-    """Suppress hints, in a program that runs the next command itself."""
-    token = _prints_hints.set(False)
-    try:
-        yield
-    finally:
-        _prints_hints.reset(token)
-
-
-def print_hint(text: str) -> None:
-    """Print a hint about the next step, except inside `without_hints`."""
-    if prints_hints():
-        print(text)
-
-
-def prints_hints() -> bool:
-    """Whether hints are printed, outside `without_hints`."""
-    return _prints_hints.get()
 
 
 def print_next(label: str, command: str, options: Sequence[str]) -> None:
-    """Print the next command as a hint."""
-    print_hint(f"{label}: {command_line(command, options)}")
+    """Print the next command."""
+    print(f"{label}: {command_line(command, options)}")
 
 
 def command_line(command: str, options: Sequence[str]) -> str:

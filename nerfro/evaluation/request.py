@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated, Literal, Optional
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 
 from nerfro.core.errors import Interrupted, NerfroError, warn
 from nerfro.core.paths import user_path
@@ -47,37 +47,37 @@ class EvaluateConfig:
     overwrite: bool = False  # whether to replace an earlier evaluation in `out`
 
 
-def require_one_task(config: DictConfig) -> None:
+def require_one_task(options: EvaluateConfig) -> None:
     """Refuse options without effect, and options with contradictory values."""
-    if (config.checkpoint is None) == (config.predictions is None):
+    if (options.checkpoint is None) == (options.predictions is None):
         raise NerfroError("give either checkpoint=RUN, or predictions=DIR and references=DIR, to score")
-    if config.predictions is not None and config.references is None:
-        raise NerfroError(f"predictions={config.predictions} need references; give references=DIR")
+    if options.predictions is not None and options.references is None:
+        raise NerfroError(f"predictions={options.predictions} need references; give references=DIR")
     others: tuple[str, ...]
-    if config.checkpoint is None:
+    if options.checkpoint is None:
         task, others = "predictions", ("split", "chunk_size", "subdivision")
     else:
         task, others = "checkpoint", ("references", "masks", "mask_labels", "alpha")
-    refuse_unused(config, EvaluateConfig, others, f"with {task}=...")
+    refuse_unused(options, others, f"with {task}=...")
 
 
 @contextmanager
-def own_folder(config: DictConfig, default: Path) -> Iterator[Path]:
+def own_folder(options: EvaluateConfig, default: Path) -> Iterator[Path]:
     """Lock the output folder; raises an error unless the folder is empty or holds a replaceable evaluation."""
-    folder = default if config.out is None else user_path(config.out)
+    folder = default if options.out is None else user_path(options.out)
     with lock_folder(folder, "out"):
         if not (folder / REQUEST_FILE).is_file():
             require_only(folder, (), "it is not the folder of an evaluation; give another out=...")
-        refuse_existing([folder / "metrics.json"], config.overwrite)
+        refuse_existing([folder / "metrics.json"], options.overwrite)
         try:
             yield folder
         except KeyboardInterrupt:
             raise Interrupted("run the same command to start again") from None
 
 
-def record(folder: Path, config: DictConfig) -> None:
-    """Write the configuration, which marks the folder as that of an evaluation, before any other file."""
-    write_atomically(folder / REQUEST_FILE, OmegaConf.to_yaml(config, resolve=True))
+def record(folder: Path, options: EvaluateConfig) -> None:
+    """Write the options, which marks the folder as that of an evaluation, before any other file."""
+    write_atomically(folder / REQUEST_FILE, OmegaConf.to_yaml(options))
 
 
 def report_unused_gpu(option: str) -> None:

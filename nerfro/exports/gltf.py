@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from omegaconf import DictConfig
 from trimesh.exchange.gltf import export_glb
 
 from nerfro.core.errors import NerfroError
@@ -16,16 +15,16 @@ from nerfro.exports.meshes import glass_meshes, inside_mesh
 from nerfro.files.atomic import write_atomically
 from nerfro.media.material import Dispersion
 from nerfro.viewing.changes import absorption_of
-from nerfro.viewing.exports import EXPORTS, Export
+from nerfro.viewing.exports import EXPORTS, Export, ExportConfig
 from nerfro.viewing.trained_scene import TrainedScene
 
 # The y axis is up in glTF, and the z axis in nerfro.
 _Z_UP_TO_Y_UP = trimesh.transformations.rotation_matrix(-math.pi / 2, [1, 0, 0])
 
 
-def write_mesh(scene: TrainedScene, out: Path, config: DictConfig) -> str:
-    """Write the surfaces of the glass and of the dense content as .glb; `config` is an `ExportConfig`."""
-    glass, inside = glass_meshes(scene), inside_mesh(scene, config.resolution, config.half_depth)
+def write_mesh(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
+    """Write the surfaces of the glass and of the dense content as .glb."""
+    glass, inside = glass_meshes(scene), inside_mesh(scene, options.resolution, options.half_depth)
     if not glass and inside is None:
         raise NerfroError("the scene has neither glass nor dense content to write; raise half_depth")
     write_atomically(out, _encode_glb(scene, glass, inside))

@@ -12,7 +12,6 @@ import numpy as np
 import torch
 import trimesh
 from jaxtyping import Float
-from omegaconf import DictConfig
 from trimesh.exchange.ply import export_ply
 
 from nerfro.core.cameras import Cameras
@@ -23,7 +22,7 @@ from nerfro.files.deep_images import write_radiance
 from nerfro.media.solid import Solid
 from nerfro.synthetic.path_tracer import envmap_texture
 from nerfro.viewing.changes import absorption_of
-from nerfro.viewing.exports import EXPORTS, Export
+from nerfro.viewing.exports import EXPORTS, Export, ExportConfig
 from nerfro.viewing.page import page_split
 from nerfro.viewing.trained_scene import TrainedScene
 
@@ -43,18 +42,18 @@ _ELEMENTS = {
 }  # fmt: skip
 
 
-def write_mitsuba(scene: TrainedScene, out: Path, config: DictConfig) -> str:
+def write_mitsuba(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
     """Write an .xml scene, with meshes and sky beside the file (`MITSUBA_FILES`).
 
     The glass is a `dielectric`, with partial reflection; the parameter `glass` selects another material, such as
     `transmitting_glass` (see `nerfro/synthetic/glass.py`) for a model without partial reflection. The content
     is a light source with the radiance that is seen from outside. The sensors are the test cameras in their order, or
-    the cameras of another split if there are no test cameras. `config` is an `ExportConfig`.
+    the cameras of another split if there are no test cameras.
 
     Raises:
         NerfroError: bodies lie inside others or overlap.
     """
-    glass, inside = glass_meshes(scene), inside_mesh(scene, config.resolution, config.half_depth)
+    glass, inside = glass_meshes(scene), inside_mesh(scene, options.resolution, options.half_depth)
     if len(glass) > 1:
         _require_apart(scene, glass)
     split = page_split(scene.source)
@@ -65,7 +64,7 @@ def write_mitsuba(scene: TrainedScene, out: Path, config: DictConfig) -> str:
         "sky": {"type": "envmap", "filename": sky_file.name, "to_world": _Y_UP_TO_Z_UP},
     }
     glass_files = [glass_file, *(out.with_name(f"{out.stem}_glass_{body}.ply") for body in range(1, len(glass)))]
-    refuse_existing(glass_files[1:], config.overwrite)
+    refuse_existing(glass_files[1:], options.overwrite)
     corners = torch.from_numpy(trimesh.bounds.corners(scene.bounds.numpy())).float()
     reach = float(torch.cdist(cameras.camera_to_world[..., 3].float(), corners).max())
     _write_sky(sky_file, scene)

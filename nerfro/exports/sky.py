@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from omegaconf import DictConfig
-
 from nerfro.files.lat_long import save_lat_long
-from nerfro.viewing.exports import EXPORTS, Export
+from nerfro.viewing.exports import EXPORTS, Export, ExportConfig
 from nerfro.viewing.trained_scene import TrainedScene
 
 
-def write_sky(scene: TrainedScene, out: Path, config: DictConfig) -> str:
-    """Write the background radiance; `config` is an `ExportConfig`, whose resolution is the number of rows."""
-    sky = scene.sky_of_height(config.resolution or scene.sky_height)
+def write_sky(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
+    """Write the background radiance; `options.resolution` is the number of rows."""
+    sky = scene.sky_of_height(options.resolution or scene.sky_height)
     save_lat_long(out, sky)
     return f"the sky: {sky.shape[1]}x{sky.shape[0]} pixels, lat-long, z up"
 

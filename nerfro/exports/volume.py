@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from omegaconf import DictConfig
-
 from nerfro.files.cache import save_arrays
-from nerfro.viewing.exports import EXPORTS, Export
+from nerfro.viewing.exports import EXPORTS, Export, ExportConfig
 from nerfro.viewing.trained_scene import TrainedScene
 from nerfro.viewing.volume import RESOLUTION, sample_field
 
 
-def write_volume(scene: TrainedScene, out: Path, config: DictConfig) -> str:
-    """Write density, linear radiance and the corners of the grid as .npz; `config` is an `ExportConfig`."""
-    volume = sample_field(scene, config.resolution or RESOLUTION)
+def write_volume(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
+    """Write density, linear radiance and the corners of the grid as .npz."""
+    volume = sample_field(scene, options.resolution or RESOLUTION)
     arrays = {"density": volume.density, "rgb": volume.radiance, "box": volume.box}
     save_arrays(out, {name: values.numpy() for name, values in arrays.items()})
     return f"the inside: {'x'.join(map(str, volume.density.shape))} vertices with density and linear rgb"

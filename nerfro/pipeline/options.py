@@ -5,13 +5,12 @@ from __future__ import annotations
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Any, Optional
 
 from annotated_types import Ge, Le
 from omegaconf import MISSING, DictConfig
 
-from nerfro.cli.overrides import as_overrides, is_given
+from nerfro.cli.overrides import is_given
 from nerfro.core.errors import NerfroError
 from nerfro.registry.allowed import Count, Natural
 
@@ -88,18 +87,17 @@ def have_poses(config: DictConfig, overrides: list[str]) -> bool:
     return posed
 
 
-def common_options(config: DictConfig, overrides: list[str], scene: Path, photograph: Sequence[int]) -> list[str]:
+def common_options(config: DictConfig, overrides: list[str], photograph: Sequence[int]) -> list[str]:
     """Determine the options of the training that do not depend on the assumptions about the object.
 
     Args:
         config: options of the command.
         overrides: the command line.
-        scene: the scene file.
         photograph: width and height of the photographs, in pixels; empty if unknown.
     """
-    options, extra = as_overrides({"scene": scene}), shlex.split(config.train)
-    if not is_given("camera.exposure", extra):
-        options.append("camera.exposure=true")  # telephones select an exposure for each photograph
+    extra = shlex.split(config.train)
+    # Telephones select an exposure for each photograph.
+    options = [] if is_given("camera.exposure", extra) else ["camera.exposure=true"]
     if photograph and not is_given("data.downscale", overrides):
         options.append(f"data.downscale={max(1.0, max(photograph) / config.pixels):.4g}")
     return [*options, *extra]

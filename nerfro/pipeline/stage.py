@@ -1,4 +1,4 @@
-"""A stage of `python -m nerfro.reconstruct`: a command with results that are kept until an input file changes."""
+"""A stage of `nerfro.reconstruct`, whose results are kept until an input file changes."""
 
 from __future__ import annotations
 
@@ -7,31 +7,32 @@ import gc
 import itertools
 import os
 import signal
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
+from typing import TypeVar
 
 import torch
 
-from nerfro.cli.entry import call
-from nerfro.cli.failures import EXIT_INTERRUPTED, in_one_line
-from nerfro.cli.overrides import command_line, without_hints
+from nerfro.cli.failures import in_one_line
+from nerfro.cli.overrides import command_line
 from nerfro.core.errors import Interrupted, NerfroError
 
 _SEED = 67280421310721  # of torch in a new process
+Value = TypeVar("Value")
 
 
 @dataclass(frozen=True)
 class Stage:
-    """A command of nerfro in this process, with input and output files.
+    """A stage with input and output files.
 
     Attributes:
-        command: name of the command, as in `python -m nerfro.COMMAND`.
-        options: command-line options.
-        result: the last file that the command writes.
+        command: name of the command that does the same, as in `python -m nerfro.COMMAND`.
+        options: options of this command.
+        result: the last file that the stage writes.
         preview: file or folder that the user should check.
-        inputs: files that the command reads; the command is repeated if one of them is newer than the result.
+        inputs: files that the stage reads; the stage is repeated if one of them is newer than the result.
     """
 
     command: str
@@ -45,33 +46,31 @@ class Stage:
         """Whether the result exists and no input is newer."""
         return self.result.is_file() and not is_older(self.result, self.inputs)
 
-    def run(self) -> None:
-        """Run the command in this process unless the stage is done.
+    def run(self, work: Callable[[], Value], read: Callable[[], Value]) -> Value:
+        """Return the value of the stage.
+
+        Args:
+            work: function that computes the value and writes the files.
+            read: function that reads the value from files, for a stage that is done.
 
         Raises:
-            NerfroError: the command failed.
-            Interrupted: the command was interrupted.
+            NerfroError: the stage failed.
+            Interrupted: the stage was interrupted.
         """
         if self.is_done:
             print(f"{self.command}: done; {self.result} is kept (delete the file to repeat the stage)", flush=True)
-            return
+            return read()
         print(f"\n{self.command}: {command_line(self.command, self.options)}", flush=True)
-        # Training has saved a checkpoint.
-        again = "continue" if self.command == "train" else "start this stage again"
-        incomplete = f"{self.command} is incomplete; repeat the same command to {again}"
         try:
-            # A command depends on no random numbers of earlier stages.
-            with without_hints(), torch.random.fork_rng(devices=[]):
+            with torch.random.fork_rng(devices=[]):  # a stage depends on no random numbers of earlier stages
                 torch.manual_seed(_SEED)
-                call(self.command, list(self.options))
+                value = work()
             if not self.result.is_file():
                 raise NerfroError(f"{self.result} was not written")
         except KeyboardInterrupt:
-            raise Interrupted(incomplete) from None
-        except SystemExit as end:
-            if end.code != EXIT_INTERRUPTED:
-                raise
-            raise Interrupted(incomplete) from None
+            # Training has saved a checkpoint.
+            again = "continue" if self.command == "train" else "start this stage again"
+            raise Interrupted(f"{self.command} is incomplete; repeat the same command to {again}") from None
         except Exception as error:
             if os.environ.get("NERFRO_DEBUG"):
                 raise
@@ -81,6 +80,7 @@ class Stage:
             ) from error
         gc.collect()  # models refer to themselves
         print(f"{self.command}: done; look at {self.preview}", flush=True)
+        return value
 
 
 @contextlib.contextmanager

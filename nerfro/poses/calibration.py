@@ -102,7 +102,7 @@ class Calibration:
         return [*lines, lens + ("" if deviation is None else f"; standard deviation of fx {deviation:.2f}")]
 
 
-def calibrate(detections: dict[str, TagDetections], size: tuple[int, int], model: LensModel) -> Calibration:
+def calibrate_by_tags(detections: dict[str, TagDetections], size: tuple[int, int], model: LensModel) -> Calibration:
     """Minimize the reprojection error over all poses and the lens.
 
     Estimation and removal of outliers alternate until no outliers remain, for at most ten estimates.

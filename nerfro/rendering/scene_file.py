@@ -22,7 +22,6 @@ from nerfro.files.atomic import write_atomically
 from nerfro.files.reading import read_json
 from nerfro.media.bodies import BodySettings
 from nerfro.registry.allowed import Count, check_settings
-from nerfro.registry.registration import plugin_of
 
 SCENE = "scene.json"
 _ADVICE = "see docs/reference/file_formats.md, or run nerfro.preprocess again"
@@ -103,6 +102,26 @@ class SceneFile:
             chosen |= {f"{group}.{name}": value for name, value in values.items()}
         return chosen
 
+    def added_to(self, overrides: Sequence[str], names: Collection[str], source: str) -> list[str]:
+        """Add the settings of the scene to overrides, which have precedence.
+
+        Args:
+            overrides: overrides of a command.
+            names: names of the settings of the command; other settings of the scene have no effect.
+            source: name of the scene, for a warning.
+        """
+        options = {name: value for name, _, value in (text.partition("=") for text in overrides) if name in names}
+        settings = self.settings(data_type=options.get("data"), medium=options.get("medium"))
+        is_known = is_given("medium.ior", overrides) or options.get("medium") == "vessel"
+        if self.provenance.doubts and "medium" in names and not is_known:
+            warn(f"{source}: the photographs do not determine the index ({self.provenance.doubts[0]}); set medium.ior=")
+        settings = {n: value for n, value in settings.items() if n.partition(".")[0] in names and n not in options}
+        # After the flags of Hydra, and before all other overrides.
+        start = next(
+            (i for i, text in enumerate(overrides) if "=" in text and not text.startswith("-")), len(overrides)
+        )
+        return [*overrides[:start], *as_overrides(settings), *overrides[start:]]
+
     def save(self, path: Path) -> None:
         """Write the file, with the command of this process and the versions of packages."""
         folder = os.path.realpath(path.parent)
@@ -131,14 +150,6 @@ class SceneFile:
             for name, body in self.bodies.items()
         }
         return replace(self, data=self.data | {"root": place(str(self.data["root"]))}, bodies=bodies)
-
-
-def described(node: DictConfig, type_name: str) -> dict[str, Any]:
-    """Describe a component by its type and the settings with other values than the defaults of the class."""
-    defaults = {name: default for name, _, default in plugin_of(node).fields()}
-    values = cast(dict[str, Any], OmegaConf.to_container(node, resolve=True))
-    del values["_target_"]
-    return {"type": type_name} | {name: value for name, value in values.items() if value != defaults.get(name)}
 
 
 def take_bodies(medium: dict[str, Any]) -> dict[str, BodySettings]:
@@ -200,18 +211,9 @@ def with_scene(arguments: Sequence[str], names: Collection[str]) -> list[str]:
         return list(arguments)
     if len(files) > 1:
         raise NerfroError(f"{files[0]} and {files[1]} are both given; give one scene file")
-    others = [text for text in arguments if text not in files]
     path = user_path(files[0].partition("=")[2].strip("'\""))
     scene = read_scene_file(path)
-    chosen = {text.partition("=")[0]: text.partition("=")[2] for text in others if text.partition("=")[0] in names}
-    settings = scene.settings(data_type=chosen.get("data"), medium=chosen.get("medium"))
-    is_known = is_given("medium.ior", others) or chosen.get("medium") == "vessel"
-    if scene.provenance.doubts and "medium" in names and not is_known:
-        warn(f"{path}: the photographs do not determine the index ({scene.provenance.doubts[0]}); set medium.ior=")
-    kept = {name: value for name, value in settings.items() if name.partition(".")[0] in names and name not in chosen}
-    # After the flags of Hydra, and before all other overrides.
-    start = next((i for i, text in enumerate(others) if "=" in text and not text.startswith("-")), len(others))
-    return [*others[:start], *as_overrides(kept), *others[start:]]
+    return scene.added_to([text for text in arguments if text not in files], names, str(path))
 
 
 def _given(body: BodySettings | Provenance) -> dict[str, object]:

@@ -3,25 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
 
 import torch
-from hydra import compose, initialize_config_dir
-from hydra.core.config_store import ConfigStore
-from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
 from lightning.pytorch import seed_everything
 from omegaconf import DictConfig
 
-from nerfro.cli.entry import check_configuration
-from nerfro.cli.failures import in_one_line
-from nerfro.cli.options import describe_command
-from nerfro.cli.overrides import full_key, prints_hints
+from nerfro.cli.calls import Composition, composed
+from nerfro.cli.overrides import as_overrides
 from nerfro.core.errors import NerfroError, warn
-from nerfro.core.paths import CONF_DIR
 from nerfro.data.base import DataSource, Views
-from nerfro.registry.registration import discover
 from nerfro.rendering import Renderer
-from nerfro.rendering.scene_file import with_scene
+from nerfro.rendering.scene_file import SceneFile, with_scene
 from nerfro.samplers.paths.thin_walls import warn_of_thin_walls
 from nerfro.training.config import TrainConfig, build_data, build_each, build_model, check_run, resolve_trainer_options
 from nerfro.training.data_module import RayDataModule, traced
@@ -50,51 +45,72 @@ def build(experiment: str | None = None, overrides: Sequence[str] = ()) -> tuple
     Raises:
         NerfroError: a setting is not allowed, or the data cannot be read.
     """
-    discover()
-    ConfigStore.instance().store(name="train_schema", node=TrainConfig, provider="nerfro")
-    chosen = [] if experiment is None else [f"+experiment={experiment}"]
-    given = with_scene([*chosen, *map(full_key, overrides)], ["data", "medium"])
-    try:
-        with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
-            config = compose("train", given)
-    except HydraException as error:
-        describe_command("train", TrainConfig, CONF_DIR).require_known(given)
-        raise NerfroError(in_one_line(error)) from error
-    check_configuration(config, TrainConfig, CONF_DIR)
-    check_run(config)
-    for line in settings_without_effect(config, given):
+    with composed_training(experiment, overrides) as composition:
+        warn_without_effect(composition)
+        if composition.config.callbacks:
+            warn("nerfro.build ignores callbacks; give them to your own Trainer: lightning.Trainer(callbacks=[...])")
+        training = Training.start(composition.config)
+    return training.module, training.data
+
+
+def composed_training(
+    experiment: str | None,
+    overrides: Sequence[str],
+    scene: SceneFile | str | Path | None = None,
+    out: str | Path | None = None,
+) -> AbstractContextManager[Composition]:
+    """Compose the configuration of a training, see `nerfro.training.run.train` and `nerfro.cli.calls.composed`."""
+    arguments = [] if experiment is None else [f"+experiment={experiment}"]
+    arguments += [] if scene is None or isinstance(scene, SceneFile) else as_overrides({"scene": scene})
+    arguments += [*overrides, *([] if out is None else as_overrides({"hydra.run.dir": out}))]
+
+    def expand(overrides: Sequence[str], names: Sequence[str]) -> list[str]:
+        overrides = with_scene(overrides, names)
+        return scene.added_to(overrides, names, "scene") if isinstance(scene, SceneFile) else overrides
+
+    return composed("train", TrainConfig, arguments, expand, check_run)
+
+
+def warn_without_effect(composition: Composition) -> None:
+    """Warn of given settings that have no effect in combination with the other settings."""
+    for line in settings_without_effect(composition.config, composition.overrides):
         warn(line)
-    resolve_trainer_options(config)
-    if config.callbacks:
-        warn("nerfro.build ignores callbacks; give them to your own Trainer: lightning.Trainer(callbacks=[...])")
-    seed_everything(config.seed, verbose=False)
-    source = build_data(config)
-    return build_training(config, source, source.load("train"))
 
 
-def check_command(config: DictConfig) -> None:
-    """Check the configuration of `nerfro.train`, and warn of settings of the command line that have no effect.
+@dataclass(frozen=True)
+class Training:
+    """Data and module of a training.
 
-    Raises:
-        NerfroError: the configuration cannot train.
+    Attributes:
+        source: the data set.
+        views: its training views.
+        module: the module, which contains the model as `module.renderer`.
+        data: batches of training pixels, and validation views.
     """
-    check_run(config)
-    if prints_hints():
-        for line in settings_without_effect(config, HydraConfig.get().overrides.task):
-            warn(line)
+
+    source: DataSource
+    views: Views
+    module: TrainingModule
+    data: RayDataModule
+
+    @classmethod
+    def start(cls, config: DictConfig) -> Training:
+        """Set the seed, read the training views, and build the model.
+
+        Args:
+            config: configuration of the run, see `TrainConfig`; missing settings are derived from the data.
+
+        Raises:
+            NerfroError: a component cannot be built, or medium and data set have different origins.
+        """
+        seed_everything(config.seed, verbose=False)
+        resolve_trainer_options(config)
+        source = build_data(config)
+        views = source.load("train")
+        return cls(source, views, *_build(config, source, views))
 
 
-def build_training(config: DictConfig, source: DataSource, training: Views) -> tuple[TrainingModule, RayDataModule]:
-    """Build the module and the data of a run.
-
-    Args:
-        config: configuration of the run, see `TrainConfig`; missing settings are derived from the data.
-        source: data set of the run.
-        training: its training views.
-
-    Raises:
-        NerfroError: medium and data set have different origins.
-    """
+def _build(config: DictConfig, source: DataSource, training: Views) -> tuple[TrainingModule, RayDataModule]:
     validation = source.load("val").checked() if config.evaluation.every > 0 and "val" in source.splits else None
     batches = RayBatches.of(training, config)
     renderer = build_model(config, training)

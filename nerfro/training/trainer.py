@@ -141,12 +141,6 @@ def lightning_precision(config: DictConfig) -> str:
     return "bf16-mixed" if fast_bfloat16(training_device(config)) else "32-true"
 
 
-def prepare_process(seed: int) -> None:
-    """Set the seed and the messages of Lightning for this process."""
-    _quieten_lightning()
-    pl.seed_everything(seed, verbose=False)
-
-
 def fit(
     trainer: pl.Trainer,
     module: pl.LightningModule,
@@ -183,7 +177,7 @@ def finish_logs(trainer: pl.Trainer, scores: Mapping[str, float | None]) -> None
             logger.experiment.finish()
 
 
-def _quieten_lightning() -> None:
+def quieten_lightning() -> None:
     """Suppress Lightning's hints about data loaders and hardware, which do not apply here."""
     for package in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(package).setLevel(logging.WARNING)

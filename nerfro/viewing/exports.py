@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Optional
 
-from omegaconf import MISSING, DictConfig
+from omegaconf import MISSING
 
 from nerfro.core.errors import NerfroError
 from nerfro.registry.allowed import Count, Names, Positive
@@ -50,7 +50,7 @@ class Export:
     """
 
     suffixes: tuple[str, ...]
-    write: Callable[[TrainedScene, Path, DictConfig], str]
+    write: Callable[[TrainedScene, Path, ExportConfig], str]
     companions: tuple[str, ...] = ()
     unused: tuple[str, ...] = ()
 

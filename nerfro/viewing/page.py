@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from markupsafe import Markup
-from omegaconf import DictConfig
 from PIL import Image
 from torch import Tensor
 
@@ -22,7 +21,7 @@ from nerfro.files.images import data_uri, to_8bit
 from nerfro.files.templates import fill_template
 from nerfro.rendering import ColourSpace
 from nerfro.viewing.baking import Baked, bake_sky, bake_surface, bake_volume
-from nerfro.viewing.exports import EXPORTS, Export
+from nerfro.viewing.exports import EXPORTS, Export, ExportConfig
 from nerfro.viewing.trained_scene import TrainedScene
 from nerfro.viewing.volume import MIN_OPTICAL_DEPTH, RESOLUTION, sample_field
 
@@ -155,8 +154,8 @@ def contraction_radius(scene: TrainedScene) -> float | None:
     return radius
 
 
-def _write(scene: TrainedScene, out: Path, config: DictConfig) -> str:
-    page = make_page(scene, config.resolution or RESOLUTION)
+def _write(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
+    page = make_page(scene, options.resolution or RESOLUTION)
     write_atomically(out, page)
     return f"an interactive page of {len(page) / 1e6:.1f} MB"
 

@@ -13,9 +13,10 @@ from typing import Annotated, Any, Literal, Optional
 import torch
 from annotated_types import Ge, Gt, Le, Lt
 from jaxtyping import Float
-from omegaconf import MISSING, DictConfig, ListConfig
+from omegaconf import MISSING
 from torch import Tensor
 
+from nerfro.cli.calls import changed_settings
 from nerfro.core.cameras import Cameras
 from nerfro.core.errors import NerfroError
 from nerfro.core.lens import distort, fold_radius
@@ -81,62 +82,61 @@ class Shots:
     film: bool
 
 
-def check_request(config: DictConfig) -> None:
+def check_request(options: RenderConfig) -> None:
     """Check that the options are consistent, before anything is loaded."""
-    given = [name for name in ("path", "views", "position") if config[name] is not None]
+    given = [name for name in ("path", "views", "position") if getattr(options, name) is not None]
     if len(given) != 1:
         raise NerfroError(
             f"{len(given)} options select the cameras ({', '.join(given)}); give exactly one of path=orbit, "
             "path=FILE.json, views=test, and position=[X,Y,Z]"
         )
     for name in ("position", "target"):
-        if config[name] is not None and len(config[name]) != 3:
-            raise NerfroError(f"{name}={list(config[name])} is no point; give three numbers")
-    if config.target is not None and config.position is None:
-        raise NerfroError(f"target={list(config.target)} needs position=[X,Y,Z]; add the position, or remove target")
-    if config.path is not None and config.path not in PATHS and not config.path.endswith(".json"):
-        raise NerfroError(f"path={config.path} is not known; give {', '.join(PATHS)}, or a FILE.json of cameras")
-    _size(config, 1, 1)
-    if config.path not in PATHS:
-        refuse_unused(config, RenderConfig, _OF_PATHS, f"without path={' or '.join(PATHS)}")
-    if config.path is None:
-        refuse_unused(config, RenderConfig, ("seconds", "film"), "on still images")
-    elif config.format == "exr":
-        refuse_unused(config, RenderConfig, ("seconds", "film"), "with format=exr, of which no film is made")
+        if getattr(options, name) is not None and len(getattr(options, name)) != 3:
+            raise NerfroError(f"{name}={list(getattr(options, name))} is no point; give three numbers")
+    if options.target is not None and options.position is None:
+        raise NerfroError(f"target={list(options.target)} needs position=[X,Y,Z]; add the position, or remove target")
+    if options.path is not None and options.path not in PATHS and not options.path.endswith(".json"):
+        raise NerfroError(f"path={options.path} is not known; give {', '.join(PATHS)}, or a FILE.json of cameras")
+    _size(options, 1, 1)
+    if options.path not in PATHS:
+        refuse_unused(options, _OF_PATHS, f"without path={' or '.join(PATHS)}")
+    if options.path is None:
+        refuse_unused(options, ("seconds", "film"), "on still images")
+    elif options.format == "exr":
+        refuse_unused(options, ("seconds", "film"), "with format=exr, of which no film is made")
 
 
-def prepared(config: DictConfig, scene: TrainedScene) -> TrainedScene:
+def prepared(options: RenderConfig, scene: TrainedScene) -> TrainedScene:
     """Apply the options for rays per pixel, chunk size and sky to a loaded scene."""
-    changes = {name: value for name, value in config.subdivision.items() if value is not None}
-    subdivision = replace(scene.subdivision, **changes)
-    renderer = variant(scene.renderer, chunk_size=config.chunk_size or scene.renderer.chunk_size)
+    subdivision = replace(scene.subdivision, **changed_settings(options.subdivision))
+    renderer = variant(scene.renderer, chunk_size=options.chunk_size or scene.renderer.chunk_size)
     scene = replace(scene, renderer=renderer, subdivision=subdivision)
-    return scene if config.sky is None else scene.with_(sky=config.sky)
+    return scene if options.sky is None else scene.with_(sky=options.sky)
 
 
-def find_shots(config: DictConfig, scene: TrainedScene) -> Shots:
+def find_shots(options: RenderConfig, scene: TrainedScene) -> Shots:
     """Return the selected cameras with their resolution and field of view."""
-    shots = _views(config.views, scene) if config.views is not None else _free_cameras(config, scene)
+    shots = _views(options.views, scene) if options.views is not None else _free_cameras(options, scene)
     cameras = shots.cameras
-    if config.fov is not None:
-        cameras = _with_field_of_view(cameras, config.fov)
-    cameras = _resized(cameras, *_size(config, cameras.width, cameras.height))
-    if config.fov is not None or config.resolution is not None:
+    if options.fov is not None:
+        cameras = _with_field_of_view(cameras, options.fov)
+    cameras = _resized(cameras, *_size(options, cameras.width, cameras.height))
+    if options.fov is not None or options.resolution is not None:
         _require_invertible(cameras, shots.names)
     return replace(shots, cameras=cameras)
 
 
-def _free_cameras(config: DictConfig, scene: TrainedScene) -> Shots:
+def _free_cameras(options: RenderConfig, scene: TrainedScene) -> Shots:
     """Make the camera of a still image, of a path around the object, or of a file."""
     geometry = CaptureGeometry.of(scene.cameras("train"), scene.bounds)
-    if config.position is not None:
-        target = geometry.centre if config.target is None else _local(config.target, scene)
-        cameras = geometry.look_at(_local(config.position, scene)[None], target)
-    elif config.path in PATHS:
-        start = OrbitPosition(config.azimuth, config.elevation, config.distance or geometry.distance)
-        cameras = path_cameras(geometry, config.path, start, config.frames)
+    if options.position is not None:
+        target = geometry.centre if options.target is None else _local(options.target, scene)
+        cameras = geometry.look_at(_local(options.position, scene)[None], target)
+    elif options.path in PATHS:
+        start = OrbitPosition(options.azimuth, options.elevation, options.distance or geometry.distance)
+        cameras = path_cameras(geometry, options.path, start, options.frames)
     else:
-        cameras = read_cameras(user_path(config.path), geometry, scene.source.origin)
+        cameras = read_cameras(user_path(str(options.path)), geometry, scene.source.origin)
     return Shots(cameras, _numbered("frame", len(cameras), 4), len(cameras) > 1)
 
 
@@ -192,10 +192,10 @@ def _resized(cameras: Cameras, width: int, height: int) -> Cameras:
     )  # fmt: skip
 
 
-def _size(config: DictConfig, width: int, height: int) -> tuple[int, int]:
+def _size(options: RenderConfig, width: int, height: int) -> tuple[int, int]:
     """Return width and height in pixels."""
-    given = config.resolution
-    sides = list(given) if isinstance(given, ListConfig) else [given]
+    given = options.resolution
+    sides = list(given) if isinstance(given, list) else [given]
     if given is None:
         return width, height
     if not all(isinstance(side, int) and side > 0 for side in sides) or len(sides) > 2:

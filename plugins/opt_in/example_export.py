@@ -8,12 +8,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from omegaconf import DictConfig
-
-from nerfro.parts import EXPORTS, Export, TrainedScene, write_atomically
+from nerfro.parts import EXPORTS, Export, ExportConfig, TrainedScene, write_atomically
 
 
-def write_centres(scene: TrainedScene, out: Path, config: DictConfig) -> str:
+def write_centres(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
     """Write the centres of the training cameras, in world units, and return a description of the file."""
     centres = scene.cameras("train").camera_to_world[:, :, 3].tolist()
     write_atomically(out, "x,y,z\n" + "".join(",".join(map(str, centre)) + "\n" for centre in centres))

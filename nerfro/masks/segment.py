@@ -1,43 +1,63 @@
-"""The command `mask`: from the options to the masks."""
+"""Masks of the object: from the options of `nerfro.mask` to the files."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 
 import torch
 from omegaconf import DictConfig
 
+from nerfro.cli.calls import Composition, composed
+from nerfro.cli.overrides import as_overrides
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import EMBEDDED_PREFIX
 from nerfro.core.progress import progress_bar
 from nerfro.data.base import DataSource
+from nerfro.data.capture import Capture
 from nerfro.data.frames import require_root
 from nerfro.files.atomic import write_atomically
 from nerfro.files.folder_lock import lock_folder
 from nerfro.masks.mask_files import MaskTask, read_outlines
 from nerfro.masks.masking import Segmentation
+from nerfro.masks.options import MaskConfig
 from nerfro.masks.outline_page import OutlinePage
 from nerfro.registry.registration import build
+from nerfro.rendering.scene_file import with_scene
 
 _OUTLINES = "outlines.json"
 
 
-@torch.no_grad()
-def run(config: DictConfig) -> None:
-    """Segment the outlined views, then all other views, and write the missing masks.
+def segment(capture: Capture, overrides: Sequence[str] = (), **settings: object) -> Capture:
+    """Segment the object in all photographs of a capture, and write the missing masks.
 
     Args:
-        config: resolved `nerfro.mask.MaskConfig`.
+        capture: photographs with poses, and possibly some masks.
+        overrides: settings as on the command line of `python -m nerfro.mask`.
+        **settings: options by name, as in `segment(capture, outlines={"img_01.jpg": [120, 80, 400, 460]})`.
+
+    Returns:
+        The capture, with masks.
 
     Raises:
         NerfroError: the data set is part of nerfro, there is nothing to start from, or the views disagree.
     """
+    given = [*capture.overrides, *as_overrides(settings), *overrides]
+    with composed("mask", MaskConfig, given, with_scene) as composition:
+        return segment_composed(composition)
+
+
+@torch.no_grad()
+def segment_composed(composition: Composition) -> Capture:
+    """Write the missing masks for composed options, see `segment`."""
+    config = composition.config
     if str(config.data.root).startswith(EMBEDDED_PREFIX):
         raise NerfroError(f"data.root={config.data.root} is part of nerfro and has masks; set data.root to your folder")
     source = build(config.data)
     require_root(source.root)
     with lock_folder(source.root, "data.root"):
         _mask(config, source)
+    return Capture.of(composition)
 
 
 def _mask(config: DictConfig, source: DataSource) -> None:

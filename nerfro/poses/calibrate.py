@@ -1,103 +1,107 @@
-"""The command `calibrate`: from the options to the data set."""
+"""Lens and poses of photographs: from the options of `nerfro.calibrate` to the data set."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import cast
 
 import numpy as np
-from omegaconf import DictConfig
 
-from nerfro.cli.overrides import as_overrides, print_next
+from nerfro.cli.calls import options_of
 from nerfro.core.errors import NerfroError, warn
 from nerfro.core.paths import relative_path, user_path
 from nerfro.core.progress import track
+from nerfro.data.capture import Capture
 from nerfro.data.masks import find_mask, require_used
 from nerfro.files.atomic import refuse_existing
 from nerfro.files.folder_lock import lock_folder
 from nerfro.poses.boards import TagBoard, print_sheets, tag_grid, twelve_faces
 from nerfro.poses.calibrated_data import FILES, ray_range, split_views, write_calibrated
-from nerfro.poses.calibration import Calibration, calibrate
+from nerfro.poses.calibration import Calibration, LensModel, calibrate_by_tags
+from nerfro.poses.options import CalibrateConfig
 from nerfro.poses.photographs import list_photographs, luminance, outside_mask
-from nerfro.poses.structure_from_motion import SfmSettings, find_model, import_model
+from nerfro.poses.structure_from_motion import Pairs, SfmSettings, find_model, import_model
 
 # Limits above which a warning is printed: reprojection error in pixels, and relative deviation of the focal length.
 _MAX_ERROR, _MAX_FOCAL_DEVIATION = 0.7, 0.02
 
 
-def run(config: DictConfig) -> None:
-    """Estimate lens and poses of photographs, write the data set, and print the next command.
+def calibrate(options: CalibrateConfig | None = None, /, **settings: object) -> Capture:
+    """Estimate lens and poses of photographs, and write the data set.
 
     Args:
-        config: resolved `nerfro.calibrate.CalibrateConfig`.
+        options: the options of `python -m nerfro.calibrate`.
+        **settings: options by name, as in `calibrate(images="photographs", target="colmap", out="data/glass")`.
+
+    Returns:
+        The data set; without `images`, its folder holds only the board for printing.
 
     Raises:
         NerfroError: an option is missing, the photographs do not determine the poses, or files exist.
     """
-    _check_options(config)
-    out = user_path(config.out)
+    options = options_of(CalibrateConfig, options, settings)
+    out = _checked_folder(options)
     with lock_folder(out, "out"):
-        _calibrate(config, out)
+        _calibrate(options, out)
+    return Capture(out)
 
 
-def _check_options(config: DictConfig) -> None:
-    """Check the options.
+def _checked_folder(options: CalibrateConfig) -> Path:
+    """Check the options, and return the output folder.
 
     Raises:
         NerfroError: an option is missing.
     """
-    if config.out is None:
+    if options.out is None:
         raise NerfroError("out= is missing; set out= to the folder for the data set")
-    if config.images is None and not (config.write_board and config.target != "colmap"):
+    if options.images is None and not (options.write_board and options.target != "colmap"):
         raise NerfroError(
             "images= is missing; set images= to the folder of the photographs, or write_board=true to print a board"
         )
+    return user_path(options.out)
 
 
-def _make_board(config: DictConfig) -> TagBoard:
+def _make_board(options: CalibrateConfig) -> TagBoard:
     """Build the board that the options describe."""
-    if config.board == "grid":
-        return tag_grid(config.rows or 7, config.columns or 5, config.size)
-    if config.columns or config.rows:
+    if options.board == "grid":
+        return tag_grid(options.rows or 7, options.columns or 5, options.size)
+    if options.columns or options.rows:
         raise NerfroError("board=twelve_faces always has 3x3 tags on each face; set board=grid for columns= and rows=")
-    return twelve_faces(config.size)
+    return twelve_faces(options.size)
 
 
-def _calibrate(config: DictConfig, out: Path) -> None:
-    board = None if config.target == "colmap" else _make_board(config)
-    if config.write_board:
-        _write_board(board, out, config.overwrite)
-        if config.images is None:
-            return
-    images, size = list_photographs(user_path(config.images))
+def _calibrate(options: CalibrateConfig, out: Path) -> None:
+    board = None if options.target == "colmap" else _make_board(options)
+    if options.write_board:
+        _write_board(board, out, options.overwrite)
+    if options.images is None:
+        return
+    lens = cast(LensModel, options.lens)
+    images, size = list_photographs(user_path(options.images))
     # Masks lie where the loader of the data set will look for them.
     masks = [find_mask(out, out / relative_path(image, out)) for image in images]
     require_used(out, [out / relative_path(image, out) for image in images], masks)
-    refuse_existing([out / name for name in FILES], config.overwrite)
+    refuse_existing([out / name for name in FILES], options.overwrite)
     if board is None:
-        settings = SfmSettings(config.lens, config.pairs, config.threads, config.mask_labels)
-        model = find_model(config.reconstruction, images, masks, out / "sparse", settings, config.overwrite)
+        settings = SfmSettings(lens, cast(Pairs, options.pairs), options.threads, options.mask_labels)
+        model = find_model(options.reconstruction, images, masks, out / "sparse", settings, options.overwrite)
         calibration, points = import_model(model, images, size)
         quads, seen = [], points
     else:
         detections = {
-            image.name: outside_mask(board.detect(luminance(image)), mask, config.mask_labels)
+            image.name: outside_mask(board.detect(luminance(image)), mask, options.mask_labels)
             for image, mask in zip(track("detecting tags", images), masks, strict=True)
         }
-        calibration = calibrate(detections, size, config.lens)
+        calibration = calibrate_by_tags(detections, size, lens)
         quads, points = [sheet.corners for sheet in board.sheets()], np.empty((0, 3))
         seen = np.concatenate(quads)
     # With an existing model, the option has no effect.
-    may_distort = config.lens == "pinhole" and (board is not None or model.is_relative_to(out / "sparse"))
+    may_distort = lens == "pinhole" and (board is not None or model.is_relative_to(out / "sparse"))
     _report(calibration, "points" if board is None else "tags", may_distort, out)
-    splits = split_views([image.name for image in images if image.name in calibration.poses], config.test_every)
+    splits = split_views([image.name for image in images if image.name in calibration.poses], options.test_every)
     reach = ray_range(calibration, seen)
-    written = write_calibrated(out, images, size, calibration, splits, config.target, (quads, points), reach)
+    written = write_calibrated(out, images, size, calibration, splits, options.target, (quads, points), reach)
     print(f"wrote {', '.join(written)}")
-    options = as_overrides({"data": "opencv", "data.root": out})
-    if any(masks):
-        print_next("next", "preprocess", options)
-    else:
-        print_next("next", "mask", [*options, "view=true"])
 
 
 def _write_board(board: TagBoard | None, out: Path, overwrite: bool) -> None:

@@ -1,0 +1,176 @@
+"""Calls of commands from Python: typed options from keyword arguments, and compositions of overrides."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import dataclasses
+import os
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+from hydra import compose, initialize_config_dir
+from hydra.core.config_store import ConfigStore
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+
+from nerfro.cli.composition import composed_with
+from nerfro.cli.entry import added, check_configuration
+from nerfro.cli.failures import in_one_line
+from nerfro.cli.options import describe_command
+from nerfro.cli.overrides import full_key
+from nerfro.core.errors import NerfroError, nearest_of
+from nerfro.core.paths import CONF_DIR
+from nerfro.registry.allowed import check_settings
+from nerfro.registry.registration import discover, plugin_of
+
+Options = TypeVar("Options")
+Expand = Callable[[Sequence[str], Sequence[str]], list[str]]
+
+
+def options_of(
+    schema: type[Options], options: Options | None, settings: Mapping[str, object], **arguments: object
+) -> Options:
+    """Check the options of a command, given as a dataclass, as keyword arguments, or as both.
+
+    Args:
+        schema: dataclass of the options.
+        options: the options; None for the defaults.
+        settings: keyword arguments, which have precedence; paths may be objects.
+        **arguments: further settings; None leaves the value of `options`.
+
+    Raises:
+        NerfroError: a name is unknown, or a value is missing or not allowed.
+    """
+    names = [field.name for field in dataclasses.fields(cast(Any, schema))]
+    settings = {**settings, **{name: value for name, value in arguments.items() if value is not None}}
+    for name in settings:
+        if name not in names:
+            raise NerfroError(f"{name} is not a setting; {nearest_of(name, names)}")
+    values = {name: os.fspath(value) if isinstance(value, os.PathLike) else value for name, value in settings.items()}
+    try:
+        typed = cast(DictConfig, OmegaConf.merge(OmegaConf.structured(options or schema), values))
+        check_settings(typed, schema)
+        return cast(Options, OmegaConf.to_object(typed))
+    except MissingMandatoryValue as error:
+        raise NerfroError(f"{error.full_key}=... is missing") from error
+    except OmegaConfBaseException as error:
+        raise NerfroError(in_one_line(error)) from error
+
+
+def options_in(config: DictConfig, schema: type[Options]) -> Options:
+    """Return the checked configuration of a command as a dataclass."""
+    options = OmegaConf.to_object(config)
+    assert isinstance(options, schema)
+    return options
+
+
+def parsed(overrides: Sequence[str]) -> dict[str, Any]:
+    """Parse overrides such as `lens=radial` to settings."""
+    overrides_of_hydra = OverridesParser.create().parse_overrides(list(overrides))
+    return {override.get_key_element(): override.value() for override in overrides_of_hydra}
+
+
+def changed_settings(options: object) -> dict[str, Any]:
+    """Return the settings of a dataclass with other values than the defaults, for example to print a command line."""
+    defaults = dataclasses.asdict(type(options)())  # type: ignore[call-overload]
+    values = dataclasses.asdict(options)  # type: ignore[call-overload]
+    return {name: value for name, value in values.items() if value != defaults[name]}
+
+
+@dataclass(frozen=True)
+class Composition:
+    """A configuration that is composed of groups and checked.
+
+    Attributes:
+        config: the configuration.
+        choices: selected option of each group.
+        overrides: the overrides in the configuration.
+        folder: folder of the run.
+    """
+
+    config: DictConfig
+    choices: Mapping[str, str]
+    overrides: list[str]
+    folder: Path
+
+    @classmethod
+    def of_job(cls, config: DictConfig) -> Composition:
+        """Return the composition of the current job of Hydra."""
+        job = HydraConfig.get()
+        return cls(config, job.runtime.choices, list(job.overrides.task), Path(job.runtime.output_dir))
+
+    def described(self, group: str) -> dict[str, Any]:
+        """Describe a component by its type and the settings with other values than the defaults of the class."""
+        node = self.config[group]
+        defaults = {name: default for name, _, default in plugin_of(node).fields()}
+        values = cast(dict[str, Any], OmegaConf.to_container(node, resolve=True))
+        del values["_target_"]
+        changed = {name: value for name, value in values.items() if value != defaults.get(name)}
+        return {"type": self.choices[group]} | changed
+
+
+@contextlib.contextmanager
+def composed(
+    command: str,
+    schema: type,
+    overrides: Sequence[str],
+    expand: Expand,
+    check: Callable[[DictConfig], None] = lambda config: None,
+) -> Iterator[Composition]:
+    """Compose the configuration of a command for a call from Python.
+
+    Inside the context, the command is the current job of Hydra and the main program, so that records contain its
+    command line, and Lightning starts further processes of a training with this command line.
+
+    Args:
+        command: name of the command.
+        schema: dataclass of the root of the configuration.
+        overrides: settings as on the command line.
+        expand: function that replaces overrides that stand for several settings, see `entry_point`.
+        check: further check of the configuration.
+
+    Raises:
+        NerfroError: a setting does not exist, or its value is not allowed.
+    """
+
+    def check_all(config: DictConfig) -> None:
+        check_configuration(config, schema, CONF_DIR)
+        check(config)
+
+    discover()
+    ConfigStore.instance().store(name=f"{command}_schema", node=schema, provider="nerfro")
+    arguments = expand([*map(full_key, overrides)], [field.name for field in dataclasses.fields(schema)])
+    arguments = [*map(added, arguments)] if command == "train" else arguments
+    try:
+        with composed_with(check_all), initialize_config_dir(str(CONF_DIR), version_base="1.3"):
+            job = compose(command, arguments, return_hydra_config=True)
+    except HydraException as error:
+        describe_command(command, schema, CONF_DIR).require_known(arguments)
+        raise NerfroError(in_one_line(error)) from error
+    with open_dict(job):
+        job.hydra.runtime.output_dir = job.hydra.run.dir
+    config = copy.deepcopy(job)
+    with open_dict(config):
+        del config["hydra"]
+    with _as_main_program(command, arguments, job):
+        yield Composition.of_job(config)
+
+
+@contextlib.contextmanager
+def _as_main_program(command: str, arguments: Sequence[str], job: DictConfig) -> Iterator[None]:
+    main, hydra = sys.modules["__main__"], HydraConfig.instance()
+    spec, argv, outer = getattr(main, "__spec__", None), sys.argv, hydra.cfg
+    main.__spec__, sys.argv = find_spec(f"nerfro.{command}"), [command, *arguments]
+    hydra.set_config(job)
+    try:
+        yield
+    finally:
+        main.__spec__, sys.argv, hydra.cfg = spec, argv, outer
