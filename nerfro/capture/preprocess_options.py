@@ -6,7 +6,7 @@ import typing
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import Annotated, Any
 
 import numpy as np
 from annotated_types import Ge, Le
@@ -65,16 +65,16 @@ class PreprocessConfig:
     data: Any = MISSING
     medium: Any = MISSING
     refine: bool = False
-    mesh: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
-    room: Optional[bool] = None  # noqa: UP045
-    out: Optional[str] = None  # noqa: UP045
+    mesh: str | None = None
+    room: bool | None = None
+    out: str | None = None
     resolution: Annotated[int, Ge(16), Le(1024)] = 96
-    box_min: Optional[list[float]] = None  # noqa: UP045
-    box_max: Optional[list[float]] = None  # noqa: UP045
-    wrong_masks: Optional[Natural] = 0  # noqa: UP045
-    keep: Optional[Count] = None  # noqa: UP045
+    box_min: list[float] | None = None
+    box_max: list[float] | None = None
+    wrong_masks: Natural | None = 0
+    keep: Count | None = None
     smoothing: NotNegative = 1.0
-    symmetry: Annotated[Optional[str], Symmetry] = None  # noqa: UP045
+    symmetry: Annotated[str | None, Symmetry] = None
     vessel: bool = False
     overwrite: bool = False
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Optional
+from typing import Annotated, Any
 
 from annotated_types import Ge, Le
 from omegaconf import MISSING
@@ -32,7 +32,7 @@ class MaskConfig:
 
     data: Any = MISSING
     outlines: Any = None
-    sam2: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
+    sam2: str | None = None
     hull_only: bool = False
     overwrite: bool = False
     view: bool = False

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Optional
+from typing import Annotated, Any
 
 from annotated_types import Ge, Le
 from omegaconf import MISSING, DictConfig
@@ -43,12 +43,12 @@ class ReconstructConfig:
 
     data: Any = MISSING
     medium: Any = MISSING
-    images: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
-    video: Optional[str] = None  # noqa: UP045
+    images: str | None = None
+    video: str | None = None
     frames: Annotated[int, Ge(3), Le(1000)] = 60
-    masks: Optional[str] = None  # noqa: UP045
+    masks: str | None = None
     outlines: Any = None
-    out: Optional[str] = None  # noqa: UP045
+    out: str | None = None
     trial_steps: Natural = 600
     pixels: Count = 256
     calibrate: str = ""

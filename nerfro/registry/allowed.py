@@ -11,15 +11,14 @@ import functools
 import inspect
 import os
 import types
-import typing
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
 from jaxtyping import Float
-from omegaconf import MISSING
+from omegaconf import MISSING, DictConfig, OmegaConf
 from pydantic import AllowInfNan, BeforeValidator, TypeAdapter, ValidationError
 
 from nerfro.core.errors import NerfroError, nearest_of
@@ -119,18 +118,14 @@ def validate(schema: type[Settings], values: object, prefix: str = "") -> Settin
     """
     if not isinstance(values, Mapping):
         raise NerfroError(f"{prefix[:-1]}={values} is not a set of settings; write {prefix}NAME=VALUE")
-    hints, fields = annotations(schema), {field.name: field for field in dataclasses.fields(typing.cast(Any, schema))}
+    hints, fields = annotations(schema), {field.name: field for field in dataclasses.fields(cast(Any, schema))}
     require_names(prefix, fields, values)
-    own = {name: value for name, value in values.items() if value != MISSING}
+    own = {str(name): value for name, value in values.items() if not is_missing(value)}
     for name, field in fields.items():
-        nested, default = schema_of(hints[name]), field.default
-        if (
-            name not in own
-            and field.default_factory is dataclasses.MISSING
-            and default in (dataclasses.MISSING, MISSING)
-        ):
+        if name not in own and is_missing(default_of(field)):
             raise MissingSettingError(f"{prefix}{name}")
-        if nested is not None and name in own and isinstance(own[name], Mapping):
+        nested = schema_of(hints[name])
+        if nested is not None and isinstance(own.get(name), Mapping):
             if dataclasses.is_dataclass(hints[name]):
                 own[name] = validate(nested, own[name], f"{prefix}{name}.")
             else:
@@ -143,6 +138,7 @@ class MissingSettingError(NerfroError):
 
     def __init__(self, name: str) -> None:
         super().__init__(f"{name}=... is missing")
+        self.name = name
 
 
 def require_names(prefix: str, names: Iterable[str], values: Iterable[object]) -> None:
@@ -332,3 +328,21 @@ def corners_of_box(
             f"and none beyond {_FURTHEST}"
         )
     return box
+
+
+def is_missing(value: object) -> bool:
+    """Test whether a value stands for a required setting that is not set."""
+    return isinstance(value, str) and value == MISSING
+
+
+def plain(node: Any) -> dict[str, Any]:
+    """Convert a node of a configuration to a mapping without interpolations."""
+    return cast(dict, OmegaConf.to_container(node, resolve=True)) if isinstance(node, DictConfig) else dict(node)
+
+
+def untyped(settings: Any) -> Any:
+    """Copy a dataclass to one with the same names and values, whose types OmegaConf does not check."""
+    values = {field.name: getattr(settings, field.name) for field in dataclasses.fields(settings)}
+    values = {name: untyped(value) if dataclasses.is_dataclass(value) else value for name, value in values.items()}
+    kinds = {name: type(value) if dataclasses.is_dataclass(value) else Any for name, value in values.items()}
+    return dataclasses.make_dataclass(type(settings).__name__, kinds.items())(**values)

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Optional
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -49,17 +48,23 @@ class Subdivision:
 
     side: Side = 1
     divergence: NotNegative = 0.0
-    contrast: Optional[Positive] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
+    contrast: Positive | None = None
     contrast_start: Natural = 0
 
 
 @dataclass
 class SubdivisionChanges:
-    """Attributes of a `Subdivision` that are replaced; None keeps the value of the run."""
+    """Attributes of a `Subdivision` that are replaced; None keeps the value of the run.
 
-    side: Optional[Side] = None  # noqa: UP045 - rays along each side of a divided pixel
-    divergence: Optional[NotNegative] = None  # noqa: UP045 - minimum angle, in pixel angles, for which pixels are divided
-    contrast: Optional[Positive] = None  # noqa: UP045 - minimum difference of a channel for which pixels are divided
+    Attributes:
+        side: rays along each side of a divided pixel.
+        divergence: minimum angle, in pixel angles, for which pixels are divided.
+        contrast: minimum difference of a channel for which pixels are divided.
+    """
+
+    side: Side | None = None
+    divergence: NotNegative | None = None
+    contrast: Positive | None = None
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from nerfro.data.lenses import Lens
 from nerfro.geometry.lines import nearest_point
 from nerfro.registry.allowed import Coordinate
 
-_MAX_COORDINATE = get_args(Coordinate)[1].at_most  # world units
+_MAX_COORDINATE = get_args(Coordinate)[2].le  # world units
 
 # The cameras share a target if it lies in front of at least 90 % of them, within 30 degrees of the optical axis.
 _MIN_COSINE_TO_TARGET, _MIN_SHARE_OF_CAMERAS = 0.87, 0.9
