@@ -64,7 +64,7 @@ MESH = "embedded:torus/mesh.ply"
         ("loss", "backdrop", {"colour": [255.0] * 3}, "three numbers in"),
         ("loss", "photometric", {"ramp": -1}, "ramp=-1 is not allowed; take at least 0"),
         ("loss", "photometric", {"start": -1}, "start=-1 is not allowed; take at least 0"),
-        ("loss", "photometric", {"weight": -1}, "weight=-1.0 is not allowed; take at least 0"),
+        ("loss", "photometric", {"weight": -1}, "weight=-1 is not allowed; take at least 0"),
         ("loss", "smoothness", {"tile_size": 1}, "tile_size=1 is not allowed; take at least 2"),
         ("loss", "total_variation", {"angle": 0.0}, "more than 0 and less than 90"),
         ("medium", "ball", {"ior": 0.0}, "ior=0.0 is not allowed; take more than 0"),

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 import torch
@@ -220,7 +221,7 @@ class Observations:
         self.shift, self._mesh, self._room = shift, mesh.relative_to(shift), room
 
     @property
-    def distance(self) -> str | None:
+    def distance(self) -> Literal["near", "far"] | None:
         """Distance of the surroundings, `near` or `far`; None if neither given nor reconstructed."""
         known = self.__dict__.get("surroundings")
         near = self._room if known is None else isinstance(known.background, Room)

@@ -42,9 +42,9 @@ def options_of(
     Raises:
         NerfroError: a name is unknown, or a value is missing or not allowed.
     """
-    values = {} if options is None else dict(vars(options))
-    values |= settings | {name: value for name, value in arguments.items() if value is not None}
-    return validate(schema, values)
+    values = {} if options is None else vars(options)
+    changes = {name: value for name, value in arguments.items() if value is not None}
+    return validate(schema, {**values, **settings, **changes})
 
 
 def parsed(overrides: Sequence[str]) -> dict[str, Any]:

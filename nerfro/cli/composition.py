@@ -29,7 +29,7 @@ from nerfro.cli.overrides import SHORT_NAMES, full_key
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import CONF_DIR, refuse_root, user_path
 from nerfro.core.trust import MAX_YAML_CHARACTERS, GuardedConfigLoader, require_bounded_yaml
-from nerfro.registry.allowed import MissingSettingError, annotations, plain, require_names, validate
+from nerfro.registry.allowed import MissingSettingError, hints_of, plain, require_names, validate
 from nerfro.registry.registration import discover
 
 Expand = Callable[[Sequence[str], Sequence[str]], list[str]]
@@ -58,7 +58,7 @@ class Composer:
         """Write the arguments of a command line in the grammar of Hydra."""
         overrides = [quoted(full_key(argument), self.verbatim) for argument in arguments]
         if self.expand is not None:
-            overrides = self.expand(overrides, list(annotations(self.schema)))
+            overrides = self.expand(overrides, list(hints_of(self.schema)))
         return [*map(added, overrides)] if self.command == "train" else overrides
 
     def require_valid(self, config: DictConfig) -> None:
@@ -69,7 +69,7 @@ class Composer:
         """
         groups = [path.name for path in CONF_DIR.iterdir() if path.is_dir()]
         values = plain(config)
-        require_names("", [*annotations(self.schema), *groups], values)
+        require_names("", [*hints_of(self.schema), *groups], values)
         with missing_with_example(self.command):
             validate(self.schema, values)
             if self.check is not None:
@@ -183,10 +183,10 @@ def _require_declared(node: DictConfig, prefix: str, also: Sequence[str] = ()) -
     """
     schema = OmegaConf.get_type(node)
     if is_dataclass(schema):
-        require_names(prefix, [*annotations(schema), *also], node)
+        require_names(prefix, [*hints_of(schema), *also], node)
     for name, child in node.items_ex(resolve=False):
         if isinstance(child, DictConfig) and name not in also and not child._is_none():
-            _require_declared(child, f"{prefix}{name}.")
+            _require_declared(child, f"{prefix}{name!s}.")
 
 
 class BoundedFiles(FileConfigSource):

@@ -151,7 +151,7 @@ def _unselected(key: str) -> str | None:
     """Explain how to add a missing loss or callback to the experiment; None for other settings."""
     kind, name, option = [*key.split("."), "", ""][:3]
     plugin = next((plugin for plugin in plugins() if (plugin.kind, plugin.name) == (kind, name)), None)
-    if plugin is None or kind not in SEVERAL or (option and option not in plugin.setting_names):
+    if plugin is None or kind not in SEVERAL or (option and option not in plugin.hints):
         return None
     if kind != "callbacks":
         setting = option or {"loss": "weight"}.get(kind, "SETTING")

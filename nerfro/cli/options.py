@@ -29,7 +29,7 @@ from omegaconf import DictConfig, OmegaConf
 from nerfro.cli.overrides import full_key, is_scene_file
 from nerfro.core.errors import NerfroError, nearest_of
 from nerfro.core.paths import CONF_DIR, PACKAGE_DIR, cache_dir
-from nerfro.registry.allowed import Refused, annotations, default_of, is_missing, type_name, untyped
+from nerfro.registry.allowed import Refused, default_of, hints_of, is_missing, type_name, untyped
 from nerfro.registry.registration import ENTRY_POINTS, KINDS, SEVERAL, Plugin, plugin_folders, plugins
 
 # Groups without a default in conf/train.yaml.
@@ -212,7 +212,7 @@ def schema_options(schema: Any, values: Mapping[str, Any], prefix: str = "") -> 
         values: values that replace the defaults.
         prefix: full name of the node, with a dot at the end.
     """
-    hints, explained = annotations(schema), google_docstring(inspect.getdoc(schema) or "")[1]
+    hints, explained = hints_of(schema), google_docstring(inspect.getdoc(schema) or "")[1]
     for field in dataclasses.fields(schema):
         hint, name, default = hints[field.name], prefix + field.name, default_of(field)
         if field.name.startswith("_") or any(isinstance(limit, Refused) for limit in get_args(hint)):
@@ -269,7 +269,7 @@ def google_docstring(docstring: str) -> tuple[str, dict[str, str]]:
 
 def _names(schema: Any, prefix: str = "") -> dict[str, list[str]]:
     """Return the names of the settings of a dataclass and of nested dataclasses, by the full name of the node."""
-    hints = annotations(schema)
+    hints = hints_of(schema)
     names = {prefix: list(hints)}
     for name, hint in hints.items():
         if dataclasses.is_dataclass(hint):

@@ -118,7 +118,7 @@ def validate(schema: type[Settings], values: object, prefix: str = "") -> Settin
     """
     if not isinstance(values, Mapping):
         raise NerfroError(f"{prefix[:-1]}={values} is not a set of settings; write {prefix}NAME=VALUE")
-    hints, fields = annotations(schema), {field.name: field for field in dataclasses.fields(cast(Any, schema))}
+    hints, fields = hints_of(schema), {field.name: field for field in dataclasses.fields(cast(Any, schema))}
     require_names(prefix, fields, values)
     own = {str(name): value for name, value in values.items() if not is_missing(value)}
     for name, field in fields.items():
@@ -154,7 +154,7 @@ def require_names(prefix: str, names: Iterable[str], values: Iterable[object]) -
 
 
 @functools.cache
-def annotations(schema: Any) -> dict[str, Any]:
+def hints_of(schema: Any) -> dict[str, Any]:
     """Return the annotations of a dataclass or function by name, including `Annotated`."""
     return get_type_hints(schema, include_extras=True)
 
@@ -180,7 +180,7 @@ def validated(where: str) -> Callable[[type[Class]], type[Class]]:
         @functools.wraps(constructor)
         def init(self: Any, *arguments: Any, **named: Any) -> None:
             bound = signature.bind(self, *arguments, **named)
-            bound.arguments |= check(f"{where}: ", annotations(constructor), bound.arguments)
+            bound.arguments |= check(f"{where}: ", hints_of(constructor), bound.arguments)
             constructor(*bound.args, **bound.kwargs)
 
         cls.__init__ = init  # type: ignore[misc,method-assign]
@@ -195,16 +195,19 @@ def setting_type(hint: Any) -> Any:
     Settings are int, float, bool, str, `Literal`, their optional, list and dict forms, and all of these `Annotated`.
     """
     origin, args = get_origin(hint), get_args(hint)
-    if hint in (int, float):
-        return Annotated[hint, AllowInfNan(False), BeforeValidator(functools.partial(_exact, hint))]
-    if hint is str:
-        return Annotated[str, BeforeValidator(_text)]
+    if hint in (int, float, str):
+        return setting_type(Annotated[hint, None])
     if hint is bool or origin is Literal:
         return hint
     if origin is Annotated:
-        inner = Any if args[0] is Any else setting_type(args[0])
         limits = [BeforeValidator(limit.refuse) if isinstance(limit, Refused) else limit for limit in args[1:]]
-        return None if inner is None else Annotated[(inner, *limits)]
+        if args[0] is float and AllowInfNan(True) not in limits:
+            limits.append(AllowInfNan(False))
+        if args[0] in _CONVERSIONS:
+            limits.append(BeforeValidator(_CONVERSIONS[args[0]]))
+        inner = args[0] if args[0] in (Any, *_CONVERSIONS) else setting_type(args[0])
+        arguments = (inner, *limits)
+        return None if inner is None else Annotated[arguments]
     if origin in (Union, types.UnionType):
         inner = setting_type(_without_none(args)) if type(None) in args and len(args) == 2 else None
         return None if inner is None else Union[inner, None]  # noqa: UP007 - for a variable
@@ -220,15 +223,23 @@ def _adapter(hint: Any) -> TypeAdapter | None:
     return None if kind is None else TypeAdapter(kind)
 
 
-def _exact(kind: type, value: Any) -> Any:
-    """Refuse booleans as numbers, and floating-point numbers as integers."""
-    if isinstance(value, bool) or (kind is int and isinstance(value, float)):
-        raise ValueError("take an integer" if kind is int else "take a number")
+def _integer(value: Any) -> Any:
+    if isinstance(value, bool | float):
+        raise ValueError("take an integer")
+    return value
+
+
+def _number(value: Any) -> Any:
+    if isinstance(value, bool):
+        raise ValueError("take a number")
     return value
 
 
 def _text(value: Any) -> Any:
     return str(value) if isinstance(value, os.PathLike | int | float) else value
+
+
+_CONVERSIONS = {int: _integer, float: _number, str: _text}  # before pydantic validates a value
 
 
 def _without_none(args: Sequence[Any]) -> Any:

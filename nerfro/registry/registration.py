@@ -31,8 +31,8 @@ from omegaconf.errors import OmegaConfBaseException
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import PLUGINS_DIR, PLUGINS_PACKAGE
 from nerfro.registry.allowed import (
-    annotations,
     check,
+    hints_of,
     is_missing,
     plain,
     require_names,
@@ -214,8 +214,9 @@ def check_node(node: object) -> type:
     """
     node = _settings_of(node)
     plugin = plugin_of(node)
-    derived = {key for key in node if OmegaConf.is_interpolation(node, key)}
-    values = settings_of(plugin, {**cast(dict, OmegaConf.to_container(node)), **dict.fromkeys(derived)})
+    written = cast(dict[str, Any], OmegaConf.to_container(node))
+    derived = {name for name in written if OmegaConf.is_interpolation(node, name)}
+    values = settings_of(plugin, written | dict.fromkeys(derived))
     check(f"{plugin.kind}={plugin.name}: ", plugin.hints, {name: values[name] for name in values.keys() - derived})
     return plugin.cls
 
@@ -411,7 +412,7 @@ def _make_plugin(kind: str, name: str, cls: type) -> Plugin:
             hints[parameter.name] = hint
             defaults[parameter.name] = MISSING if parameter.default is parameter.empty else parameter.default
     for attribute in _attributes(cls):
-        hints[attribute] = annotations(cls)[attribute]
+        hints[attribute] = hints_of(cls)[attribute]
         defaults[attribute] = getattr(cls, attribute)
     return Plugin(kind, name, cls, hints, defaults, frozenset(parts))
 
@@ -432,7 +433,7 @@ def _parameters(cls: type) -> list[tuple[inspect.Parameter, Any]]:
         constructor = inspect.unwrap(base.__init__)  # type: ignore[misc]
         _, *own = inspect.signature(constructor).parameters.values()
         for parameter in own:
-            parameters.setdefault(parameter.name, (parameter, annotations(constructor).get(parameter.name)))
+            parameters.setdefault(parameter.name, (parameter, hints_of(constructor).get(parameter.name)))
         if not any(parameter.kind == parameter.VAR_KEYWORD for parameter in own):
             return [pair for pair in parameters.values() if pair[0].kind != inspect.Parameter.VAR_KEYWORD]
     return list(parameters.values())
