@@ -80,11 +80,13 @@ Share = Annotated[float, Gt(0), Lt(1)]
 Coordinate = Annotated[float, Ge(-_FURTHEST), Le(_FURTHEST)]  # world units
 Distance = Annotated[float, Ge(0), Le(_FURTHEST)]  # world units
 
+_LONGEST = 100  # characters of a value in a message
+_BEYOND_LIMITS = ("greater_than_equal", "greater_than", "less_than_equal", "less_than")  # types of pydantic's errors
 _WORDS = {Ge: ("at least", "ge"), Gt: ("more than", "gt"), Le: ("at most", "le"), Lt: ("less than", "lt")}
 
 
-def check(where: str, hints: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Check values against annotations, and convert them to the annotated types.
+def convert(where: str, hints: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Check settings against annotations, and convert them to the annotated types; digits are numbers, too.
 
     Args:
         where: start of the error message.
@@ -100,9 +102,21 @@ def check(where: str, hints: Mapping[str, Any], values: Mapping[str, Any]) -> di
         try:
             converted[name] = value if adapter is None else adapter.validate_python(value)
         except ValidationError as error:
-            shown = repr(value) if len(repr(value)) < 100 else f"{repr(value)[:100]}..."
-            raise NerfroError(f"{where}{name}={shown} is not allowed; {_advice(hints[name], error)}") from None
+            raise _not_allowed(where, name, value, _advice(hints[name], error.errors()[0])) from None
     return converted
+
+
+def check(where: str, hints: Mapping[str, Any], values: Mapping[str, Any]) -> None:
+    """Check values of a file against annotations, like `convert`; text is no number, and None is always allowed."""
+    present = {name: value for name, value in values.items() if value is not None}
+    for name, value in convert(where, hints, present).items():
+        if value != present[name]:
+            raise _not_allowed(where, name, present[name], _advice(hints[name], {"type": "", "loc": (0,)}))
+
+
+def _not_allowed(where: str, name: str, value: object, advice: str) -> NerfroError:
+    shown = repr(value) if len(repr(value)) < _LONGEST else f"{repr(value)[:_LONGEST]}..."
+    return NerfroError(f"{where}{name}={shown} is not allowed; {advice}")
 
 
 def validate(schema: type[Settings], values: object, prefix: str = "") -> Settings:
@@ -130,7 +144,7 @@ def validate(schema: type[Settings], values: object, prefix: str = "") -> Settin
                 own[name] = validate(nested, own[name], f"{prefix}{name}.")
             else:
                 own[name] = {key: validate(nested, node, f"{prefix}{name}.{key}.") for key, node in own[name].items()}
-    return schema(**check(prefix, hints, own))
+    return schema(**convert(prefix, hints, own))
 
 
 class MissingSettingError(NerfroError):
@@ -180,7 +194,7 @@ def validated(where: str) -> Callable[[type[Class]], type[Class]]:
         @functools.wraps(constructor)
         def init(self: Any, *arguments: Any, **named: Any) -> None:
             bound = signature.bind(self, *arguments, **named)
-            bound.arguments |= check(f"{where}: ", hints_of(constructor), bound.arguments)
+            bound.arguments |= convert(f"{where}: ", hints_of(constructor), bound.arguments)
             constructor(*bound.args, **bound.kwargs)
 
         cls.__init__ = init  # type: ignore[misc,method-assign]
@@ -225,13 +239,13 @@ def _adapter(hint: Any) -> TypeAdapter | None:
 
 def _integer(value: Any) -> Any:
     if isinstance(value, bool | float):
-        raise ValueError("take an integer")
+        raise ValueError("no integer")
     return value
 
 
 def _number(value: Any) -> Any:
     if isinstance(value, bool):
-        raise ValueError("take a number")
+        raise ValueError("no number")
     return value
 
 
@@ -246,22 +260,27 @@ def _without_none(args: Sequence[Any]) -> Any:
     return next(arg for arg in args if arg is not type(None))
 
 
-def _advice(hint: Any, error: ValidationError) -> str:
-    """Say which values a setting may have."""
-    kind, *_ = (entry["type"] for entry in error.errors(include_url=False))
-    reason = error.errors(include_url=False)[0].get("ctx", {}).get("error")
+def _advice(hint: Any, error: Mapping[str, Any]) -> str:
+    """Say which values a setting may have.
+
+    Args:
+        hint: annotation of the setting.
+        error: an error of pydantic: its type, the position in a list, and the exception of a validator.
+    """
     inner, limits, choices = _parts(hint)
-    if reason is not None and str(reason) not in ("take an integer", "take a number"):
-        return str(reason)
+    if error["type"] == "value_error" and any(isinstance(mark, Refused) for mark in get_args(hint)):
+        return str(error["ctx"]["error"])
     if choices:
         return f"choose {', '.join(map(repr, choices))}"
     if get_origin(inner) in (list, tuple, Sequence):
-        depth = len(error.errors(include_url=False)[0]["loc"])
-        return _advice(get_args(inner)[0], error) if depth else "take a list"
+        return _advice(get_args(inner)[0], {**error, "loc": error["loc"][1:]}) if error["loc"] else "take a list"
     names = {int: "an integer", float: "a finite number", str: "text", bool: "true or false"}
-    if limits and not kind.startswith("int_") and reason is None:
-        return f"take {limits}"
-    return ", ".join([f"take {names.get(inner, 'a mapping')}", *([limits] if limits else [])])
+    is_in_type = error["type"] in _BEYOND_LIMITS or inner is float
+    return (
+        f"take {limits}"
+        if limits and is_in_type
+        else ", ".join(filter(None, [f"take {names.get(inner, 'a mapping')}", limits]))
+    )
 
 
 def _parts(hint: Any) -> tuple[Any, str, tuple[Any, ...]]:

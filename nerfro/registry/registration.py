@@ -31,7 +31,7 @@ from omegaconf.errors import OmegaConfBaseException
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import PLUGINS_DIR, PLUGINS_PACKAGE
 from nerfro.registry.allowed import (
-    check,
+    convert,
     hints_of,
     is_missing,
     plain,
@@ -217,7 +217,7 @@ def check_node(node: object) -> type:
     written = cast(dict[str, Any], OmegaConf.to_container(node))
     derived = {name for name in written if OmegaConf.is_interpolation(node, name)}
     values = settings_of(plugin, written | dict.fromkeys(derived))
-    check(f"{plugin.kind}={plugin.name}: ", plugin.hints, {name: values[name] for name in values.keys() - derived})
+    convert(f"{plugin.kind}={plugin.name}: ", plugin.hints, {name: values[name] for name in values.keys() - derived})
     return plugin.cls
 
 
@@ -269,7 +269,7 @@ def create(plugin: Plugin, node: DictConfig | Mapping[str, object], **parts: obj
     """
     values = settings_of(plugin, node)
     attributes = {name: values.pop(name) for name in _attributes(plugin.cls) if name in values}
-    attributes = check(f"{plugin.kind}={plugin.name}: ", plugin.hints, attributes)
+    attributes = convert(f"{plugin.kind}={plugin.name}: ", plugin.hints, attributes)
     made = plugin.cls(**values, **parts)
     for name, value in attributes.items():
         setattr(made, name, value)
@@ -304,7 +304,7 @@ def configure(plugin: Plugin, node: DictConfig | Mapping[str, object]) -> dict[s
     Raises:
         NerfroError: a setting is unknown or missing, or its value is not allowed.
     """
-    return check(f"{plugin.kind}={plugin.name}: ", plugin.hints, settings_of(plugin, node))
+    return convert(f"{plugin.kind}={plugin.name}: ", plugin.hints, settings_of(plugin, node))
 
 
 def settings_of(plugin: Plugin, node: DictConfig | Mapping[str, object]) -> dict[str, Any]:
