@@ -133,7 +133,7 @@ def test_damaged_data_is_refused(
         (["+batches.foo=3"], ["batches.foo is not a setting; known: batching, num_validation_views"]),
         (["+sampler.point.num_samples=5"], ["sampler.point is not a setting; did you mean points?"]),
         (["+hydra.run.foo=1"], ["hydra.run.foo is not a setting; known: dir"]),
-        (["field.width=abc"], ["field=nerf: width='abc' is not allowed; take an integer, at least 1"]),
+        (["field.width=abc"], ["field=nerf: width='abc' is not allowed; take a number, not text"]),
         (["field=null"], ["Got NoneType; give the name of an option"]),
         (["+loss.boundry.weight=1"], ["no loss is called 'boundry'; known: backdrop, background"]),
         (["sampler.path.integrator=foo"], ["integrator='foo' is not allowed; choose 'adaptive', 'euler'"]),

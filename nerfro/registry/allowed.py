@@ -80,6 +80,7 @@ Share = Annotated[float, Gt(0), Lt(1)]
 Coordinate = Annotated[float, Ge(-_FURTHEST), Le(_FURTHEST)]  # world units
 Distance = Annotated[float, Ge(0), Le(_FURTHEST)]  # world units
 
+_TEXT = "float_parsing"  # type of pydantic's errors about text instead of a number
 _LONGEST = 100  # characters of a value in a message
 _BEYOND_LIMITS = ("greater_than_equal", "greater_than", "less_than_equal", "less_than")  # types of pydantic's errors
 _WORDS = {Ge: ("at least", "ge"), Gt: ("more than", "gt"), Le: ("at most", "le"), Lt: ("less than", "lt")}
@@ -111,7 +112,12 @@ def check(where: str, hints: Mapping[str, Any], values: Mapping[str, Any]) -> No
     present = {name: value for name, value in values.items() if value is not None}
     for name, value in convert(where, hints, present).items():
         if value != present[name]:
-            raise _not_allowed(where, name, present[name], _advice(hints[name], {"type": "", "loc": (0,)}))
+            raise _not_allowed(
+                where,
+                name,
+                present[name],
+                _advice(hints[name], {"type": _TEXT if isinstance(present[name], str) else "", "loc": (0,)}),
+            )
 
 
 def _not_allowed(where: str, name: str, value: object, advice: str) -> NerfroError:
@@ -274,6 +280,8 @@ def _advice(hint: Any, error: Mapping[str, Any]) -> str:
         return f"choose {', '.join(map(repr, choices))}"
     if get_origin(inner) in (list, tuple, Sequence):
         return _advice(get_args(inner)[0], {**error, "loc": error["loc"][1:]}) if error["loc"] else "take a list"
+    if error["type"] in (_TEXT, "int_parsing"):
+        return "take a number, not text"
     names = {int: "an integer", float: "a finite number", str: "text", bool: "true or false"}
     is_in_type = error["type"] in _BEYOND_LIMITS or inner is float
     return (
