@@ -7,17 +7,17 @@ Examples:
 
 from __future__ import annotations
 
+import contextlib
+import io
 import re
-import signal
-import subprocess
 import sys
 from datetime import datetime
 from pathlib import Path
+from typing import TextIO
 
-import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
+import nerfro.cli.startup
 from nerfro.cli.failures import errors_in_one_line
-from nerfro.core.trust import command_of_module
-from nerfro.evaluation.results import read_metrics_json
+from nerfro.core.trust import leave_current_directory
 from nerfro.viewing.server import open_page
 
 _OPTIONS = (
@@ -33,27 +33,31 @@ def main() -> None:
     """Train with the interactive page, export the final page, and print where it is."""
     with errors_in_one_line():
         print("nerfro: starting; the first start compiles kernels, up to a minute", file=sys.stderr, flush=True)
+        leave_current_directory()
         folder = Path("outputs", f"demo_{datetime.now():%Y-%m-%d_%H-%M-%S}").resolve()
-        _run("train", *_OPTIONS, f"hydra.run.dir={folder}", *sys.argv[1:])
-        _run("export", f"checkpoint={folder}", "what=page", f"out={folder / 'page.html'}")
-        result = read_metrics_json(folder / "metrics.json").result
-        psnr, num_views = result.mean("psnr"), len(result.views)
-        print(f"PSNR {psnr:.1f} dB on {num_views} photographs that were not trained on; page: {folder / 'page.html'}")
+        with contextlib.redirect_stdout(_Addresses(sys.stdout)):
+            # The package imports the functions on access, after the line above.
+            run = nerfro.train(overrides=[*_OPTIONS, *sys.argv[1:]], out=folder)
+            page = nerfro.export(run, "page", folder / "page.html")
+        assert run.scores is not None  # of the test views
+        psnr, num_views = run.scores.result.mean("psnr"), len(run.scores.result.views)
+        print(f"PSNR {psnr:.1f} dB on {num_views} photographs that were not trained on; page: {page}")
 
 
-def _run(command: str, *options: str) -> None:
-    """Run a command, and show only the address of its page; errors and progress are on standard error."""
-    arguments = [*command_of_module(f"nerfro.{command}"), *options]
-    with subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True) as process:
-        before = signal.signal(signal.SIGINT, lambda number, frame: None)  # the command ends in a line of its own
-        for line in process.stdout or ():
-            address = re.search(r"http://\S+", line)
-            if address is not None:
-                print(line, end="", flush=True)
+class _Addresses(io.StringIO):
+    """Output of which only the address of the page is shown; errors and progress are on standard error."""
+
+    def __init__(self, shown: TextIO) -> None:
+        super().__init__()
+        self._shown = shown
+
+    def write(self, text: str) -> int:
+        address = re.search(r"http://\S+", text)
+        if address is not None:
+            with contextlib.redirect_stdout(self._shown):
+                print(text.rstrip(), flush=True)
                 open_page(address[0])
-    signal.signal(signal.SIGINT, before)
-    if process.returncode != 0:
-        sys.exit(process.returncode)
+        return len(text)
 
 
 if __name__ == "__main__":

@@ -4,16 +4,24 @@ Examples:
     nerfro plugins
     nerfro plugins medium field=hash_grid
     nerfro plugins material
+    nerfro plugins settings
 """
 
 from __future__ import annotations
 
+import inspect
 import sys
 
+import nerfro.capture.refinement
+import nerfro.capture.vessel_fit
 import nerfro.cli.startup
-import nerfro.training.lightning_callbacks  # noqa: F401 - registers callbacks
+import nerfro.masks.masking
+import nerfro.poses.structure_from_motion
+import nerfro.silhouettes.surface
+import nerfro.training.lightning_callbacks  # noqa: F401 - registers callbacks, as the others register settings
 from nerfro.cli.failures import errors_in_one_line
 from nerfro.cli.options import plugin_options
+from nerfro.core.provenance import AlgorithmSettings
 from nerfro.media.material import MATERIALS
 from nerfro.registry.registration import Plugin, discover, find, plugins
 
@@ -21,14 +29,14 @@ from nerfro.registry.registration import Plugin, discover, find, plugins
 def main() -> None:
     """List all plugins, or those of the types (`medium`) or options (`medium=ball`) on the command line.
 
-    The type `material` stands for the catalogue of materials.
+    The type `material` stands for the catalogue of materials, and `settings` for the tuned numbers of algorithms.
     """
     with errors_in_one_line():
         discover()
-        arguments = sys.argv[1:]
-        if "material" in arguments:
-            _print_materials()
-            arguments.remove("material")
+        arguments, catalogues = sys.argv[1:], {"material": _print_materials, "settings": _print_settings}
+        for name in [name for name in catalogues if name in arguments]:
+            catalogues[name]()
+            arguments.remove(name)
             if not arguments:
                 return
         for plugin in _chosen(arguments):
@@ -42,6 +50,12 @@ def _print_materials() -> None:
     for name, formula in MATERIALS.items():
         print(f"material={name}  {formula.description}")
         print(f"    n_d = {formula.ior:.4f}, Abbe number {formula.abbe:.1f}; {formula.source}")
+
+
+def _print_settings() -> None:
+    """Print the settings of algorithms, which Python code passes as the argument `settings`, with their defaults."""
+    for settings in AlgorithmSettings.classes.values():
+        print(f"{settings.__module__}.{settings()!r}\n\n{inspect.getdoc(settings)}\n")
 
 
 def _chosen(arguments: list[str]) -> list[Plugin]:

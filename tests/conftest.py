@@ -191,11 +191,8 @@ def run_here(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 
 
 @pytest.fixture
-def train_here(unchecked: None, run_here: Runner, monkeypatch: pytest.MonkeyPatch) -> Runner:
-    """`python -m nerfro.train` in this process, without looking for LPIPS weights."""
-    from nerfro.evaluation.metrics import ImageMetrics
-
-    monkeypatch.setattr("nerfro.training.run.prepared_metrics", ImageMetrics)
+def train_here(unchecked: None, run_here: Runner) -> Runner:
+    """`python -m nerfro.train` in this process."""
     return functools.partial(run_here, "train")
 
 
@@ -212,20 +209,14 @@ def train_paper(train_here: Runner, tiny_run: list[str], tmp_path: Path) -> Runn
 
 
 @pytest.fixture
-def evaluate_here(unchecked: None, run_here: Runner, monkeypatch: pytest.MonkeyPatch) -> Runner:
-    """`python -m nerfro.evaluate` in this process, on the CPU and without looking for LPIPS weights."""
-    from nerfro.evaluation.metrics import ImageMetrics
-
-    monkeypatch.setattr("nerfro.pipeline.evaluate.prepared_metrics", ImageMetrics)
+def evaluate_here(unchecked: None, run_here: Runner) -> Runner:
+    """`python -m nerfro.evaluate` in this process, on the CPU."""
     return functools.partial(run_here, "evaluate", "device=cpu")
 
 
 def train_in(folder: Path, *overrides: str) -> Path:
     """Train like `train_here`, for fixtures that several tests share; returns the folder of the run."""
-    from nerfro.evaluation.metrics import ImageMetrics
-
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("nerfro.training.run.prepared_metrics", ImageMetrics)
         patch.setattr(sys, "argv", ["nerfro.train", *overrides, f"hydra.run.dir={folder}"])
         importlib.import_module("nerfro.train").main()
     return folder

@@ -25,9 +25,7 @@ def _main(name: str, arguments: list[str], log: Path, environment: dict[str, str
             os.dup2(file.fileno(), stream.fileno())
     sys.argv = [f"nerfro.{name}", *arguments]
     os.environ.update(environment, HYDRA_FULL_ERROR="1")
-    module = importlib.import_module(f"nerfro.{name}")
-    module.prepared_metrics = importlib.import_module("nerfro.evaluation.metrics").ImageMetrics
-    module.main()
+    importlib.import_module(f"nerfro.{name}").main()
 
 
 def _errors(log: Path) -> Path:

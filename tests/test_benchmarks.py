@@ -19,7 +19,6 @@ from lightning.pytorch.callbacks import timer
 
 import nerfro
 from benchmarks.capture import align_to_truth
-from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.files.images import save_png
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.poses.video import extract_frames
@@ -62,7 +61,6 @@ def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> R
     def run_script(name: str, *arguments: object) -> list[str]:
         monkeypatch.syspath_prepend(str(FOLDER))
         monkeypatch.setattr(subprocess, "run", train_here)
-        monkeypatch.setattr("nerfro.training.run.prepared_metrics", ImageMetrics)
         monkeypatch.setattr(sys, "argv", [name, *map(str, arguments)])
         # Benchmarks replace these.
         for module, attribute in ((timer, "time"), (ball_photographs, "SIZE")):

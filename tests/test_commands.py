@@ -3,7 +3,6 @@
 import json
 import re
 import shlex
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -13,7 +12,10 @@ import pytest
 import nerfro.demo
 from nerfro.cli.completion import completions
 from nerfro.cli.options import Described, recall, remember
+from nerfro.core.errors import NerfroError
 from nerfro.core.paths import PACKAGE_DIR
+from nerfro.evaluation.results import EvaluationResult, RunMetrics, ViewScores
+from nerfro.training.run import Run
 from nerfro.viewing.server import open_page
 from tests.conftest import Runner, refused
 from tests.processes import python
@@ -118,12 +120,16 @@ def test_completion_of_commands_options_and_choices(
 def test_demo_opens_the_page_and_prints_the_score_in_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run_here: Runner
 ) -> None:
-    program = "import json, sys; print('much'); print('nerfro: the page: http://localhost:1', flush=True)\n"
-    program += "folder = next(a for a in sys.argv if a.startswith('hydra.run.dir=')).partition('=')[2]\n"
-    program += "import os; os.makedirs(folder); open(f'{folder}/metrics.json', 'w').write(sys.argv[1])"
-    scores = {"views": [{"name": "a", "psnr": 31.26}], "steps": 1, "train_seconds": 1.0, "rays_per_second": 1.0}
-    commands = {"nerfro.train": [program, json.dumps(scores)], "nerfro.export": ["pass"]}
-    monkeypatch.setattr(nerfro.demo, "command_of_module", lambda name: [sys.executable, "-c", *commands[name]])
+    def train(overrides: list[str], out: Path) -> Run:
+        print("much")
+        print("nerfro: the page: http://localhost:1", flush=True)
+        if "seed=7" in overrides:
+            raise NerfroError("no seven")
+        scores = EvaluationResult((ViewScores("a", {"psnr": 31.26}),))
+        return Run(out, RunMetrics(scores))
+
+    monkeypatch.setattr(nerfro, "train", train)
+    monkeypatch.setattr(nerfro, "export", lambda run, what, out: print("more") or out)
     opened: list[str] = []
     monkeypatch.setattr(nerfro.demo, "open_page", opened.append)
     monkeypatch.chdir(tmp_path)
@@ -132,9 +138,7 @@ def test_demo_opens_the_page_and_prints_the_score_in_one_line(
     address, last = done.out.splitlines()
     assert address == "nerfro: the page: http://localhost:1"
     assert last.startswith("PSNR 31.3 dB on 1 photographs that were not trained on; page: ")
-    commands["nerfro.train"] = ["raise SystemExit(3)"]
-    assert run_here("demo", code=3).out == ""
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert run_here("demo", "seed=7", code=1).error == "nerfro: error: no seven"
 
 
 def test_pages_open_in_graphical_browsers_and_are_printed_over_ssh(

@@ -25,7 +25,7 @@ from nerfro.training.config import TrainConfig
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
 from nerfro.training.trainer import make_trainer
 from tests.conftest import Runner, weights_of
-from tests.processes import OFFLINE
+from tests.processes import ONE_THREAD
 
 # Gradients are sums in another order, so they differ in their last bits. Adam divides them by their size, and would
 # make whole steps of what rounding has left of zero.
@@ -51,6 +51,7 @@ import time
 import torch
 import torch.distributed as dist
 from nerfro.losses.base import Loss
+from nerfro.registry.allowed import untyped
 from nerfro.registry.registration import register
 
 @register("loss", "watching")
@@ -83,7 +84,7 @@ def start(tmp_path: Path) -> Callable[..., subprocess.Popen[str]]:
     plugins = tmp_path / "watching_plugins"
     plugins.mkdir()
     (plugins / "watching.py").write_text(WATCHING_LOSS)
-    environment = os.environ | OFFLINE | {"NERFRO_PLUGINS": str(plugins), "TORCH_HOME": str(tmp_path / "torch")}
+    environment = os.environ | ONE_THREAD | {"NERFRO_PLUGINS": str(plugins), "TORCH_HOME": str(tmp_path / "torch")}
 
     def start(name: str, *overrides: str, launcher: Sequence[str] = (), **variables: str) -> subprocess.Popen[str]:
         command = [sys.executable, *launcher, "-m", "nerfro.train", *overrides, *TWO_PROCESSES]
@@ -207,7 +208,7 @@ def test_every_parameter_has_a_gradient_if_no_ray_meets_the_object(tiny_default_
 @pytest.mark.parametrize("strategy", ["ddp", "auto"])
 def test_processes_do_not_exchange_buffers(strategy: str, tmp_path: Path) -> None:
     two = {"trainer": {"devices": 2, "accelerator": "cpu", "strategy": strategy}}
-    config = OmegaConf.merge(OmegaConf.structured(TrainConfig), two)
+    config = OmegaConf.merge(OmegaConf.structured(untyped(TrainConfig())), two)
     trainer = make_trainer(config, tmp_path, Throughput(), [])
     assert trainer.strategy._ddp_kwargs["broadcast_buffers"] is False
 

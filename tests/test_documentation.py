@@ -1,5 +1,6 @@
 """The Python code of README, guides and notebooks runs, and the plugins that the guides define train."""
 
+import ast
 import json
 import linecache
 import re
@@ -10,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from omegaconf import OmegaConf
 
 import nerfro
 import nerfro.media.material
@@ -20,6 +20,7 @@ from nerfro.media.material import MATERIALS
 from nerfro.registry.registration import discover, find
 from nerfro.testing import check
 from nerfro.viewing.exports import EXPORTS, ExportConfig, find_export
+from tests.ball_photographs import RECONSTRUCTION_TRAINING, save_with_masks
 from tests.conftest import Runner
 
 CHECKOUT = PACKAGE_DIR.parent
@@ -73,7 +74,7 @@ def test_plugins_of_the_guide_train(
 
 def test_export_of_the_guide_writes_its_file(guide_plugins: list[str], trained_run: Path, tmp_path: Path) -> None:
     scene, out = nerfro.load(trained_run), tmp_path / "centres.csv"
-    find_export("centres", out).write(scene, out, OmegaConf.structured(ExportConfig))
+    find_export("centres", out).write(scene, out, ExportConfig())
     np.testing.assert_allclose(np.loadtxt(out, delimiter=","), scene.cameras("train").camera_to_world[:, :, 3])
 
 
@@ -84,6 +85,33 @@ def test_code_that_uses_a_run_executes(page: str, trained_run: Path, monkeypatch
     for block in python_blocks(page):
         exec(re.sub(r'"(outputs/refractive/RUN|outputs/first)"', repr(str(trained_run)), block), namespace)
     assert torch.allclose(torch.as_tensor(namespace["bent"].directions).norm(dim=-1), torch.tensor(1.0))
+
+
+def test_code_of_the_chain_executes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, unchecked: None) -> None:
+    """On small photographs of a ball with poses, as each command on its own."""
+    save_with_masks(tmp_path / "ball")
+    monkeypatch.chdir(tmp_path)
+    *chain, together = python_blocks("docs/tutorials/python_chain.md")
+    small = {
+        '"data/glass", data="opencv"': '"ball", data="blender", settings={"near": 0.5}',
+        '"medium.ior=1.5"': '"medium.ior=1.45", "medium.resolution=32", "resolution=24"',
+        'split="val"': 'split="train"',
+        '["trainer.max_time=4m"]': repr([*RECONSTRUCTION_TRAINING, "trainer.max_steps=2", "phase.background.steps=9"]),
+    }
+    code = "".join(chain)
+    for text, other in small.items():
+        assert code.count(text) == 1
+        code = code.replace(text, other)
+    namespace: dict[str, Any] = {}
+    exec(code, namespace)
+    assert namespace["scene"].bodies["object"].ior == 1.45
+    assert namespace["run"].scores.steps == 2
+    assert namespace["scores"].result.views == namespace["run"].scores.result.views
+    assert all(file.stat().st_size > 0 for file in [*namespace["frames"], namespace["page"]])
+    record = json.loads(Path("outputs/glass/run/run.json").read_text())
+    assert " -m nerfro.train " in record["command"]
+    assert "hydra.run.dir=outputs/glass/run" in record["command"]
+    ast.parse(together)
 
 
 def test_reference_explains_every_option() -> None:

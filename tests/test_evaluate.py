@@ -48,7 +48,7 @@ def test_folder_of_images_is_scored_in_every_region(
         assert view["regions"]["crop"]["psnr"] == pytest.approx(expected, abs=1e-4)
     mean = sum(view["regions"]["crop"]["psnr"] for view in content["views"]) / 2
     assert content["regions"]["crop"]["psnr"] == pytest.approx(mean)
-    assert content["notes"]["lpips"] == "no network was given"
+    assert content["notes"]["lpips"] == "images, masks or crops below 31 pixels"
     for name in ("metrics", "metrics_mask", "metrics_crop"):
         assert f"{content['views'][1]['name']}," in (tmp_path / "out" / f"{name}.csv").read_text()
     assert "pen" in out

@@ -1,15 +1,21 @@
 """Every import points down: from the commands through the packages to the core, types included."""
 
 import ast
+import inspect
+import math
 import re
 import sys
+from collections import ChainMap
 from collections.abc import Iterator
+from dataclasses import FrozenInstanceError, fields
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
 from nerfro.core.paths import PACKAGE_DIR, PLUGINS_DIR
+from nerfro.core.provenance import AlgorithmSettings
+from nerfro.registry.registration import discover
 from tests.size import count_by_component, count_code_lines
 
 # From above to below: a package imports what follows it, and itself.
@@ -232,3 +238,18 @@ def test_only_its_class_writes_an_attribute() -> None:
     found = {module: outside_writes(ast.parse(file.read_text(encoding="utf-8"))) for module, file in files.items()}
     assert {module: writes for module, writes in found.items() if writes} == {}
     assert outside_writes(ast.parse("def f(body):\n    body.surface = None")) == ["body.surface"]
+
+
+def test_settings_of_algorithms_are_frozen_and_documented() -> None:
+    import nerfro.plugins  # noqa: F401 - imports the algorithms
+
+    discover()
+    assert "HullSettings" in AlgorithmSettings.classes
+    modules = [vars(sys.modules[settings.__module__]) for settings in AlgorithmSettings.classes.values()]
+    names_of_settings = dict(ChainMap(*modules), inf=math.inf)
+    for settings in AlgorithmSettings.classes.values():
+        names = re.findall(r"^    (\w[\w, ]*):", inspect.getdoc(settings), re.M)
+        assert {field.name for field in fields(settings)} == {*", ".join(names).split(", ")}, settings
+        with pytest.raises(FrozenInstanceError):
+            setattr(settings(), names[0].split(", ")[0], None)
+        assert eval(repr(settings()), names_of_settings) == settings()

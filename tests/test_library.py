@@ -1,6 +1,8 @@
 """`import nerfro` as a library: a run from its folder, and the optics alone."""
 
+import inspect
 import math
+import pickle
 import urllib.request
 from pathlib import Path
 
@@ -13,6 +15,7 @@ from PIL import Image
 import nerfro
 from nerfro.core.errors import NerfroError
 from nerfro.files.images import load_png
+from nerfro.training.run_folder import LAST_CHECKPOINT
 from tests.closed_forms import ball_exits, beam
 from tests.conftest import UTM, Runner, moved_mesh, refused
 from tests.processes import printed_by
@@ -29,6 +32,23 @@ def test_missing_name_is_an_attribute_error() -> None:
     assert {"TrainedScene", "bend", "load"} <= set(nerfro.__all__) <= {*dir(nerfro), "__version__"}
     for name in nerfro.__all__:
         assert getattr(nerfro, name) is not None
+
+
+def test_functions_keep_their_names_beside_the_modules_of_commands(trained_run: Path, tmp_path: Path) -> None:
+    import nerfro.export
+    from nerfro.train import main
+
+    for function in (nerfro.train, nerfro.calibrate, nerfro.export):
+        assert inspect.isfunction(function)
+        assert pickle.loads(pickle.dumps(function)) is function
+    assert main.__module__ == "nerfro.train"
+    for settings, message in (
+        ({"resolutoin": 8}, "resolutoin is not a setting; did you mean resolution"),
+        ({"resolution": 0}, "resolution=0 is not allowed"),
+        ({"out": tmp_path / "sky.txt"}, r"sky\.txt is not a file of sky; it must end in"),
+    ):
+        refused(message, nerfro.export, trained_run, "sky", **{"out": tmp_path / "sky.hdr"} | settings)
+    refused("out=... is missing", nerfro.export, trained_run, "sky")
 
 
 def test_run_is_loaded_rendered_and_exported(trained_run: Path, tmp_path: Path, run_here: Runner) -> None:
@@ -56,10 +76,10 @@ def test_run_is_loaded_rendered_and_exported(trained_run: Path, tmp_path: Path, 
     printed_by("-c", program)
     refused(r"checkpoint .* does not exist", nerfro.load, tmp_path / "gone")
 
-    common = f"checkpoint={trained_run}/checkpoints/last.ckpt", "device=cpu", "resolution=8"
-    run_here("export", *common, "what=sky", f"out={tmp_path / 'sky.hdr'}")
-    assert (tmp_path / "sky.hdr").stat().st_size > 0
-    run_here("export", *common, "what=sky", f"out={tmp_path / 'sky.hdr'}", code=1)  # nothing is overwritten
+    sky = nerfro.export(trained_run / LAST_CHECKPOINT, "sky", tmp_path / "sky.hdr", device="cpu", resolution=8)
+    assert sky.stat().st_size > 0
+    common = f"checkpoint={trained_run}", "device=cpu", "resolution=8"
+    run_here("export", *common, "what=sky", f"out={sky}", code=1)  # nothing is overwritten
 
 
 @pytest.mark.parametrize("interface", ["mesh", "sdf"])

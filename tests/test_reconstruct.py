@@ -18,6 +18,7 @@ import tifffile
 import torch
 from PIL import ExifTags, Image
 
+import nerfro
 from nerfro.capture import refinement
 from nerfro.cli.calls import changed_settings
 from nerfro.cli.overrides import as_overrides
@@ -25,7 +26,6 @@ from nerfro.core.errors import NerfroError
 from nerfro.data import image_files
 from nerfro.data.capture import Capture
 from nerfro.data.masks import find_mask
-from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.results import read_metrics_json
 from nerfro.files.images import save_png
 from nerfro.files.reading import open_image
@@ -265,7 +265,9 @@ TRIALS = ["train"] * 3  # straight rays, solid body, vessel
 ALL = ["calibrate", "preprocess", *TRIALS, "train", "summary", "export"]
 
 
-def test_photographs_pass_every_stage_once(reconstruct: Runner, pretended: Pretended) -> None:
+def test_photographs_pass_every_stage_once(
+    reconstruct: Runner, pretended: Pretended, photos: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     options = "medium.resolution=64", "train=trainer.max_steps=3 logger=none", "preprocess=keep=1"
     done = reconstruct("data.far=9", *options)
     assert pretended.names == ALL
@@ -288,10 +290,12 @@ def test_photographs_pass_every_stage_once(reconstruct: Runner, pretended: Prete
     assert solid[:3] == train[:3]
     assert len({option.partition("=")[0] for option in solid}) == len(solid)  # no option is given twice
     assert vessel[:2] == ["+experiment=glass", "medium=vessel"]
-    again = reconstruct("data.far=9")
+    run = nerfro.reconstruct(["data.far=9"], images=photos, masks=photos.parent / "silhouettes", out=pretended.out)
+    assert (run.folder, run.scores.steps) == (pretended.out / "run", 1)
     assert pretended.names == ALL
-    assert again.out.count(" is kept (delete the file to repeat the stage)") == len(ALL)
-    assert again.out.endswith(f"report: {pretended.out}/report/report.html\npage: {pretended.out}/page.html\n")
+    printed = capsys.readouterr().out
+    assert printed.count(" is kept (delete the file to repeat the stage)") == len(ALL)
+    assert printed.endswith(f"report: {pretended.out}/report/report.html\npage: {pretended.out}/page.html\n")
 
 
 def test_changed_inputs_repeat_the_dependent_stages(reconstruct: Runner, pretended: Pretended) -> None:
@@ -437,7 +441,6 @@ def test_posed_photographs_of_a_ball_become_a_scene(
     """All stages but that of poses; each gives the same result alone, and leaves nothing behind."""
     data, out = tmp_path / "ball", tmp_path / "out"
     save_with_masks(data)
-    monkeypatch.setattr("nerfro.training.run.prepared_metrics", ImageMetrics)
     short = refinement.RefinementSettings((refinement.DescentStage(20, 1e-4, (3.0, 1.0)),), 1000)
     monkeypatch.setattr(refinement, "RefinementSettings", lambda: short)
     train = [*RECONSTRUCTION_TRAINING, "trainer.max_steps=2", "phase.background.steps=100"]

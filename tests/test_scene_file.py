@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
+from nerfro.core.provenance import AlgorithmSettings
 from nerfro.media.bodies import BodySettings
 from nerfro.rendering.scene_file import Provenance, SceneFile, read_scene_file, with_scene
 from tests.conftest import refused
@@ -42,6 +43,7 @@ def test_scene_file_is_valid_after_moving_its_folder(tmp_path: Path, monkeypatch
     (tmp_path / "old capture").rename("new")
     moved = read_scene_file(Path("new/surface/scene.json"))
     assert moved.provenance.versions["nerfro"]
+    assert moved.provenance.algorithms == [*AlgorithmSettings.used.values()]
     moved.provenance = scene.provenance
     assert json.dumps(moved, default=vars) == json.dumps(scene, default=vars).replace("old capture", "new")
     link = tmp_path / "elsewhere" / "link"

@@ -15,12 +15,12 @@ from hydra.core.plugins import Plugins
 from omegaconf import OmegaConf
 
 from nerfro.core.paths import CONF_DIR, scene_name
-from nerfro.registry.allowed import check_settings
+from nerfro.registry.allowed import plain, validate
 from nerfro.training.config import TrainConfig
 from nerfro.training.sweeps import identity_of
 from tests.conftest import Runner, composed
 from tests.forked import Command
-from tests.processes import OFFLINE, python
+from tests.processes import ONE_THREAD, python
 
 SWEEPS = sorted(path.stem for path in (CONF_DIR / "sweep").glob("*.yaml"))
 
@@ -37,7 +37,7 @@ def start(tmp_path: Path, waiting_plugins: str, tiny_run: list[str]) -> Callable
     """Start a sweep with a loss that waits in a process, in tmp_path/sweep; what it prints goes to tmp_path/<name>."""
     options = [*tiny_run, "evaluation.every=0", "+loss.waiting.weight=1", f"hydra.sweep.dir={tmp_path / 'sweep'}"]
     options += ["trainer.max_steps=20", "checkpoint.every_steps=4", "checkpoint.every_seconds=null"]
-    environment = {**OFFLINE, "TORCH_HOME": str(tmp_path), "NERFRO_PLUGINS": waiting_plugins}
+    environment = {**ONE_THREAD, "TORCH_HOME": str(tmp_path), "NERFRO_PLUGINS": waiting_plugins}
     return lambda overrides, name: Command("train", ["-m", *options, *overrides], tmp_path / name, **environment)
 
 
@@ -102,7 +102,7 @@ def test_sweep_file_composes_its_cells(name: str) -> None:
     assert hydra.sweep.dir == f"outputs/sweeps/{name}"
     for key, values in hydra.sweeper.params.items():
         for value in values.split(","):
-            check_settings(composed(f"{key}={value}"), TrainConfig)
+            validate(TrainConfig, plain(composed(f"{key}={value}")))
 
 
 SWEEPER = """
@@ -226,7 +226,7 @@ def test_launchers_run_cells_in_other_processes(
     overrides = [f"medium.mesh={tmp_path / 'nowhere.ply'},{'${data.root}/mesh.ply'}", "trainer.max_steps=2"]
     overrides.append(f"hydra/launcher={launcher}")
     overrides += ["evaluation.every=0", f"hydra.sweep.dir={tmp_path / 'sweep'}"]
-    environment = {**OFFLINE, "TORCH_HOME": str(tmp_path)}
+    environment = {**ONE_THREAD, "TORCH_HOME": str(tmp_path)}
     done = python("-m", "nerfro.train", "-m", *tiny_run, *overrides, folder=tmp_path, **environment)
     log = done.stdout + done.stderr
     assert done.returncode == 1, log

@@ -64,6 +64,7 @@ def test_run_writes_metrics_images_and_its_configuration(run: Path, overrides: l
     assert config.medium.mesh == f"{tiny_scene}/mesh.ply", "interpolations are resolved"
     facts = json.loads((run / "run.json").read_text())
     assert facts["seed"] == 0
+    assert any(line.startswith("BackgroundSettings(max_pixels=8, ") for line in facts["algorithms"])
     assert torch.__version__.startswith(facts["versions"]["torch"])  # the wheel may lack the suffix +cu130
     assert all(override in facts["command"] for override in overrides if "{" not in override)
 

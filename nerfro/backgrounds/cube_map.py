@@ -115,9 +115,9 @@ def lookup(
     resolution, offset, padded_offset = (
         constant(values, texels.device) for values in (levels.resolutions, levels.offsets, padded_offsets)
     )
-    place = (coordinates[:, None] + 1) * (0.5 * resolution[:, None]) + 0.5  # in padded texels, with integer centres
-    corner = torch.minimum(place.long().clamp(min=0), resolution[:, None])
-    (u, v), (column, row) = (place - corner).unbind(-1), corner.unbind(-1)
+    position = (coordinates[:, None] + 1) * (0.5 * resolution[:, None]) + 0.5  # in padded texels, with integer centres
+    corner = torch.minimum(position.long().clamp(min=0), resolution[:, None])
+    (u, v), (column, row) = (position - corner).unbind(-1), corner.unbind(-1)
     weights = torch.stack([(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v], dim=-1)
     # Where three faces meet, the missing fourth texel is the mean of the three.
     ends = (0, resolution)

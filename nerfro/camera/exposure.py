@@ -9,9 +9,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-# Number of Gauss-Newton steps that fit a gain.
-_STEPS = 20
-
 
 class PerView(nn.Module):
     """Module whose tensors are empty until `begin` or the loading of a checkpoint sets the number of views."""
@@ -79,10 +76,10 @@ def fit_gain(
     with torch.inference_mode(False), torch.enable_grad():
         radiance, target = radiance.double().clone(), target.double().clone()
         logarithm = torch.zeros(3, dtype=torch.float64, device=radiance.device)
-        for _ in range(_STEPS):
-            each = logarithm.expand_as(radiance).clone().requires_grad_()
-            shown = encode(each.exp() * radiance)
-            (slope,) = torch.autograd.grad(shown.sum(), each)
+        for _ in range(20):
+            log_gains = logarithm.expand_as(radiance).clone().requires_grad_()
+            shown = encode(log_gains.exp() * radiance)
+            (slope,) = torch.autograd.grad(shown.sum(), log_gains)
             # Pixels that are saturated in both images carry no information.
             error = torch.where((target >= 1) & (shown > 1), 0.0, shown.detach() - target)
             slope = torch.where((target >= 1) & (shown > 1), 0.0, slope)

@@ -9,8 +9,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-_ITERATIONS = 10  # alternating updates of rotation and scale
-
 
 class Similarity(NamedTuple):
     """Similarity transformation of the world, x -> scale * rotation x + shift."""
@@ -44,7 +42,8 @@ def similarity(
     means = [(shifts[:, None] * poses[..., 3]).sum(0) / shifts.sum() for poses in (old, new)]
     before, after = (poses[..., 3] - mean for poses, mean in zip((old, new), means, strict=True))
     scale, rotation = torch.ones_like(shifts[0]), torch.eye(3).to(old)
-    for _ in range(_ITERATIONS):
+    # Updates of rotation and scale alternate.
+    for _ in range(10):
         # For small angles, the squared distance of two rotation matrices is twice the square of the angle.
         both = torch.einsum("v,vij,vkj->ik", 0.5 * turns, new[..., :3], old[..., :3])
         both = both + scale * torch.einsum("v,vi,vk->ik", shifts, after, before)

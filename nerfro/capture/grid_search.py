@@ -11,16 +11,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Num
 
-_NUM_BOOTSTRAP = 200
 MIN_VIEWS = 5  # with pixels, for a standard error: resampling of fewer views underestimates the error
-# A minimum of the quadratic function farther from the centre, relative to the half axes of the grid, is not used.
-_MAX_EXTRAPOLATION = 1.5
 
 
-def bootstrap_weights(counts: Float[np.ndarray, "V"]) -> Float[np.ndarray, "resamples V"]:
+def bootstrap_weights(counts: Float[np.ndarray, "V"], num_samples: int = 200) -> Float[np.ndarray, "resamples V"]:
     """Return how often each view is drawn in random samples of the views with pixels."""
     num_views = int(np.count_nonzero(counts))
-    drawn = np.random.default_rng(0).multinomial(num_views, (counts > 0) / max(1, num_views), _NUM_BOOTSTRAP)
+    drawn = np.random.default_rng(0).multinomial(num_views, (counts > 0) / max(1, num_views), num_samples)
     return drawn.astype(np.float64)
 
 
@@ -57,6 +54,7 @@ def quadratic_minimum(
     candidates: Float[np.ndarray, "candidates indices"],
     errors: Float[np.ndarray, "resamples candidates"],
     axes: Float[np.ndarray, "indices indices"],
+    max_extrapolation: float = 1.5,
 ) -> Minimum:
     """Fit a quadratic function to the errors of all candidates by least squares, and find its minimum.
 
@@ -64,6 +62,7 @@ def quadratic_minimum(
         candidates: points of the grid.
         errors: one set of errors for each weighting.
         axes: half axes of the grid, in columns.
+        max_extrapolation: largest distance of the minimum from the centre of the grid, relative to the half axes.
     """
     count, centre = candidates.shape[1], candidates.mean(0)
     inverse = np.linalg.inv(axes)
@@ -78,7 +77,7 @@ def quadratic_minimum(
     convex = np.linalg.eigvalsh(hessian)[:, 0] > 1e-9
     invertible = np.where(convex[:, None, None], hessian, np.eye(count))
     minimum = -np.linalg.solve(invertible, coefficients[:, 1 : 1 + count, None])[..., 0]
-    near = convex & (np.abs(minimum).max(1) < _MAX_EXTRAPOLATION)
+    near = convex & (np.abs(minimum).max(1) < max_extrapolation)
     minimum = np.where(near[:, None], minimum, x[errors.argmin(1)])
     return Minimum(centre + minimum @ axes.T, np.diagonal(inverse.T @ hessian @ inverse, axis1=1, axis2=2))
 

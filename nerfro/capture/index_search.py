@@ -32,6 +32,7 @@ from nerfro.capture.preprocess_options import INDEX, Request, build_medium, inde
 from nerfro.capture.surroundings import Observations, Pixels, Room, Surroundings, robust_scale
 from nerfro.core.errors import NerfroError, warn
 from nerfro.core.progress import fraction_bar
+from nerfro.core.provenance import AlgorithmSettings
 from nerfro.core.robust import geman_mcclure, geman_mcclure_weight
 from nerfro.files.atomic import write_atomically
 from nerfro.media.base import Medium
@@ -39,11 +40,8 @@ from nerfro.media.solid import Solid, body_names
 from nerfro.rendering.scene_file import Provenance
 from nerfro.samplers.paths.snell import Snell
 
-LOWEST, HIGHEST = 1.0, 2.5  # range of the search
-_RANGE = HIGHEST - LOWEST
 
-
-class _Plan(NamedTuple):
+class SearchPlan(NamedTuple):
     """Sizes of the search grids. Radii are fractions of the range of the search."""
 
     coarse_steps: int  # candidates along each axis of the first grid
@@ -52,26 +50,59 @@ class _Plan(NamedTuple):
     fine_radii: tuple[float, ...]  # one for each refinement
     fine_pixels: int
 
-    def num_rays(self, num_bodies: int) -> int:
+
+@dataclass(frozen=True)
+class IndexSettings(AlgorithmSettings):
+    """Settings of the index search (`find_indices`).
+
+    Attributes:
+        lowest, highest: range of the search.
+        plans: sizes of the grids for one body and for two.
+        near_pixels: number of pixels for near surroundings, which are rendered for each ray.
+        max_grids: largest number of grids of one radius, which follow the minimum.
+        typical_grids: typical number of these grids, for the progress.
+        max_elongation: largest elongation of the grid along the valley of two bodies, whose indices trade.
+        slope_pixels: number of pixels that determine the direction of the valley.
+        difference: finite difference for this direction, as a fraction of the range.
+        max_events: rays with more events, and more than two per surface, are left out: small errors of the surface turn
+            them far.
+        min_depth: smallest depth of the valley of a reliable estimate, relative to the error of unrelated colours.
+        max_standard_error: largest standard error of a reliable estimate, as a fraction of the range.
+        min_distance_from_end: smallest distance of a reliable estimate from the ends of the range, as a fraction.
+        min_known: smallest fraction of the pixels with known surroundings.
+        lowest_material: index that all ordinary liquids and solids exceed; that of ice is 1.31.
+    """
+
+    lowest: float = 1.0
+    highest: float = 2.5
+    plans: tuple[SearchPlan, ...] = field(
+        default=(
+            SearchPlan(31, 12_000, 9, (1 / 30, 1 / 75), 60_000),
+            SearchPlan(13, 4_000, 5, (1 / 75, 1 / 75), 20_000),
+        )
+    )
+    near_pixels: int = 12_000
+    max_grids: int = 10
+    typical_grids: int = 4
+    max_elongation: float = 6.0
+    slope_pixels: int = 6_000
+    difference: float = 1 / 300
+    max_events: int = 4
+    min_depth: float = 0.03
+    max_standard_error: float = 0.02
+    min_distance_from_end: float = 1 / 150
+    min_known: float = 0.1
+    lowest_material: float = 1.25
+
+    @property
+    def range(self) -> float:
+        """Width of the range of the search."""
+        return self.highest - self.lowest
+
+    def num_rays(self, plan: SearchPlan, num_bodies: int) -> int:
         """Estimate the number of rays to trace."""
-        fine = _TYPICAL_GRIDS * self.fine_steps**num_bodies * self.fine_pixels
-        return self.coarse_steps**num_bodies * self.coarse_pixels + fine
-
-
-# By number of bodies.
-_PLANS = {1: _Plan(31, 12_000, 9, (1 / 30, 1 / 75), 60_000), 2: _Plan(13, 4_000, 5, (1 / 75, 1 / 75), 20_000)}
-_NEAR_PIXELS = 12_000  # near surroundings are rendered for each ray, so fewer pixels are used
-# Maximum number of grids of one radius, which follow the minimum, and typical number of grids, for the progress.
-_MAX_GRIDS, _TYPICAL_GRIDS = 10, 4
-# The indices of two bodies trade, so their valley is narrow. Grids are elongated along the valley by at most this
-# factor. Finite differences at so many pixels, over this fraction of the range, determine the direction of the valley.
-_MAX_ELONGATION, _SLOPE_PIXELS, _DIFFERENCE = 6.0, 6_000, 1 / 300
-# Rays with more events, or more than two per surface, are left out: small errors of the surface turn them far.
-_MAX_EVENTS = 4
-# Limits of a reliable estimate: depth of the valley relative to the error of unrelated colours, standard error and
-# distance from the ends of the search relative to the range, and fraction of the pixels with known surroundings.
-_MIN_DEPTH, _MAX_STANDARD_ERROR, _MIN_DISTANCE_FROM_END, _MIN_KNOWN = 0.03, 0.02, 1 / 150, 0.1
-_LOWEST_MATERIAL = 1.25  # ordinary liquids and solids have larger indices; that of ice is 1.31
+        fine = self.typical_grids * plan.fine_steps**num_bodies * plan.fine_pixels
+        return plan.coarse_steps**num_bodies * plan.coarse_pixels + fine
 
 
 @dataclass(frozen=True)
@@ -101,7 +132,11 @@ class Estimate:
 
 
 def find_indices(
-    medium: Solid, through: Pixels, surroundings: Surroundings, progress: Callable[[float], None] = lambda done: None
+    medium: Solid,
+    through: Pixels,
+    surroundings: Surroundings,
+    progress: Callable[[float], None] = lambda done: None,
+    settings: IndexSettings = IndexSettings(),
 ) -> Estimate:
     """Search the indices of one or two bodies from coarse to fine grids.
 
@@ -110,23 +145,23 @@ def find_indices(
         through: pixels inside the silhouette of the object.
         surroundings: known surroundings.
         progress: called with the completed fraction.
+        settings: range, grids and limits.
 
     Raises:
         NerfroError: there are more than two bodies, or no ray of the pixels meets the medium.
     """
+    settings.use()
     num_bodies = len(medium.iors)
-    if num_bodies not in _PLANS:
+    if num_bodies > len(settings.plans):
         raise NerfroError(
             f"the medium has {num_bodies} bodies, and at most two indices are searched for; set medium.ior= and "
             "medium.inner_iors=, or ior or material of each of bodies="
         )
-    plan = _PLANS[num_bodies]
+    plan = settings.plans[num_bodies - 1]
     if isinstance(surroundings.background, Room):
-        plan = plan._replace(coarse_pixels=_NEAR_PIXELS // 4, fine_pixels=_NEAR_PIXELS)
-    num_rays = plan.num_rays(num_bodies)
-    search = _Search(
-        medium, through.some(plan.fine_pixels), surroundings, lambda traced: progress(min(1, traced / num_rays))
-    )
+        plan = plan._replace(coarse_pixels=settings.near_pixels // 4, fine_pixels=settings.near_pixels)
+    num_rays, pixels = settings.num_rays(plan, num_bodies), through.some(plan.fine_pixels)
+    search = _Search(medium, pixels, surroundings, lambda traced: progress(min(1, traced / num_rays)), settings)
     coarse, coarse_errors = _coarse_search(search, plan, num_bodies)
     values, grid = _refine_minimum(search, plan, coarse[coarse_errors.argmin()])
     progress(1.0)
@@ -137,10 +172,12 @@ def find_indices(
 
 
 def _coarse_search(
-    search: _Search, plan: _Plan, num_bodies: int
+    search: _Search, plan: SearchPlan, num_bodies: int
 ) -> tuple[Float[np.ndarray, "candidates indices"], Float[np.ndarray, " candidates"]]:
     """Compute the mean errors of candidates over the whole range of the search."""
-    candidates = 0.5 * (LOWEST + HIGHEST + _RANGE * _grid(plan.coarse_steps, num_bodies))
+    settings = search.settings
+    offsets = settings.range * _grid(plan.coarse_steps, num_bodies)
+    candidates = 0.5 * (settings.lowest + settings.highest + offsets)
     return candidates, mean_errors(*search.errors(candidates, plan.coarse_pixels, False))[0]
 
 
@@ -170,7 +207,7 @@ class _FineGrid(NamedTuple):
 
 
 def _refine_minimum(
-    search: _Search, plan: _Plan, start: Float[np.ndarray, " indices"]
+    search: _Search, plan: SearchPlan, start: Float[np.ndarray, " indices"]
 ) -> tuple[Float[np.ndarray, " indices"], _FineGrid]:
     """Follow the minimum with grids of decreasing radius.
 
@@ -182,17 +219,17 @@ def _refine_minimum(
     Returns:
         The minimum, and the last grid.
     """
-    offsets, values = _grid(plan.fine_steps, len(start)), start
+    settings, offsets, values = search.settings, _grid(plan.fine_steps, len(start)), start
     for radius in plan.fine_radii:
         num_pixels = plan.fine_pixels // (1 if radius == plan.fine_radii[-1] else 3)
-        for _ in range(_MAX_GRIDS):
-            axes = radius * _RANGE * search.valley(values)
+        for _ in range(settings.max_grids):
+            axes = radius * settings.range * search.valley(values)
             extent = np.abs(axes).sum(1)
-            centre = values.clip(LOWEST + extent, HIGHEST - extent)
+            centre = values.clip(settings.lowest + extent, settings.highest - extent)
             candidates = centre + offsets @ axes.T
             grid = _FineGrid(candidates, axes, *search.errors(candidates, num_pixels, True))
             minimum = grid.minimum().values[0]
-            values = minimum.clip(LOWEST, HIGHEST)
+            values = minimum.clip(settings.lowest, settings.highest)
             if (np.abs(np.linalg.solve(axes, minimum - centre)) < 0.5).all():
                 break
     return values, grid
@@ -212,24 +249,27 @@ def _doubts(
 ) -> list[str]:
     """List the reasons why the photographs do not determine the indices."""
     depth = 1 - float(mean_errors(grid.sums, grid.counts).min()) / search.unrelated
-    known, num_views = grid.counts.sum() / search.num_pixels, np.count_nonzero(grid.counts)
+    settings, low, high = search.settings, search.settings.lowest, search.settings.highest
+    known_fraction, num_views = grid.counts.sum() / search.num_pixels, np.count_nonzero(grid.counts)
     # Without a valley, the spread of the minima does not show whether the views agree.
     standard_errors = np.where(grid.minimum().curvatures[0] > 0, standard_errors, np.inf)
     doubts = []
-    if known < _MIN_KNOWN:
-        doubts.append(f"for {1 - known:.0%} of the object's pixels no photograph shows the origin of the light")
-    if depth < _MIN_DEPTH:
+    if known_fraction < settings.min_known:
+        doubts.append(
+            f"for {1 - known_fraction:.0%} of the object's pixels no photograph shows the origin of the light"
+        )
+    if depth < settings.min_depth:
         doubts.append(
             f"the best {' and '.join(names)} reduces the error of unrelated colours by only {max(0.0, depth):.1%}: the "
             "object may be opaque, or the surroundings are unknown in the exit directions"
         )
-    end = _MIN_DISTANCE_FROM_END * _RANGE
+    end = settings.min_distance_from_end * settings.range
     for name, value, error in zip(names, values, standard_errors, strict=True):
-        if not LOWEST + end < value < HIGHEST - end:
-            doubts.append(f"the {name} is at an end of the search range, {LOWEST:.4g} to {HIGHEST:.4g}")
-        elif _MAX_STANDARD_ERROR * _RANGE < error < np.inf:
+        if not low + end < value < high - end:
+            doubts.append(f"the {name} is at an end of the search range, {low:.4g} to {high:.4g}")
+        elif settings.max_standard_error * settings.range < error < np.inf:
             doubts.append(f"the {name} has a standard error of {error:.2g}: the views do not agree")
-    if LOWEST + end < values[0] < _LOWEST_MATERIAL:
+    if low + end < values[0] < settings.lowest_material:
         doubts.append(f"no liquid or solid has an index of {values[0]:.3g}: the object may be opaque or hollow")
     if num_views < MIN_VIEWS:
         doubts.append(f"{num_views} views are too few for a standard error; photograph from more sides")
@@ -240,12 +280,18 @@ class _Search:
     """Errors of candidate indices at pixels of the object; `progress` is called with the number of traced rays."""
 
     def __init__(
-        self, medium: Solid, through: Pixels, surroundings: Surroundings, progress: Callable[[int], None]
+        self,
+        medium: Solid,
+        through: Pixels,
+        surroundings: Surroundings,
+        progress: Callable[[int], None],
+        settings: IndexSettings,
     ) -> None:
+        self.settings = settings
         self._achromatic, self._surroundings = medium.achromatic(), surroundings
         self._progress, self._num_traced = progress, 0
-        medium = self._achromatic.with_indices(torch.full_like(medium.iors, 0.5 * (LOWEST + HIGHEST)))
-        self._sampler = Snell(max_events=max(_MAX_EVENTS, 2 * len(medium.iors)))
+        medium = self._achromatic.with_indices(torch.full_like(medium.iors, 0.5 * (settings.lowest + settings.highest)))
+        self._sampler = Snell(max_events=max(settings.max_events, 2 * len(medium.iors)))
         self._pixels = through[self._sampler(through.rays, medium).refracted]
         self.num_pixels = len(self._pixels)
         if not self.num_pixels:
@@ -263,32 +309,32 @@ class _Search:
         The directions are the eigenvectors of the Gauss-Newton matrix of the robust residuals. For one index the
         result is 1.
         """
-        count = len(values)
+        count, settings = len(values), self.settings
         if count == 1:
             return np.eye(count)
-        pixels = self._pixels.some(_SLOPE_PIXELS)
-        residuals, known = self._residuals(pixels, values)
+        pixels = self._pixels.some(settings.slope_pixels)
+        residuals, usable = self._residuals(pixels, values)
         slopes = []
-        for offset in _DIFFERENCE * _RANGE * np.eye(count):
-            (after, known_after), (before, known_before) = (
-                self._residuals(pixels, values + each) for each in (offset, -offset)
-            )
+        for offset in settings.difference * settings.range * np.eye(count):
+            after, usable_after = self._residuals(pixels, values + offset)
+            before, usable_before = self._residuals(pixels, values - offset)
             slopes.append(after - before)
-            known &= known_after & known_before
+            usable &= usable_after & usable_before
         weights = geman_mcclure_weight(residuals, self._scale)
-        jacobian = torch.stack(slopes, -1)[known].double()
-        products = torch.einsum("p,pci,pcj->ij", weights[known].double(), jacobian, jacobian).numpy()
+        jacobian = torch.stack(slopes, -1)[usable].double()
+        products = torch.einsum("p,pci,pcj->ij", weights[usable].double(), jacobian, jacobian).numpy()
         eigenvalues, directions = np.linalg.eigh(products)
         if not eigenvalues.max() > 0:  # the surroundings are unknown for all pixels
             return np.eye(count)
         ratio = eigenvalues.max() / eigenvalues.clip(1e-9 * eigenvalues.max())
-        return directions * np.sqrt(ratio).clip(max=_MAX_ELONGATION)
+        return directions * np.sqrt(ratio).clip(max=settings.max_elongation)
 
     def _residuals(
         self, pixels: Pixels, values: Float[np.ndarray, " indices"]
     ) -> tuple[Float[torch.Tensor, "Q 3"], Bool[torch.Tensor, "Q"]]:
         """Compute the residuals of pixels for one candidate, and whether the residuals are known."""
-        medium = self._achromatic.with_indices(torch.from_numpy(values.clip(LOWEST, HIGHEST)))
+        values = values.clip(self.settings.lowest, self.settings.highest)
+        medium = self._achromatic.with_indices(torch.from_numpy(values))
         trace = self._sampler.trace(pixels.rays, medium)
         radiance, known = self._surroundings.radiance(trace.path.exits())
         return radiance - pixels.radiance, known & ~trace.exceeded
@@ -309,14 +355,14 @@ class _Search:
             Sums of the errors, and number of pixels of each view.
         """
         pixels = self._pixels.some(num_pixels)
-        errors, known_for_all = [], torch.ones(len(pixels), dtype=torch.bool)
+        errors, usable_for_all = [], torch.ones(len(pixels), dtype=torch.bool)
         for values in candidates:
-            residuals, known = self._residuals(pixels, values)
-            known_for_all &= known
-            errors.append(torch.where(known, geman_mcclure(residuals, self._scale), self.unrelated))
+            residuals, usable = self._residuals(pixels, values)
+            usable_for_all &= usable
+            errors.append(torch.where(usable, geman_mcclure(residuals, self._scale), self.unrelated))
             self._num_traced += len(pixels)
             self._progress(self._num_traced)
-        used = known_for_all if common else torch.ones_like(known_for_all)
+        used = usable_for_all if common else torch.ones_like(usable_for_all)
         view, num_views = pixels.view[used], len(pixels.cameras)
         sums = [torch.bincount(view, error[used].double(), num_views).numpy() for error in errors]
         return np.stack(sums), torch.bincount(view, minlength=num_views).double().numpy()
@@ -376,9 +422,9 @@ def find_medium(request: Request, observations: Observations, medium: Medium) ->
         return FoundMedium(medium)
     if not isinstance(medium, Solid):
         raise NerfroError("the index of this type of medium cannot be searched for; set medium.ior=, or medium=object")
-    found = _search_index(observations, medium, request.folder)
-    searched = medium.with_indices(torch.from_numpy(found.values))
-    return FoundMedium(searched, found, index_settings(request.config.medium, medium.names, found.values))
+    estimate = _search_index(observations, medium, request.folder)
+    searched = medium.with_indices(torch.from_numpy(estimate.values))
+    return FoundMedium(searched, estimate, index_settings(request.config.medium, medium.names, estimate.values))
 
 
 def _search_index(observations: Observations, medium: Solid, folder: Path) -> Estimate:
@@ -391,14 +437,14 @@ def _search_index(observations: Observations, medium: Solid, folder: Path) -> Es
     """
     through, surroundings = observations.through, observations.surroundings
     with fraction_bar("search") as progress:
-        found = find_indices(medium, through, surroundings, progress)
-    for name, value, error in zip(found.names, found.values, found.standard_errors, strict=True):
+        estimate = find_indices(medium, through, surroundings, progress)
+    for name, value, error in zip(estimate.names, estimate.values, estimate.standard_errors, strict=True):
         # At an end of the search range, all samples of the views have the same minimum.
         spread = f" +- {error:.2g} (standard error by resampling of the views)" if 0 < error < np.inf else ""
         print(f"{name}: {value:.5g}{spread}")
-    for doubt in found.doubts:
-        warn(f"the photographs do not determine the {' and '.join(found.names)}: {doubt}")
-    values = [round(value, 5) for value in found.values.tolist()]
-    figures = {"ior": values, "standard_error": found.written_errors, "doubts": found.doubts}
+    for doubt in estimate.doubts:
+        warn(f"the photographs do not determine the {' and '.join(estimate.names)}: {doubt}")
+    values = [round(value, 5) for value in estimate.values.tolist()]
+    figures = {"ior": values, "standard_error": estimate.written_errors, "doubts": estimate.doubts}
     write_atomically(folder / INDEX, json.dumps(figures, indent=1) + "\n")
-    return found
+    return estimate

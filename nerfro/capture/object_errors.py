@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -10,6 +11,7 @@ from jaxtyping import Float
 
 from nerfro.capture.grid_search import bootstrap_weights, mean_errors, standard_error
 from nerfro.capture.surroundings import Observations, robust_scale
+from nerfro.core.provenance import AlgorithmSettings
 from nerfro.core.robust import geman_mcclure
 from nerfro.media.base import Medium
 from nerfro.media.solid import Solid
@@ -18,12 +20,26 @@ from nerfro.samplers.paths.snell import Snell
 # Indices of water and of soda-lime glass, for photographs that do not determine the index.
 COMMON_INDICES = {"water": 1.333, "glass": 1.52}
 STRAIGHT, SOLID, VESSEL = "straight rays", "solid body", "vessel"
-_NUM_PIXELS = 6000
-_MIN_WEIGHT = 0.02
-# A body is supported if it decreases the error of straight rays by this number of standard errors, and by at least this
-# fraction of the decrease of the best body. On the real glass of water, the errors of the solid body and of the vessel
-# differ by 0.014 in the wrong order, and both decrease the error by 0.25 (docs/lab/simulated_glassware.md).
-_SUPPORTED, _MIN_GAIN = 3.0, 0.75
+
+
+@dataclass(frozen=True)
+class ObjectErrorSettings(AlgorithmSettings):
+    """Settings of the errors at pixels of the object, and of the support of bodies (`unsupported_bodies`).
+
+    On the real glass of water, the errors of the solid body and of the vessel differ by 0.014 in the wrong order, and
+    both decrease the error by 0.25 (docs/lab/simulated_glassware.md).
+
+    Attributes:
+        num_pixels: number of pixels.
+        min_weight: smallest weight of a reflected or refracted path.
+        num_errors: a supported body decreases the error of straight rays by at least this number of standard errors.
+        min_gain: smallest decrease of a supported body, as a fraction of the decrease of the best body.
+    """
+
+    num_pixels: int = 6000
+    min_weight: float = 0.02
+    num_errors: float = 3.0
+    min_gain: float = 0.75
 
 
 class ObjectErrors:
@@ -32,13 +48,20 @@ class ObjectErrors:
     Args:
         observations: observations of the object and its surroundings.
         progress: called with the number of bodies.
+        settings: number of pixels, and smallest weight.
     """
 
-    def __init__(self, observations: Observations, progress: Callable[[int], None] = lambda count: None) -> None:
+    def __init__(
+        self,
+        observations: Observations,
+        progress: Callable[[int], None] = lambda count: None,
+        settings: ObjectErrorSettings = ObjectErrorSettings(),
+    ) -> None:
+        settings.use()
         self._surroundings = observations.surroundings
-        self._pixels = observations.through.some(_NUM_PIXELS)
+        self._pixels = observations.through.some(settings.num_pixels)
         self._scale = robust_scale(self._surroundings)
-        self._sampler = Snell(branches="all", least_weight=_MIN_WEIGHT)
+        self._sampler = Snell(branches="all", least_weight=settings.min_weight)
         self._progress, self._num_bodies = progress, 0
         self.counts = np.bincount(self._pixels.view, minlength=len(self._pixels.cameras)).astype(np.float64)
         self.samples = bootstrap_weights(self.counts)
@@ -63,7 +86,11 @@ class ObjectErrors:
 
 
 def unsupported_bodies(
-    observations: Observations, solid: Solid, index_is_doubtful: bool, vessel: Solid | None
+    observations: Observations,
+    solid: Solid,
+    index_is_doubtful: bool,
+    vessel: Solid | None,
+    settings: ObjectErrorSettings = ObjectErrorSettings(),
 ) -> list[str]:
     """Print the errors of bodies, and return the names of those that are not worth a training.
 
@@ -75,11 +102,12 @@ def unsupported_bodies(
         solid: solid body with the index that was found.
         index_is_doubtful: whether to compare bodies of water and of glass instead.
         vessel: fitted vessel, if any.
+        settings: limits of the support.
     """
     iors = {f"{SOLID}, {name}": ior for name, ior in COMMON_INDICES.items()} if index_is_doubtful else {}
     bodies = {name: _with_index(solid, ior) for name, ior in iors.items()} or {SOLID: solid}
     bodies |= {} if vessel is None else {VESSEL: vessel}
-    measured = ObjectErrors(observations)
+    measured = ObjectErrors(observations, settings=settings)
     errors = {name: measured.of(body) for name, body in {STRAIGHT: _with_index(solid, 1.0), **bodies}.items()}
     print("error of the object's pixels against the surroundings in the exit directions (0: exact, 1: unrelated):")
     for name, error in errors.items():
@@ -88,8 +116,8 @@ def unsupported_bodies(
     supported = [
         name
         for name in bodies
-        if measured.decreases(errors[STRAIGHT], errors[name], _SUPPORTED)
-        and gains[name] > _MIN_GAIN * max(gains.values())
+        if measured.decreases(errors[STRAIGHT], errors[name], settings.num_errors)
+        and gains[name] > settings.min_gain * max(gains.values())
     ]
     print(f"bodies that these pixels support: {', '.join(supported) or 'none'}")
     return [name for name in bodies if name not in supported]

@@ -33,8 +33,6 @@ from nerfro.silhouettes.upright import find_up
 
 MESH = "mesh.ply"
 INDEX, FIGURES = "index.json", "refinement.json"
-# Margin of the index grid around the object, as a fraction of the object's size.
-_MARGIN = 0.15
 _OF_HULL = ("resolution", "keep", "smoothing", "symmetry")
 
 
@@ -188,13 +186,14 @@ def surface_settings(
     settings: dict[str, object] = {}
     names = ("medium.box_min", "medium.box_max", "medium.bodies")  # each of several bodies has a box of its own
     if not any(is_given(name, request.overrides) for name in names):
-        centre, half_side = mesh.bounds.mean(0) + origin, (0.5 + _MARGIN) * float(np.ptp(mesh.bounds, axis=0).max())
+        # A margin of 15 % of the object's size.
+        centre, half_side = mesh.bounds.mean(0) + origin, 0.65 * float(np.ptp(mesh.bounds, axis=0).max())
         digits = max(0, num_decimals(half_side, 7))
         for name, corner in (("box_min", centre - half_side), ("box_max", centre + half_side)):
             settings[name] = [round(float(x), digits) for x in corner]
-    is_vessel = "wall" in request.config.medium
-    if is_vessel and not is_given("medium.up", request.overrides) and (found := find_up(cameras, mesh)) is not None:
-        up, reason = found
+    is_up_needed = "wall" in request.config.medium and not is_given("medium.up", request.overrides)
+    if is_up_needed and (estimate := find_up(cameras, mesh)) is not None:
+        up, reason = estimate
         settings["up"] = [round(float(x), 4) for x in up]
         print(f"up is {settings['up']}, {reason}; set medium.up= to change the direction")
     return settings
@@ -223,8 +222,8 @@ def index_settings(medium: DictConfig, names: Iterable[str], iors: Iterable[floa
     first, *inner = values = [round(float(ior), 4) for ior in iors]
     bodies = medium.get("bodies")
     if bodies is not None:
-        given = typing.cast(dict[str, dict[str, Any]], OmegaConf.to_container(bodies, resolve=True))
-        return {"bodies": {name: given[name] | {"ior": ior} for name, ior in zip(names, values, strict=True)}}
+        settings = typing.cast(dict[str, dict[str, Any]], OmegaConf.to_container(bodies, resolve=True))
+        return {"bodies": {name: settings[name] | {"ior": ior} for name, ior in zip(names, values, strict=True)}}
     return {"ior": first} | ({"inner_iors": inner} if inner else {})
 
 

@@ -35,6 +35,7 @@ from nerfro.capture.room_panorama import RoomPanorama, panorama_of
 from nerfro.capture.surroundings import Observations, Pixels, Room, Surroundings
 from nerfro.core.errors import NerfroError, warn
 from nerfro.core.progress import fraction_bar
+from nerfro.core.provenance import AlgorithmSettings
 from nerfro.core.robust import geman_mcclure
 from nerfro.core.types import Exits, Path
 from nerfro.files.atomic import write_atomically
@@ -47,26 +48,6 @@ from nerfro.silhouettes.pose_conventions import overlap
 from nerfro.silhouettes.rims import RimFinder
 from nerfro.silhouettes.silhouettes import mesh_silhouettes
 from nerfro.silhouettes.visual_hull import Silhouettes
-
-_MAX_VALIDATION_PIXELS = 20_000
-# Scale of the Geman-McClure loss, linear radiance: residual at which the loss is 1/2 of its maximum and the weight 1/4.
-_ROBUST_SCALE = 0.1
-# Standard deviation of contours in pixels, and weights of contours and of roughness. Chosen as in RefinementSettings.
-_CONTOUR_DEVIATION, _CONTOUR_WEIGHT, _ROUGHNESS_WEIGHT = 0.25, 0.1, 0.1
-_NUM_CONTOUR_POINTS = 4000  # in each step
-_VALIDATE_EVERY = 25  # steps
-# A stage ends early if the validation error exceeds the smallest error by this fraction.
-_MAX_INCREASE = 0.03
-# A surface is accepted if the validation error decreases by at least this fraction. A wrong surface also explains some
-# of the reflections, the tint and the interior: errors decreased by 0.012 to 0.11 for better surfaces, and by up to
-# 0.009 for worse ones (docs/lab/surface_refinement.md).
-_MIN_GAIN = 0.01
-_BLUR_SAMPLES = 32
-# Resolution of blurred surroundings, texels per standard deviation of the blur, and minimum texels per side of a face.
-_TEXELS_PER_DEVIATION, _MIN_TEXELS = 1.5, 16
-# Newton steps of the projection onto a surface, and smallest length of the gradient of the distance that they use. On
-# ridges, where the gradient nearly vanishes, the steps would be too long.
-_NEWTON_STEPS, _MIN_GRADIENT = 5, 0.5
 
 
 @dataclass(frozen=True)
@@ -85,17 +66,30 @@ class DescentStage:
 
 
 @dataclass(frozen=True)
-class RefinementSettings:
+class RefinementSettings(AlgorithmSettings):
     """Settings of the refinement. docs/lab/surface_refinement.md describes how the defaults were chosen.
 
     Attributes:
         stages: stages of the descent. Each stage starts with the surface of the smallest validation error, and ends
-            early if the validation error exceeds the smallest one by 3 %.
+            early if the validation error exceeds the smallest one by more than `max_increase`.
         num_pixels: number of pixels in each step.
         levels: numbers of control points along each side of the splines that displace the surface.
         smoothings: standard deviations of the tested smoothings, as fractions of the object's size.
         max_overlap_loss: largest decrease of the mean overlap with the silhouettes, because smoothing decreases the
             error a little even where it cuts edges. Infinite for silhouettes that are no masks.
+        max_validation_pixels: largest number of validation pixels.
+        validate_every: number of steps between validations.
+        max_increase: see `stages`, as a fraction of the smallest error.
+        min_gain: smallest decrease of the validation error of an accepted surface, as a fraction. A wrong surface also
+            explains some of the reflections, the tint and the interior: errors decreased by 0.012 to 0.11 for better
+            surfaces, and by up to 0.009 for worse ones.
+        robust_scale: scale of the Geman-McClure loss, linear radiance: residual at which the loss is 1/2 of its maximum
+            and the weight 1/4.
+        contour_deviation: standard deviation of contours, in pixels.
+        contour_weight, roughness_weight: weights of contours and of roughness, relative to the photometric error.
+        num_contour_points: number of contour points in each step.
+        blur_samples: number of directions over which blurred surroundings are averaged.
+        texels_per_deviation: resolution of blurred surroundings, in texels per standard deviation of the blur.
     """
 
     stages: tuple[DescentStage, ...] = (
@@ -108,6 +102,17 @@ class RefinementSettings:
     levels: tuple[int, ...] = (12, 24, 48)
     smoothings: tuple[float, ...] = (0.005, 0.007, 0.01, 0.014)
     max_overlap_loss: float = 0.003
+    max_validation_pixels: int = 20_000
+    validate_every: int = 25
+    max_increase: float = 0.03
+    min_gain: float = 0.01
+    robust_scale: float = 0.1
+    contour_deviation: float = 0.25
+    contour_weight: float = 0.1
+    roughness_weight: float = 0.1
+    num_contour_points: int = 4000
+    blur_samples: int = 32
+    texels_per_deviation: float = 1.5
 
 
 @dataclass(frozen=True)
@@ -164,6 +169,7 @@ def refine_surface(
     Raises:
         NerfroError: no pixel shows known surroundings through the object.
     """
+    settings.use()
     descent = _Descent(problem, learn_index, settings)
     error = descent.initial_error
     smoothed = descent.smooth_start(error)
@@ -174,19 +180,19 @@ def refine_surface(
         for step in range(stage.steps):
             descent.step(stage, step)
             progress((done + step + 1) / total)
-            if (step + 1) % _VALIDATE_EVERY == 0:
-                steps.append(steps[-1] + _VALIDATE_EVERY)
+            if (step + 1) % settings.validate_every == 0:
+                steps.append(steps[-1] + settings.validate_every)
                 errors.append(descent.validation_error(descent.medium()))
                 if errors[-1] == min(errors):
                     best = descent.values()
-                elif errors[-1] > (1 + _MAX_INCREASE) * min(errors):
+                elif errors[-1] > (1 + settings.max_increase) * min(errors):
                     break
         done += stage.steps
     descent.begin(best)
     refined, smoothed = descent.smoothed(descent.medium(), min(errors))
     progress(1.0)
     steps, errors = [*steps, steps[-1]], [*errors, smoothed]
-    if smoothed > (1 - _MIN_GAIN) * error or not descent.keeps_outlines(refined):
+    if smoothed > (1 - settings.min_gain) * error or not descent.keeps_outlines(refined):
         return Refined(problem.mesh, problem.medium, steps, errors)
     return Refined(_project_onto(problem.mesh, refined), refined, steps, errors)
 
@@ -287,17 +293,17 @@ class _Descent:
         self.offsets = Displacement(tuple(medium.grids[0].distances.shape), self.size, settings.levels)
         self.learned = [*self.offsets.levels, self.iors]
         self.training, validation = problem.through.split()
-        self.validation = validation.some(_MAX_VALIDATION_PIXELS)
-        errors, known = self._validation_errors(medium)
-        if not known.any():
+        self.validation = validation.some(settings.max_validation_pixels)
+        errors, is_valid = self._validation_errors(medium)
+        if not is_valid.any():
             raise NerfroError("no pixel shows known surroundings through the object; remove refine=true")
-        self.validation, self.initial_errors = self.validation[known], errors[known]
+        self.validation, self.initial_errors = self.validation[is_valid], errors[is_valid]
         self.overlap = overlap(mesh, silhouettes).mean()
         rims, cameras = RimFinder(mesh, silhouettes).find(), silhouettes.cameras
         self.rims = torch.from_numpy(rims.points).float()
         middle = torch.from_numpy(mesh.bounds.mean(0)).float()
         distance = (cameras.camera_to_world[:, :, 3] - middle).norm(dim=-1)
-        self.contour_deviation = _CONTOUR_DEVIATION * float((distance / cameras.fx).mean())
+        self.contour_deviation = settings.contour_deviation * float((distance / cameras.fx).mean())
         background = problem.surroundings.background
         self.panorama = panorama_of(background, medium, middle) if isinstance(background, Room) else background
 
@@ -316,16 +322,17 @@ class _Descent:
     @torch.no_grad()
     def begin(self, values: list[Tensor], seed: int = 0) -> None:
         """Set the learned values, and reset optimizer and random numbers."""
-        for learned, each in zip(self.learned, values, strict=True):
-            learned.copy_(each)
+        for learned, value in zip(self.learned, values, strict=True):
+            learned.copy_(value)
         self.optimizer = torch.optim.Adam(self.learned, betas=(0.9, 0.99), eps=1e-12)
         self.generator = torch.Generator().manual_seed(seed)
 
     def step(self, stage: DescentStage, step: int) -> None:
         """Make one step of a stage."""
         done = step / stage.steps
-        if step % _VALIDATE_EVERY == 0:
-            self.blurred = _blurred(self.panorama, stage.blur[0] + (stage.blur[1] - stage.blur[0]) * done)
+        if step % self.settings.validate_every == 0:
+            degrees = stage.blur[0] + (stage.blur[1] - stage.blur[0]) * done
+            self.blurred = _blurred(self.panorama, degrees, self.settings)
         self.optimizer.param_groups[0]["lr"] = stage.rate * 0.5 * (1 + math.cos(math.pi * done))
         self.optimizer.zero_grad()
         with torch.enable_grad():
@@ -333,19 +340,18 @@ class _Descent:
         self.optimizer.step()
 
     def _loss(self) -> Tensor:
-        medium = self._medium()
-        chosen = torch.randint(len(self.training), (self.settings.num_pixels,), generator=self.generator)
-        pixels = self.training[chosen]
+        medium, settings = self._medium(), self.settings
+        pixels = self.training[torch.randint(len(self.training), (settings.num_pixels,), generator=self.generator)]
         path, usable = self._traced(pixels, medium)
         rays = pixels.rays[usable]
         path = self.sampler.replay(path[usable], rays, medium)
         residual = self.blurred(path.exits()).clamp(max=1) - pixels.radiance[usable]
-        photometric = geman_mcclure(residual, _ROBUST_SCALE).sum() / max(1, len(rays))
-        rims = self.rims[torch.randint(len(self.rims), (_NUM_CONTOUR_POINTS,), generator=self.generator)]
-        current, given = (each.grids[0](rims)[0] for each in (medium, self.problem.medium))
-        square = ((current - given) / self.contour_deviation).square()
+        photometric = geman_mcclure(residual, settings.robust_scale).sum() / max(1, len(rays))
+        rims = self.rims[torch.randint(len(self.rims), (settings.num_contour_points,), generator=self.generator)]
+        current, initial = (solid.grids[0](rims)[0] for solid in (medium, self.problem.medium))
+        square = ((current - initial) / self.contour_deviation).square()
         contours = (square / (1 + square)).mean()
-        return photometric + _CONTOUR_WEIGHT * contours + _ROUGHNESS_WEIGHT * self.offsets.roughness()
+        return photometric + settings.contour_weight * contours + settings.roughness_weight * self.offsets.roughness()
 
     def smooth_start(self, error: float) -> float:
         """Smooth the initial surface, whose validation error is given, and return its new error; see `smoothed`."""
@@ -389,15 +395,15 @@ class _Descent:
         Pixels with unknown surroundings for the new surface keep their initial error, so that a surface cannot
         lower its error by hiding pixels.
         """
-        errors, known = self._validation_errors(medium)
-        return float(torch.where(known, errors, self.initial_errors).mean())
+        errors, is_valid = self._validation_errors(medium)
+        return float(torch.where(is_valid, errors, self.initial_errors).mean())
 
     @torch.no_grad()
     def _validation_errors(self, medium: SdfGrid) -> tuple[Float[Tensor, "Q"], Bool[Tensor, "Q"]]:
         """Compute the robust errors of the validation pixels, and whether their surroundings are known."""
         trace = self.sampler.trace(self.validation.rays, medium)
         radiance, known = self.problem.surroundings.radiance(trace.path.exits())
-        errors = geman_mcclure(radiance - self.validation.radiance, _ROBUST_SCALE)
+        errors = geman_mcclure(radiance - self.validation.radiance, self.settings.robust_scale)
         return errors, known & ~trace.exceeded & trace.path.refracted
 
     @torch.no_grad()
@@ -409,19 +415,19 @@ class _Descent:
 
 
 @torch.no_grad()
-def _blurred(panorama: EnvironmentMap | RoomPanorama, degrees: float) -> Background:
+def _blurred(panorama: EnvironmentMap | RoomPanorama, degrees: float, settings: RefinementSettings) -> Background:
     """Convolve surroundings with a Gaussian of the given standard deviation."""
     if degrees == 0:
         return panorama
     sky = panorama.colours if isinstance(panorama, RoomPanorama) else panorama
     generator = torch.Generator().manual_seed(0)
-    side = round(_TEXELS_PER_DEVIATION * 90 / degrees)  # a face of the cube spans 90 degrees
-    directions = texel_directions(max(_MIN_TEXELS, side))
+    side = round(settings.texels_per_deviation * 90 / degrees)  # a face of the cube spans 90 degrees
+    directions = texel_directions(max(16, side))
     total = torch.zeros_like(directions)
-    for _ in range(_BLUR_SAMPLES):
+    for _ in range(settings.blur_samples):
         turned = directions + math.radians(degrees) * torch.randn(3, generator=generator)
         total += sky(Exits(turned / turned.norm(dim=-1, keepdim=True))).clamp(max=1)
-    blurred = EnvironmentMap.of_texels(total / _BLUR_SAMPLES)
+    blurred = EnvironmentMap.of_texels(total / settings.blur_samples)
     return RoomPanorama(panorama.middle, blurred, panorama.distances) if isinstance(panorama, RoomPanorama) else blurred
 
 
@@ -430,8 +436,9 @@ def _project_onto(mesh: TriangleMesh, medium: SdfGrid) -> TriangleMesh:
     vertices = torch.from_numpy(mesh.vertices).float()
     grid = medium.grids[0]
     spacing = float(grid.spacing.min())
-    for _ in range(_NEWTON_STEPS):
+    for _ in range(5):
         phi, gradient = grid(vertices)
-        square = gradient.square().sum(-1, keepdim=True).clamp(min=_MIN_GRADIENT**2)
+        # On ridges, where the gradient nearly vanishes, the steps would be too long.
+        square = gradient.square().sum(-1, keepdim=True).clamp(min=0.5**2)
         vertices = vertices - (phi[:, None] * gradient / square).clamp(-spacing, spacing)
     return TriangleMesh(vertices.double().numpy(), mesh.faces)

@@ -19,10 +19,6 @@ from nerfro.core.types import Exits
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.samplers.paths.snell import Snell
 
-_SIDE = 192  # texels per side of a cube face, half a degree each
-_CHUNK = 16384  # rays rendered at once
-_STEPS = 5  # fixed-point iterations of the lookup; few suffice, because the object is small beside its surroundings
-
 
 class RoomPanorama(Background):
     """A panorama with depth around a point; the lookup intersects exit rays from other positions with the depth.
@@ -33,11 +29,14 @@ class RoomPanorama(Background):
         middle: centre of the panorama.
         colours: linear radiance by direction.
         distances: distance of each texel (see `cube_map.texel_directions`), world units.
+        steps: number of iterations of the lookup; few suffice, because the object is small beside its surroundings.
     """
 
-    def __init__(self, middle: Float[Tensor, "3"], colours: EnvironmentMap, distances: Float[Tensor, "T"]) -> None:
+    def __init__(
+        self, middle: Float[Tensor, "3"], colours: EnvironmentMap, distances: Float[Tensor, "T"], steps: int = 5
+    ) -> None:
         super().__init__()
-        self.middle, self.colours, self.distances = middle, colours, distances
+        self.middle, self.colours, self.distances, self.steps = middle, colours, distances, steps
         side = round((len(distances) / 6) ** 0.5)
         self._levels, self._padded = cube_map.CubeLevels((side,)), cube_map.padded_texels(side).flatten()
 
@@ -55,7 +54,7 @@ class RoomPanorama(Background):
         square = starts.square().sum(-1, keepdim=True)
         seen, lengths = directions, torch.zeros_like(along)
         texels = self.distances[:, None].expand(-1, 3)
-        for _ in range(_STEPS):
+        for _ in range(self.steps):
             distance = cube_map.lookup(*cube_map.project(seen), texels, self._padded, self._levels)[:, :1]
             lengths = ((along.square() - square + distance.square()).clamp(min=0).sqrt() - along).clamp(min=0)
             seen = starts + lengths * directions
@@ -63,11 +62,18 @@ class RoomPanorama(Background):
 
 
 @torch.no_grad()
-def panorama_of(room: Room, medium: SdfGrid, middle: Float[Tensor, "3"]) -> RoomPanorama:
-    """Render a panorama of near surroundings from the surface of an object outwards."""
+def panorama_of(room: Room, medium: SdfGrid, middle: Float[Tensor, "3"], side: int = 192) -> RoomPanorama:
+    """Render a panorama of near surroundings from the surface of an object outwards.
+
+    Args:
+        room: the surroundings.
+        medium: the object.
+        middle: centre of the panorama.
+        side: texels per side of a face; 192 are half a degree each.
+    """
     radius = float((medium.box[1] - medium.box[0]).norm())
     radiance, distances = [], []
-    for directions in cube_map.texel_directions(_SIDE).split(_CHUNK):
+    for directions in cube_map.texel_directions(side).split(16384):
         ones = torch.ones(len(directions))
         inwards = Rays(middle + radius * directions, -directions, 0 * ones, 0 * ones, 2 * radius * ones)
         path = Snell()(inwards, medium)

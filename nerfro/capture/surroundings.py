@@ -22,6 +22,7 @@ from nerfro.core.draws import Draws
 from nerfro.core.errors import NerfroError
 from nerfro.core.light import to_linear
 from nerfro.core.progress import fraction_bar
+from nerfro.core.provenance import AlgorithmSettings
 from nerfro.core.rays import Rays
 from nerfro.core.types import WORLD_ORIGIN, Exits
 from nerfro.data.base import Views
@@ -33,25 +34,31 @@ from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.samplers.subdivision import pixel_rays
 from nerfro.silhouettes.silhouettes import VALIDATION_EVERY, PixelBlocks, mesh_silhouettes
 
-# Photographs are downscaled to at most so many pixels per side, in linear radiance.
-_MAX_PIXELS = 200
-# Number of steps and pixels per step for distant and near surroundings, and first and last learning rate.
-_SKY_STEPS, _SKY_PIXELS = 300, 16384
-_NEAR_STEPS, _NEAR_PIXELS = 400, 2048
-_RATES = (0.03, 0.0015)
-# Surroundings are near if a sky leaves more than this fraction of the variance of validation views unexplained.
-_MAX_SKY_RESIDUAL = 0.25
-# Lower bound of the variance of linear radiance.
-_MIN_VARIANCE = 1e-4
-# Resolution of the map of observed directions: maximum texels per side of a face, and training pixels per texel, chosen
-# so that the map has no holes where photographs cover the surroundings.
-_SEEN_TEXELS, _SEEN_PIXELS = 64, 8
-# Scale of the Geman-McClure loss as a fraction of the standard deviation of the surroundings: residual at which the
-# loss is 1/2 of its maximum and the weight 1/4. The loss is robust, because opaque objects inside the body spoil many
-# pixels.
-_SCALE_FRACTION = 0.5
-# Lower bound of this scale, linear radiance.
-_MIN_SCALE = 1e-3
+
+@dataclass(frozen=True)
+class SurroundingsSettings(AlgorithmSettings):
+    """Settings of the reconstruction of surroundings (`divide_pixels` and `learn_surroundings`).
+
+    Attributes:
+        max_pixels: photographs are downscaled to at most so many pixels per side, in linear radiance.
+        sky_steps, sky_pixels: number of steps, and of pixels per step, for distant surroundings.
+        near_steps, near_pixels: the same for near surroundings.
+        rates: first and last learning rate.
+        max_sky_residual: surroundings are near if a sky leaves more than this fraction of the variance of validation
+            views unexplained.
+        seen_texels, seen_pixels: resolution of the map of observed directions: largest number of texels per side of a
+            face, and training pixels per texel, so that the map has no holes where photographs cover the surroundings.
+    """
+
+    max_pixels: int = 200
+    sky_steps: int = 300
+    sky_pixels: int = 16384
+    near_steps: int = 400
+    near_pixels: int = 2048
+    rates: tuple[float, float] = (0.03, 0.0015)
+    max_sky_residual: float = 0.25
+    seen_texels: int = 64
+    seen_pixels: int = 8
 
 
 @dataclass(frozen=True)
@@ -71,8 +78,8 @@ class Pixels:
     def __len__(self) -> int:
         return len(self.index)
 
-    def __getitem__(self, chosen: Tensor) -> Pixels:
-        return Pixels(self.cameras, self.index[chosen], self.radiance[chosen])
+    def __getitem__(self, selection: Tensor) -> Pixels:
+        return Pixels(self.cameras, self.index[selection], self.radiance[selection])
 
     @property
     def view(self) -> Int[Tensor, "Q"]:
@@ -90,16 +97,22 @@ class Pixels:
 
     def some(self, count: int) -> Pixels:
         """Select at most `count` random pixels with a fixed seed."""
-        chosen = torch.randperm(len(self), generator=torch.Generator().manual_seed(0))[:count]
-        return self[chosen.sort().values]
+        drawn = torch.randperm(len(self), generator=torch.Generator().manual_seed(0))[:count]
+        return self[drawn.sort().values]
 
 
 def robust_scale(surroundings: Surroundings) -> float:
-    """Return the scale of the Geman-McClure loss for residuals against the surroundings, linear radiance."""
-    return max(_SCALE_FRACTION * float(surroundings.colours.std(0).mean()), _MIN_SCALE)
+    """Return the scale of the Geman-McClure loss for residuals against the surroundings, linear radiance.
+
+    At a residual of half the standard deviation of the surroundings, the loss is 1/2 of its maximum and the weight 1/4.
+    The loss is robust, because opaque objects inside the body spoil many pixels.
+    """
+    return max(0.5 * float(surroundings.colours.std(0).mean()), 1e-3)
 
 
-def divide_pixels(views: Views, mesh: TriangleMesh) -> tuple[Pixels, Pixels]:
+def divide_pixels(
+    views: Views, mesh: TriangleMesh, settings: SurroundingsSettings = SurroundingsSettings()
+) -> tuple[Pixels, Pixels]:
     """Select the pixels beside the object and the pixels inside its silhouette.
 
     Silhouettes are the masks, or projections of the mesh if there are no masks. Pixels on and next to the outline
@@ -108,6 +121,7 @@ def divide_pixels(views: Views, mesh: TriangleMesh) -> tuple[Pixels, Pixels]:
     Args:
         views: photographs with poses.
         mesh: surface of the object.
+        settings: size of the photographs.
 
     Returns:
         Pixels beside the object, and pixels inside.
@@ -115,7 +129,7 @@ def divide_pixels(views: Views, mesh: TriangleMesh) -> tuple[Pixels, Pixels]:
     Raises:
         NerfroError: one of the selections is empty.
     """
-    blocks = PixelBlocks(views.cameras, _MAX_PIXELS)
+    blocks = PixelBlocks(views.cameras, settings.max_pixels)
     cameras = blocks.cameras(views.cameras)
     silhouettes = None if views.masks is not None else mesh_silhouettes(mesh, cameras, 1).float()
     parts: list[list[tuple[Tensor, Tensor]]] = [[], []]
@@ -165,7 +179,11 @@ class Surroundings:
 
 
 def learn_surroundings(
-    beside: Pixels, mesh: TriangleMesh, near: bool | None, progress: Callable[[float], None] = lambda done: None
+    beside: Pixels,
+    mesh: TriangleMesh,
+    near: bool | None,
+    progress: Callable[[float], None] = lambda done: None,
+    settings: SurroundingsSettings = SurroundingsSettings(),
 ) -> Surroundings:
     """Reconstruct the surroundings of an object from the pixels beside the object.
 
@@ -175,30 +193,30 @@ def learn_surroundings(
         near: whether the surroundings are so near that parallel rays see different points; None decides by validation
             views.
         progress: called with the completed fraction.
+        settings: steps and limits.
     """
+    settings.use()
     training, validation = beside.split()
-    validation = validation.some(_SKY_PIXELS)
-    found = None
+    validation = validation.some(settings.sky_pixels)
+    sky = None
     if not near:
         # Texels are as wide as pixels, and at most half as many, because unobserved texels would be noise.
         side = min(1.5 * float(beside.cameras.fx.mean()) * math.pi / 2, math.sqrt(len(training) / 12))
         levels = [4 * 2**level for level in range(16) if 4 * 2**level <= max(16, side)]
         background = EnvironmentMap(levels)
-        _learn(background, training, _SKY_STEPS, _SKY_PIXELS, progress)
-        n = max(1, min(_SEEN_TEXELS, int(math.sqrt(len(training) / (6 * _SEEN_PIXELS)))))
+        _learn(background, training, settings.sky_steps, settings.sky_pixels, settings.rates, progress)
+        n = max(1, min(settings.seen_texels, int(math.sqrt(len(training) / (6 * settings.seen_pixels)))))
         seen = torch.zeros(6, n, n, dtype=torch.bool)
         seen[_texel(training.rays.directions, n)] = True
-        found = Surroundings(background, seen, _unexplained(background, validation), validation.radiance)
-    if near or (near is None and found is not None and found.unexplained > _MAX_SKY_RESIDUAL):
-        middle = torch.from_numpy(mesh.bounds.mean(0)).float()
-        distance = (beside.cameras.camera_to_world[:, :, 3] - middle).norm(dim=-1)
-        field = Room(mesh.bounds, float(distance.mean()))
-        _learn(field, training, _NEAR_STEPS, _NEAR_PIXELS, progress)
-        unexplained = _unexplained(field, validation)
-        if found is None or unexplained < found.unexplained:
-            found = Surroundings(field, None, unexplained, validation.radiance)
-    assert found is not None
-    return found
+        sky = Surroundings(background, seen, _unexplained(background, validation), validation.radiance)
+        if near is False or sky.unexplained <= settings.max_sky_residual:
+            return sky
+    middle = torch.from_numpy(mesh.bounds.mean(0)).float()
+    distance = (beside.cameras.camera_to_world[:, :, 3] - middle).norm(dim=-1)
+    field = Room(mesh.bounds, float(distance.mean()))
+    _learn(field, training, settings.near_steps, settings.near_pixels, settings.rates, progress)
+    room = Surroundings(field, None, _unexplained(field, validation), validation.radiance)
+    return room if sky is None or room.unexplained < sky.unexplained else sky
 
 
 class Observations:
@@ -209,22 +227,28 @@ class Observations:
         mesh: surface of the object.
         room: whether the surroundings are near; None decides by validation views.
         shift: origin of the observations in the coordinates of views and mesh.
+        settings: settings of the surroundings.
 
     Attributes:
         views: the photographs, with poses relative to `shift`.
     """
 
     def __init__(
-        self, views: Views, mesh: TriangleMesh, room: bool | None, shift: Float[np.ndarray, "3"] = WORLD_ORIGIN
+        self,
+        views: Views,
+        mesh: TriangleMesh,
+        room: bool | None,
+        shift: Float[np.ndarray, "3"] = WORLD_ORIGIN,
+        settings: SurroundingsSettings = SurroundingsSettings(),
     ) -> None:
         self.views = replace(views, cameras=views.cameras.relative_to(shift))
-        self.shift, self._mesh, self._room = shift, mesh.relative_to(shift), room
+        self.shift, self._mesh, self._room, self._settings = shift, mesh.relative_to(shift), room, settings
 
     @property
     def distance(self) -> Literal["near", "far"] | None:
         """Distance of the surroundings, `near` or `far`; None if neither given nor reconstructed."""
-        known = self.__dict__.get("surroundings")
-        near = self._room if known is None else isinstance(known.background, Room)
+        surroundings = self.__dict__.get("surroundings")
+        near = self._room if surroundings is None else isinstance(surroundings.background, Room)
         return None if near is None else "near" if near else "far"
 
     @cached_property
@@ -236,14 +260,14 @@ class Observations:
     def surroundings(self) -> Surroundings:
         """Reconstructed surroundings; prints their type and accuracy."""
         with fraction_bar("surroundings") as progress:
-            found = learn_surroundings(self._divided[0], self._mesh, self._room, progress)
-        distance = "near" if isinstance(found.background, Room) else "far away"
-        print(f"surroundings: {distance}; {1 - found.unexplained:.1%} of the variance of validation views is explained")
-        return found
+            learned = learn_surroundings(self._divided[0], self._mesh, self._room, progress, self._settings)
+        distance, explained = "near" if isinstance(learned.background, Room) else "far away", 1 - learned.unexplained
+        print(f"surroundings: {distance}; {explained:.1%} of the variance of validation views is explained")
+        return learned
 
     @cached_property
     def _divided(self) -> tuple[Pixels, Pixels]:
-        return divide_pixels(self.views, self._mesh)
+        return divide_pixels(self.views, self._mesh, self._settings)
 
 
 class Room(Background):
@@ -287,10 +311,17 @@ class Room(Background):
         return rendered.radiance, rendered.depth
 
 
-def _learn(background: Background, pixels: Pixels, steps: int, batch: int, progress: Callable[[float], None]) -> None:
+def _learn(
+    background: Background,
+    pixels: Pixels,
+    steps: int,
+    batch: int,
+    rates: tuple[float, float],
+    progress: Callable[[float], None],
+) -> None:
     batch = min(batch, max(1024, len(pixels) // 16))
     generator = torch.Generator().manual_seed(0)
-    first, last = _RATES
+    first, last = rates
     optimizer = torch.optim.Adam(background.parameters(), first, eps=1e-15)
     with torch.enable_grad():
         for step in range(steps):
@@ -313,7 +344,7 @@ def _learn(background: Background, pixels: Pixels, steps: int, batch: int, progr
 @torch.no_grad()
 def _unexplained(background: Background, pixels: Pixels) -> float:
     error = background(Exits.unbent(pixels.rays)).clamp(max=1) - pixels.radiance
-    return float(error.square().mean() / pixels.radiance.var(0).mean().clamp(min=_MIN_VARIANCE))
+    return float(error.square().mean() / pixels.radiance.var(0).mean().clamp(min=1e-4))
 
 
 def _texel(directions: Float[Tensor, "P 3"], n: int) -> tuple[Tensor, Tensor, Tensor]:

@@ -60,7 +60,7 @@ def _quoted(value: object) -> str:
         return "{" + ",".join(f"{name}:{_quoted(each)}" for name, each in value.items()) + "}"
     if isinstance(value, list):
         return f"[{','.join(map(_quoted, value))}]"
-    text = "null" if value is None else str(value)
+    text = "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
     if re.fullmatch(r"[\w./+@%-]+", text, re.ASCII):
         return text
     return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'

@@ -1,4 +1,4 @@
-"""Command line and versions of packages, for records of results."""
+"""Command line, versions of packages and settings of algorithms, for records of results."""
 
 from __future__ import annotations
 
@@ -6,8 +6,31 @@ import shlex
 import sys
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import ClassVar
 
 _PACKAGES = ("nerfro", "torch", "lightning", "hydra-core", "torchmetrics", "numpy", "numba", "trimesh")
+
+
+class AlgorithmSettings:
+    """Base class of the settings of an algorithm: a frozen dataclass of tuned numbers with a default for each.
+
+    The function of the algorithm takes an instance as its argument `settings` and calls `use`. `nerfro plugins
+    settings` lists all subclasses; run.json and scene.json record the settings that a process has used.
+
+    Attributes:
+        classes: all subclasses by name.
+        used: the settings of algorithms that have run in this process, by class, as Python expressions.
+    """
+
+    classes: ClassVar[dict[str, type[AlgorithmSettings]]] = {}
+    used: ClassVar[dict[str, str]] = {}
+
+    def __init_subclass__(cls) -> None:
+        AlgorithmSettings.classes[cls.__name__] = cls
+
+    def use(self) -> None:
+        """Remember these settings for the records of this process."""
+        AlgorithmSettings.used[type(self).__name__] = repr(self)
 
 
 def command_line() -> str:

@@ -45,12 +45,6 @@ def leave_current_directory() -> None:
         sys.path[:] = [place for place in sys.path if Path(place).resolve() != here]
 
 
-def command_of_module(name: str) -> list[str]:
-    """Return a command line equivalent to `python -m NAME`, but without imports from the current directory."""
-    program = f"import runpy, sys; sys.path[0] = {str(PACKAGE_DIR.parent)!r}; "
-    return [sys.executable, "-c", f"{program}runpy.run_module({name!r}, run_name='__main__', alter_sys=True)"]
-
-
 class GuardedConfigLoader(ConfigLoaderImpl):
     """Hydra's configuration loader with a check that refuses foreign classes before Hydra instantiates any class.
 

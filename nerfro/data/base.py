@@ -68,10 +68,10 @@ class Views:
 
     def __post_init__(self) -> None:
         for name in ("images", "masks", "usable"):
-            given = getattr(self, name)
-            if not isinstance(given, (Tensor, LazyImages)) and (given is not None or name == "images"):
+            value = getattr(self, name)
+            if not isinstance(value, (Tensor, LazyImages)) and (value is not None or name == "images"):
                 raise NerfroError(
-                    f"Views.{name} is a {type(given).__name__}; give one tensor of all views, as by torch.stack, or "
+                    f"Views.{name} is a {type(value).__name__}; give one tensor of all views, as by torch.stack, or "
                     "LazyImages"
                 )
 
@@ -80,14 +80,14 @@ class Views:
 
     def select(self, views: Sequence[int]) -> Views:
         """Return the views with the given indices, in this order."""
-        chosen = list(views)
-        given = {name: getattr(self, name) for name in ("images", "masks", "usable")}
+        indices = list(views)
+        values = {name: getattr(self, name) for name in ("images", "masks", "usable")}
         images: dict[str, Any] = {
-            name: p.select(chosen) if isinstance(p, LazyImages) else p for name, p in given.items()
+            name: p.select(indices) if isinstance(p, LazyImages) else p for name, p in values.items()
         }
-        images = {name: p[chosen] if isinstance(p, Tensor) else p for name, p in images.items()}
-        names, frames = [self.names[view] for view in chosen], [self.frames[view] for view in chosen if self.frames]
-        return replace(self, cameras=self.cameras.select(chosen), names=names, frames=frames, **images)
+        images = {name: p[indices] if isinstance(p, Tensor) else p for name, p in images.items()}
+        names, frames = [self.names[view] for view in indices], [self.frames[view] for view in indices if self.frames]
+        return replace(self, cameras=self.cameras.select(indices), names=names, frames=frames, **images)
 
     def joined(self, other: Views) -> Views | None:
         """Append other views, without masks of usable pixels; None unless all image and mask files have one size."""

@@ -43,9 +43,4 @@ class Capture:
     @property
     def masks(self) -> list[Path]:
         """Files of the masks."""
-        return mask_files(resolve_path(self.root))
-
-
-def mask_files(root: Path) -> list[Path]:
-    """Return the files of masks in the folder of a capture."""
-    return [file for pattern in _MASKS for file in root.glob(pattern)]
+        return [file for pattern in _MASKS for file in resolve_path(self.root).glob(pattern)]

@@ -29,7 +29,6 @@ SPLITS = ["train", "val", "test"]
 Item = TypeVar("Item")
 
 _ROTATION_TOLERANCE = 1e-3
-_MIN_PRECISION = 2e-4  # spacing of the coordinates of cameras, relative to the extent of their positions
 
 
 @dataclass(frozen=True)
@@ -151,7 +150,7 @@ class PosedImages(DataSource):
     def _require_precision(self, centres: Float[np.ndarray, "V 3"]) -> None:
         """Refuse cameras that are far from the origin compared with the distances between the cameras."""
         size, spacing = np.ptp(centres, axis=0).max(), float(np.spacing(np.float32(np.abs(centres).max())))
-        if spacing > _MIN_PRECISION * size > 0:
+        if spacing > 2e-4 * size > 0:
             middle = centres.mean(0).round(math.ceil(-math.log10(size))) + self.origin
             advice = "subtract this point from all positions of cameras, points and mesh"
             if self.origin.any():
@@ -189,9 +188,9 @@ def list_images(folder: Path, suffixes: Sequence[str] = IMAGE_SUFFIXES) -> list[
     files = [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(("mask_", "."))]
     images = [path for path in files if path.suffix.lower() in suffixes]
     if not images:
-        found = sorted({path.suffix.lower() for path in files if path.suffix})
+        others = sorted({path.suffix.lower() for path in files if path.suffix})
         raise NerfroError(
-            f"{folder} holds no image{f', but {first_of(found)} files' if found else ''}; allowed are "
+            f"{folder} holds no image{f', but {first_of(others)} files' if others else ''}; allowed are "
             f"{', '.join(suffixes)}. nerfro.reconstruct also reads HEIC photographs and, with video=FILE, videos"
         )
     return sorted(images)

@@ -17,9 +17,6 @@ from nerfro.files.reading import open_image
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 Alpha = Literal["drop", "white", "black"]
-# An image has labels if its levels are at most this many, and this share of the pixels between 0 and the highest level
-# have eight equal neighbours.
-_MAX_LABELS, _MIN_FLAT = 64, 0.25
 
 Levels = UInt8[np.ndarray, "H W *C"] | UInt16[np.ndarray, "H W *C"]
 
@@ -131,12 +128,12 @@ def _has_labels(levels: Levels, lossy: bool) -> bool:
         return len(present[present > 0]) == 1
     inner = levels[1:-1, 1:-1]
     partial = (inner > 0) & (inner < np.iinfo(levels.dtype).max)
-    if present[0] > 0 or len(present) > _MAX_LABELS or not partial.any():
+    if present[0] > 0 or len(present) > 64 or not partial.any():
         return False
     height, width = inner.shape
     offsets = [(row, column) for row in range(3) for column in range(3)]
     flat = np.all([levels[r : r + height, c : c + width] == inner for r, c in offsets], axis=0)
-    return bool(flat[partial].mean() > _MIN_FLAT)
+    return bool(flat[partial].mean() > 0.25)
 
 
 def downscaled(size: tuple[int, int], factor: float) -> tuple[int, int]:

@@ -19,10 +19,6 @@ from nerfro.core.cameras import Window
 from nerfro.core.errors import NerfroError
 from nerfro.data.image_files import Levels, area_mean, downscaled, read_size, to_levels, to_unit
 
-# Maximum number of files decoded at the same time, which bounds the memory for decoding.
-_MAX_THREADS = 8
-# `decoded_once` keeps so many bytes, and only images of which at least so many fit.
-_KEPT_BYTES, _MIN_KEPT = 2**29, 128
 _decoded: dict[Hashable, Levels] | None = None
 
 
@@ -124,7 +120,8 @@ class LazyImages:
         if key in _decoded:
             return _decoded[key]
         levels = self._decode(index)
-        if levels.nbytes * max(len(_decoded), _MIN_KEPT) <= _KEPT_BYTES:
+        # At most 512 MB are kept, and only images of which at least 128 fit.
+        if levels.nbytes * max(len(_decoded), 128) <= 2**29:
             _decoded[key] = levels
         return levels
 
@@ -143,7 +140,8 @@ class LazyImages:
 
     def all_levels(self) -> Iterator[Levels]:
         """Decode all images in order with several threads, only a few images ahead of the consumer."""
-        threads = min(os.cpu_count() or 1, _MAX_THREADS)
+        # A limit of 8 bounds the memory for decoding.
+        threads = min(os.cpu_count() or 1, 8)
         # Decoding releases the global interpreter lock, so threads suffice.
         with ThreadPoolExecutor(threads) as pool:
             ahead: deque[Future[Levels]] = deque()

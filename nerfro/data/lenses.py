@@ -46,13 +46,6 @@ _NUMBERS = {
     **dict.fromkeys(("cx", "cy", *_NAMES), _NUMBER),
 }
 
-# A focal length in units of the longer side of the image: a field of view from 0.06 to 177.7 degrees.
-_MIN_FOCAL, _MAX_FOCAL = 0.01, 1000
-# Largest ratio of the sides of a pixel, and largest distance of the principal point from the centre in images.
-_MAX_PIXEL_RATIO, _MAX_SHIFT = 4, 5
-# Maximum error in pixels after undistorting and distorting a point again.
-_DISTORTION_TOLERANCE = 0.01
-
 
 @dataclass(frozen=True)
 class Lens:
@@ -161,31 +154,31 @@ def _numbers(level: Mapping[str, Any], rational: bool, where: str) -> dict[str, 
         rational: whether k4, k5 and k6 belong to the denominator (`FULL_OPENCV`).
         where: subject of the error message.
     """
-    found = {key: level[key] for key in _NUMBERS if level.get(key) is not None}
-    check(f"{where}: ", _NUMBERS, found)
+    numbers = {key: level[key] for key in _NUMBERS if level.get(key) is not None}
+    check(f"{where}: ", _NUMBERS, numbers)
     matrix, dist = level.get("cam_mat"), level.get("dist")
     for key, others in (("cam_mat", ("fl_x", "fl_y", "cx", "cy")), ("dist", _NAMES)):
-        both = [other for other in others if level.get(key) is not None and other in found]
+        both = [other for other in others if level.get(key) is not None and other in numbers]
         if both:
             raise NerfroError(f"{where}: {key} and {both[0]} both state the lens; keep one of them")
     if matrix is not None:
         lens = Lens.of_matrix(parse_matrix(matrix, ((3, 3),), f"{where}: cam_mat"), f"{where}: cam_mat")
-        found |= {"fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy}
-        check(f"{where}: cam_mat: ", _NUMBERS, found)
+        numbers |= {"fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy}
+        check(f"{where}: cam_mat: ", _NUMBERS, numbers)
     if rational:
         renamed = zip(("k4", "k5", "k6"), _COEFFICIENTS[2], strict=True)
-        found |= {new: found.pop(old) for old, new in renamed if old in found}
-    if found.pop("k5", 0) or found.pop("k6", 0):
+        numbers |= {new: numbers.pop(old) for old, new in renamed if old in numbers}
+    if numbers.pop("k5", 0) or numbers.pop("k6", 0):
         raise NerfroError(
             f"{where}: k5 and k6 belong to OpenCV's rational model, in which k4, k5 and k6 form the denominator; set "
             "camera_model to FULL_OPENCV, or remove both"
         )
     if dist is not None:
-        found |= _opencv_distortion(dist, where)
+        numbers |= _opencv_distortion(dist, where)
     for axis in "xy":
-        if f"{axis}_fov" in found:
-            found.setdefault(f"camera_angle_{axis}", math.radians(found[f"{axis}_fov"]))
-    return found
+        if f"{axis}_fov" in numbers:
+            numbers.setdefault(f"camera_angle_{axis}", math.radians(numbers[f"{axis}_fov"]))
+    return numbers
 
 
 def _opencv_distortion(numbers: Any, where: str) -> dict[str, float]:
@@ -236,12 +229,10 @@ def check_lenses(lenses: Iterable[Lens], names: Iterable[str], size: tuple[int, 
     """
     longer, outside = max(size), []
     limits = {
-        "fx": Annotated[float, Ge(_MIN_FOCAL * longer), Le(_MAX_FOCAL * longer)],
-        "fy / fx": Annotated[float, Ge(1 / _MAX_PIXEL_RATIO), Le(_MAX_PIXEL_RATIO)],
-        **{
-            key: Annotated[float, Ge(-_MAX_SHIFT * side), Le((1 + _MAX_SHIFT) * side)]
-            for key, side in zip(("cx", "cy"), size, strict=True)
-        },
+        # A field of view from 0.06 to 177.7 degrees.
+        "fx": Annotated[float, Ge(0.01 * longer), Le(1000 * longer)],
+        "fy / fx": Annotated[float, Ge(1 / 4), Le(4)],
+        **{key: Annotated[float, Ge(-5 * side), Le(6 * side)] for key, side in zip(("cx", "cy"), size, strict=True)},
     }
     first: dict[Lens, str] = {}
     for lens, name in zip(lenses, names, strict=True):
@@ -267,7 +258,8 @@ def _check_distortion(lens: Lens, size: tuple[int, int], name: str) -> None:
     distortion = torch.tensor(lens.distortion, dtype=torch.float64).expand(len(points), 9)
     ideal, area = undistort(points, distortion)
     error: Tensor = (distort(ideal, distortion)[0] - points).norm(dim=-1) * lens.fx
-    if not bool(((error < _DISTORTION_TOLERANCE) & (area > 0)).all()):
+    # A point that is undistorted and distorted again moves by at most 0.01 pixels.
+    if not bool(((error < 0.01) & (area > 0)).all()):
         raise NerfroError(
             f"{name}: the lens distortion is not invertible everywhere in the image; "
             "check the coefficients and their order, or undistort the images first"

@@ -168,13 +168,13 @@ def find_masks(
 
 def masked_views(views: Views) -> Views:
     """Select the views that have mask files, if only some views have one; otherwise, return all views."""
-    chosen = [i for i, frame in enumerate(views.frames) if frame.mask is not None]
-    if views.masks is not None or not chosen or not isinstance(views.images, LazyImages):
+    with_mask = [i for i, frame in enumerate(views.frames) if frame.mask is not None]
+    if views.masks is not None or not with_mask or not isinstance(views.images, LazyImages):
         return views
-    some, images = views.select(chosen), views.images
+    some, images = views.select(with_mask), views.images
     files, masks = zip(*((frame.image, frame.mask) for frame in some.frames), strict=True)
-    found = find_masks(files, masks, images.downscale, images.size[::-1], views.mask_labels)
-    return replace(some, masks=found if found is None or images.window is None else found.cut(images.window))
+    read = find_masks(files, masks, images.downscale, images.size[::-1], views.mask_labels)
+    return replace(some, masks=read if read is None or images.window is None else read.cut(images.window))
 
 
 def with_other_splits(views: Views, source: DataSource, split: str) -> Views:

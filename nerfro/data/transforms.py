@@ -43,13 +43,13 @@ class Manifest:
         check(f"{self.path}: ", {key: float}, {key: value})
         return default if value is None else value
 
-    def lenses(self, chosen: Sequence[int] | None = None) -> list[Lens]:
-        """Read the lenses of all frames, or of the chosen ones, for the size of their images; see `read_lens`."""
+    def lenses(self, indices: Sequence[int] | None = None) -> list[Lens]:
+        """Read the lenses of all frames, or of those at `indices`, for the size of their images; see `read_lens`."""
         entries: Any = self.document["frames"]
-        chosen = range(len(self.frames)) if chosen is None else chosen
-        size = read_size(self.frames[chosen[0]].image)[:2]
-        where = (f"{self.path}: '{self.frames[i].name}'" for i in chosen)
-        return [read_lens(self.document, entries[i], size, place) for i, place in zip(chosen, where, strict=True)]
+        indices = range(len(self.frames)) if indices is None else indices
+        size = read_size(self.frames[indices[0]].image)[:2]
+        where = (f"{self.path}: '{self.frames[i].name}'" for i in indices)
+        return [read_lens(self.document, entries[i], size, name) for i, name in zip(indices, where, strict=True)]
 
 
 def find_splits(root: Path) -> dict[str, Path]:
@@ -59,15 +59,15 @@ def find_splits(root: Path) -> dict[str, Path]:
         At least one file; train, val and test come first.
     """
     require_root(root)
-    found = {path.stem.removesuffix("_transforms"): path for path in root.glob("*_transforms.json")}
-    found |= {path.stem.removeprefix("transforms_"): path for path in root.glob("transforms_*.json")}
-    if not found:
+    files = {path.stem.removesuffix("_transforms"): path for path in root.glob("*_transforms.json")}
+    files |= {path.stem.removeprefix("transforms_"): path for path in root.glob("transforms_*.json")}
+    if not files:
         raise NerfroError(
             f"data.root={root} holds no transforms_<split>.json; give the folder of a data set, see "
             "docs/guides/data_formats.md"
         )
     rank = {name: i for i, name in enumerate(SPLITS)}
-    return {name: found[name] for name in sorted(found, key=lambda name: (rank.get(name, len(rank)), name))}
+    return {name: files[name] for name in sorted(files, key=lambda name: (rank.get(name, len(rank)), name))}
 
 
 def read_manifest(root: Path, split: str, mask_key: str = "mask_path", skip_missing: bool = False) -> Manifest:
@@ -94,8 +94,8 @@ def parse_manifest(path: Path, mask_key: str = "mask_path", skip_missing: bool =
     if not frames:
         raise NerfroError(f"{path} has an empty list 'frames'; a split needs at least one")
     names = [_frame_name(f"{path}: frame {i}", frame) for i, frame in enumerate(frames)]
-    found = {name: _existing_image(path.parent, name) for name in set(names)}
-    images = [found[name] for name in names]
+    image_of = {name: _existing_image(path.parent, name) for name in set(names)}
+    images = [image_of[name] for name in names]
     counts = Counter(image for image in images if image is not None)  # by file: `r_0` and `r_0.png` are one image
     repeated = {f"'{name}'": None for name, image in zip(names, images, strict=True) if image and counts[image] > 1}
     if repeated:

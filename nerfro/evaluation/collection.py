@@ -26,15 +26,13 @@ def metrics(*names: str) -> torchmetrics.MetricCollection:
     discover()
     for name in names:
         find("metric", name)
-    found = build_metrics()
-    for name in names or found:
-        found[name].prepare()
+    built = build_metrics()
     for name in names:
-        if found[name].missing is not None:
-            raise NerfroError(f"metric={name} is not available: {found[name].missing}")
-    chosen = names or [name for name, metric in found.items() if metric.missing is None]
+        if built[name].missing is not None:
+            raise NerfroError(f"metric={name} is not available: {built[name].missing}")
+    usable = names or [name for name, metric in built.items() if metric.missing is None]
     # Metrics with equal values are not the same metric, so torchmetrics must not group them.
-    return torchmetrics.MetricCollection({name: MeanOverImages(found[name]) for name in chosen}, compute_groups=False)
+    return torchmetrics.MetricCollection({name: MeanOverImages(built[name]) for name in usable}, compute_groups=False)
 
 
 class MeanOverImages(torchmetrics.Metric):

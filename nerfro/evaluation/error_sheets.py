@@ -14,8 +14,6 @@ from nerfro.evaluation.image_metrics import ImageMetric
 from nerfro.files.drawing import sheet
 from nerfro.files.images import save_image
 
-_MIN_WIDTH = 256  # pixels; smaller images are enlarged in sheets, because captions need this width
-
 
 @torch.no_grad()
 def error_maps(
@@ -49,6 +47,7 @@ def write_error_sheet(
     maps = error_maps(prediction, reference, metrics)
     images = [prediction, reference, *(error.colours() for error in maps)]
     captions = ["prediction", "reference", *(f"{error.title}, 0 to {error.limit:g}" for error in maps)]
-    width = -(-_MIN_WIDTH // reference.shape[1]) * reference.shape[1]
+    # Smaller images are enlarged, because captions need a width of 256 pixels.
+    width = -(-256 // reference.shape[1]) * reference.shape[1]
     title = "error maps: black is 0, and pale yellow is the end of the scale or more"
     save_image(folder / "errors" / f"{name}.png", sheet(images, captions, width, len(images), title))

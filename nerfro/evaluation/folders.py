@@ -96,9 +96,9 @@ def match_folders(
     _require(predicted, truth, f"reference in references={references}")
     _require(truth, predicted, f"prediction in predictions={predictions}")
     if masks is None:
-        found = {name: find_mask(references, path) for name, path in truth.items()}
-        require_used(references, list(truth.values()), list(found.values()))
-        files = {name: path for name, path in found.items() if path is not None}
+        mask_files = {name: find_mask(references, path) for name, path in truth.items()}
+        require_used(references, list(truth.values()), list(mask_files.values()))
+        files = {name: path for name, path in mask_files.items() if path is not None}
         where = f"references={references}, where others have one"
     else:
         named = {name.removeprefix("mask_"): path for name, path in _list_images(masks, "masks").items()}

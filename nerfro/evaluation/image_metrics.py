@@ -59,9 +59,6 @@ class ImageMetric(nn.Module, ABC):
             Score; NaN if it is not defined, for example for an empty mask.
         """
 
-    def prepare(self) -> None:
-        """Load what scoring needs, such as a network, or set `missing`; called once before images are scored."""
-
     def error_map(self, prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> ErrorMap | None:
         """Compute the error of each pixel for sheets of error maps; by default, the metric has no map."""
         return None

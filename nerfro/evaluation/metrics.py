@@ -91,11 +91,3 @@ class ImageMetrics(nn.Module):
                 too_small = f"images, masks or crops below {metric.min_size} pixels"
                 notes[name] = metric.missing or (too_small if metric.min_size > 1 else "it has no value")
         return notes
-
-
-def prepared_metrics() -> ImageMetrics:
-    """Build all metrics, and load what they need, such as networks, as far as available."""
-    metrics = ImageMetrics()
-    for metric in metrics.metrics.values():
-        metric.prepare()
-    return metrics

@@ -18,10 +18,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-_RESOLUTION = 600
-# Margin around the box, as a fraction of its longest side.
-_MARGIN = 0.15
-
 
 def draw_paths(path: Path, medium: Medium, file: FilePath) -> None:
     """Write a plot of a few paths and the medium to a PNG file; see `plot_paths`."""
@@ -54,8 +50,9 @@ def plot_paths(axes: Axes, path: Path, medium: Medium) -> None:
     vertices = path.positions.detach().cpu()
     centre = medium.box.mean(0).to(vertices)
     across, up = _plane(path.main_polyline(vertices), centre)
-    half = (0.5 + _MARGIN) * float((medium.box[1] - medium.box[0]).max())
-    steps = torch.linspace(-half, half, _RESOLUTION).to(centre)
+    # The margin around the box is 15 % of its longest side.
+    half = (0.5 + 0.15) * float((medium.box[1] - medium.box[0]).max())
+    steps = torch.linspace(-half, half, 600).to(centre)
     points = centre + steps[None, :, None] * across + steps[:, None, None] * up
     n = torch.cat([medium(rows)[0].cpu() for rows in points.to(medium.box).split(50)])
     extent = (-half, half, -half, half)

@@ -7,16 +7,13 @@ from torch import Tensor
 
 from nerfro.core.errors import NerfroError
 
-COVERED = 0.5  # minimum coverage of a pixel of the object
-DILATION = 35  # pixels; the paper's authors dilate masks by a box of this side before the crop
-
 
 def object_pixels(coverage: Float[Tensor, "H W"]) -> Bool[Tensor, "H W"]:
-    """Return the pixels of the object from the coverage of each pixel in [0, 1] (`Views.masks`)."""
-    return coverage >= COVERED
+    """Return the pixels of which the object covers at least half, from the coverage (`Views.masks`)."""
+    return coverage >= 0.5
 
 
-def crop_rectangle(inside: Bool[Tensor, "H W"], dilation: int = DILATION) -> tuple[slice, slice]:
+def crop_rectangle(inside: Bool[Tensor, "H W"], dilation: int = 35) -> tuple[slice, slice]:
     """Return the bounding rectangle of the dilated mask, the region of the paper's scores on real scenes.
 
     All pixels of the rectangle count. Dilation by a centred box of odd side d moves each side of the bounding rectangle

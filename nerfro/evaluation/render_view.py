@@ -27,11 +27,11 @@ def render_view(renderer: Renderer, cameras: Cameras, view: int, subdivision: Su
     if subdivision.contrast is not None:
         shown = renderer.scene.colour_space.to_display(rendered.radiance)
         divided |= contrast(lambda some: shown[some - pixels[0]], cameras, pixels) >= subdivision.contrast
-    chosen = divided.nonzero()[:, 0]
-    if len(chosen) == 0:
+    pixels_to_divide = divided.nonzero()[:, 0]
+    if len(pixels_to_divide) == 0:
         return rendered
     radiance, num_parts = rendered.radiance.clone(), subdivision.side**2
-    for some in chosen.split(max(1, renderer.chunk_size // num_parts)):
+    for some in pixels_to_divide.split(max(1, renderer.chunk_size // num_parts)):
         parts = renderer.render(part_rays(cameras, pixels[some], subdivision.side)).radiance
         radiance[some] = parts.view(-1, num_parts, 3).mean(1)
     return replace(rendered, radiance=radiance)

@@ -92,8 +92,8 @@ def optimized(result: EvaluationResult, name: str) -> float:
     scores = {f"{region}.{metric}": mean for region in result.regions for metric, mean in result.means(region).items()}
     score = scores.get(name if "." in name else f"{FULL}.{name}")
     if score is None:
-        known = ", ".join(key.removeprefix(f"{FULL}.") for key, mean in scores.items() if mean is not None)
-        raise NerfroError(f"optimized_metric={name} was not scored; choose one of {known}")
+        names = ", ".join(key.removeprefix(f"{FULL}.") for key, mean in scores.items() if mean is not None)
+        raise NerfroError(f"optimized_metric={name} was not scored; choose one of {names}")
     return score
 
 

@@ -314,10 +314,10 @@ def _scores_table(
     summary: Mapping[str, Mapping[str, Score]] | None = None,
 ) -> Table:
     """Tabulate scores by row label and metric, without empty columns."""
-    known = image_metrics()
-    columns = tuple(Column(metric.title, metric.better, metric.decimals) for metric in known.values())
+    metrics = image_metrics()
+    columns = tuple(Column(metric.title, metric.better, metric.decimals) for metric in metrics.values())
     body, foot = (
-        tuple(Row(label, tuple(scores[name] for name in known)) for label, scores in part.items())
+        tuple(Row(label, tuple(scores[name] for name in metrics)) for label, scores in part.items())
         for part in (rows, summary or {})
     )
     table = Table(title, label_title, columns, body, foot, notes=tuple(notes))

@@ -17,9 +17,6 @@ from nerfro.viewing.surface import level_set
 from nerfro.viewing.trained_scene import TrainedScene
 from nerfro.viewing.volume import POINTS_AT_ONCE, RESOLUTION, sample_field
 
-_HALF_DEPTH = 0.01  # default of half_depth, relative to the longest side of the object
-_MIN_COMPONENT = 0.02  # triangles of the smallest component that is kept, relative to the largest component
-
 
 def glass_meshes(scene: TrainedScene) -> list[trimesh.Trimesh]:
     """Triangulate the surface of each body, with vertex normals; returns an empty list without bodies."""
@@ -52,7 +49,7 @@ def inside_mesh(scene: TrainedScene, resolution: int | None, half_depth: float |
         Mesh with vertex normals and the vertex attribute `radiance` (linear), or None if no content is dense enough.
     """
     volume = sample_field(scene, resolution or RESOLUTION)
-    level = math.log(2) / (half_depth or _HALF_DEPTH * float((scene.bounds[1] - scene.bounds[0]).max()))
+    level = math.log(2) / (half_depth or 0.01 * float((scene.bounds[1] - scene.bounds[0]).max()))
     # The padding closes surfaces at the faces of the box. A logarithm of the density is closer to linear across a
     # surface than the density.
     values = functional.pad(volume.density, (1,) * 6).clamp(min=1e-3 * level).log()
@@ -79,5 +76,6 @@ def largest_components(mesh: TriangleMesh) -> TriangleMesh:
     """Remove small separate components, which are artefacts that explain edges and reflections of the glass."""
     component = bodies_of(mesh)
     counts = np.bincount(component)
-    used, index = np.unique(mesh.faces[counts[component] >= _MIN_COMPONENT * counts.max()], return_inverse=True)
+    # Smaller components are dropped.
+    used, index = np.unique(mesh.faces[counts[component] >= 0.02 * counts.max()], return_inverse=True)
     return TriangleMesh(mesh.vertices[used], index.reshape(-1, 3))

@@ -20,7 +20,6 @@ from nerfro.files.reading import load_arrays
 # Maximum size of all entries in bytes; the least recently used entries are removed first.
 LIMIT = 32 * 2**30
 _ENTRIES = ("distance_*.npz", "occupancy_*.npz", "mapped_*.npy")
-_ABANDONED_SECONDS = 86400.0
 _CHECKSUM = "checksum"  # name of the array that holds the checksum of an entry
 
 
@@ -79,7 +78,8 @@ def make_room(folder: Path, num_bytes: int) -> None:
     """
     for pattern in _ENTRIES:
         for partial, status in _statuses(folder.glob(f".{pattern}*.partial")):
-            if time.time() - status.st_mtime > _ABANDONED_SECONDS:
+            # A partial file that is a day old is abandoned.
+            if time.time() - status.st_mtime > 86400.0:
                 partial.unlink(missing_ok=True)
     entries = _statuses(path for pattern in _ENTRIES for path in folder.glob(pattern))
     total = num_bytes + sum(status.st_size for _, status in entries)
@@ -91,11 +91,11 @@ def make_room(folder: Path, num_bytes: int) -> None:
 
 def _statuses(paths: Iterable[Path]) -> list[tuple[Path, os.stat_result]]:
     """Query the status of files; files that have just been removed are left out."""
-    found = []
+    statuses = []
     for path in paths:
         with contextlib.suppress(FileNotFoundError):
-            found.append((path, path.stat()))
-    return found
+            statuses.append((path, path.stat()))
+    return statuses
 
 
 def _checksum(arrays: Mapping[str, np.ndarray]) -> str:

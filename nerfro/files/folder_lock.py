@@ -98,7 +98,7 @@ def _remove_unfinished(folder: Path) -> None:
 
 def require_only(folder: Path, allowed: tuple[str, ...], advice: str) -> None:
     """Raise an error if a folder contains other files than `allowed`; hidden files are ignored."""
-    found = sorted(path.name for path in folder.iterdir() if not path.name.startswith(".")) if folder.is_dir() else []
-    foreign = [name for name in found if name not in allowed]
+    names = sorted(path.name for path in folder.iterdir() if not path.name.startswith(".")) if folder.is_dir() else []
+    foreign = [name for name in names if name not in allowed]
     if foreign:
         raise NerfroError(f"{folder} already holds {first_of(foreign)}; {advice}")

@@ -42,8 +42,8 @@ def sample(radiance: Float[Tensor, "H W 3"], where: Float[Tensor, "points 3"], w
     u = (0.5 - torch.atan2(where[:, 1], where[:, 0]) / (2 * math.pi)) * columns + 1
     v = torch.acos(where[:, 2].clamp(-1, 1)) / math.pi
     grid = torch.stack([u / (columns + 2) * 2 - 1, v * 2 - 1], dim=-1)[None, None]
-    found = torch.nn.functional.grid_sample(image, grid, padding_mode="border", align_corners=False)
-    return found[0, :, 0].T
+    sampled = torch.nn.functional.grid_sample(image, grid, padding_mode="border", align_corners=False)
+    return sampled[0, :, 0].T
 
 
 def load_lat_long(path: Path | str) -> Float[Tensor, "H 2*H 3"]:

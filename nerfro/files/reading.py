@@ -99,10 +99,10 @@ def open_image(path: Path, upright: bool = True) -> Iterator[tuple[Image.Image, 
 
 def _bits(image: Image.Image, file: BinaryIO) -> int:
     if image.format == "PNG":
-        place = file.tell()
+        position = file.tell()
         file.seek(24)
         (bits,) = file.read(1)
-        file.seek(place)
+        file.seek(position)
         return bits
     if isinstance(image, TiffImagePlugin.TiffImageFile):
         return max(8, *image.tag_v2.get(TiffImagePlugin.BITSPERSAMPLE, (8,)))
@@ -114,7 +114,7 @@ def _metadata_follow_pixels(file: BinaryIO) -> bool:
 
     Pillow decodes a file without its end, and reads what follows the pixels only after decoding.
     """
-    place, kind, after_pixels, found = file.tell(), b"", False, False
+    position, kind, after_pixels, follows = file.tell(), b"", False, False
     file.seek(8)
     while kind != b"IEND":
         head = file.read(8)
@@ -126,12 +126,12 @@ def _metadata_follow_pixels(file: BinaryIO) -> bool:
         elif after_pixels:
             start = file.read(min(length, 17))
             length -= len(start)
-            found |= kind == b"eXIf" or start in (b"Raw profile type ", b"XML:com.adobe.xmp")
+            follows |= kind == b"eXIf" or start in (b"Raw profile type ", b"XML:com.adobe.xmp")
         file.seek(length, 1)
         if len(file.read(4)) < 4:  # checksum
             raise OSError("the file is truncated")
-    file.seek(place)
-    return found
+    file.seek(position)
+    return follows
 
 
 def orientation_of(image: Image.Image) -> int:

@@ -15,8 +15,6 @@ from nerfro.geometry.mesh import TriangleMesh
 
 _MARGIN = 1e-3  # fraction of an edge; surfaces that touch at the ends of an edge do not cross
 _TOUCHING = 1e-5  # fraction of the mesh's extent; points closer to a surface along a line lie on the surface
-_MIN_POINTS, _MAX_POINTS = 2**9, 2**16  # numbers of points of a body that are tested against other bodies
-_NUM_LINES = 3  # lines through each point, in both directions
 
 
 def bodies_of(mesh: TriangleMesh) -> Int[np.ndarray, "F"]:
@@ -77,10 +75,11 @@ class _Others:
         A surface without points clear of the others coincides with the others and has no side.
         """
         generator = np.random.default_rng(0)
-        some = own[:: -(-len(own) // _MAX_POINTS)]
-        weights = generator.dirichlet(np.ones(3), (-(-_MIN_POINTS // len(some)), len(some)))
+        # Between 512 and 65,536 points of a body are tested, on three lines through each point.
+        some = own[:: -(-len(own) // 2**16)]
+        weights = generator.dirichlet(np.ones(3), (-(-512 // len(some)), len(some)))
         points = torch.from_numpy(np.einsum("nfc,fcx->nfx", weights, some).reshape(-1, 3))
-        lines = torch.nn.functional.normalize(torch.from_numpy(generator.normal(size=(_NUM_LINES, 3))), dim=-1)
+        lines = torch.nn.functional.normalize(torch.from_numpy(generator.normal(size=(3, 3))), dim=-1)
         # For points on a surface, the parities of the two directions differ.
         odd = torch.stack([self._are_met_oddly(points, sign * line) for line in lines for sign in (1, -1)])
         return bool(odd.all(0).any() != (~odd).all(0).any())

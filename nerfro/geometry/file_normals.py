@@ -8,8 +8,6 @@ from jaxtyping import Bool, Float, Int
 from nerfro.geometry.orientation import area_vectors, patches
 
 _MIN_COSINE = np.cos(np.radians(30.0))  # between the normals of a corner and of its triangle
-_LARGEST_RATIO = 0.98  # of the residual of the file's normals to that of averages
-_DECIMALS = 1e5  # normals at one vertex that agree to 1 / _DECIMALS are one normal
 
 
 def informative_normals(
@@ -63,7 +61,7 @@ def informative_normals(
     # The second weight counts the triangles of one flat polygon once.
     weights = (np.ones(angle.shape), 1 / num_coplanar, angle, area, area * angle)
     best = np.min([residual(average(weight)) for weight in weights], axis=0)
-    return (residual(normals) < _LARGEST_RATIO**2 * best)[patch]
+    return (residual(normals) < 0.98**2 * best)[patch]
 
 
 def _numbered(index: Int[np.ndarray, "F 3"], normals: Float[np.ndarray, "F 3 3"]) -> Int[np.ndarray, "F 3"]:
@@ -71,5 +69,6 @@ def _numbered(index: Int[np.ndarray, "F 3"], normals: Float[np.ndarray, "F 3 3"]
     # Products with an odd number that wrap around scatter the keys evenly; sorting rows would take much longer.
     key = index.astype(np.int64)
     for axis in range(3):
-        key = key * 6364136223846793005 + np.rint(normals[..., axis] * _DECIMALS).astype(np.int64)
+        # Normals at one vertex that agree to 1e-5 are one normal.
+        key = key * 6364136223846793005 + np.rint(normals[..., axis] * 1e5).astype(np.int64)
     return np.unique(key, return_inverse=True)[1].reshape(index.shape)

@@ -111,9 +111,9 @@ def bspline_basis(num_control: int, num_places: int) -> Float[Tensor, "num_place
     """Return cubic B-splines of evenly spaced control points, evaluated from the second to the last but one."""
     from scipy.interpolate import BSpline  # takes a quarter of a second
 
-    place = np.linspace(1, num_control - 2, num_places)
+    positions = np.linspace(1, num_control - 2, num_places)
     spline = BSpline.basis_element(np.arange(-2.0, 3.0), extrapolate=False)  # NaN outside the knots
-    return torch.from_numpy(np.nan_to_num(spline(place[:, None] - np.arange(num_control)))).float()
+    return torch.from_numpy(np.nan_to_num(spline(positions[:, None] - np.arange(num_control)))).float()
 
 
 def smooth(values: Float[Tensor, "X Y Z *C"], size: int, sigma: float) -> Float[Tensor, "X Y Z *C"]:

@@ -15,9 +15,6 @@ from nerfro.geometry.mesh import TriangleMesh
 from nerfro.geometry.normals import corner_normals
 from nerfro.geometry.orientation import patches
 
-_TOUCHING = 1e-5  # fraction of the extent; bounding boxes closer to each other count as overlapping
-_SAME_PLANE = 1e-3  # difference of unit normals, and of heights as fractions of the extent, within one plane
-
 
 @dataclass(frozen=True)
 class Triangles:
@@ -89,7 +86,8 @@ class MeshIntersector:
 
 def _share_plane(tree: cKDTree, planes: Float[np.ndarray, "F 4"]) -> bool:
     """Return whether a plane, in either orientation, is one of the planes of a search tree."""
-    distances = [tree.query(sign * planes, distance_upper_bound=_SAME_PLANE)[0] for sign in (1, -1)]
+    # Tolerance of unit normals, and of heights as fractions of the extent.
+    distances = [tree.query(sign * planes, distance_upper_bound=1e-3)[0] for sign in (1, -1)]
     return bool(np.isfinite(distances).any())
 
 
@@ -115,7 +113,7 @@ class LayeredIntersector:
         planes = [torch.cat([normals, heights], -1)[group].numpy() for group in groups]
         trees = [cKDTree(plane) for plane in planes]
         layers: list[list[int]] = []
-        for number, (low, high) in enumerate(boxes - extent * torch.tensor([[_TOUCHING], [-_TOUCHING]])):
+        for number, (low, high) in enumerate(boxes - extent * torch.tensor([[1e-5], [-1e-5]])):
             for layer in layers:
                 near = ((boxes[layer, 0] <= high) & (boxes[layer, 1] >= low)).all(1)
                 if not any(_share_plane(trees[layer[i]], planes[number]) for i in near.nonzero()[:, 0]):
@@ -130,5 +128,5 @@ class LayeredIntersector:
     def first_hits(self, x: Float[Tensor, "R 3"], d: Float[Tensor, "R 3"]) -> Int[Tensor, "R L"]:
         """Return the first triangle that each ray hits in each layer, -1 for none."""
         hits = [layer.first_hits(x, d) for layer in self._layers]
-        found = [torch.where(hit >= 0, faces[hit], -1) for hit, faces in zip(hits, self._faces, strict=True)]
-        return torch.stack(found, -1)
+        triangles = [torch.where(hit >= 0, faces[hit], -1) for hit, faces in zip(hits, self._faces, strict=True)]
+        return torch.stack(triangles, -1)

@@ -64,12 +64,6 @@ class TriangleMesh:
         write_atomically(path, header.encode() + self.vertices.astype("<f8").tobytes() + faces.tobytes())
 
 
-_THINNEST = 1e-4  # relative to the longest side; boxes are stored with seven significant digits
-# Distance from the origin, in sizes of the object, beyond which rays have coordinates relative to the object. Rays are
-# in single precision, whose relative spacing of 1.2e-7 turns exit directions by up to 0.01 degrees at this distance.
-_FAR = 100
-
-
 def local_origin(points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "3"]:
     """Return the origin of the coordinate system for tracing, world units.
 
@@ -80,7 +74,9 @@ def local_origin(points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "3"
     """
     low, high = points.min(0), points.max(0)
     centre, size = 0.5 * (low + high), float((high - low).max())
-    if not 0 < _FAR * size < np.abs(centre).max():
+    # Rays are in single precision, whose relative spacing of 1.2e-7 turns exit directions by up to 0.01 degrees at a
+    # distance of 100 sizes.
+    if not 0 < 100 * size < np.abs(centre).max():
         return np.zeros(3)
     return centre.round(num_decimals(size, 1))
 
@@ -125,7 +121,8 @@ def load_mesh(path: Path, accept_open_mesh: bool = False) -> TriangleMesh:
     check(f"mesh {path} reaches too far; scale it to about one unit: ", {"coordinate": Coordinate},
           {"coordinate": float(vertices.flat[np.abs(vertices).argmax()])})  # fmt: skip
     extents = np.ptp(vertices, axis=0)
-    if extents.min() <= _THINNEST * extents.max():
+    # Boxes are stored with seven significant digits.
+    if extents.min() <= 1e-4 * extents.max():
         raise NerfroError(
             f"mesh {path} is {extents.min():g} world units thin and {extents.max():g} long, so it has no inside; "
             "export a solid"

@@ -7,9 +7,6 @@ from jaxtyping import Float
 
 from nerfro.geometry.mesh import TriangleMesh
 
-# Ratio of the largest to the smallest triangle around a vertex above which areas are the weights.
-_UNEVEN = 8.0
-
 # Edges with larger angles between their faces stay sharp, in degrees; 30 is a common default of modelling programs.
 CREASE_DEGREES = 30.0
 
@@ -46,7 +43,8 @@ def corner_normals(mesh: TriangleMesh) -> Float[np.ndarray, "F 3 3"]:
     second = order[np.repeat(starts[corner_vertex], group_sizes) + within]
     smooth = (flat[first // 3] * flat[second // 3]).sum(1) >= cosine
     group_areas = np.where(smooth, areas[second], areas[first])
-    uneven = np.maximum.reduceat(group_areas, group_starts) > _UNEVEN * np.minimum.reduceat(group_areas, group_starts)
+    # If the triangles around a vertex differ in size by more than this factor, areas are the weights.
+    uneven = np.maximum.reduceat(group_areas, group_starts) > 8.0 * np.minimum.reduceat(group_areas, group_starts)
     contribution = (np.where(uneven[first], areas[second], weights[second]) * smooth)[:, None] * flat[second // 3]
     sums = np.add.reduceat(contribution, group_starts)
     smoothed = np.where((sums != 0).any(-1, keepdims=True), unit(sums), np.repeat(flat, 3, 0)).reshape(-1, 3, 3)

@@ -7,7 +7,6 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-_NUM_LINES = 5  # per patch
 # A point of a triangle (barycentric coordinates) and a deviation from its normal, without symmetry, so that lines do
 # not pass through edges of regular meshes.
 _BARYCENTRIC, _DEVIATION = np.array([0.23, 0.31, 0.46]), np.array([0.07, 0.11, -0.05])
@@ -36,7 +35,8 @@ def inward_faces(vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarra
     centres, radii = (low + high) / 2, np.linalg.norm(high - low, axis=1) / 2
     for group in groups:
         votes = 0
-        for face in group[:_NUM_LINES][areas[group[:_NUM_LINES]] > 0]:
+        some = group[:5]
+        for face in some[areas[some] > 0]:
             line = crosses[face] / areas[face] + _DEVIATION
             point = _BARYCENTRIC @ triangles[face]
             distances = np.linalg.norm(np.cross(centres - point, line), axis=1) / np.linalg.norm(line)

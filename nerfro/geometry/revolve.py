@@ -8,8 +8,6 @@ from jaxtyping import Float
 
 from nerfro.geometry.mesh import TriangleMesh
 
-_SECTIONS = 160  # vertices around the axis
-
 
 def revolve(
     profile: Float[np.ndarray, "points 2"], foot: Float[np.ndarray, "3"], axis: Float[np.ndarray, "3"]
@@ -22,7 +20,7 @@ def revolve(
         axis: unit direction of the axis.
     """
     size = np.ptp(profile, axis=0).max()  # trimesh drops triangles with areas below 1e-8
-    body = trimesh.creation.revolve(profile / size, sections=_SECTIONS)
+    body = trimesh.creation.revolve(profile / size, sections=160)
     across = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
     across /= np.linalg.norm(across)
     vertices = size * body.vertices @ np.stack([across, np.cross(axis, across), axis]) + foot

@@ -15,8 +15,6 @@ from nerfro.geometry.normals import corner_normals
 from nerfro.geometry.occupancy import PLANES, occupancy_fraction, triangles_by_plane
 from nerfro.kernels.compilation import compiled, compiled_parallel
 
-_MIN_DEPTH = 0.01  # of a vertex inside the mesh, voxels
-
 
 def signed_distance_grid(
     mesh: TriangleMesh,
@@ -57,7 +55,7 @@ def signed_distance_grid(
     distance, height = _distance_to(triangles[shown], normals[shown], origin, spacing, resolution, reach)
     inside = occupancy_fraction(mesh, box, resolution, subsamples=1) > 0.5
     # Vertices on a flat mesh can count as inside.
-    require_inside(bool((inside & (distance > _MIN_DEPTH * spacing.min())).any()))
+    require_inside(bool((inside & (distance > 0.01 * spacing.min())).any()))
     if lid is not None:
         inside |= _distance_to(triangles[lid], normals[lid], origin, spacing, resolution, reach)[0] < distance
     return (np.where(inside, -distance, distance) - height).astype(np.float32)
@@ -76,8 +74,8 @@ def _distance_to(
     distance, height = (np.full((resolution,) * 3, value, np.float32) for value in (np.inf, 0.0))
     for first in track("distances", range(0, resolution, PLANES)):
         planes = slice(first, first + PLANES)
-        found = distance[planes], height[planes]
-        _narrow_band((triangles, normals), order, starts[first:], (origin, spacing), first, reach, found)
+        slices = distance[planes], height[planes]
+        _narrow_band((triangles, normals), order, starts[first:], (origin, spacing), first, reach, slices)
     # The surface point nearest to a vertex lies within half a voxel diagonal of a vertex in the band.
     half_diagonal = 0.5 * float(np.linalg.norm(spacing))
     far = distance_to_set(distance <= half_diagonal, spacing) - half_diagonal

@@ -36,18 +36,18 @@ _TILE, _COLUMNS = 220, 6  # width of a tile in pixels, tiles per row
 _OUTSIDE = (0.0, 0.0, 90.0)  # 8-bit colour that is added outside the mask
 
 
-def read_outlines(given: object) -> dict[str, list]:
+def read_outlines(source: object) -> dict[str, list]:
     """Read outlines by image name, each a box or a polygon, from a mapping or a JSON file."""
-    if OmegaConf.is_config(given):
-        given = OmegaConf.to_container(given)  # type: ignore[arg-type]
-    if isinstance(given, str):
-        given = read_json(user_path(given), "give a JSON file of outlines by name")
-    if given is None:
+    if OmegaConf.is_config(source):
+        source = OmegaConf.to_container(source)  # type: ignore[arg-type]
+    if isinstance(source, str):
+        source = read_json(user_path(source), "give a JSON file of outlines by name")
+    if source is None:
         return {}
-    if not isinstance(given, Mapping):
+    if not isinstance(source, Mapping):
         raise NerfroError("outlines= must be {NAME:[LEFT,TOP,RIGHT,BOTTOM]} or a JSON file with such a mapping")
     outlines = {}
-    for name, outline in given.items():
+    for name, outline in source.items():
         try:
             numbers = np.array(outline, np.float64)
         except (TypeError, ValueError):
@@ -77,8 +77,8 @@ def load_all(source: DataSource) -> tuple[Cameras, list[UInt8[np.ndarray, "H W 3
             views = source.load(split)
         if len(views.frames) != len(views):
             raise NerfroError("this data format does not provide image files; convert the data set to data=opencv")
-        known = {frame.image for frame in frames}
-        fresh = [i for i, frame in enumerate(views.frames) if frame.image not in known]
+        loaded = {frame.image for frame in frames}
+        fresh = [i for i, frame in enumerate(views.frames) if frame.image not in loaded]
         parts += [views.cameras.select(fresh)] if fresh else []  # a split without new images may have another size
         images += [np.uint8(np.rint(255 * views.images[i].numpy())) for i in fresh]
         frames += [views.frames[i] for i in fresh]
@@ -91,13 +91,13 @@ def load_all(source: DataSource) -> tuple[Cameras, list[UInt8[np.ndarray, "H W 3
 def find_frame(name: str, frames: list[Frame]) -> int:
     """Find a frame by its name in the data set, or by its file name with, without or before a change of extension."""
     stem = Path(name).stem if Path(name).suffix.lower() in PHOTOGRAPH_SUFFIXES else name
-    found = [i for i, frame in enumerate(frames) if frame.name == name]
-    found = found or [i for i, frame in enumerate(frames) if frame.image.name == name]
-    found = found or [i for i, frame in enumerate(frames) if frame.image.stem in (name, stem)]
-    if len(found) != 1:
-        problem = "is not an image of the data set" if not found else f"matches {len(found)} images of the data set"
+    matches = [i for i, frame in enumerate(frames) if frame.name == name]
+    matches = matches or [i for i, frame in enumerate(frames) if frame.image.name == name]
+    matches = matches or [i for i, frame in enumerate(frames) if frame.image.stem in (name, stem)]
+    if len(matches) != 1:
+        problem = "is not an image of the data set" if not matches else f"matches {len(matches)} images of the data set"
         raise NerfroError(f"outlines: {name} {problem}; names of the data set look like {frames[0].name}")
-    return found[0]
+    return matches[0]
 
 
 def check_start(frames: list[Frame], outlined: Collection[int], kept: Collection[int], hull_only: bool) -> None:
@@ -281,24 +281,24 @@ class MaskTask:
             return propagate(self.images, self.cameras, given, self.hull_only, progress)
         names = [frame.image.name for frame in self.frames]
         order = numeric_order(names) or sorted(range(len(names)), key=names.__getitem__)
-        place = {view: number for number, view in enumerate(order)}
+        rank = {view: number for number, view in enumerate(order)}
         images = [self.images[view] for view in order]
-        prompts = {place[view]: mask for view, mask in given.items()}
-        corners = {place[view]: box for view, box in boxes.items()}
+        prompts = {rank[view]: mask for view, mask in given.items()}
+        corners = {rank[view]: box for view, box in boxes.items()}
         tracked = track_object(self.tracker, images, prompts, corners, progress)
         return check_tracked(self.cameras, given, {order[number]: mask for number, mask in tracked.items()})
 
-    def save(self, outlines: Mapping[str, list], found: Segmentation) -> str:
+    def save(self, outlines: Mapping[str, list], segmentation: Segmentation) -> str:
         """Write all masks but the kept ones and a contact sheet, print a report, and return a message."""
         polygons = {find_frame(name, self.frames) for name, outline in outlines.items() if np.ndim(outline) == 2}
         made = [view for view in range(len(self.frames)) if view not in self.kept]
         for view in made:
             # Hull and segmentation agree on an empty mask if a photograph does not show the object.
-            by_hull = view in found.by_hull or not found.masks[view].any()
-            method = POLYGON if view in polygons else found.shape if by_hull else None
+            by_hull = view in segmentation.by_hull or not segmentation.masks[view].any()
+            method = POLYGON if view in polygons else segmentation.shape if by_hull else None
             method = TRACKED if method is None and self.tracker is not None else method
-            save_mask(self.frames[view], found.masks[view], method)
+            save_mask(self.frames[view], segmentation.masks[view], method)
         path = self.source.root / _SHEET
-        save_image(path, mask_sheet(self.images, self.frames, found))
-        report_masks(self.frames, found)
+        save_image(path, mask_sheet(self.images, self.frames, segmentation))
+        report_masks(self.frames, segmentation)
         return f"wrote {len(made)} masks beside their images (mask_*.png); check them in {path}"

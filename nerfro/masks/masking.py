@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -14,19 +14,34 @@ from skimage.draw import polygon2mask
 
 from nerfro.core.cameras import Cameras
 from nerfro.core.errors import NerfroError
+from nerfro.core.provenance import AlgorithmSettings
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.masks.outline_hull import AGREES, MAX_SIDE, MIN_VIEWS, OutlineHull
+from nerfro.masks.outline_hull import AGREES, MAX_SIDE, MIN_VIEWS, OutlineHull, OutlineHullSettings
 from nerfro.poses.opencv import opencv
 
-_ITERATIONS = 5
-# Margin around the region that provides the background colours of GrabCut, as a fraction of the longer side.
-_BACKGROUND_MARGIN = 0.4
-# Fractions of the diameter of a projected hull: how far the object may extend beyond, and depth of the certain core.
-_REACH, _CORE = 0.06, 0.2
-# Largest number of given masks at which a body of revolution and the methods of segmentation are compared.
-_FEW = 12
-# Number of mixture components per region in OpenCV's GrabCut.
-_NUM_COMPONENTS = 5
+_NUM_COMPONENTS = 5  # mixture components per region in OpenCV's GrabCut
+
+
+@dataclass(frozen=True)
+class SegmentationSettings(AlgorithmSettings):
+    """Settings of the segmentation by GrabCut (`propagate`).
+
+    Attributes:
+        iterations: number of iterations of GrabCut.
+        background_margin: margin around the region that provides the background colours, as a fraction of the longer
+            side.
+        reach: how far the object may extend beyond its projected hull, as a fraction of the hull's diameter.
+        core: depth of the certain core of the projected hull, as the same fraction.
+        few: largest number of given masks at which a body of revolution and the methods are compared.
+        hull: settings of the visual hull that guides the segmentation.
+    """
+
+    iterations: int = 5
+    background_margin: float = 0.4
+    reach: float = 0.06
+    core: float = 0.2
+    few: int = 12
+    hull: OutlineHullSettings = field(default=OutlineHullSettings(), repr=False)
 
 
 def grab_cut(
@@ -34,6 +49,7 @@ def grab_cut(
     likely: Bool[np.ndarray, "H W"],
     possible: Bool[np.ndarray, "H W"],
     certain: Bool[np.ndarray, "H W"] | None = None,
+    settings: SegmentationSettings = SegmentationSettings(),
 ) -> Bool[np.ndarray, "H W"]:
     """Segment an object in an sRGB image by the colours inside and outside (GrabCut, Rother et al., SIGGRAPH 2004).
 
@@ -42,6 +58,7 @@ def grab_cut(
         likely: pixels that probably show the object.
         possible: pixels that may show the object.
         certain: pixels that certainly show the object.
+        settings: number of iterations, and margin.
 
     Returns:
         Mask of the largest connected component, without holes; empty if no pixel remains.
@@ -51,7 +68,7 @@ def grab_cut(
     rows, columns = (np.flatnonzero(possible.any(axis)) for axis in (1, 0))
     if len(rows) == 0:
         return mask
-    margin = int(_BACKGROUND_MARGIN * max(np.ptp(rows), np.ptp(columns))) + 4
+    margin = int(settings.background_margin * max(np.ptp(rows), np.ptp(columns))) + 4
     window = tuple(slice(max(0, one[0] - margin), one[-1] + 1 + margin) for one in (rows, columns))
     height, width = likely[window].shape
     scale = min(1.0, MAX_SIDE / max(height, width))
@@ -72,9 +89,9 @@ def grab_cut(
     pixels = cv2.resize(np.ascontiguousarray(image[window]), small, interpolation=cv2.INTER_AREA)
     # GrabCut does not depend on the order of the channels.
     models = np.zeros((1, 65)), np.zeros((1, 65))
-    cv2.grabCut(pixels, labels, None, *models, _ITERATIONS, cv2.GC_INIT_WITH_MASK)
-    found = np.where(labels & 1, 1.0, 0.0).astype(np.float32)
-    enlarged = cv2.resize(cv2.GaussianBlur(found, (0, 0), 0.7), (width, height), interpolation=cv2.INTER_LINEAR)
+    cv2.grabCut(pixels, labels, None, *models, settings.iterations, cv2.GC_INIT_WITH_MASK)
+    segmented = np.where(labels & 1, 1.0, 0.0).astype(np.float32)
+    enlarged = cv2.resize(cv2.GaussianBlur(segmented, (0, 0), 0.7), (width, height), interpolation=cv2.INTER_LINEAR)
     mask[window] = enlarged > 0.5
     return _largest_component(mask & possible)
 
@@ -155,6 +172,7 @@ def propagate(
     given: Mapping[int, Bool[np.ndarray, "H W"]],
     hull_only: bool = False,
     progress: Callable[[], None] = lambda: None,
+    settings: SegmentationSettings = SegmentationSettings(),
 ) -> Segmentation:
     """Segment the object in all views, starting from given masks of one or more views.
 
@@ -173,22 +191,24 @@ def propagate(
         given: known masks by view.
         hull_only: do not use GrabCut; all missing masks are projections of the hull.
         progress: called once for each view without a given mask.
+        settings: settings of GrabCut and of the hull.
 
     Raises:
         NerfroError: too few views agree with the given masks.
     """
     wanted = [view for view in range(len(images)) if view not in given]
-    outlines = OutlineHull(cameras, given)
-    strategy = _choose_strategy(images, outlines, given, wanted, hull_only)
+    settings.use()
+    outlines = OutlineHull(cameras, given, settings.hull)
+    strategy = _choose_strategy(images, outlines, given, wanted, hull_only, settings)
     accepted, overlaps = {}, {}
     if strategy.uses_grab_cut:
         for view in wanted:
-            region, cut = _guided(images[view], outlines, view, strategy.surface)
+            region, cut = _guided(images[view], outlines, view, strategy.surface, settings)
             overlaps[view] = _overlap(cut, region)
             if overlaps[view] >= AGREES:
                 accepted[view] = cut
             progress()
-    surface = OutlineHull(cameras, {**given, **accepted}).hull() if accepted else strategy.surface
+    surface = OutlineHull(cameras, {**given, **accepted}, settings.hull).hull() if accepted else strategy.surface
     by_hull = [view for view in wanted if view not in accepted]
     projections = outlines.seen_from([*by_hull, *given], surface)
     masks = {**given, **accepted, **{view: projections[view] for view in by_hull}}
@@ -217,6 +237,7 @@ def _choose_strategy(
     given: Mapping[int, Bool[np.ndarray, "H W"]],
     wanted: Sequence[int],
     hull_only: bool,
+    settings: SegmentationSettings,
 ) -> _Strategy:
     """Choose between projections and GrabCut, and between a body of revolution and the visual hull (see `propagate`).
 
@@ -226,15 +247,16 @@ def _choose_strategy(
         given: known masks by view.
         wanted: views without a given mask.
         hull_only: do not use GrabCut.
+        settings: settings of GrabCut.
 
     Raises:
         NerfroError: too few views agree with the given masks.
     """
-    body = outlines.revolution() if wanted and 2 <= len(given) <= _FEW else None
+    body = outlines.revolution() if wanted and 2 <= len(given) <= settings.few else None
     if body is not None:
         return _Strategy(body, "body of revolution", uses_grab_cut=False)
     if not hull_only and len(given) < MIN_VIEWS:
-        _add_reference_views(images, outlines)
+        _add_reference_views(images, outlines, settings)
     if wanted and len(outlines) < MIN_VIEWS:
         if hull_only:
             raise NerfroError(
@@ -252,27 +274,34 @@ def _choose_strategy(
             "the visual hull of the given masks is empty; correct the masks or the poses, and check the format of the "
             "data set (data=), which determines the camera axes"
         )
-    are_few = MIN_VIEWS < len(given) <= _FEW
-    uses_grab_cut = not hull_only and not (are_few and _hull_predicts_better(images, outlines, given))
+    are_few = MIN_VIEWS < len(given) <= settings.few
+    uses_grab_cut = not hull_only and not (are_few and _hull_predicts_better(images, outlines, given, settings))
     return _Strategy(hull, "visual hull", uses_grab_cut)
 
 
 def _guided(
-    image: UInt8[np.ndarray, "H W 3"], outlines: OutlineHull, view: int, hull: TriangleMesh | None
+    image: UInt8[np.ndarray, "H W 3"],
+    outlines: OutlineHull,
+    view: int,
+    hull: TriangleMesh | None,
+    settings: SegmentationSettings,
 ) -> tuple[Bool[np.ndarray, "H W"], Bool[np.ndarray, "H W"]]:
     """Return the projection of the hull of all other views, and the mask of GrabCut that starts from the projection."""
     region = outlines.seen_from([view], outlines.hull(without=view) if view in outlines else hull)[view]
-    core = _distance(region) > _CORE * _diameter(region)
-    return region, grab_cut(image, region, _dilate(region, _REACH), core)
+    core = _distance(region) > settings.core * _diameter(region)
+    return region, grab_cut(image, region, _dilate(region, settings.reach), core, settings)
 
 
 def _hull_predicts_better(
-    images: Sequence[UInt8[np.ndarray, "H W 3"]], outlines: OutlineHull, given: Mapping[int, Bool[np.ndarray, "H W"]]
+    images: Sequence[UInt8[np.ndarray, "H W 3"]],
+    outlines: OutlineHull,
+    given: Mapping[int, Bool[np.ndarray, "H W"]],
+    settings: SegmentationSettings,
 ) -> bool:
     """Test whether the hull of the other given masks predicts each given mask better than GrabCut in the mean."""
     gains = []
     for view, mask in given.items():
-        region, cut = _guided(images[view], outlines, view, None)
+        region, cut = _guided(images[view], outlines, view, None, settings)
         gains.append(_overlap(region, mask) - _overlap(cut, mask))
     return float(np.mean(gains)) > 0
 
@@ -283,12 +312,15 @@ def _overlap(one: Bool[np.ndarray, "H W"], other: Bool[np.ndarray, "H W"]) -> fl
     return float((one & other).sum() / either) if either else 1.0
 
 
-def _add_reference_views(images: Sequence[UInt8[np.ndarray, "H W 3"]], outlines: OutlineHull) -> None:
+def _add_reference_views(
+    images: Sequence[UInt8[np.ndarray, "H W 3"]], outlines: OutlineHull, settings: SegmentationSettings
+) -> None:
     """Add views from new directions as long as all masks agree with their visual hull."""
     refused: list[int] = []
     while (view := outlines.next_view(refused)) is not None:
         region = outlines.seen_from([view], outlines.hull())[view]
-        if not outlines.add_if_agreed(view, grab_cut(images[view], region, _dilate(region, _REACH))):
+        mask = grab_cut(images[view], region, _dilate(region, settings.reach), settings=settings)
+        if not outlines.add_if_agreed(view, mask):
             refused.append(view)
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
 from nerfro.core.cameras import Cameras
+from nerfro.core.provenance import AlgorithmSettings
 from nerfro.geometry.lines import nearest_point
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.poses.opencv import opencv
@@ -23,18 +25,31 @@ MAX_SIDE = 480
 # Smallest intersection over union of a mask and a hull that agree.
 AGREES = 0.85
 MIN_VIEWS = 3
-_VOXELS = 80
-# Fraction of the views that may be wrong about any point.
-_WRONG_FRACTION = 0.1
-# Smallest angle, in degrees, between the directions of different views; and the angle within which all views look from
-# one side, so that the rays through the centroids of the masks do not determine the depth of the object.
-_MIN_VIEW_ANGLE, _ONE_SIDE = 25.0, 15.0
-# Smallest intersection over union of a body of revolution and each of its masks, which may be drawn by hand.
-_SYMMETRIC = 0.94
-# A view may reduce the overlap of the hull with any initial mask by at most so much, together with all added views.
-_MAX_LOSS = 0.03
-# Enlargement of the box if all views look from one side.
-_DEPTH_MARGIN = 1.6
+
+
+@dataclass(frozen=True)
+class OutlineHullSettings(AlgorithmSettings):
+    """Settings of the visual hull of a growing set of silhouettes (`OutlineHull`).
+
+    Attributes:
+        voxels: number of voxels along the longest side of the hull.
+        wrong_fraction: fraction of the views that may be wrong about any point.
+        min_view_angle: smallest angle in degrees between the directions of different views.
+        one_side: angle in degrees within which all views look from one side, so that the rays through the centroids of
+            the masks do not determine the depth of the object.
+        depth_margin: enlargement of the box if all views look from one side.
+        min_symmetric: smallest intersection over union of a body of revolution and each of its masks, which may be
+            drawn by hand.
+        max_loss: largest decrease of the overlap of the hull with any initial mask, by all added views together.
+    """
+
+    voxels: int = 80
+    wrong_fraction: float = 0.1
+    min_view_angle: float = 25.0
+    one_side: float = 15.0
+    depth_margin: float = 1.6
+    min_symmetric: float = 0.94
+    max_loss: float = 0.03
 
 
 class OutlineHull:
@@ -43,9 +58,17 @@ class OutlineHull:
     Args:
         cameras: cameras of all views.
         masks: initial masks by view.
+        settings: limits.
     """
 
-    def __init__(self, cameras: Cameras, masks: Mapping[int, Bool[np.ndarray, "H W"]]) -> None:
+    def __init__(
+        self,
+        cameras: Cameras,
+        masks: Mapping[int, Bool[np.ndarray, "H W"]],
+        settings: OutlineHullSettings = OutlineHullSettings(),
+    ) -> None:
+        settings.use()
+        self.settings = settings
         scale = max(1.0, max(cameras.width, cameras.height) / MAX_SIDE)
         self.size = cameras.width, cameras.height
         self.cameras = cameras.resized(round(cameras.width / scale), round(cameras.height / scale))
@@ -82,9 +105,9 @@ class OutlineHull:
         if view not in self:
             return False
         silhouettes = self._silhouettes()
-        agreement = coarse_agreement(silhouettes, int(_WRONG_FRACTION * len(silhouettes)))
+        agreement = coarse_agreement(silhouettes, int(self.settings.wrong_fraction * len(silhouettes)))
         agrees = agreement.min() >= GOOD_OVERLAP
-        if not agrees or (self._overlaps(self.hull()) < self._initial_overlaps - _MAX_LOSS).any():
+        if not agrees or (self._overlaps(self.hull()) < self._initial_overlaps - self.settings.max_loss).any():
             del self._outlines[view]
             self._hulls.clear()
         return view in self
@@ -98,7 +121,8 @@ class OutlineHull:
         # The hull of few views says less about the axis than the cameras and the centres of the masks do.
         silhouettes = self._silhouettes()
         body = fit_revolution(hull, silhouettes, axis=(nearest_point(*centre_lines(silhouettes)), up))
-        return body if body is not None and self._overlaps(body).min() >= _SYMMETRIC else None
+        fits = body is not None and self._overlaps(body).min() >= self.settings.min_symmetric
+        return body if fits else None
 
     def _overlaps(self, hull: TriangleMesh | None) -> Float[np.ndarray, "V"]:
         """Compute the intersection over union of the silhouette of a hull with each initial mask."""
@@ -111,10 +135,13 @@ class OutlineHull:
         """Compute the hull of all views, optionally without one; None if the hull is empty."""
         if without not in self._hulls:
             silhouettes = self._silhouettes(without)
-            wrong = int(_WRONG_FRACTION * len(silhouettes))
+            settings, wrong = self.settings, int(self.settings.wrong_fraction * len(silhouettes))
             centre = self._centre_from_one_side(silhouettes)
-            box = find_box(silhouettes, wrong) if centre is None else _box_around(centre, silhouettes)
-            self._hulls[without] = carve_mesh(silhouettes, box, _VOXELS, wrong)
+            if centre is None:
+                box = find_box(silhouettes, wrong)
+            else:
+                box = _box_around(centre, silhouettes, settings.depth_margin)
+            self._hulls[without] = carve_mesh(silhouettes, box, settings.voxels, wrong)
         return self._hulls[without]
 
     def seen_from(self, views: Sequence[int], hull: TriangleMesh | None) -> dict[int, Bool[np.ndarray, "H W"]]:
@@ -134,7 +161,7 @@ class OutlineHull:
         towards /= np.linalg.norm(towards, axis=1, keepdims=True)
         # Opposite views see the same outline, so the sign of a direction does not matter.
         cosines = np.abs(towards @ towards[[*self._outlines, *refused]].T).max(1)
-        candidates = np.flatnonzero(cosines <= np.cos(np.radians(_MIN_VIEW_ANGLE)))
+        candidates = np.flatnonzero(cosines <= np.cos(np.radians(self.settings.min_view_angle)))
         return int(candidates[cosines[candidates].argmax()]) if len(candidates) else None
 
     def _silhouettes(self, without: int | None = None) -> Silhouettes:
@@ -151,17 +178,17 @@ class OutlineHull:
         look at.
         """
         origins, directions = centre_lines(silhouettes)
-        if np.abs(directions @ directions.T).min() < np.cos(np.radians(_ONE_SIDE)):
+        if np.abs(directions @ directions.T).min() < np.cos(np.radians(self.settings.one_side)):
             return None
         poses = self.cameras.camera_to_world.double().numpy()
         offset = nearest_point(poses[:, :, 3], -poses[:, :, 2]) - origins[0]
         return origins[0] + max(float(offset @ directions[0]), 1e-3 * float(np.linalg.norm(offset))) * directions[0]
 
 
-def _box_around(centre: Float[np.ndarray, "3"], silhouettes: Silhouettes) -> Float[np.ndarray, "2 3"]:
+def _box_around(centre: Float[np.ndarray, "3"], silhouettes: Silhouettes, margin: float) -> Float[np.ndarray, "2 3"]:
     """Return a cube somewhat wider than the first mask, because the depth is uncertain."""
     cameras, inside = silhouettes.cameras, silhouettes.masks[0] > 0.5
     pixels = max(int(inside.any(axis).sum()) for axis in (0, 1))
     distance = float(np.linalg.norm(centre - cameras.camera_to_world[0, :, 3].double().numpy()))
-    half_side = _DEPTH_MARGIN * 0.5 * pixels * distance / float(cameras.fx[0])
+    half_side = margin * 0.5 * pixels * distance / float(cameras.fx[0])
     return np.stack([centre - half_side, centre + half_side])

@@ -23,8 +23,6 @@ from nerfro.masks.masking import Segmentation
 from nerfro.viewing.server import PageServer, open_page
 
 _TEMPLATE = Path(__file__).with_name("outlines.html.jinja")
-_MAX_SIDE = 960  # of a photograph on the page, pixels
-_TOLERANCE = 0.5  # largest distance, in pixels, between a mask and its outline on the page
 
 Outlines = dict[str, list]
 
@@ -79,17 +77,17 @@ class OutlinePage:
             self.outlines, self._found = outlines, None
         masks, notes = {}, {}
         try:
-            found = self._found = self._found or self.segment(self.outlines)
+            segmentation = self._found = self._found or self.segment(self.outlines)
         except NerfroError as error:
             if request["save"]:
                 raise
             message = str(error)
         else:
-            masks = {view: self._contours(view, mask) for view, mask in found.masks.items()}
-            notes = {view: f"given, overlap {overlap:.3f}" for view, overlap in found.agreement.items()}
-            message = f"{len(found.by_hull)} masks are projections of the {found.shape}"
+            masks = {view: self._contours(view, mask) for view, mask in segmentation.masks.items()}
+            notes = {view: f"given, overlap {overlap:.3f}" for view, overlap in segmentation.agreement.items()}
+            message = f"{len(segmentation.by_hull)} masks are projections of the {segmentation.shape}"
             if request["save"]:
-                message = self.save(self.outlines, found)
+                message = self.save(self.outlines, segmentation)
                 self._server.finish()
         return {"outlines": self.outlines, "masks": masks, "notes": notes, "message": message}
 
@@ -97,7 +95,7 @@ class OutlinePage:
         photographs = []
         for frame, image, (width, height) in zip(self.frames, self.images, self._sizes, strict=True):
             picture = Image.fromarray(image)
-            picture.thumbnail((_MAX_SIDE, _MAX_SIDE))
+            picture.thumbnail((960, 960))
             uri = data_uri(np.asarray(picture), "JPEG", quality=85)
             photographs.append({"name": frame.name, "width": width, "height": height, "image": uri})
         return photographs
@@ -106,7 +104,9 @@ class OutlinePage:
         """Convert a mask to polygons of (column, row) in pixels of the image file."""
         scale = np.divide(self._sizes[view], mask.shape[::-1])
         rings = [
-            approximate_polygon(ring, _TOLERANCE) for ring in find_contours(np.pad(mask, 1).astype(np.float32), 0.5)
+            # Vertices lie within half a pixel of the mask.
+            approximate_polygon(ring, 0.5)
+            for ring in find_contours(np.pad(mask, 1).astype(np.float32), 0.5)
         ]
         return [((ring[:, ::-1] - 0.5) * scale).round(1).tolist() for ring in rings]
 

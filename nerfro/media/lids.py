@@ -9,12 +9,11 @@ from nerfro.geometry.bodies import bodies_of
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.geometry.orientation import area_vectors
 
-# Triangles count as level if their normals are within 45 degrees of up.
-_LEVEL = np.cos(np.pi / 4)
-
 
 def find_lid(mesh: TriangleMesh, up: Float[np.ndarray, "3"]) -> Bool[np.ndarray, "F"]:
     """Find the lid of a mesh: the connected level triangles around the highest level triangle.
+
+    Triangles count as level if their normals are within 45 degrees of up.
 
     Args:
         mesh: outer surface of the vessel.
@@ -25,7 +24,7 @@ def find_lid(mesh: TriangleMesh, up: Float[np.ndarray, "3"]) -> Bool[np.ndarray,
     """
     triangles = mesh.triangles
     normals = area_vectors(triangles)
-    level = normals @ up > _LEVEL * np.linalg.norm(normals, axis=-1)
+    level = normals @ up > np.cos(np.pi / 4) * np.linalg.norm(normals, axis=-1)
     if not level.any():
         return level
     component = bodies_of(TriangleMesh(mesh.vertices, mesh.faces[level]))

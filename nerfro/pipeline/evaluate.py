@@ -12,7 +12,7 @@ from nerfro.core.paths import user_path
 from nerfro.data.image_files import Alpha
 from nerfro.evaluation.error_sheets import write_error_sheet
 from nerfro.evaluation.folders import match_folders
-from nerfro.evaluation.metrics import prepared_metrics
+from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.request import EvaluateConfig, find_device, own_folder, record, require_one_task
 from nerfro.evaluation.results import RunMetrics
 from nerfro.evaluation.scoring import score_folders
@@ -58,7 +58,7 @@ def _evaluate_checkpoint(options: EvaluateConfig, path: Path) -> RunMetrics:
     with own_folder(options, path.parent.parent / f"evaluate_{options.split}") as folder:
         scene = scene_of(checkpoint, trained, device)
         views = scene.views(options.split).checked()
-        metrics = prepared_metrics()
+        metrics = ImageMetrics()
         record(folder, options)
         result, treated = score_split(scene.renderer, views, metrics, folder, scene.subdivision, options.split)
         for index, view in enumerate(result.views):
@@ -88,7 +88,7 @@ def _evaluate_folder(options: EvaluateConfig, predictions: Path, references: Pat
         pair.load(alpha)
     device = find_device(options.device)
     with own_folder(options, predictions / "scores") as folder:
-        metrics = prepared_metrics()
+        metrics = ImageMetrics()
         record(folder, options)
         scores = RunMetrics(score_folders(pairs, alpha, metrics, folder, device))
         write_scores(scores, f"{predictions} against {references}", folder)

@@ -18,7 +18,7 @@ from nerfro.cli.calls import Composition, changed_settings, composed, options_of
 from nerfro.cli.overrides import as_overrides, is_given, not_given, of_groups
 from nerfro.core.errors import NerfroError, warn
 from nerfro.core.paths import resolve_path, user_path
-from nerfro.data.capture import Capture, mask_files
+from nerfro.data.capture import Capture
 from nerfro.data.lazy_images import decoded_once
 from nerfro.evaluation.results import EXPOSED, FULL, read_metrics_json
 from nerfro.files.folder_lock import lock_folder
@@ -87,7 +87,7 @@ def _calibrate(config: DictConfig, capture: Capture, out: Path) -> Capture:
             f"{len(photographs)} photographs do not determine poses and shape; take at least {_MIN_PHOTOGRAPHS}, "
             "better 60, from all sides"
         )
-    if not config.outlines and "view=true" not in shlex.split(config.mask) and not mask_files(out):
+    if not config.outlines and "view=true" not in shlex.split(config.mask) and not capture.masks:
         raise NerfroError(
             "the photographs have no masks; add mask='view=true' to draw the outline of the object in two to five "
             f"images in the browser, outlines={{{photographs[0].stem}:[[COLUMN,ROW],...],...}}, or masks=FOLDER"

@@ -21,9 +21,7 @@ from nerfro.files.atomic import atomic_file
 
 Family = Literal["tag36h11", "tagStandard41h12"]
 
-# Of printed pages: resolution, margin and largest width; lengths in metres.
-_DOTS_PER_METRE = 300 / 0.0254
-_MARGIN, _WIDEST = 0.008, 3.0
+_WIDEST = 3.0  # printed page, in metres
 
 
 class Layout(NamedTuple):
@@ -244,17 +242,17 @@ def print_sheets(sheets: list[Sheet], folder: Path) -> list[Path]:
         if width > _WIDEST:
             message = f"the board is {width:g} m wide, the limit is {_WIDEST:g} m; give size= in metres"
             raise NerfroError(message)
-        enlarged = max(1, round(width * _DOTS_PER_METRE / sheet.levels.shape[1]))
+        enlarged = max(1, round(width * (300 / 0.0254) / sheet.levels.shape[1]))
         levels = np.kron(sheet.levels, np.ones((enlarged, enlarged), np.uint8))
         per_metre = levels.shape[1] / width
         resolution = 0.0254 * per_metre
-        margin = round(_MARGIN * per_metre)
+        margin = round(0.008 * per_metre)
         page = Image.fromarray(np.pad(levels, margin, constant_values=255))
         caption = f"{sheet.title}; {1000 * width:.1f} mm wide: print at 100 % and measure"
         size = 0.45 * margin
         size *= min(1, levels.shape[1] / ImageFont.load_default(size).getlength(caption))
-        place = margin, page.height - margin / 2
-        ImageDraw.Draw(page).text(place, caption, 0, ImageFont.load_default(size), anchor="lm")
+        position = margin, page.height - margin / 2
+        ImageDraw.Draw(page).text(position, caption, 0, ImageFont.load_default(size), anchor="lm")
         pages.append(page.convert("1", dither=Image.Dither.NONE))  # a PDF of grey levels would be lossy
     files = [folder / "board.pdf", *(folder / f"board_{number:02d}.png" for number in range(len(pages)))]
     with atomic_file(files[0]) as stream:

@@ -20,15 +20,14 @@ from nerfro.poses.calibration import Calibration
 SPLITS = ("train", "val", "test")
 REPORT, PLOT = "calibration.json", "cameras.png"
 FILES = (*(f"transforms_{split}.json" for split in SPLITS), REPORT, PLOT)
-_MAX_POINTS = 4000  # in the plot
 
 
 def split_views(names: list[str], every: int) -> dict[str, list[str]]:
     """Split names into training, validation and test: every `every`-th name is for test, as many for validation."""
     splits: dict[str, list[str]] = {split: [] for split in SPLITS}
     for number, name in enumerate(sorted(names)):
-        place = number % every
-        splits["test" if place == 0 else "val" if place == every // 2 and every > 2 else "train"].append(name)
+        rank = number % every
+        splits["test" if rank == 0 else "val" if rank == every // 2 and every > 2 else "train"].append(name)
     return splits
 
 
@@ -131,7 +130,7 @@ def _plot_cameras(
 
     if len(points):
         low, high = np.quantile(points, (0.02, 0.98), axis=0)
-        points = points[((points >= low) & (points <= high)).all(1)][:: -(-len(points) // _MAX_POINTS)]
+        points = points[((points >= low) & (points <= high)).all(1)][:: -(-len(points) // 4000)]
     axes_shown = np.eye(3) if quads else _upright(up_direction(torch.from_numpy(-poses[:, :, 1])).numpy())
     cameras, points = np.einsum("ij,vjk->vik", axes_shown, poses), points @ axes_shown.T
     focus = nearest_point(cameras[:, :, 3], cameras[:, :, 2])

@@ -9,20 +9,32 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from nerfro.core.errors import NerfroError
+from nerfro.core.provenance import AlgorithmSettings
 from nerfro.poses.boards import TagDetections
 from nerfro.poses.opencv import opencv
 
 LensModel = Literal["pinhole", "radial", "opencv"]
 
-# A corner is an outlier (of a misread tag, or of a tag seen through the glass) if its error exceeds so many standard
-# deviations and so many pixels. The median of 2-D normal errors is 1.18 standard deviations.
-_OUTLIER_DEVIATIONS, _MIN_OUTLIER_ERROR = 5.0, 1.0
-_MAX_ESTIMATES = 10
-# Images with fewer tags are skipped; the paper's authors require twelve corners, four for each tag. Fewer images do
-# not determine the lens.
-_MIN_TAGS, _MIN_IMAGES = 3, 3
-# Initial focal length of the paper's authors, in units of the longer side of the image.
-_INITIAL_FOCAL = 1.2
+
+@dataclass(frozen=True)
+class TagSettings(AlgorithmSettings):
+    """Settings of the calibration by tags.
+
+    Attributes:
+        outlier_deviations, min_outlier_error: a corner is an outlier (of a misread tag, or of a tag seen through the
+            glass) if its error exceeds so many standard deviations and so many pixels.
+        max_estimates: largest number of estimates.
+        min_tags: images with fewer tags are skipped; the paper's authors require twelve corners, four for each tag.
+        min_images: smallest number of images, because fewer do not determine the lens.
+        initial_focal: initial focal length of the paper's authors, in units of the longer side of the image.
+    """
+
+    outlier_deviations: float = 5.0
+    min_outlier_error: float = 1.0
+    max_estimates: int = 10
+    min_tags: int = 3
+    min_images: int = 3
+    initial_focal: float = 1.2
 
 
 @dataclass(frozen=True)
@@ -102,44 +114,53 @@ class Calibration:
         return [*lines, lens + ("" if deviation is None else f"; standard deviation of fx {deviation:.2f}")]
 
 
-def calibrate_by_tags(detections: dict[str, TagDetections], size: tuple[int, int], model: LensModel) -> Calibration:
+def calibrate_by_tags(
+    detections: dict[str, TagDetections],
+    size: tuple[int, int],
+    model: LensModel,
+    settings: TagSettings = TagSettings(),
+) -> Calibration:
     """Minimize the reprojection error over all poses and the lens.
 
-    Estimation and removal of outliers alternate until no outliers remain, for at most ten estimates.
+    Estimation and removal of outliers alternate until no outliers remain.
 
     Args:
         detections: detected tags by image name.
         size: width and height of the images, in pixels.
         model: distortion coefficients to estimate.
+        settings: limits, and the initial focal length.
 
     Raises:
         NerfroError: too few images have enough tags, or the lens cannot be estimated.
     """
+    settings.use()
+    min_tags, min_images = settings.min_tags, settings.min_images
     skipped: dict[str, str] = {}
     num_outliers = dict.fromkeys(detections, 0)
     current = dict(detections)
-    for number in range(1, _MAX_ESTIMATES + 1):
-        kept = {name: each for name, each in current.items() if each.num_tags >= _MIN_TAGS}
-        for name, each in current.items():
+    for number in range(1, settings.max_estimates + 1):
+        kept = {name: tags for name, tags in current.items() if tags.num_tags >= min_tags}
+        for name, tags in current.items():
             if name not in kept:
                 removed = f" ({num_outliers[name]} points removed as outliers)" if num_outliers[name] else ""
-                skipped[name] = f"{each.num_tags} tags found, {_MIN_TAGS} needed{removed}"
-        if len(kept) < _MIN_IMAGES:
+                skipped[name] = f"{tags.num_tags} tags found, {min_tags} needed{removed}"
+        if len(kept) < min_images:
             raise NerfroError(
-                f"{len(kept)} of {len(detections)} images show at least {_MIN_TAGS} tags of the board, {_MIN_IMAGES} "
+                f"{len(kept)} of {len(detections)} images show at least {min_tags} tags of the board, {min_images} "
                 "are needed; check board=, and that the board is sharp and large enough in the images"
             )
-        intrinsics, extrinsics = _estimate(list(kept.values()), size, model)
+        intrinsics, extrinsics = _estimate(list(kept.values()), size, model, settings.initial_focal)
         located = dict(zip(kept, extrinsics, strict=True))
-        errors = {name: _errors(each, intrinsics, *located[name]) for name, each in kept.items()}
+        errors = {name: _errors(tags, intrinsics, *located[name]) for name, tags in kept.items()}
+        # The median of 2-D normal errors is 1.18 standard deviations.
         deviation = float(np.median(np.concatenate(list(errors.values())))) / 1.18
-        limit = max(_MIN_OUTLIER_ERROR, _OUTLIER_DEVIATIONS * deviation)
+        limit = max(settings.min_outlier_error, settings.outlier_deviations * deviation)
         outliers = {name: _outliers(kept[name], error, limit) for name, error in errors.items()}
-        if number == _MAX_ESTIMATES or not any(chosen.any() for chosen in outliers.values()):
+        if number == settings.max_estimates or not any(removed.any() for removed in outliers.values()):
             break
-        for name, chosen in outliers.items():
-            num_outliers[name] += int(chosen.sum())
-        current = {name: kept[name].select(~chosen) for name, chosen in outliers.items()}
+        for name, removed in outliers.items():
+            num_outliers[name] += int(removed.sum())
+        current = {name: kept[name].select(~removed) for name, removed in outliers.items()}
     poses = {}
     for name, (rotation, translation) in located.items():
         camera_axes = opencv().Rodrigues(rotation)[0].T
@@ -160,7 +181,7 @@ def _outliers(
 
 
 def _estimate(
-    detections: list[TagDetections], size: tuple[int, int], model: LensModel
+    detections: list[TagDetections], size: tuple[int, int], model: LensModel, initial_focal: float
 ) -> tuple[Intrinsics, list[tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]]]:
     """Estimate the lens, and for each image the rotation vector and translation from world to camera."""
     cv2 = opencv()
@@ -169,11 +190,11 @@ def _estimate(
         flags |= cv2.CALIB_ZERO_TANGENT_DIST
     if model == "pinhole":
         flags |= cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2
-    focal = _INITIAL_FOCAL * max(size)
+    focal = initial_focal * max(size)
     guess = np.array([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1]])
     _, matrix, distortion, rotations, translations, deviations, _, _ = cv2.calibrateCameraExtended(
-        [each.board_points.astype(np.float32) for each in detections],
-        [each.image_points.astype(np.float32) for each in detections],
+        [tags.board_points.astype(np.float32) for tags in detections],
+        [tags.image_points.astype(np.float32) for tags in detections],
         size,
         guess,
         np.zeros(5),

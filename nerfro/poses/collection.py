@@ -22,7 +22,6 @@ from nerfro.poses.calibrated_data import REPORT
 from nerfro.poses.photographs import HEIF_SUFFIXES, PHOTOGRAPH_SUFFIXES, one_of_each_pair, require_one_of_each_name
 from nerfro.poses.video import extract_frames
 
-_QUALITY = 95  # of converted photographs
 # EXIF data of 16-bit files that are kept; others describe the file.
 _KEPT_TAGS = (ExifTags.Base.Orientation, ExifTags.Base.Make, ExifTags.Base.Model)
 
@@ -62,28 +61,28 @@ def link_photographs(photographs: Path, masks: Path | None, out: Path) -> None:
     Raises:
         NerfroError: a folder does not exist or holds no photograph, or photographs differ only in their extension.
     """
-    given = one_of_each_pair(list_images(photographs, PHOTOGRAPH_SUFFIXES))
+    originals = one_of_each_pair(list_images(photographs, PHOTOGRAPH_SUFFIXES))
     if masks is not None and not masks.is_dir():
         raise NerfroError(f"masks={masks} is not a folder; give the folder of the masks of the photographs")
     is_calibrated = (out / REPORT).is_file()
     if not is_calibrated:
-        require_one_of_each_name(given)
+        require_one_of_each_name(originals)
     for link in (*out.glob("images/*"), *out.glob("masks/*")):
         if not link.exists():
             link.unlink()
     (out / "images").mkdir(parents=True, exist_ok=True)
     beside = (file for file in photographs.glob("mask_*") if file.suffix.lower() in IMAGE_SUFFIXES)
-    for file in track("linking", sorted([*given, *beside])):
+    for file in track("linking", sorted([*originals, *beside])):
         _place_photograph(file, out / "images", replaces=not is_calibrated)
     of_folder = [] if masks is None else [file for file in masks.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES]
     for file in track("linking", sorted(file for file in of_folder if not file.name.startswith("."))):
-        place = out / ("images" if file.name.startswith("mask_") else "masks")
-        place.mkdir(exist_ok=True)
+        target = out / ("images" if file.name.startswith("mask_") else "masks")
+        target.mkdir(exist_ok=True)
         # A converted photograph has another extension, so that of the photograph is left out.
         stem = Path(file.stem).stem if (photographs / file.stem).is_file() else file.stem
-        _link(place / f"{stem}{file.suffix}", file)
+        _link(target / f"{stem}{file.suffix}", file)
     if not is_calibrated:
-        _warn_of_others(given, out / "images")
+        _warn_of_others(originals, out / "images")
 
 
 def _warn_of_others(given: Sequence[Path], folder: Path) -> None:
@@ -128,8 +127,8 @@ def _place_photograph(file: Path, folder: Path, replaces: bool) -> None:
     if file.suffix.lower() in HEIF_SUFFIXES:
         pillow_heif = optional("pillow_heif", "capture", f"{file} needs pillow-heif", ", or give JPEG files")
         pillow_heif.register_heif_opener()
-    place, converted = folder / file.name, folder / f"{file.stem}.jpg"
-    for existing in (place, converted):
+    link, converted = folder / file.name, folder / f"{file.stem}.jpg"
+    for existing in (link, converted):
         if existing.exists() and not (replaces and _links_to_other(existing, file)):
             return
         existing.unlink(missing_ok=True)
@@ -137,9 +136,9 @@ def _place_photograph(file: Path, folder: Path, replaces: bool) -> None:
         if file.suffix.lower() in HEIF_SUFFIXES or orientation_of(image) in range(2, 9):
             upright = ImageOps.exif_transpose(_as_stored(file, image, bits)).convert("RGB")
             with atomic_file(converted) as output:
-                upright.save(output, "JPEG", quality=_QUALITY, exif=upright.getexif())
+                upright.save(output, "JPEG", quality=95, exif=upright.getexif())
             return
-    place.symlink_to(file.resolve())
+    link.symlink_to(file.resolve())
 
 
 def _as_stored(file: Path, image: Image.Image, bits: int) -> Image.Image:

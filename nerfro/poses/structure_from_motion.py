@@ -24,6 +24,7 @@ from nerfro.core.errors import NerfroError
 from nerfro.core.optional import optional
 from nerfro.core.paths import user_path
 from nerfro.core.progress import progress_bar, track
+from nerfro.core.provenance import AlgorithmSettings
 from nerfro.data.formats.colmap_model import MODEL_FOLDERS, find_model_folder, lens_of, read_colmap
 from nerfro.data.image_files import read_mask, to_unit
 from nerfro.data.lenses import Lens, check_lenses
@@ -35,23 +36,10 @@ Pairs = Literal["sequential", "all"]
 _MODELS = "models"  # temporary folder of new models
 # COLMAP's camera model for each of nerfro's lens models.
 _CAMERAS = {"pinhole": "PINHOLE", "radial": "RADIAL", "opencv": "OPENCV"}
-# Features within this distance of the object's outline also describe the object. Fraction of the image width.
-_MARGIN = 0.01
-_SEED, _ALL_THREADS = 0, -1
-# Sequential matching pairs each image with so many following ones, and with those 16, 32, 64, ... images later.
-_NUM_NEIGHBORS = 10
-# File names are a sequence if this fraction of the steps between their numbers is at most so many median steps.
-_LARGE_STEP, _MIN_REGULAR = 4, 0.9
-# Sequential matching is not trusted for groups of images whose links to other images have fewer points in common. On a
-# simulated tumbler, a link of 41 points was wrong; correct links of the other captures have 55 points or more.
-_MIN_COMMON_POINTS = 50
-_BYTES_PER_IMAGE = 2**22  # of COLMAP's database
-# COLMAP reports no progress, so the work is divided into chunks of images and of pairs.
-_IMAGES_PER_CHUNK, _PAIRS_PER_CHUNK = 4, 100
 
 
 @dataclass(frozen=True)
-class SfmSettings:
+class SfmSettings(AlgorithmSettings):
     """Settings of structure from motion.
 
     Attributes:
@@ -60,12 +48,22 @@ class SfmSettings:
             images whose pose is missing or uncertain with all images.
         threads: number of threads; None uses all cores.
         mask_labels: labels of the object in the masks, see `nerfro.data.image_files.read_mask`.
+        margin: features within this distance of the object's outline also describe the object; fraction of the image
+            width.
+        num_neighbors: sequential matching pairs each image with so many following ones, and with those 16, 32, 64, ...
+            images later.
+        min_common_points: sequential matching is not trusted for groups of images whose links to other images have
+            fewer points in common. On a simulated tumbler, a link of 41 points was wrong; correct links of the other
+            captures have 55 points or more.
     """
 
     lens: LensModel = "pinhole"
     pairs: Pairs | None = None
     threads: int | None = None
     mask_labels: Sequence[int] | None = None
+    margin: float = 0.01
+    num_neighbors: int = 10
+    min_common_points: int = 50
 
 
 def find_model(
@@ -75,10 +73,10 @@ def find_model(
     if model is not None:
         return user_path(model)
     folder = images[0].parent
-    found = find_model_folder(root / name for root in (folder.parent, folder) for name in MODEL_FOLDERS)
-    if found is not None:
-        print(f"using the COLMAP model {found} with its lens; move its files away to compute another model")
-        return found
+    existing = find_model_folder(root / name for root in (folder.parent, folder) for name in MODEL_FOLDERS)
+    if existing is not None:
+        print(f"using the COLMAP model {existing} with its lens; move its files away to compute another model")
+        return existing
     refuse_existing([out], overwrite)
     num_masks = sum(mask is not None for mask in masks)
     print(f"structure from motion of {len(images)} images, {num_masks} of them with a mask of the object")
@@ -106,22 +104,25 @@ def run_structure_from_motion(
         NerfroError: no image has a pose, or the disk is full.
     """
     pycolmap = require_pycolmap()
-    pycolmap.set_random_seed(_SEED)
+    settings.use()
+    pycolmap.set_random_seed(0)
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
-    names, threads = [image.name for image in images], settings.threads or _ALL_THREADS
+    names, threads = [image.name for image in images], settings.threads or -1
     with tempfile.TemporaryDirectory() as scratch:
-        require_room(Path(scratch), _BYTES_PER_IMAGE * len(images), "TMPDIR")  # COLMAP would abort the process
+        # The database has 4 MB per image, and COLMAP would abort the process.
+        require_room(Path(scratch), 2**22 * len(images), "TMPDIR")
         database = Path(scratch) / "database.db"
         _extract(pycolmap, images, masks, Path(scratch), settings, threads)
         order = numeric_order(names) if settings.pairs != "all" else None
         if settings.pairs == "sequential" and order is None:
             order = sorted(range(len(names)), key=names.__getitem__)
-        pairs = list(itertools.combinations(range(len(names)), 2)) if order is None else sequential_pairs(order)
+        all_pairs = list(itertools.combinations(range(len(names)), 2))
+        pairs = all_pairs if order is None else sequential_pairs(order, settings.num_neighbors)
         _match(pycolmap, database, [(names[i], names[j]) for i, j in pairs], threads)
         models = _map(pycolmap, database, images, threads)
-        if settings.pairs is None and order is not None and len(linked := _linked(models)) < len(images):
+        if settings.pairs is None and order is not None and len(linked := _linked(models, settings)) < len(images):
             print(f"{len(linked)} of {len(images)} images have a certain pose: matching the others with all images")
-            left = set(itertools.combinations(range(len(names)), 2)) - {(min(pair), max(pair)) for pair in pairs}
+            left = set(all_pairs) - {(min(pair), max(pair)) for pair in pairs}
             left = {pair for pair in left if not {names[pair[0]], names[pair[1]]} <= linked}
             _match(pycolmap, database, [(names[i], names[j]) for i, j in sorted(left)], threads)
             models = _map(pycolmap, database, images, threads)
@@ -148,21 +149,24 @@ def _copy_model(model: Path, folder: Path) -> Path:
 
 
 def numeric_order(names: Sequence[str]) -> list[int] | None:
-    """Return the order of numbered file names such as IMG_0007.jpg; None if the names are not a sequence."""
+    """Return the order of numbered file names such as IMG_0007.jpg; None if the names are not a sequence.
+
+    Names are a sequence if at least 90 % of the steps between their numbers are at most four median steps.
+    """
     parts = [re.fullmatch(r"(.*?)(\d+)\D*", name) for name in names]
     if any(part is None for part in parts) or len({part[1] for part in parts if part}) != 1:
         return None
     numbers = [int(part[2]) for part in parts if part]
     order = sorted(range(len(names)), key=numbers.__getitem__)
     steps = np.diff(np.array(numbers)[order])
-    if len(steps) == 0 or steps.min() < 1 or (steps <= _LARGE_STEP * np.median(steps)).mean() < _MIN_REGULAR:
+    if len(steps) == 0 or steps.min() < 1 or (steps <= 4 * np.median(steps)).mean() < 0.9:
         return None
     return order
 
 
-def sequential_pairs(order: Sequence[int]) -> list[tuple[int, int]]:
-    """Pair each image with the following ten, and with those 16, 32, 64, ... places later, which close loops."""
-    strides = [*range(1, _NUM_NEIGHBORS + 1), *(2**power for power in range(4, len(order).bit_length()))]
+def sequential_pairs(order: Sequence[int], num_neighbors: int = 10) -> list[tuple[int, int]]:
+    """Pair each image with the following ones, and with those 16, 32, 64, ... places later, which close loops."""
+    strides = [*range(1, num_neighbors + 1), *(2**power for power in range(4, len(order).bit_length()))]
     return [(order[i], order[i + stride]) for stride in strides for i in range(len(order) - stride)]
 
 
@@ -179,12 +183,12 @@ def _extract(
     masked.mkdir()
     for image, mask in zip(images, masks, strict=True):
         if mask is not None:
-            _write_ignored(mask, masked / f"{image.name}.png", settings.mask_labels)
+            _write_ignored(mask, masked / f"{image.name}.png", settings)
     reader, options = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
     reader.camera_model, options.num_threads = _CAMERAS[settings.lens], threads
     if any(mask is not None for mask in masks):
         reader.mask_path = masked
-    for chunk in _chunks([image.name for image in images], _IMAGES_PER_CHUNK, "finding features"):
+    for chunk in _chunks([image.name for image in images], 4, "finding features"):
         pycolmap.extract_features(
             scratch / "database.db",
             images[0].parent,
@@ -207,7 +211,7 @@ def _match(pycolmap: Any, database: Path, pairs: Sequence[tuple[str, str]], thre
     with closing(sqlite3.connect(database)) as connection, connection:
         numbers = dict(connection.execute("SELECT name, image_id FROM images"))
         connection.execute("UPDATE images SET name = image_id")
-    for chunk in _chunks(pairs, _PAIRS_PER_CHUNK, f"matching {len(pairs)} pairs"):
+    for chunk in _chunks(pairs, 100, f"matching {len(pairs)} pairs"):
         lines = [f"{numbers[one]} {numbers[other]}\n" for one, other in chunk]
         pairing.match_list_path.write_text("".join(lines), encoding="utf-8")
         pycolmap.match_image_pairs(database, matching_options=options, pairing_options=pairing)
@@ -219,7 +223,7 @@ def _map(pycolmap: Any, database: Path, images: Sequence[Path], threads: int) ->
     """Register the images one after the other and write models beside the database; returns the models by number."""
     options = pycolmap.IncrementalPipelineOptions()
     options.ba_refine_principal_point = False
-    options.random_seed, options.num_threads = _SEED, threads
+    options.random_seed, options.num_threads = 0, threads
     folder = database.with_name(_MODELS)
     folder.mkdir(exist_ok=True)
     with progress_bar("registering images", len(images)) as progress:
@@ -239,11 +243,12 @@ def _map(pycolmap: Any, database: Path, images: Sequence[Path], threads: int) ->
 
 
 def _chunks(items: Sequence[Any], size: int, description: str) -> Iterator[Sequence[Any]]:
+    """Divide work into chunks with a progress bar, because COLMAP reports no progress."""
     starts = range(0, len(items), size)
     return (items[start : start + size] for start in track(description, starts))
 
 
-def _linked(models: dict[int, Any]) -> set[str]:
+def _linked(models: dict[int, Any], settings: SfmSettings) -> set[str]:
     """Return the names of the images of the largest model that are linked by pairs with many points in common.
 
     Other images have no pose or may have a wrong one, which the reprojection error does not reveal.
@@ -256,14 +261,14 @@ def _linked(models: dict[int, Any]) -> set[str]:
     _, columns = np.unique(np.concatenate(points), return_inverse=True)
     rows = np.repeat(np.arange(len(images)), [len(some) for some in points])
     seen = csr_array((np.ones(len(rows)), (rows, columns)))
-    _, group = connected_components(seen @ seen.T >= _MIN_COMMON_POINTS)
+    _, group = connected_components(seen @ seen.T >= settings.min_common_points)
     return {image.name for image, number in zip(images, group, strict=True) if number == np.bincount(group).argmax()}
 
 
-def _write_ignored(mask: Path, file: Path, labels: Sequence[int] | None = None) -> None:
+def _write_ignored(mask: Path, file: Path, settings: SfmSettings) -> None:
     """Write a COLMAP mask, in which features at black pixels are ignored."""
-    inside: Float[np.ndarray, "H W"] = to_unit(read_mask(mask, labels)) > 0.5
-    margin = max(1, round(_MARGIN * inside.shape[1]))
+    inside: Float[np.ndarray, "H W"] = to_unit(read_mask(mask, settings.mask_labels)) > 0.5
+    margin = max(1, round(settings.margin * inside.shape[1]))
     Image.fromarray(np.where(binary_dilation(inside, iterations=margin), 0, 255).astype(np.uint8)).save(file)
 
 

@@ -16,10 +16,6 @@ from nerfro.core.progress import track
 from nerfro.files.atomic import write_atomically
 from nerfro.poses.opencv import opencv
 
-# Sharpness is measured on frames of at most so many pixels per side.
-_SHARPNESS_PIXELS = 480
-_QUALITY = 95  # of the JPEG files
-
 
 def extract_frames(video: Path, folder: Path, count: int) -> list[Path]:
     """Write the sharpest frame of each of `count` equal parts of a video as `frame_NNNNN.jpg`.
@@ -45,8 +41,8 @@ def extract_frames(video: Path, folder: Path, count: int) -> list[Path]:
             "or reduce frames="
         )
     edges = np.linspace(0, len(sharpness), count + 1).round().astype(int)
-    chosen = {int(first + sharpness[first:last].argmax()) for first, last in itertools.pairwise(edges)}
-    files = {number: folder / f"frame_{number:05d}.jpg" for number in sorted(chosen)}
+    sharpest = {int(first + sharpness[first:last].argmax()) for first, last in itertools.pairwise(edges)}
+    files = {number: folder / f"frame_{number:05d}.jpg" for number in sorted(sharpest)}
     folder.mkdir(parents=True, exist_ok=True)
     for file in folder.glob("frame_*.jpg"):
         if file not in files.values() or file.stat().st_mtime_ns < video.stat().st_mtime_ns:
@@ -54,7 +50,7 @@ def extract_frames(video: Path, folder: Path, count: int) -> list[Path]:
     waiting = {number for number, file in files.items() if not file.is_file()}
     for number, frame in enumerate(_frames(video) if waiting else ()):
         if number in waiting:
-            _, encoded = opencv().imencode(".jpg", frame, [opencv().IMWRITE_JPEG_QUALITY, _QUALITY])
+            _, encoded = opencv().imencode(".jpg", frame, [opencv().IMWRITE_JPEG_QUALITY, 95])
             write_atomically(files[number], encoded.tobytes())
             waiting.remove(number)
         if not waiting:
@@ -69,7 +65,8 @@ def _sharpness(video: Path) -> Float[np.ndarray, "F"]:
     total = int(max(0.0, capture.get(cv2.CAP_PROP_FRAME_COUNT)))
     capture.release()
     for frame in track("finding sharp frames", _frames(video), total=total or None):
-        scale = min(1.0, _SHARPNESS_PIXELS / max(frame.shape[:2]))
+        # Sharpness is measured on frames of at most 480 pixels per side.
+        scale = min(1.0, 480 / max(frame.shape[:2]))
         size = math.ceil(frame.shape[1] * scale), math.ceil(frame.shape[0] * scale)
         grey = cv2.cvtColor(cv2.resize(frame, size, interpolation=cv2.INTER_AREA), cv2.COLOR_BGR2GRAY)
         values.append(float(cv2.Laplacian(grey, cv2.CV_64F).var()))
@@ -91,8 +88,8 @@ def _frames(video: Path) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
     capture = _open(video)
     try:
         while True:
-            found, frame = capture.read()
-            if not found:
+            succeeded, frame = capture.read()
+            if not succeeded:
                 return
             yield frame
     finally:

@@ -14,7 +14,7 @@ from typing import Any, Literal
 from nerfro.cli.overrides import as_overrides, is_given, is_scene_file
 from nerfro.core.errors import NerfroError, warn
 from nerfro.core.paths import EMBEDDED_PREFIX, user_path
-from nerfro.core.provenance import command_line, versions
+from nerfro.core.provenance import AlgorithmSettings, command_line, versions
 from nerfro.files.atomic import write_atomically
 from nerfro.files.reading import read_json
 from nerfro.media.bodies import BodySettings
@@ -31,6 +31,7 @@ class Provenance:
     Attributes:
         command: command line of the writer.
         versions: versions of packages.
+        algorithms: settings of the algorithms that the command has used (see `provenance.AlgorithmSettings`).
         standard_error: standard error of the estimated index of each body, null for few views; empty for given indices.
         doubts: reasons for doubt about the indices; empty for reliable indices.
         unsupported: names of bodies that do not explain the pixels of the object better than straight rays.
@@ -38,6 +39,7 @@ class Provenance:
 
     command: str = ""
     versions: dict[str, str] = field(default_factory=dict)
+    algorithms: list[str] = field(default_factory=list)
     standard_error: list[float | None] = field(default_factory=list)
     doubts: list[str] = field(default_factory=list)
     unsupported: list[str] = field(default_factory=list)
@@ -123,8 +125,9 @@ class SceneFile:
         """Write the file, with the command of this process and the versions of packages."""
         folder = os.path.realpath(path.parent)
         scene = self._with_paths(lambda place: Path(os.path.relpath(os.path.realpath(user_path(place)), folder)))
-        known = {name: version for name, version in versions().items() if version is not None}
-        origin = replace(self.provenance, command=command_line(), versions=known)
+        installed = {name: version for name, version in versions().items() if version is not None}
+        algorithms = list(AlgorithmSettings.used.values())
+        origin = replace(self.provenance, command=command_line(), versions=installed, algorithms=algorithms)
         document = {name: value for name, value in vars(scene).items() if value not in (None, {}, [])}
         text = json.dumps(document | {"provenance": origin}, default=_given, indent=1)
         # Lists of numbers are on one line.

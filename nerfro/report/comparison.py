@@ -95,15 +95,15 @@ def find_metrics(names: Sequence[str] | None = None) -> dict[str, type[ImageMetr
     Raises:
         NerfroError: there is no name, or a name is unknown.
     """
-    known = image_metrics()
+    available = image_metrics()
     if names is None:
-        names = list(known)
+        names = list(available)
     if not names:
-        raise NerfroError(f"metrics: the list is empty; choose from {', '.join(known)}")
+        raise NerfroError(f"metrics: the list is empty; choose from {', '.join(available)}")
     for name in names:
-        if name not in known:
-            raise NerfroError(f"metrics: '{name}' is not a metric; choose from {', '.join(known)}")
-    return {name: known[name] for name in names}
+        if name not in available:
+            raise NerfroError(f"metrics: '{name}' is not a metric; choose from {', '.join(available)}")
+    return {name: available[name] for name in names}
 
 
 def _comparison(
@@ -114,11 +114,11 @@ def _comparison(
     cells: dict[tuple[str, EvaluationSet], tuple[EvaluatedRun, ...]] = {}
     notes = []
     for run in sorted(runs, key=lambda r: (r.seed, -r.evaluated_at)):
-        place = titles[run.folder], run.test_set
-        others = cells.get(place, ())
+        cell = titles[run.folder], run.test_set
+        others = cells.get(cell, ())
         newer = next((other for other in others if other.seed == run.seed), None)
         if newer is None:
-            cells[place] = (*others, run)
+            cells[cell] = (*others, run)
         else:
             notes.append(f"{shown(run.folder)} is omitted: {shown(newer.folder)} is a newer run with the same seed")
     commits = sorted({str(run.facts.get("commit"))[:7] for run in runs})

@@ -102,7 +102,7 @@ def _scenes(prefix: str, comparison: Comparison, selection: Selection) -> list[S
 
 
 def _run_origin(comparison: Comparison, run: EvaluatedRun) -> RunOrigin:
-    place = next(place for place, runs in comparison.cells.items() if run in runs)
+    cell = next(cell for cell, runs in comparison.cells.items() if run in runs)
     facts, metrics = run.facts, run.metrics
     commit = facts.get("commit") or "not a git checkout"
     texts: dict[str, Any] = {
@@ -112,9 +112,10 @@ def _run_origin(comparison: Comparison, run: EvaluatedRun) -> RunOrigin:
         "spent": _spent(metrics.steps, metrics.train_seconds, metrics.rays_per_second),
         "versions": ", ".join(f"{name} {version}" for name, version in facts["versions"].items() if version),
         "python": facts["python"],
+        "settings of algorithms": "; ".join(facts["algorithms"]) or "none",
     }
     config = OmegaConf.to_yaml(OmegaConf.create(json.loads(json.dumps(run.config))))
-    method, test_set = place
+    method, test_set = cell
     return RunOrigin(method, comparison.scenes[test_set], run.seed, shown(run.folder), texts, config)
 
 

@@ -30,6 +30,7 @@ _FACTS: dict[str, Any] = {
     **dict.fromkeys(("commit", "gpu"), (str, type(None))),
     "threads": int,
     "versions": dict,
+    "algorithms": list,
 }
 
 
@@ -149,8 +150,8 @@ def find_runs(places: Sequence[str]) -> tuple[list[EvaluatedRun], list[str]]:
                 f"runs: {place} does not exist; give run folders, folders that contain these, or glob patterns"
             )
         # A run of a sweep that failed early contains only the record of the failure.
-        found = (file for match in matches for name in ("run.json", CELL_FILE) for file in match.rglob(name))
-        folders |= {file.parent.resolve() for file in found}
+        records = (file for match in matches for name in ("run.json", CELL_FILE) for file in match.rglob(name))
+        folders |= {file.parent.resolve() for file in records}
     runs, unfinished = [], []
     for folder in sorted(folders):
         try:

@@ -23,7 +23,6 @@ from nerfro.report.runs import EvaluatedRun, EvaluationSet
 from nerfro.training.config import build_data
 
 PNG_SIDE = 256  # pixels; larger images are embedded as JPEG to limit the size of the page
-JPEG_QUALITY = 95
 
 
 @dataclass(frozen=True)
@@ -156,4 +155,4 @@ def embed_image(rgb: Float[Tensor, "H W 3"]) -> str:
     pixels = to_8bit(rgb).numpy()
     if max(pixels.shape[:2]) <= PNG_SIDE:
         return data_uri(pixels, "PNG", optimize=True)
-    return data_uri(pixels, "JPEG", quality=JPEG_QUALITY, subsampling=0)
+    return data_uri(pixels, "JPEG", quality=95, subsampling=0)

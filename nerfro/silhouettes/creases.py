@@ -3,31 +3,42 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 from scipy import sparse
 
+from nerfro.core.provenance import AlgorithmSettings
 from nerfro.geometry.normals import unit
 from nerfro.silhouettes.moving_mesh import MeshGeometry, MovingMesh, solve_symmetric
 from nerfro.silhouettes.rims import Rims
 
-# Number of smoothing rounds of the triangle normals, and angular width of the filter, in radians.
-_ROUNDS, _ANGULAR_WIDTH = 3, 0.35
-# Number of least-squares steps.
-STEPS = 12
 
-
-class Sides(NamedTuple):
+@dataclass(frozen=True)
+class Sides:
     """Weights of the prior on the sides between sharp edges, relative to one observation of the outline."""
 
     flat: float  # alignment of triangles with the filtered normals
     staying: float  # damping of the displacements
 
 
-# Chosen on a box and a cylinder, confirmed on a hexagonal prism.
-FACETS, CURVED = Sides(flat=1.0, staying=1e-5), Sides(flat=0.05, staying=1e-4)
+@dataclass(frozen=True)
+class CreaseSettings(AlgorithmSettings):
+    """Settings of sharp edges (`sharpened`), chosen on a box and a cylinder, confirmed on a hexagonal prism.
+
+    Attributes:
+        steps: number of least-squares steps.
+        rounds: number of smoothing rounds of the triangle normals.
+        angular_width: width of the filter of the normals, in radians.
+        facets, curved: priors of the two variants of a surface, for flat and for curved sides.
+    """
+
+    steps: int = 12
+    rounds: int = 3
+    angular_width: float = 0.35
+    facets: Sides = Sides(flat=1.0, staying=1e-5)
+    curved: Sides = Sides(flat=0.05, staying=1e-4)
 
 
 def has_creases(surface: MeshGeometry) -> bool:
@@ -42,6 +53,7 @@ def sharpened(
     rims_of: Callable[[Float[np.ndarray, "vertices 3"]], Rims],
     sides: Sides,
     step: Callable[[], None] = lambda: None,
+    settings: CreaseSettings = CreaseSettings(),
 ) -> Float[np.ndarray, "vertices 3"]:
     """Move vertices in all directions until sides are smooth, edges are sharp, and contours meet the masks.
 
@@ -57,21 +69,23 @@ def sharpened(
         mesh: triangles of the surface.
         rims_of: function that returns the contour points of a surface with given vertices.
         sides: weights of the prior.
-        step: called after each of `STEPS` steps.
+        step: called after each step.
+        settings: number of steps, and the filter of the normals.
 
     Returns:
         The new vertices.
     """
-    for _ in range(STEPS):
-        vertices = _solved(vertices, mesh, rims_of(vertices), sides)
+    settings.use()
+    for _ in range(settings.steps):
+        vertices = _solved(vertices, mesh, rims_of(vertices), sides, settings)
         step()
     return vertices
 
 
 def _solved(
-    vertices: Float[np.ndarray, "vertices 3"], mesh: MovingMesh, rims: Rims, sides: Sides
+    vertices: Float[np.ndarray, "vertices 3"], mesh: MovingMesh, rims: Rims, sides: Sides, settings: CreaseSettings
 ) -> Float[np.ndarray, "vertices 3"]:
-    direction, area = _filtered_normals(vertices, mesh)
+    direction, area = _filtered_normals(vertices, mesh, settings)
     weight = np.sqrt(np.repeat(area / area.mean(), 3))
     flat = _projected_differences(
         (mesh.faces.ravel(), np.roll(mesh.faces, -1, axis=1).ravel()),
@@ -93,7 +107,7 @@ def _solved(
 
 
 def _filtered_normals(
-    vertices: Float[np.ndarray, "vertices 3"], mesh: MovingMesh
+    vertices: Float[np.ndarray, "vertices 3"], mesh: MovingMesh, settings: CreaseSettings
 ) -> tuple[Float[np.ndarray, "F 3"], Float[np.ndarray, "F"]]:
     """Filter the triangle normals without smoothing across sharp edges (guided normal filtering, Zhang et al. 2015).
 
@@ -114,10 +128,10 @@ def _filtered_normals(
     squared_distance = ((middle[row] - middle[column]) ** 2).sum(1)
     squared_difference = ((guide[row] - guide[column]) ** 2).sum(1)
     variance = squared_distance[squared_distance > 0].mean()
-    weights = np.exp(-squared_distance / (2 * variance) - squared_difference / (2 * _ANGULAR_WIDTH**2))
+    weights = np.exp(-squared_distance / (2 * variance) - squared_difference / (2 * settings.angular_width**2))
     weights = area[column] * weights
     averaging, direction = sparse.csr_matrix((weights, (row, column)), touching.shape), unit(normals)
-    for _ in range(_ROUNDS):
+    for _ in range(settings.rounds):
         direction = unit(averaging @ direction)
     return direction, area
 

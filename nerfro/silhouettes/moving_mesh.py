@@ -14,8 +14,6 @@ from nerfro.geometry.normals import unit
 
 # Cosine of the smallest angle between the triangles at a crease, and between the normals on both sides beyond them.
 _CREASE = np.cos(np.radians(30))
-# Fraction of the tangential way to the centroid of the neighbours that vertices move in one step.
-_SPREADING = 0.5
 
 
 class MeshGeometry(NamedTuple):
@@ -59,7 +57,7 @@ class MovingMesh:
     def normals(self, vertices: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "vertices 3"]:
         """Compute unit vertex normals as area-weighted means over the adjacent triangles."""
         of_faces = self.face_normals(vertices)
-        sums = [np.bincount(self.faces.ravel(), np.repeat(each, 3), len(vertices)) for each in of_faces.T]
+        sums = [np.bincount(self.faces.ravel(), np.repeat(values, 3), len(vertices)) for values in of_faces.T]
         return unit(np.stack(sums, -1))
 
     def geometry(self, vertices: Float[np.ndarray, "vertices 3"]) -> MeshGeometry:
@@ -82,9 +80,9 @@ class MovingMesh:
         return float(np.sqrt(((ends[:, 0] - ends[:, 1]) ** 2).sum(1).mean()))
 
     def spread(self, vertices: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "vertices 3"]:
-        """Move vertices tangentially towards the centroid of their neighbours, which equalizes the triangles."""
+        """Move vertices tangentially by half the way to the centroid of their neighbours, to equalize the triangles."""
         normals, towards = self.normals(vertices), self.mean @ vertices - vertices
-        return vertices + _SPREADING * (towards - (towards * normals).sum(1, keepdims=True) * normals)
+        return vertices + 0.5 * (towards - (towards * normals).sum(1, keepdims=True) * normals)
 
 
 def solve_symmetric(system: sparse.spmatrix, right: Float[np.ndarray, " vectors"]) -> Float[np.ndarray, " vectors"]:

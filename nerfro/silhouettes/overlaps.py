@@ -21,8 +21,6 @@ from nerfro.silhouettes.silhouettes import mesh_silhouettes, pixel_stride
 from nerfro.silhouettes.visual_hull import Silhouettes
 
 SHEET, REPORT = "overlays.png", "overlaps.json"
-_MAX_VIEWS, _COLUMNS = 48, 8
-_WIDTH = 192  # width of a tile, in pixels
 _BOTH, _MASK_ONLY, _SURFACE_ONLY = (60, 190, 90), (235, 60, 45), (40, 110, 240)
 
 
@@ -60,8 +58,8 @@ def report_overlaps(
     print(f"  {overlaps.mean():.4f}  mean; {overlaps[worst]:.4f} lowest, {views.names[worst]}")
     _warn_of_bad(overlaps, views.names, silhouettes, wrong_masks)
     _draw_overlays(views, mesh, overlaps, folder)
-    each = dict(zip(views.names, (round(float(x), 4) for x in overlaps), strict=True))
-    figures = {"mean": round(float(overlaps.mean()), 4), "views": each}
+    by_view = dict(zip(views.names, (round(float(x), 4) for x in overlaps), strict=True))
+    figures = {"mean": round(float(overlaps.mean()), 4), "views": by_view}
     write_atomically(folder / REPORT, json.dumps(figures, indent=1) + "\n")
 
 
@@ -80,21 +78,21 @@ def _warn_of_bad(
 
 
 def _draw_overlays(views: Views, mesh: TriangleMesh, overlaps: Float[np.ndarray, "V"], folder: Path) -> None:
-    """Write a contact sheet of the views with the smallest overlap, the worst first.
+    """Write a contact sheet of the 48 views with the smallest overlap, the worst first.
 
     Green pixels belong to mask and silhouette, red ones to the mask alone, blue ones to the silhouette alone.
     """
     assert views.masks is not None
     stride = pixel_stride(views.cameras, OVERLAP_PIXELS)
-    chosen = np.argsort(overlaps, kind="stable")[:_MAX_VIEWS].tolist()
+    worst = np.argsort(overlaps, kind="stable")[:48].tolist()
     pictures, captions = [], []
-    cameras = views.cameras.select(chosen)
-    for view, ours in zip(chosen, mesh_silhouettes(mesh, cameras, stride), strict=True):
+    cameras = views.cameras.select(worst)
+    for view, ours in zip(worst, mesh_silhouettes(mesh, cameras, stride), strict=True):
         theirs = views.masks[view][::stride, ::stride] > 0.5
         pictures.append(_tinted(views.images[view][::stride, ::stride], ours, theirs))
         captions.append(f"{overlaps[view]:.3f}  {views.names[view]}")
-    legend = f"green: both, red: mask only, blue: surface only; worst {len(chosen)} of {len(views)} views"
-    save_image(folder / SHEET, sheet(pictures, captions, _WIDTH, _COLUMNS, legend))
+    legend = f"green: both, red: mask only, blue: surface only; worst {len(worst)} of {len(views)} views"
+    save_image(folder / SHEET, sheet(pictures, captions, 192, 8, legend))
 
 
 def _tinted(image: Tensor, ours: Tensor, theirs: Tensor) -> Tensor:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -10,19 +10,30 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.core.errors import NerfroError
+from nerfro.core.provenance import AlgorithmSettings
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.silhouettes.silhouettes import mesh_silhouettes, pixel_stride
 from nerfro.silhouettes.visual_hull import Silhouettes, carve_mesh, find_box
 
-# Resolution of the coarse hull: voxels per side, and maximum number of pixels per side of the masks.
-_COARSE_VOXELS, _COARSE_PIXELS = 48, 64
 # The silhouettes of a visual hull agree with its masks; a smaller overlap or agreement indicates an error in the input.
 GOOD_OVERLAP = 0.9
 OVERLAP_PIXELS = 256  # per side, for overlaps; larger masks are subsampled
-# Tolerance of the coarse hull at outlines, in pixels of the downscaled masks.
-_SLACK = 1.5
-# One wrong view is allowed per so many views; an agreement is better only if the gain exceeds the second number.
-_VIEWS_PER_WRONG, _MIN_GAIN = 6, 0.005
+
+
+@dataclass(frozen=True)
+class AgreementSettings(AlgorithmSettings):
+    """Settings of the comparison of masks with their coarse visual hull (`coarse_agreement`).
+
+    Attributes:
+        voxels: number of voxels per side of the hull.
+        pixels: largest number of pixels per side of the masks.
+        slack: tolerance at outlines, in pixels of the downscaled masks.
+    """
+
+    voxels: int = 48
+    pixels: int = 64
+    slack: float = 1.5
+
 
 # Alternative conventions of the poses in a file, with the correction of each, the most frequent mistakes first.
 # `_Turn` is applied to the camera axes (x right, y up, z back), after the inversion of the matrix if the flag is set.
@@ -50,19 +61,22 @@ def overlap(mesh: TriangleMesh, silhouettes: Silhouettes, max_pixels: int = OVER
     return torch.where(either > 0, both / either, 1.0).numpy()
 
 
-def coarse_agreement(silhouettes: Silhouettes, wrong_masks: int = 0) -> Float[np.ndarray, "V"]:
+def coarse_agreement(
+    silhouettes: Silhouettes, wrong_masks: int = 0, settings: AgreementSettings = AgreementSettings()
+) -> Float[np.ndarray, "V"]:
     """Compute the agreement of a coarse visual hull with each mask.
 
     The agreement is 1 minus the number of differing pixels that are not near the outline, relative to the area of the
     mask, clamped at 0. The agreement with an empty hull is 0.
     """
-    hull = carve_mesh(silhouettes, find_box(silhouettes, wrong_masks), _COARSE_VOXELS, wrong_masks)
+    settings.use()
+    hull = carve_mesh(silhouettes, find_box(silhouettes, wrong_masks), settings.voxels, wrong_masks)
     if hull is None:
         return np.zeros(len(silhouettes))
-    stride = pixel_stride(silhouettes.cameras, _COARSE_PIXELS)
+    stride = pixel_stride(silhouettes.cameras, settings.pixels)
     ours = mesh_silhouettes(hull, silhouettes.cameras, stride)
     outlines = silhouettes.distances[:, ::stride, ::stride]
-    differs = (ours != (outlines > 0)) & (outlines.abs() > _SLACK * stride)
+    differs = (ours != (outlines > 0)) & (outlines.abs() > settings.slack * stride)
     return (1 - differs.sum((1, 2)).double() / (outlines > 0).sum((1, 2)).clamp(min=1)).clamp(min=0).numpy()
 
 
@@ -72,23 +86,23 @@ def require_consistent_poses(silhouettes: Silhouettes, names: list[str], wrong_m
     Raises:
         NerfroError: it does not; the message names the misread pose convention or the inconsistent views, if found.
     """
-    found = float(np.median(coarse_agreement(silhouettes, wrong_masks)))
-    if found >= GOOD_OVERLAP:
+    agreement = float(np.median(coarse_agreement(silhouettes, wrong_masks)))
+    if agreement >= GOOD_OVERLAP:
         return
-    state = f"the visual hull agrees with the masks only to {found:.0%}"
-    state = "the visual hull is empty: no point lies inside all masks" if found == 0 else state
+    state = f"the visual hull agrees with the masks only to {agreement:.0%}"
+    state = "the visual hull is empty: no point lies inside all masks" if agreement == 0 else state
     scores = [float(np.median(coarse_agreement(_changed(silhouettes, i, t), wrong_masks))) for _, i, t in _ALTERNATIVES]
     # Symmetric objects agree equally well with several conventions; the first of the list is the most frequent mistake.
     best = next(i for i, score in enumerate(scores) if score >= max(scores) - 0.002)
-    if scores[best] > max(GOOD_OVERLAP, found):
+    if scores[best] > max(GOOD_OVERLAP, agreement):
         raise NerfroError(
             f"{state}; the poses use another convention: with {_ALTERNATIVES[best][0]} the agreement is "
             f"{scores[best]:.0%}; correct transform_matrix, or choose the matching data= format"
         )
     for allowed in _numbers_of_wrong_masks(len(names), wrong_masks):
-        each = coarse_agreement(silhouettes, allowed)
-        if np.median(each) >= GOOD_OVERLAP:
-            worst = [names[view] for view in np.argsort(each, kind="stable")[:allowed]]
+        agreements = coarse_agreement(silhouettes, allowed)
+        if np.median(agreements) >= GOOD_OVERLAP:
+            worst = [names[view] for view in np.argsort(agreements, kind="stable")[:allowed]]
             raise NerfroError(
                 f"{state}, but agrees if {allowed} views may be wrong; check the masks and poses of "
                 f"{', '.join(worst)}, and correct these views or set wrong_masks={allowed}"
@@ -100,16 +114,17 @@ def require_consistent_poses(silhouettes: Silhouettes, names: list[str], wrong_m
 
 
 def better_wrong_masks(silhouettes: Silhouettes, wrong_masks: int) -> int | None:
-    """Find the number of wrong views for which a coarse hull agrees best; None if no number is better."""
+    """Find the number of wrong views for which a coarse hull agrees best; None if no number is better by 0.005."""
+    min_gain = 0.005
     tried = [wrong_masks, *_numbers_of_wrong_masks(len(silhouettes), wrong_masks)]
     agreements = [float(coarse_agreement(silhouettes, allowed).mean()) for allowed in tried]
-    best = next(i for i, agreement in enumerate(agreements) if agreement >= max(agreements) - _MIN_GAIN)
-    return tried[best] if agreements[best] > agreements[0] + _MIN_GAIN else None
+    best = next(i for i, agreement in enumerate(agreements) if agreement >= max(agreements) - min_gain)
+    return tried[best] if agreements[best] > agreements[0] + min_gain else None
 
 
 def _numbers_of_wrong_masks(num_views: int, more_than: int) -> list[int]:
     """Return candidates 1, 2, 4, ... up to the largest number of wrong views that the other views outvote."""
-    most = max(1, num_views // _VIEWS_PER_WRONG)
+    most = max(1, num_views // 6)
     return [number for number in sorted({2**power for power in range(8)} | {most}) if more_than < number <= most]
 
 

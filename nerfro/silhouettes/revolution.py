@@ -15,6 +15,7 @@ from torch.func import jacfwd
 from torch.nn import functional
 from torch.nn.functional import normalize
 
+from nerfro.core.provenance import AlgorithmSettings
 from nerfro.core.robust import geman_mcclure_weight
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.geometry.revolve import revolve
@@ -23,28 +24,59 @@ from nerfro.silhouettes.visual_hull import Silhouettes
 
 Symmetry = Literal["axis", "auto"]
 
-_KNOTS = 72  # radii along the axis
-# Quantile of the distances of vertices from the axis that gives the initial radius at a height: vertices on end faces
-# lie nearer to the axis than the outline, and corners of the hull of few views lie farther away.
-_OUTER_QUANTILE, _INNER_QUANTILE = 0.8, 0.1
-_END = 4  # knots at each end whose initial radii are extrapolated, because the visual hull is inaccurate there
-# Samples per mask: points on the outline, and pixels inside and outside at distances in this range, in pixels.
-_OUTLINE_POINTS, _SIDE_POINTS, _NEAR, _FAR = 100, 40, 3.0, 40.0
-# Iterations, and scale of the Geman-McClure loss in pixels (distance at which the weight is 1/4), first and last.
-_ITERATIONS, _ROBUST_SCALE = 24, (8.0, 1.0)
-# Weight of bending relative to pixels; longest step and smallest radius, as fractions of the height.
-_BENDING, _MAX_STEP, _MIN_RADIUS = 2.0, 0.03, 1e-3
-_EDGE = 0.5  # radius of the rounded edges, in pixels
-# Weight of the height relative to the observations: no camera sees a low roof on the top or a cone below the foot.
-_FLAT = 0.003
-_END_BENDING = 10.0  # factor of bending at the ends, where the masks show only thin slices
-# Bending at which its weight is one quarter, as a fraction of the height: objects have few, sharp corners.
-_CORNER = 0.002
-# A cone below the foot is cut if its slope exceeds this fraction of the slope that no camera sees as an outline, and if
-# the slope decreases by at least this factor at the edge of the foot.
-_HIDDEN_SLOPE, _EDGE_RATIO = 0.4, 0.6
-# Number of samples along a ray, of samples in each refinement, and width in pixels of the ignored image border.
-_PLACES, _CLOSER, _BORDER = 48, 12, 2
+
+@dataclass(frozen=True)
+class RevolutionSettings(AlgorithmSettings):
+    """Settings of the fit of a body of revolution (`fit_revolution`).
+
+    Attributes:
+        knots: number of radii along the axis.
+        outer_quantile: quantile of the distances of vertices from the axis that gives the initial radius at a height:
+            vertices on end faces lie nearer to the axis than the outline, and corners of the hull farther away.
+        inner_quantile: the same for a given axis, because the hull of few views is much wider than the object.
+        end_knots: knots at each end whose initial radii are extrapolated, because the hull is inaccurate there.
+        outline_points, side_points: samples per mask on the outline, and on each side of it.
+        near, far: smallest distance of the samples on both sides, and largest distance outside, in pixels.
+        iterations: number of Gauss-Newton steps.
+        robust_scale: first and last scale of the Geman-McClure loss in pixels: distance at which the weight is 1/4.
+        bending: weight of bending relative to pixels.
+        end_bending: factor of bending at the ends, where the masks show only thin slices.
+        corner: bending at which its weight is one quarter, as a fraction of the height: objects have few, sharp
+            corners.
+        flatness: weight of the height relative to the observations: no camera sees a low roof on the top or a cone
+            below the foot.
+        max_step: longest step, as a fraction of the height.
+        min_radius: smallest radius, as a fraction of the height.
+        edge: radius of the rounded edges, in pixels.
+        hidden_slope: a cone below the foot is cut if its slope exceeds this fraction of the slope that no camera sees
+            as an outline.
+        edge_ratio: smallest factor by which the slope then decreases at the edge of the foot.
+        ray_samples, closer_samples: number of samples along a ray, and of samples in each of two refinements.
+        border: width of the ignored image border, in pixels.
+    """
+
+    knots: int = 72
+    outer_quantile: float = 0.8
+    inner_quantile: float = 0.1
+    end_knots: int = 4
+    outline_points: int = 100
+    side_points: int = 40
+    near: float = 3.0
+    far: float = 40.0
+    iterations: int = 24
+    robust_scale: tuple[float, float] = (8.0, 1.0)
+    bending: float = 2.0
+    end_bending: float = 10.0
+    corner: float = 0.002
+    flatness: float = 0.003
+    max_step: float = 0.03
+    min_radius: float = 1e-3
+    edge: float = 0.5
+    hidden_slope: float = 0.4
+    edge_ratio: float = 0.6
+    ray_samples: int = 48
+    closer_samples: int = 12
+    border: int = 2
 
 
 @dataclass(frozen=True)
@@ -75,11 +107,11 @@ class Profile:
         """Compute an approximate signed distance, negative inside; exactly zero on the surface except at its edges."""
         radius, along = self.in_plane(points)
         step = self.height / (len(self.radii) - 1)
-        place = (along / step).clamp(0, len(self.radii) - 1.001)
-        low = place.floor().long()
+        knot = (along / step).clamp(0, len(self.radii) - 1.001)
+        low = knot.floor().long()
         first, second = self.radii[low], self.radii[low + 1]
         slope = ((second - first) / step).detach()
-        side = (radius - torch.lerp(first, second, place - low)) / (1 + slope.square()).sqrt()
+        side = (radius - torch.lerp(first, second, knot - low)) / (1 + slope.square()).sqrt()
         # At rounded edges, the minimum along a ray depends on both adjacent surfaces, which gives useful gradients.
         return self.edge * torch.logsumexp(torch.stack([side, -along, along - self.height]) / self.edge, 0)
 
@@ -96,6 +128,7 @@ def fit_revolution(
     silhouettes: Silhouettes,
     progress: Callable[[float], None] = lambda done: None,
     axis: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]] | None = None,
+    settings: RevolutionSettings = RevolutionSettings(),
 ) -> TriangleMesh | None:
     """Fit a body of revolution to the outlines of the masks.
 
@@ -110,14 +143,19 @@ def fit_revolution(
         axis: a point on the initial axis and the unit direction of the axis; None takes the axis around which the
             initial surface is most circular. With a given axis, the initial radii are those of the largest body of
             revolution inside the initial surface, because the visual hull of few views is much wider than the object.
+        settings: samples, weights and limits.
 
     Returns:
         The fitted body; None if the initial surface has no axis.
     """
-    start = _initial_profile(mesh) if axis is None else _profile_around(mesh, *axis, _INNER_QUANTILE)[1]
+    settings.use()
+    if axis is None:
+        start = _initial_profile(mesh, settings)
+    else:
+        start = _profile_around(mesh, *axis, settings.inner_quantile, settings)[1]
     if start is None:
         return None
-    origins, directions, width, side = _rays(silhouettes)
+    origins, directions, width, side = _rays(silhouettes, settings)
     middle, size = start.foot + 0.5 * start.height * start.axis, start.height
     if ((origins - middle) @ start.axis).mean() < 0:  # the axis points towards the cameras
         start = Profile(start.foot + size * start.axis, -start.axis, size, start.radii.flip(0))
@@ -129,58 +167,61 @@ def fit_revolution(
     def body(numbers: Tensor) -> Profile:
         axis = normalize(start.axis + numbers[2:4] @ across, dim=0)
         foot = middle + size * (numbers[:2] @ across + numbers[4] * axis)
-        height, radii = size * (numbers[5] - numbers[4]), size * numbers[6:].clamp(min=_MIN_RADIUS)
-        return Profile(foot, axis, height, radii, _EDGE * float(size) / pixels)
+        height, radii = size * (numbers[5] - numbers[4]), size * numbers[6:].clamp(min=settings.min_radius)
+        return Profile(foot, axis, height, radii, settings.edge * float(size) / pixels)
 
     def misfits(numbers: Tensor) -> Tensor:
-        apart = body(numbers).distance(origins + place[:, None] * directions) / (width * place)
+        apart = body(numbers).distance(origins + lengths[:, None] * directions) / (width * lengths)
         return torch.where(side * apart > 0, 0.0, apart)
 
     numbers = torch.cat([torch.zeros(4), torch.tensor([-0.5, 0.5]), start.radii / size])
-    bends = functional.pad(torch.eye(_KNOTS).diff(n=2, dim=0), (6, 0))
-    bends[:_END] *= _END_BENDING
-    bends[-_END:] *= _END_BENDING
-    for iteration in range(_ITERATIONS):
-        done = min(1.0, iteration / (_ITERATIONS - 6))
-        scale = _ROBUST_SCALE[0] * (_ROBUST_SCALE[1] / _ROBUST_SCALE[0]) ** done
-        place = _nearest_place(body(numbers), origins, directions)
+    knots, end = settings.knots, settings.end_knots
+    bends = functional.pad(torch.eye(knots).diff(n=2, dim=0), (6, 0))
+    bends[:end] *= settings.end_bending
+    bends[-end:] *= settings.end_bending
+    first_scale, last_scale = settings.robust_scale
+    for iteration in range(settings.iterations):
+        done = min(1.0, iteration / (settings.iterations - 6))
+        scale = first_scale * (last_scale / first_scale) ** done
+        lengths = _nearest_lengths(body(numbers), origins, directions, settings)
         misfit, slopes = misfits(numbers).double(), jacfwd(misfits)(numbers).double()
         weight = geman_mcclure_weight(misfit[:, None], scale)
-        smooth = 1 / (1 + (bends @ numbers / _CORNER).square()).square()  # corners have little weight
-        smooth[-_END:] = 1  # the upper end would flare
-        stiff = (_BENDING * pixels) ** 2 * len(misfit) / _KNOTS * (bends.T @ (smooth[:, None] * bends)).double()
+        smooth = 1 / (1 + (bends @ numbers / settings.corner).square()).square()  # corners have little weight
+        smooth[-end:] = 1  # the upper end would flare
+        stiff = (settings.bending * pixels) ** 2 * len(misfit) / knots * (bends.T @ (smooth[:, None] * bends)).double()
         system = slopes.T @ (weight[:, None] * slopes) + stiff
         right = slopes.T @ (weight * misfit) + stiff @ numbers.double()
-        right[4:6] += _FLAT * len(misfit) * pixels * torch.tensor([-1.0, 1.0])
+        right[4:6] += settings.flatness * len(misfit) * pixels * torch.tensor([-1.0, 1.0])
         damping = 1e-3 * system.diagonal().mean() * torch.eye(len(numbers)).double()
         step = torch.linalg.solve(system + damping, right)
-        numbers = numbers - (step * (_MAX_STEP / step.abs().max()).clamp(max=1)).float()
-        progress((iteration + 1) / _ITERATIONS)
-    return _without_hidden_cone(body(numbers), least_sine).mesh()
+        numbers = numbers - (step * (settings.max_step / step.abs().max()).clamp(max=1)).float()
+        progress((iteration + 1) / settings.iterations)
+    return _without_hidden_cone(body(numbers), least_sine, settings).mesh()
 
 
-def _without_hidden_cone(body: Profile, least_sine: float) -> Profile:
+def _without_hidden_cone(body: Profile, least_sine: float, settings: RevolutionSettings) -> Profile:
     """Cut the part below a sharp edge of the foot that hardly a camera sees as an outline, such as a flat cone.
 
     Args:
         body: fitted body.
         least_sine: sine of the smallest angle between the lines of sight and the plane of the foot.
+        settings: limits of the slopes.
     """
     if least_sine <= 0:
         return body
     step = body.height / (len(body.radii) - 1)
     slopes = body.radii.diff()[: len(body.radii) // 3] / step
-    hidden = slopes[:-1] > _HIDDEN_SLOPE * (1 / least_sine**2 - 1) ** 0.5
-    edges = (hidden & (slopes[1:] < _EDGE_RATIO * slopes[:-1])).nonzero()
+    hidden = slopes[:-1] > settings.hidden_slope * (1 / least_sine**2 - 1) ** 0.5
+    edges = (hidden & (slopes[1:] < settings.edge_ratio * slopes[:-1])).nonzero()
     first = int(edges.max()) + 1 if len(edges) else 0
     foot, height = body.foot + first * step * body.axis, body.height - first * step
     return Profile(foot, body.axis, height, body.radii[first:], body.edge)
 
 
-def _initial_profile(mesh: TriangleMesh) -> Profile | None:
+def _initial_profile(mesh: TriangleMesh, settings: RevolutionSettings) -> Profile | None:
     """Choose the axis near a principal axis around which the mesh is most circular; None without an axis."""
     vertices = mesh.vertices
-    found: list[tuple[float, Profile]] = []
+    profiles: list[tuple[float, Profile]] = []
     for near in np.linalg.eigh(np.cov(vertices.T))[1].T:
         axis = body_axis(mesh, near)
         if axis is None:
@@ -189,12 +230,16 @@ def _initial_profile(mesh: TriangleMesh) -> Profile | None:
         for _ in range(2):  # centre the mesh perpendicular to the axis
             across = vertices - middle - ((vertices - middle) @ axis)[:, None] * axis
             middle = middle + across.mean(0)
-        found.append(_profile_around(mesh, middle, axis, _OUTER_QUANTILE))
-    return min(found, key=lambda each: each[0])[1] if found else None
+        profiles.append(_profile_around(mesh, middle, axis, settings.outer_quantile, settings))
+    return min(profiles, key=lambda profile: profile[0])[1] if profiles else None
 
 
 def _profile_around(
-    mesh: TriangleMesh, middle: Float[np.ndarray, "3"], axis: Float[np.ndarray, "3"], quantile: float
+    mesh: TriangleMesh,
+    middle: Float[np.ndarray, "3"],
+    axis: Float[np.ndarray, "3"],
+    quantile: float,
+    settings: RevolutionSettings,
 ) -> tuple[float, Profile]:
     """Measure the radii of a mesh around an axis.
 
@@ -203,27 +248,26 @@ def _profile_around(
         middle: point on the axis.
         axis: unit direction.
         quantile: quantile of the distances of vertices from the axis at each height.
+        settings: number of radii, and of those that are extrapolated.
 
     Returns:
         Mean deviation from a body of revolution, relative to the mean radius, and the body.
     """
+    knots, end = settings.knots, settings.end_knots
     offset = mesh.vertices - middle
     along = offset @ axis
     radius, low, high = np.linalg.norm(offset - along[:, None] * axis, axis=1), along.min(), along.max()
-    number = ((along - low) / (high - low) * (_KNOTS - 1)).round().astype(np.int64)
-    radii = np.array(
-        [np.quantile(radius[number == k], quantile) if (number == k).any() else np.nan for k in range(_KNOTS)]
-    )
-    known = np.isfinite(radii)
-    radii = np.interp(np.arange(_KNOTS), np.flatnonzero(known), radii[known])
-    radii[:_END], radii[-_END:] = radii[_END], radii[-_END - 1]
-    spread = np.abs(radius - radii[number])[(number > _END) & (number < _KNOTS - _END)].mean() / radii.mean()
+    number = ((along - low) / (high - low) * (knots - 1)).round().astype(np.int64)
+    filled = np.unique(number)
+    radii = np.interp(np.arange(knots), filled, [np.quantile(radius[number == knot], quantile) for knot in filled])
+    radii[:end], radii[-end:] = radii[end], radii[-end - 1]
+    spread = np.abs(radius - radii[number])[(number > end) & (number < knots - end)].mean() / radii.mean()
     foot, direction, outline = (torch.from_numpy(part).float() for part in (middle + low * axis, axis, radii))
     return float(spread), Profile(foot, direction, torch.tensor(float(high - low)), outline)
 
 
 def _rays(
-    silhouettes: Silhouettes,
+    silhouettes: Silhouettes, settings: RevolutionSettings
 ) -> tuple[Float[Tensor, "points 3"], Float[Tensor, "points 3"], Float[Tensor, " points"], Float[Tensor, " points"]]:
     """Sample rays on the outlines of the masks and on both sides.
 
@@ -232,42 +276,44 @@ def _rays(
         inside.
     """
     cameras, random = silhouettes.cameras, np.random.default_rng(0)
-    views, places, sides = [], [], []
+    views, pixels, sides = [], [], []
     for view, distance in enumerate(silhouettes.distances.numpy()):
-        outside = np.argwhere((distance < -_NEAR) & (distance > -_FAR)).astype(np.float32)
-        inside = np.argwhere(distance > _NEAR).astype(np.float32)
+        outside = np.argwhere((distance < -settings.near) & (distance > -settings.far)).astype(np.float32)
+        inside = np.argwhere(distance > settings.near).astype(np.float32)
         for side, points, count in (
-            (0.0, _outline_points(distance), _OUTLINE_POINTS),
-            (1.0, outside, _SIDE_POINTS),
-            (-1.0, inside, _SIDE_POINTS),
+            (0.0, _outline_points(distance, settings.border), settings.outline_points),
+            (1.0, outside, settings.side_points),
+            (-1.0, inside, settings.side_points),
         ):
-            chosen = points[random.permutation(len(points))[:count]]
-            views.append(torch.full((len(chosen),), view))
-            places.append(torch.from_numpy(chosen))
-            sides.append(torch.full((len(chosen),), side))
-    of_view, place = torch.cat(views), torch.cat(places)
+            drawn = points[random.permutation(len(points))[:count]]
+            views.append(torch.full((len(drawn),), view))
+            pixels.append(torch.from_numpy(drawn))
+            sides.append(torch.full((len(drawn),), side))
+    of_view, position = torch.cat(views), torch.cat(pixels)
     # Integers are pixel centres here.
-    rays = cameras.rays(of_view, place[:, 0], place[:, 1])
+    rays = cameras.rays(of_view, position[:, 0], position[:, 1])
     width = 1 / (0.5 * (cameras.fx + cameras.fy))[of_view]
     return rays.origins.float(), rays.directions.float(), width, torch.cat(sides)
 
 
-def _outline_points(distances: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "points 2"]:
+def _outline_points(distances: Float[np.ndarray, "H W"], border: int) -> Float[np.ndarray, "points 2"]:
     """Find points (row, column) of the outline on the lines between adjacent pixel centres, away from the border."""
     points = np.concatenate([np.empty((0, 2)), *find_contours(distances, 0)]).astype(np.float32)
-    last = np.array(distances.shape) - 1 - _BORDER
-    return points[((points >= _BORDER) & (points <= last)).all(1)]
+    last = np.array(distances.shape) - 1 - border
+    return points[((points >= border) & (points <= last)).all(1)]
 
 
 @torch.no_grad()
-def _nearest_place(body: Profile, origins: Tensor, directions: Tensor) -> Float[Tensor, " points"]:
+def _nearest_lengths(
+    body: Profile, origins: Tensor, directions: Tensor, settings: RevolutionSettings
+) -> Float[Tensor, " points"]:
     """Find the arc length along each ray at which the distance to the body is smallest."""
     middle = body.foot + 0.5 * body.height * body.axis
     reach = torch.sqrt((0.5 * body.height) ** 2 + body.radii.max() ** 2)
-    place = ((middle - origins) * directions).sum(-1)
-    for count in (_PLACES, _CLOSER, _CLOSER):
-        candidates = place[:, None] + reach * torch.linspace(-1, 1, count)
+    lengths = ((middle - origins) * directions).sum(-1)
+    for count in (settings.ray_samples, settings.closer_samples, settings.closer_samples):
+        candidates = lengths[:, None] + reach * torch.linspace(-1, 1, count)
         distances = body.distance(origins[:, None] + candidates[..., None] * directions[:, None])
-        place = candidates.gather(1, distances.argmin(1, keepdim=True))[:, 0]
+        lengths = candidates.gather(1, distances.argmin(1, keepdim=True))[:, 0]
         reach = reach * 2 / (count - 1)
-    return place
+    return lengths

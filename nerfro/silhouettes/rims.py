@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -13,6 +13,7 @@ from torch import Tensor
 
 from nerfro.core.cameras import Cameras
 from nerfro.core.errors import NerfroError
+from nerfro.core.provenance import AlgorithmSettings
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.geometry.normals import unit
 from nerfro.silhouettes.moving_mesh import MeshGeometry, MovingMesh
@@ -21,12 +22,26 @@ from nerfro.silhouettes.visual_hull import Silhouettes
 # By view: the index of the outline pixel nearest to each pixel.
 Outlines: TypeAlias = "dict[int, Int[np.ndarray, 'H W']]"
 
-# Accuracy of the outline of a binary mask, in pixels. The median misfit relative to this accuracy scales the two limits
-# below, so that a surface far from the masks keeps its observations.
-_MASK_ACCURACY = 0.35
-# Largest misfit in pixels, beyond which a contour belongs to a fold of the surface in front of itself; misfit in pixels
-# at which the weight of an observation is one half; and smallest scale of that misfit, reached with antialiased masks.
-_MAX_MISFIT, _HALF_WEIGHT, _MIN_SCALE = 3.0, 0.7, 0.3
+
+@dataclass(frozen=True)
+class RimSettings(AlgorithmSettings):
+    """Settings of the misfits of contour points (`find_rims`).
+
+    The median misfit relative to `mask_accuracy` scales the limits `max_misfit` and `half_weight`, so that a surface
+    far from the masks keeps its observations.
+
+    Attributes:
+        mask_accuracy: accuracy of the outline of a binary mask, in pixels.
+        max_misfit: largest misfit in pixels, beyond which a contour belongs to a fold of the surface in front of
+            itself.
+        half_weight: misfit in pixels at which the weight of an observation is one half.
+        min_scale: smallest scale of `half_weight`, reached with antialiased masks.
+    """
+
+    mask_accuracy: float = 0.35
+    max_misfit: float = 3.0
+    half_weight: float = 0.7
+    min_scale: float = 0.3
 
 
 class Rims(NamedTuple):
@@ -69,7 +84,9 @@ def outlines_of(silhouettes: Silhouettes) -> Outlines:
     return {view: _nearest_outline_pixel(mask) for view, mask in enumerate((silhouettes.masks > 0.5).numpy())}
 
 
-def find_rims(surface: MeshGeometry, silhouettes: Silhouettes, outlines: Outlines) -> Rims:
+def find_rims(
+    surface: MeshGeometry, silhouettes: Silhouettes, outlines: Outlines, settings: RimSettings = RimSettings()
+) -> Rims:
     """Find the outermost contour point near each pixel of the outlines of the masks.
 
     On a smooth surface, the contour crosses edges of the mesh along which the vertex normals turn away from the camera.
@@ -78,6 +95,7 @@ def find_rims(surface: MeshGeometry, silhouettes: Silhouettes, outlines: Outline
     Raises:
         NerfroError: no view sees the surface.
     """
+    settings.use()
     cameras, vertices = silhouettes.cameras, surface.vertices
     ends = vertices[surface.edges]
     spacing = float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).mean())
@@ -86,26 +104,26 @@ def find_rims(surface: MeshGeometry, silhouettes: Silhouettes, outlines: Outline
         eye = cameras.camera_to_world[view, :, 3].double().numpy()
         first, second, fraction, normal = _turning(surface, eye)
         points = vertices[first] + fraction[:, None] * (vertices[second] - vertices[first])
-        places = torch.from_numpy(points).float()
-        inside, width = (values.double().numpy() for values in silhouettes.depth_inside(view, places))
-        known = np.flatnonzero(np.isfinite(inside))
-        if not len(known):
+        positions = torch.from_numpy(points).float()
+        inside, width = (values.double().numpy() for values in silhouettes.depth_inside(view, positions))
+        visible = np.flatnonzero(np.isfinite(inside))
+        if not len(visible):
             continue
         # Pixels narrower than the edges of the mesh are grouped, or some would only contain contours of folds.
-        pixels = max(1, int(np.ceil(spacing / width[known].mean())))
-        cell = _look_up(outline, cameras.select([view]), places[known], pixels)
-        order = np.lexsort((inside[known], cell))
-        outermost = known[order[np.diff(cell[order], prepend=-1) != 0]]
+        pixels = max(1, int(np.ceil(spacing / width[visible].mean())))
+        cell = _look_up(outline, cameras.select([view]), positions[visible], pixels)
+        order = np.lexsort((inside[visible], cell))
+        outermost = visible[order[np.diff(cell[order], prepend=-1) != 0]]
         of_view = np.full(len(outermost), view)
         of_points = (first, second, fraction, points, normal, inside, width)
         parts.append((*(values[outermost] for values in of_points), of_view))
     if not parts:
         raise NerfroError("no view sees the surface; check that surface, poses and masks belong together")
     *edges, misfit, width, views = (np.concatenate(values) for values in zip(*parts, strict=True))
-    spread = float(np.median(np.abs(misfit))) / _MASK_ACCURACY
-    near = np.abs(misfit) < _MAX_MISFIT * max(1.0, spread)
-    weight = 1 / (1 + (misfit / (_HALF_WEIGHT * max(_MIN_SCALE, spread))) ** 2)
-    return Rims(*(each[near] for each in (*edges, misfit * width, weight, width, views)))
+    spread = float(np.median(np.abs(misfit))) / settings.mask_accuracy
+    near = np.abs(misfit) < settings.max_misfit * max(1.0, spread)
+    weight = 1 / (1 + (misfit / (settings.half_weight * max(settings.min_scale, spread))) ** 2)
+    return Rims(*(values[near] for values in (*edges, misfit * width, weight, width, views)))
 
 
 def _turning(
@@ -135,9 +153,9 @@ def _look_up(
     outline: Int[np.ndarray, "H W"], camera: Cameras, points: Tensor, pixels: int
 ) -> Int[np.ndarray, " points"]:
     """Return the index of the block of pixels x pixels that contains the outline pixel nearest to each point."""
-    place = camera.project(points)[0][0].numpy()
-    row = place[:, 1].astype(np.int64).clip(0, camera.height - 1)
-    column = place[:, 0].astype(np.int64).clip(0, camera.width - 1)
+    position = camera.project(points)[0][0].numpy()
+    row = position[:, 1].astype(np.int64).clip(0, camera.height - 1)
+    column = position[:, 0].astype(np.int64).clip(0, camera.width - 1)
     nearest = outline[row, column]
     return nearest // camera.width // pixels * camera.width + nearest % camera.width // pixels
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -11,16 +13,18 @@ from jaxtyping import Float, Int
 from scipy import sparse
 from scipy.spatial import cKDTree
 
+from nerfro.core.provenance import AlgorithmSettings
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.silhouettes.creases import CURVED, FACETS, STEPS, Sides, has_creases, sharpened
+from nerfro.silhouettes.creases import CreaseSettings, Sides, has_creases, sharpened
 from nerfro.silhouettes.moving_mesh import MovingMesh, solve_symmetric
-from nerfro.silhouettes.pixel_sides import by_pixel_sides
-from nerfro.silhouettes.rims import Outlines, Rims, find_rims, outlines_of
+from nerfro.silhouettes.pixel_sides import PixelSideSettings, by_pixel_sides
+from nerfro.silhouettes.rims import Outlines, Rims, RimSettings, find_rims, outlines_of
 from nerfro.silhouettes.silhouettes import VALIDATION_EVERY, is_antialiased
 from nerfro.silhouettes.visual_hull import Silhouettes
 
 
-class _Prior(NamedTuple):
+@dataclass(frozen=True)
+class Prior:
     """Regularization of the surface.
 
     The weights are relative to one observation of the outline, in units of the object's size. They are multiplied by a
@@ -37,28 +41,58 @@ class _Prior(NamedTuple):
     steady: float  # weight of changes of curvature in the last steps, per squared misfit
 
 
-# Chosen on the scenes `torus` and `ship` with antialiased masks.
-_ROUND = _Prior(area=3e-6, bending=1e-5, first=100, last=0.01, typical_curvature=True, edge=np.inf, steady=0)
-_FLAT = _Prior(area=3e-6, bending=5e-9, first=100, last=0.1, typical_curvature=False, edge=0.02, steady=4)
-# Number of steps with decreasing strength, and of last steps with the selected strength.
-_STEPS, _LAST_STEPS = 22, 6
-# Accurate binary masks: number of last steps with the probit model of pixels, factor of the strength for these steps,
-# and mean contour error in pixels above which masks count as inaccurate. Exact masks have 0.10 to 0.16, and masks
-# displaced in waves by half a pixel 0.28.
-_PROBIT_STEPS, _PROBIT_STRENGTH, _MAX_PROBIT_ERROR = 14, 0.3, 0.2
-# Factor of bending in steps that also penalize changes of curvature: strong bending would round the edges.
-_REDUCED_BENDING = 0.1
-# Estimation of the direction of largest curvature: number of blurs, turn between neighbours in radians below which the
-# direction is undefined, and exponent by which changes of curvature across an edge are discounted.
-_BLURS, _MIN_TURN, _SHARPNESS = 4, np.radians(0.5), 4
-# The strongest prior is selected whose validation error is within this factor of the smallest: noise in the masks tilts
-# the surface before it increases the contour error.
-_TOLERANCE = 1.1
-# Distance that corresponds to normals one radian apart, as a fraction of the object's size. The typical curvature
-# around a vertex is exceeded by this fraction of its neighbours: 0 on flat sides, the ball's curvature on a ball.
-_NORMAL_DISTANCE, _MIN_EXCEEDING = 0.08, 0.7
-# Number of neighbours of a vertex, chosen from so many vertices spread over the surface.
-_NUM_NEIGHBOURS, _NUM_SPREAD = 31, 1000
+@dataclass(frozen=True)
+class FitSettings(AlgorithmSettings):
+    """Settings of the smooth fit to silhouettes (`fit_surface`).
+
+    The priors were chosen on the scenes `torus` and `ship` with antialiased masks. Exact binary masks have a mean
+    contour error of 0.10 to 0.16 pixels, and masks displaced in waves by half a pixel 0.28.
+
+    Attributes:
+        round_prior, flat_prior: priors of the first and of the second surface.
+        steps: number of steps with decreasing strength of the prior.
+        last_steps: number of last steps with the selected strength.
+        probit_steps: number of last steps with the probit model of pixels, for accurate binary masks.
+        probit_strength: factor of the strength for these steps.
+        max_probit_error: mean contour error in pixels above which binary masks count as inaccurate.
+        reduced_bending: factor of bending in steps that also penalize changes of curvature: strong bending would round
+            the edges.
+        blurs: number of blurs of the direction of largest curvature.
+        min_turn: turn between neighbours in radians below which this direction is undefined.
+        sharpness: exponent by which changes of curvature across an edge are discounted.
+        tolerance: the strongest prior is selected whose validation error is within this factor of the smallest: noise
+            in the masks tilts the surface before it increases the contour error.
+        normal_distance: distance that corresponds to normals one radian apart, as a fraction of the object's size.
+        min_exceeding: fraction of the neighbours of a vertex that exceed the typical curvature: 0 on flat sides, the
+            ball's curvature on a ball.
+        num_neighbours: number of neighbours of a vertex for the typical curvature.
+        num_spread: number of vertices, spread over the surface, among which neighbours are searched for.
+        creases, rims, pixel_sides: settings of sharp edges, of contour points, and of the probit model.
+    """
+
+    round_prior: Prior = Prior(
+        area=3e-6, bending=1e-5, first=100, last=0.01, typical_curvature=True, edge=math.inf, steady=0
+    )
+    flat_prior: Prior = Prior(
+        area=3e-6, bending=5e-9, first=100, last=0.1, typical_curvature=False, edge=0.02, steady=4
+    )
+    steps: int = 22
+    last_steps: int = 6
+    probit_steps: int = 14
+    probit_strength: float = 0.3
+    max_probit_error: float = 0.2
+    reduced_bending: float = 0.1
+    blurs: int = 4
+    min_turn: float = math.radians(0.5)
+    sharpness: float = 4
+    tolerance: float = 1.1
+    normal_distance: float = 0.08
+    min_exceeding: float = 0.7
+    num_neighbours: int = 31
+    num_spread: int = 1000
+    creases: CreaseSettings = field(default=CreaseSettings(), repr=False)
+    rims: RimSettings = field(default=RimSettings(), repr=False)
+    pixel_sides: PixelSideSettings = field(default=PixelSideSettings(), repr=False)
 
 
 def fit_surface(
@@ -66,6 +100,7 @@ def fit_surface(
     silhouettes: Silhouettes,
     smoothing: float = 1.0,
     progress: Callable[[float], None] = lambda done: None,
+    settings: FitSettings = FitSettings(),
 ) -> TriangleMesh:
     """Fit a smooth surface whose contours meet the outlines of the masks.
 
@@ -101,33 +136,35 @@ def fit_surface(
         silhouettes: silhouettes of the object.
         smoothing: factor of the selected strength; larger values suit masks drawn by hand.
         progress: called with the completed fraction.
+        settings: priors, numbers of steps and limits.
     """
-    fit = _Fit(mesh, silhouettes)
-    count, total = itertools.count(1), 2 * _STEPS + 3 * _LAST_STEPS
+    settings.use()
+    fit = _Fit(mesh, silhouettes, settings)
+    count, total = itertools.count(1), 2 * settings.steps + 3 * settings.last_steps
 
     def step() -> None:
         progress(next(count) / total)
 
-    found = [fit.search(prior, step) for prior in (_ROUND, _FLAT)]
-    probit = fit.has_accurate_binary_masks(found)
-    num_last_steps = _PROBIT_STEPS if probit else _LAST_STEPS
-    total = 2 * _STEPS + 3 * num_last_steps
-    candidates = [fit.tried(each, probit, step) for each in found]
-    flat = found[-1]
+    starts = [fit.search(prior, step) for prior in (settings.round_prior, settings.flat_prior)]
+    probit = fit.has_accurate_binary_masks(starts)
+    num_last_steps = settings.probit_steps if probit else settings.last_steps
+    total = 2 * settings.steps + 3 * num_last_steps
+    candidates = [fit.tried(start, probit, step) for start in starts]
+    flat, creases = starts[-1], settings.creases
     if has_creases(fit.mesh.geometry(flat.vertices)):
-        total += 2 * STEPS
-        facets, curved = (fit.with_creases(flat, sides, probit, step) for sides in (FACETS, CURVED))
-        candidates.append(facets if facets.error <= _TOLERANCE * curved.error else curved)
-    best = min(candidates, key=lambda each: each.error)
+        total += 2 * creases.steps
+        facets, curved = (fit.with_creases(flat, sides, probit, step) for sides in (creases.facets, creases.curved))
+        candidates.append(facets if facets.error <= settings.tolerance * curved.error else curved)
+    best = min(candidates, key=lambda candidate: candidate.error)
     if best.sides is not None:
-        total += STEPS - num_last_steps
+        total += creases.steps - num_last_steps
     return TriangleMesh(fit.finished(best, fit.outlines, probit, step, smoothing), mesh.faces)
 
 
 class _Candidate(NamedTuple):
     """A surface from which the last steps start."""
 
-    prior: _Prior
+    prior: Prior
     strength: float
     vertices: Float[np.ndarray, "vertices 3"]
     error: float  # mean misfit to the validation views in world units, see `_Fit.search`, `tried` and `with_creases`
@@ -137,7 +174,8 @@ class _Candidate(NamedTuple):
 class _Fit:
     """Mesh connectivity and views of a fit."""
 
-    def __init__(self, mesh: TriangleMesh, silhouettes: Silhouettes) -> None:
+    def __init__(self, mesh: TriangleMesh, silhouettes: Silhouettes, settings: FitSettings) -> None:
+        self.settings = settings
         self.start, self.mesh, self.silhouettes = mesh.vertices, MovingMesh(mesh.faces), silhouettes
         self.size = float(np.ptp(mesh.vertices, axis=0).max())
         self.edges = edges = self.mesh.edges
@@ -148,15 +186,15 @@ class _Fit:
         self.outlines = outlines_of(silhouettes)
         self.training, self.validation = _split_views(self.outlines)
 
-    def search(self, prior: _Prior, step: Callable[[], None]) -> _Candidate:
+    def search(self, prior: Prior, step: Callable[[], None]) -> _Candidate:
         """Fit with decreasing strength of the prior, and select the strength by validation views."""
-        vertices, found = self.start, []
-        for strength in np.geomspace(prior.first, prior.last, _STEPS).tolist():
+        vertices, candidates = self.start, []
+        for strength in np.geomspace(prior.first, prior.last, self.settings.steps).tolist():
             vertices = self.moved(vertices, self.training, prior, strength)
-            found.append(_Candidate(prior, strength, vertices, self.misfit(vertices, self.validation)))
+            candidates.append(_Candidate(prior, strength, vertices, self.misfit(vertices, self.validation)))
             step()
-        limit = _TOLERANCE * min(each.error for each in found)
-        return next(each for each in found if each.error <= limit)
+        limit = self.settings.tolerance * min(candidate.error for candidate in candidates)
+        return next(candidate for candidate in candidates if candidate.error <= limit)
 
     def tried(self, candidate: _Candidate, probit: bool, step: Callable[[], None]) -> _Candidate:
         """Compute the validation error after trial steps, which are the last steps with the training views."""
@@ -188,12 +226,13 @@ class _Fit:
         """
         vertices, prior, sides = candidate.vertices, candidate.prior, candidate.sides
         if sides is not None:
-            sides = sides._replace(flat=smoothing * sides.flat)
-            return sharpened(vertices, self.mesh, lambda moved: self.rims(moved, outlines), sides, step)
-        factor, num_steps, contour_error = smoothing, _LAST_STEPS, None
+            sides = replace(sides, flat=smoothing * sides.flat)
+            rims_of, creases = lambda moved: self.rims(moved, outlines), self.settings.creases
+            return sharpened(vertices, self.mesh, rims_of, sides, step, creases)
+        factor, num_steps, contour_error = smoothing, self.settings.last_steps, None
         rims = self.rims(vertices, outlines)
         if probit:
-            factor, num_steps = _PROBIT_STRENGTH * smoothing, _PROBIT_STEPS
+            factor, num_steps = self.settings.probit_strength * smoothing, self.settings.probit_steps
             contour_error = _contour_error(rims)
         steady = factor * prior.steady * (float(np.abs(rims.misfit).mean()) / self.size) ** 2
         strength = factor * candidate.strength
@@ -204,7 +243,7 @@ class _Fit:
 
     def rims(self, vertices: Float[np.ndarray, "vertices 3"], outlines: Outlines) -> Rims:
         """Find the contour points of a surface with the given vertices."""
-        return find_rims(self.mesh.geometry(vertices), self.silhouettes, outlines)
+        return find_rims(self.mesh.geometry(vertices), self.silhouettes, outlines, self.settings.rims)
 
     def misfit(self, vertices: Float[np.ndarray, "vertices 3"], outlines: Outlines) -> float:
         """Compute the mean distance of the contour points to the outlines of the masks, in world units."""
@@ -219,8 +258,8 @@ class _Fit:
         """
         rims, weights = self.rims(vertices, self.validation), None
         contour_error = _contour_error(rims)
-        if probit and contour_error < _MAX_PROBIT_ERROR:
-            rims = by_pixel_sides(rims, self.silhouettes, contour_error)
+        if probit and contour_error < self.settings.max_probit_error:
+            rims = by_pixel_sides(rims, self.silhouettes, contour_error, self.settings.pixel_sides)
             weights = rims.weight
             if not weights.any():
                 return np.inf
@@ -230,14 +269,14 @@ class _Fit:
         """Test whether the masks are binary, and accurate for at least one candidate."""
         if is_antialiased(self.silhouettes.masks.numpy(), self.silhouettes.distances.numpy()):
             return False
-        errors = [_contour_error(self.rims(each.vertices, self.training)) for each in candidates]
-        return min(errors) < _MAX_PROBIT_ERROR
+        errors = [_contour_error(self.rims(candidate.vertices, self.training)) for candidate in candidates]
+        return min(errors) < self.settings.max_probit_error
 
     def moved(
         self,
         vertices: Float[np.ndarray, "vertices 3"],
         outlines: Outlines,
-        prior: _Prior,
+        prior: Prior,
         strength: float,
         steady: float = 0.0,
         contour_error: float | None = None,
@@ -255,20 +294,21 @@ class _Fit:
             spread: also equalize the triangles by tangential motion. For adjacent small and large triangles, as
                 marching cubes produces, the mean of the neighbours is a poor estimate of curvature.
         """
-        surface = self.mesh.geometry(vertices)
-        normals, rims = surface.normals, find_rims(surface, self.silhouettes, outlines)
+        surface, settings = self.mesh.geometry(vertices), self.settings
+        normals, rims = surface.normals, find_rims(surface, self.silhouettes, outlines, settings.rims)
         if contour_error is not None:
-            rims = by_pixel_sides(rims, self.silhouettes, contour_error)
+            rims = by_pixel_sides(rims, self.silhouettes, contour_error, settings.pixel_sides)
         curvature = _mean_curvature(vertices, normals, self.edges, self.mesh.mean)
         typical = np.zeros_like(curvature.value)
         if prior.typical_curvature:
-            typical = _typical_curvature(curvature.value, vertices, normals, _NORMAL_DISTANCE * self.size)
+            distance = settings.normal_distance * self.size
+            typical = _typical_curvature(curvature.value, vertices, normals, distance, settings)
         excess = curvature.value - typical
         # While the prior is strong, large curvature may belong to the roofs of the visual hull instead of edges.
         stiffness = self._stiffness(excess, prior.edge * max(1.0, strength))
         pressure = -self.degree * curvature.around / np.sqrt(curvature.around.mean()) * typical
         per_observation = strength * len(rims.fraction)
-        bending = per_observation * prior.bending * self.size**2 * (_REDUCED_BENDING if steady else 1)
+        bending = per_observation * prior.bending * self.size**2 * (settings.reduced_bending if steady else 1)
         terms = [
             (1.0, _outline_term(rims, normals)),
             (per_observation * prior.area, self._area_term(vertices, normals, stiffness, pressure)),
@@ -305,7 +345,7 @@ class _Fit:
         self, vertices: Float[np.ndarray, "vertices 3"], normals: Float[np.ndarray, "vertices 3"], curvature: _Curvature
     ) -> _Term:
         """Sum of squared changes of curvature along edges and flat sides."""
-        alike = sparse.diags(_along_edges(vertices, normals, self.edges, self.mesh.mean))
+        alike = sparse.diags(_along_edges(vertices, normals, self.edges, self.mesh.mean, self.settings))
         changes = curvature.change.T @ self.across.T @ alike @ self.across
         return _Term(changes @ curvature.change, -changes @ curvature.value)
 
@@ -350,8 +390,8 @@ def _bending_term(
 
 def _split_views(outlines: Outlines) -> tuple[Outlines, Outlines]:
     """Split the views into training and validation views."""
-    chosen = range(VALIDATION_EVERY - 1, len(outlines), VALIDATION_EVERY) or [len(outlines) - 1]
-    validation = {view: outlines[view] for view in chosen}
+    views = range(VALIDATION_EVERY - 1, len(outlines), VALIDATION_EVERY) or [len(outlines) - 1]
+    validation = {view: outlines[view] for view in views}
     return {view: outline for view, outline in outlines.items() if view not in validation}, validation
 
 
@@ -382,21 +422,22 @@ def _along_edges(
     normals: Float[np.ndarray, "vertices 3"],
     edges: Int[np.ndarray, "edges 2"],
     mean: sparse.csr_matrix,
+    settings: FitSettings,
 ) -> Float[np.ndarray, " edges"]:
     """Weight edges by their alignment with the direction of smallest curvature: 1 along, 0 across, 1 if undefined."""
     along, turn = (values[edges[:, 1]] - values[edges[:, 0]] for values in (vertices, normals))
     square = (along**2).sum(1)
     turning = turn[:, :, None] * turn[:, None, :] * (square.mean() / square)[:, None, None]
-    sums = [np.bincount(edges.ravel(), np.repeat(each, 2), len(vertices)) for each in turning.reshape(-1, 9).T]
+    sums = [np.bincount(edges.ravel(), np.repeat(products, 2), len(vertices)) for products in turning.reshape(-1, 9).T]
     around = np.stack(sums, -1) / np.bincount(edges.ravel(), minlength=len(vertices))[:, None]
-    for _ in range(_BLURS):
+    for _ in range(settings.blurs):
         around = 0.5 * (around + mean @ around)
     size, direction = np.linalg.eigh(around.reshape(-1, 3, 3))
     # 0 for equal curvature in both directions, 1 for curvature in a single direction.
-    single = (size[:, 2] - size[:, 1]) / (size[:, 2] + size[:, 1] + _MIN_TURN**2)
+    single = (size[:, 2] - size[:, 1]) / (size[:, 2] + size[:, 1] + settings.min_turn**2)
     along /= np.sqrt(square)[:, None]
     ends = [single[end] * np.abs((along * direction[end, :, 2]).sum(1)) for end in edges.T]
-    return ((1 - ends[0]) * (1 - ends[1])) ** _SHARPNESS
+    return ((1 - ends[0]) * (1 - ends[1])) ** settings.sharpness
 
 
 def _typical_curvature(
@@ -404,6 +445,7 @@ def _typical_curvature(
     vertices: Float[np.ndarray, "vertices 3"],
     normals: Float[np.ndarray, "vertices 3"],
     normal_distance: float,
+    settings: FitSettings,
 ) -> Float[np.ndarray, " vertices"]:
     """Compute the curvature that most neighbours of each vertex exceed, with the sign of their median.
 
@@ -411,8 +453,8 @@ def _typical_curvature(
     thin wall is far away.
     """
     points = np.concatenate([vertices, normal_distance * normals], 1)
-    chosen = np.linspace(0, len(points) - 1, min(len(points), _NUM_SPREAD)).astype(np.int64)
-    _, index = cKDTree(points[chosen]).query(points, k=min(_NUM_NEIGHBOURS, len(chosen)))
-    near = curved[chosen][index]
+    spread = np.linspace(0, len(points) - 1, min(len(points), settings.num_spread)).astype(np.int64)
+    _, index = cKDTree(points[spread]).query(points, k=min(settings.num_neighbours, len(spread)))
+    near = curved[spread][index]
     sign = np.sign(np.median(near, axis=1))
-    return sign * np.quantile((near * sign[:, None]).clip(min=0), 1 - _MIN_EXCEEDING, axis=1)
+    return sign * np.quantile((near * sign[:, None]).clip(min=0), 1 - settings.min_exceeding, axis=1)

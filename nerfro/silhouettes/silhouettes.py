@@ -15,23 +15,9 @@ from nerfro.geometry.mesh import TriangleMesh
 
 # Fits exclude every so many-th view, for validation.
 VALIDATION_EVERY = 8
-# Standard deviation, in pixels, of the blur that interpolates between the steps of a binary mask. The error on straight
-# lines is then 0.15 pixels, and corners are preserved.
-_BLUR = 1.0
-# A blur shrinks an outline of radius r by its variance / 2r. The box filter of a pixel adds a variance of 1/12.
-_BLUR_BIAS = 0.5 * (_BLUR**2 + 1 / 12)
-# A mask is antialiased if this fraction of the pixels on the outline has partial coverage. Curvature is only estimated
-# for such masks, because the curvature of a binary mask is dominated by noise.
-_MIN_PARTIAL = 0.2
-# Largest distance, in blur widths, at which the blurred mask determines the distance to the outline.
-_REACH = 1.5
-# Smallest magnitude of a distance, in pixels, so that its sign agrees with the mask.
-_MIN_DISTANCE = 1e-3
-# Margin, in pixels, around the projected vertices of a mesh, because lens distortion bends edges between them.
-_MESH_MARGIN = 8
 
 
-def outline_distance(mask: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
+def outline_distance(mask: Float[np.ndarray, "H W"], blur: float = 1.0, reach: float = 1.5) -> Float[np.ndarray, "H W"]:
     """Compute the signed distance of each pixel centre to the outline of a mask.
 
     Near a straight outline, a blurred mask equals Phi(distance / blur) with the normal distribution function Phi.
@@ -41,6 +27,9 @@ def outline_distance(mask: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]
 
     Args:
         mask: fraction of each pixel that the object covers.
+        blur: standard deviation of the blur in pixels. With 1, the error on straight lines of a binary mask is 0.15
+            pixels, and corners are preserved.
+        reach: largest distance, in blur widths, at which the blurred mask determines the distance.
 
     Returns:
         Distances in pixels, positive inside.
@@ -49,23 +38,25 @@ def outline_distance(mask: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]
     if inside.all() or not inside.any():
         return np.where(inside, np.inf, -np.inf)
     counted = np.where(inside, distance_transform_edt(inside) - 0.5, 0.5 - distance_transform_edt(~inside))
-    blurred = gaussian_filter(np.asarray(mask, np.float64), _BLUR, mode="nearest")
-    refined = _BLUR * ndtri(blurred.clip(1e-6, 1 - 1e-6))
-    if is_antialiased(mask, counted):
-        refined -= _BLUR_BIAS * _level_curvature(refined).clip(-1, 1)
-    distance = np.where((np.abs(refined) < _REACH * _BLUR) & (np.abs(counted) < 2 * _REACH), refined, counted)
-    return np.where(inside, distance.clip(min=_MIN_DISTANCE), distance.clip(max=-_MIN_DISTANCE)).astype(np.float32)
+    blurred = gaussian_filter(np.asarray(mask, np.float64), blur, mode="nearest")
+    refined = blur * ndtri(blurred.clip(1e-6, 1 - 1e-6))
+    if is_antialiased(mask, counted):  # the curvature of a binary mask is dominated by noise
+        # A blur shrinks an outline of radius r by its variance / 2r. The box filter of a pixel adds a variance of 1/12.
+        refined -= 0.5 * (blur**2 + 1 / 12) * _level_curvature(refined).clip(-1, 1)
+    distance = np.where((np.abs(refined) < reach * blur) & (np.abs(counted) < 2 * reach), refined, counted)
+    # The sign agrees with the mask.
+    return np.where(inside, distance.clip(min=1e-3), distance.clip(max=-1e-3)).astype(np.float32)
 
 
 def is_antialiased(masks: Float[np.ndarray, "*V H W"], distances: Float[np.ndarray, "*V H W"]) -> bool:
-    """Test whether masks give the coverage of pixels on the outline, or only inside and outside.
+    """Test whether a fifth of the pixels on the outlines has partial coverage, as antialiased masks have.
 
     Args:
         masks: coverage of the pixels.
         distances: distances of the pixel centres to the outlines, in pixels.
     """
     partial = ((masks > 0.02) & (masks < 0.98))[np.abs(distances) < 1]
-    return bool(partial.any() and partial.mean() > _MIN_PARTIAL)
+    return bool(partial.any() and partial.mean() > 0.2)
 
 
 def _level_curvature(values: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
@@ -112,6 +103,7 @@ class PixelBlocks:
 
 def mesh_silhouettes(mesh: TriangleMesh, cameras: Cameras, stride: int) -> Bool[Tensor, "V h w"]:
     """Test whether the rays through the centres of every stride-th pixel intersect a mesh."""
+    margin = 8  # pixels around the projected vertices, because lens distortion bends edges between them
     intersector, vertices = MeshIntersector(mesh.triangles), torch.from_numpy(mesh.vertices).float()
     row, column = torch.meshgrid(
         torch.arange(0, cameras.height, stride), torch.arange(0, cameras.width, stride), indexing="ij"
@@ -119,7 +111,7 @@ def mesh_silhouettes(mesh: TriangleMesh, cameras: Cameras, stride: int) -> Bool[
     seen = torch.zeros(len(cameras), *row.shape, dtype=torch.bool)
     for view in range(len(cameras)):
         pixels, depth = cameras.select([view]).project(vertices)
-        (left, top), (right, bottom) = pixels[0].amin(0) - _MESH_MARGIN, pixels[0].amax(0) + _MESH_MARGIN
+        (left, top), (right, bottom) = pixels[0].amin(0) - margin, pixels[0].amax(0) + margin
         near = (row >= top) & (row <= bottom) & (column >= left) & (column <= right)
         near |= depth.amin() <= 0  # pixels of points behind the camera are invalid
         rays = cameras.rays(torch.full((int(near.sum()),), view), row[near], column[near])

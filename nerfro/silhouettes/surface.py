@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+
 import numpy as np
 import torch
 from jaxtyping import Float
 
 from nerfro.core.errors import NerfroError, first_of, warn
 from nerfro.core.progress import fraction_bar
+from nerfro.core.provenance import AlgorithmSettings
 from nerfro.data.base import Views
 from nerfro.geometry.mesh import TriangleMesh, num_decimals
 from nerfro.silhouettes.pose_conventions import overlap
-from nerfro.silhouettes.revolution import Symmetry, fit_revolution
-from nerfro.silhouettes.silhouette_fit import fit_surface
+from nerfro.silhouettes.revolution import RevolutionSettings, Symmetry, fit_revolution
+from nerfro.silhouettes.silhouette_fit import FitSettings, fit_surface
 from nerfro.silhouettes.silhouettes import border_pixels
 from nerfro.silhouettes.visual_hull import (
+    HullSettings,
     Silhouettes,
     carve_grid,
     extract_surface,
@@ -24,16 +28,32 @@ from nerfro.silhouettes.visual_hull import (
 )
 
 _MIN_VIEWS, _FEW_VIEWS = 3, 12
-_COARSE_VOXELS = 64
-# Factors by which the initial box is enlarged if it cuts the hull: wrong masks shift the estimated centre.
-_BOX_FACTORS = (1.0, 1.3, 1.7)
-# Margin of the object's box, in coarse voxels.
-_MARGIN_VOXELS = 2
-# A body of revolution is preferred although its overlap may be smaller by this amount, because a free surface is rough
-# and follows errors of the masks; the overlap is computed at the given number of pixels per side.
-_MAX_OVERLAP_LOSS = {"axis": 0.01, "auto": 0.005}
-# Cameras within this angle, in degrees, see the object from one side.
-_ONE_SIDE = 75.0
+
+
+@dataclass(frozen=True)
+class SurfaceSettings(AlgorithmSettings):
+    """Settings of the surface from masks (`make_mesh`).
+
+    Attributes:
+        coarse_voxels: number of voxels along the longest side of the hull that determines the box of the object.
+        box_factors: factors by which the initial box is enlarged if it cuts the hull: wrong masks shift the estimated
+            centre.
+        margin_voxels: margin of the object's box, in coarse voxels.
+        max_loss_axis, max_loss_auto: largest decrease of the overlap with the masks for which `symmetry=axis` and
+            `symmetry=auto` prefer a body of revolution, because a free surface is rough and follows errors of masks.
+        one_side: angle in degrees; cameras within it see the object from one side.
+        hull, fit, revolution: settings of the visual hull, of the smooth fit, and of the body of revolution.
+    """
+
+    coarse_voxels: int = 64
+    box_factors: tuple[float, ...] = (1.0, 1.3, 1.7)
+    margin_voxels: int = 2
+    max_loss_axis: float = 0.01
+    max_loss_auto: float = 0.005
+    one_side: float = 75.0
+    hull: HullSettings = field(default=HullSettings(), repr=False)
+    fit: FitSettings = field(default=FitSettings(), repr=False)
+    revolution: RevolutionSettings = field(default=RevolutionSettings(), repr=False)
 
 
 def read_silhouettes(views: Views, has_box: bool) -> Silhouettes:
@@ -96,6 +116,7 @@ def make_mesh(
     symmetry: Symmetry | None = None,
     evidence: Silhouettes | None = None,
     is_revolution: bool = False,
+    settings: SurfaceSettings = SurfaceSettings(),
 ) -> TriangleMesh:
     """Carve the visual hull and fit a smooth surface.
 
@@ -111,38 +132,46 @@ def make_mesh(
         evidence: silhouettes that decide between the two surfaces; by default all.
         is_revolution: whether silhouettes are projections of a body of revolution, so that a free surface is only
             fitted if the hull has no axis.
+        settings: settings of hull and fits.
     """
-    box = _object_box(silhouettes, wrong_masks) if corners is None else corners
+    settings.use()
+    box = _object_box(silhouettes, wrong_masks, settings) if corners is None else corners
     with fraction_bar("carving") as progress:
-        distances, corner, spacing = carve_grid(silhouettes, box, resolution, wrong_masks, progress)
+        distances, corner, spacing = carve_grid(silhouettes, box, resolution, wrong_masks, progress, settings.hull)
     num_parts, num_kept = remove_strays(distances, keep)
     mesh, revolution = extract_surface(distances, corner, spacing), None
     if symmetry is not None and is_revolution:
-        revolution = _revolution(mesh, silhouettes)
+        revolution = _revolution(mesh, silhouettes, settings)
     if revolution is None and smoothing > 0:
         with fraction_bar("fitting") as progress:
-            mesh = fit_surface(mesh, silhouettes, smoothing, progress)
+            mesh = fit_surface(mesh, silhouettes, smoothing, progress, settings.fit)
     if revolution is not None:
         mesh = revolution
     elif symmetry is not None:
-        mesh = _choose_symmetry(_revolution(mesh, silhouettes), mesh, evidence or silhouettes, symmetry)
+        revolution = _revolution(mesh, silhouettes, settings)
+        max_loss = {"axis": settings.max_loss_axis, "auto": settings.max_loss_auto}[symmetry]
+        mesh = _choose_symmetry(revolution, mesh, evidence or silhouettes, symmetry, max_loss)
     if num_kept < num_parts:
         print(f"kept the largest {num_kept} of {num_parts} separate components")
     if reaches_border(distances):
-        _warn_of_open_hull(silhouettes, box)
+        _warn_of_open_hull(silhouettes, box, settings.one_side)
     print(f"{len(mesh.faces)} triangles, voxels of {spacing:.4g}")
     return mesh
 
 
-def _revolution(mesh: TriangleMesh, silhouettes: Silhouettes) -> TriangleMesh | None:
+def _revolution(mesh: TriangleMesh, silhouettes: Silhouettes, settings: SurfaceSettings) -> TriangleMesh | None:
     with fraction_bar("finding the axis") as progress:
-        return fit_revolution(mesh, silhouettes, progress)
+        return fit_revolution(mesh, silhouettes, progress, settings=settings.revolution)
 
 
 def _choose_symmetry(
-    revolution: TriangleMesh | None, free: TriangleMesh, silhouettes: Silhouettes, symmetry: Symmetry
+    revolution: TriangleMesh | None,
+    free: TriangleMesh,
+    silhouettes: Silhouettes,
+    symmetry: Symmetry,
+    max_loss: float,
 ) -> TriangleMesh:
-    """Choose the body of revolution or the free surface by the overlap of their silhouettes with the masks.
+    """Choose the body of revolution unless its overlap with the masks is smaller by more than `max_loss`.
 
     The medians are compared, because a foreground object may be cut out of some masks.
     """
@@ -152,35 +181,37 @@ def _choose_symmetry(
         return free
     symmetric, unconstrained = (float(np.median(overlap(mesh, silhouettes))) for mesh in (revolution, free))
     result = f"median overlap with the masks: {symmetric:.4f} as a body of revolution, {unconstrained:.4f} otherwise"
-    if symmetry == "axis" and symmetric < unconstrained - _MAX_OVERLAP_LOSS[symmetry]:
+    if symmetry == "axis" and symmetric < unconstrained - max_loss:
         warn(f"{result}; the object is no body of revolution, and symmetry=axis is ignored")
         return free
     print(result)
-    return revolution if symmetric >= unconstrained - _MAX_OVERLAP_LOSS[symmetry] else free
+    return revolution if symmetric >= unconstrained - max_loss else free
 
 
-def _object_box(silhouettes: Silhouettes, wrong_masks: int) -> Float[np.ndarray, "2 3"]:
+def _object_box(silhouettes: Silhouettes, wrong_masks: int, settings: SurfaceSettings) -> Float[np.ndarray, "2 3"]:
     """Estimate the bounding box of the object, with a margin, from a coarse visual hull.
 
     A box that cuts the hull is enlarged; if no enlargement contains the hull, the initial box is used.
     """
     initial = find_box(silhouettes, wrong_masks)
-    for factor in (*_BOX_FACTORS, 1.0):
+    for factor in (*settings.box_factors, 1.0):
         box = initial.mean(0) + factor * (initial - initial.mean(0))
-        distances, corner, spacing = carve_grid(silhouettes, box, _COARSE_VOXELS, wrong_masks)
+        distances, corner, spacing = carve_grid(
+            silhouettes, box, settings.coarse_voxels, wrong_masks, settings=settings.hull
+        )
         remove_strays(distances)
         if not reaches_border(distances):
             break
     inside = np.argwhere(distances < 0)
-    low, high = inside.min(0) - _MARGIN_VOXELS, inside.max(0) + _MARGIN_VOXELS
+    low, high = inside.min(0) - settings.margin_voxels, inside.max(0) + settings.margin_voxels
     return np.stack([corner + spacing * low, corner + spacing * high]).clip(*box)
 
 
-def _warn_of_open_hull(silhouettes: Silhouettes, box: Float[np.ndarray, "2 3"]) -> None:
+def _warn_of_open_hull(silhouettes: Silhouettes, box: Float[np.ndarray, "2 3"], one_side: float) -> None:
     towards = silhouettes.cameras.camera_to_world[:, :, 3] - torch.from_numpy(box.mean(0)).float()
     towards = torch.nn.functional.normalize(towards, dim=-1)
     spread = float(torch.rad2deg(torch.arccos((towards @ towards.T).clamp(-1, 1))).max())
-    if spread < _ONE_SIDE:
+    if spread < one_side:
         reason = f"all cameras look from within {spread:.0f} degrees, so silhouettes do not bound the object in depth"
     else:
         reason = "the image border cuts the masks that would bound the hull, or the box is too small"
@@ -188,5 +219,5 @@ def _warn_of_open_hull(silhouettes: Silhouettes, box: Float[np.ndarray, "2 3"]) 
     warn(f"the box {corners} cuts the visual hull: {reason}; set the box with box_min= and box_max=")
 
 
-def _names(views: Views, chosen: torch.Tensor) -> str:
-    return first_of([name for name, wanted in zip(views.names, chosen.tolist(), strict=True) if wanted])
+def _names(views: Views, is_named: torch.Tensor) -> str:
+    return first_of([name for name, named in zip(views.names, is_named.tolist(), strict=True) if named])

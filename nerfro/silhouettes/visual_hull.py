@@ -15,18 +15,25 @@ from torch import Tensor
 
 from nerfro.core.cameras import Cameras
 from nerfro.core.errors import NerfroError
+from nerfro.core.provenance import AlgorithmSettings
 from nerfro.geometry.lines import nearest_point
 from nerfro.geometry.mesh import TriangleMesh, merge_vertices
 from nerfro.silhouettes.silhouettes import border_pixels, outline_distance
 
-# Number of refinements. Each halves the voxels and evaluates only voxels near the surface of the coarser level.
-_LEVELS = 2
-# Width of the neighbourhood in voxels of the coarser level, more than a voxel's diagonal.
-_BAND = 2.0
-# Components below this fraction of the volume of the largest component are removed.
-_MIN_VOLUME = 0.02
-_MIN_VIEWS = 2
-_CHUNK = 1 << 18
+
+@dataclass(frozen=True)
+class HullSettings(AlgorithmSettings):
+    """Settings of the visual hull on a grid (`carve_grid`).
+
+    Attributes:
+        levels: number of refinements. Each halves the voxels, and evaluates only voxels near the coarser surface.
+        band: width of this neighbourhood in voxels of the coarser level, more than a voxel's diagonal.
+        chunk: number of points that are evaluated at once.
+    """
+
+    levels: int = 2
+    band: float = 2.0
+    chunk: int = 1 << 18
 
 
 @dataclass(frozen=True)
@@ -96,15 +103,15 @@ class Silhouettes:
         num_seen = torch.zeros(len(points), dtype=torch.int32)
         for view in range(len(self)):
             inside, width = self.depth_inside(view, points)
-            known = inside < torch.inf
-            num_seen += known
-            value = torch.where(known, -inside * width, -torch.inf)
+            is_seen = inside < torch.inf
+            num_seen += is_seen
+            value = torch.where(is_seen, -inside * width, -torch.inf)
             for rank in range(wrong_masks + 1):
                 largest[rank], value = torch.maximum(largest[rank], value), torch.minimum(largest[rank], value)
         outside, unseen = largest[0].abs(), num_seen == 0
         # Outside by a pixel, so that finer levels of the grid examine the border of the seen space.
         outside[unseen] = self._pixel_width(points[unseen])
-        return torch.where(num_seen < max(_MIN_VIEWS, wrong_masks + 1), outside, largest[-1])
+        return torch.where(num_seen < max(2, wrong_masks + 1), outside, largest[-1])
 
     def _pixel_width(self, points: Float[Tensor, "points 3"]) -> Float[Tensor, " points"]:
         """Return the smallest width of a pixel of any view at the distance of each point, in world units."""
@@ -149,6 +156,7 @@ def carve_grid(
     resolution: int,
     wrong_masks: int = 0,
     progress: Callable[[float], None] = lambda done: None,
+    settings: HullSettings = HullSettings(),
 ) -> tuple[Float[np.ndarray, "X Y Z"], Float[np.ndarray, "3"], float]:
     """Evaluate the visual hull on a grid, coarse to fine near the surface.
 
@@ -158,29 +166,32 @@ def carve_grid(
         resolution: number of voxels along the longest side.
         wrong_masks: number of views that may be wrong about any point.
         progress: called with the completed fraction.
+        settings: settings of the refinement.
 
     Returns:
         Signed distances at the corners of the voxels (see `Silhouettes.carve`), the lower corner, and the voxel size.
     """
-    extent = np.asarray(box[1] - box[0], np.float64)
-    factor = 2**_LEVELS
+    settings.use()
+    extent, levels = np.asarray(box[1] - box[0], np.float64), settings.levels
+    factor = 2**levels
     spacing = float(extent.max()) / (resolution // factor * factor)
     cells = np.ceil(np.round(extent / (factor * spacing), 6)).astype(int).clip(1)
     values = torch.empty(0)
-    for level in range(_LEVELS + 1):
-        step = spacing * 2 ** (_LEVELS - level)
+    for level in range(levels + 1):
+        step = spacing * 2 ** (levels - level)
         axes = [torch.from_numpy(box[0][a] + step * np.arange(cells[a] * 2**level + 1)) for a in range(3)]
         points = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).float()
         if level == 0:
             values, near = torch.empty(points.shape[:3]), torch.ones(points.shape[:3], dtype=torch.bool)
         else:
             values = F.interpolate(values[None, None], points.shape[:3], mode="trilinear", align_corners=True)[0, 0]
-            near = values.abs() < _BAND * 2 * step
+            near = values.abs() < settings.band * 2 * step
         wanted = points[near]
         carved = torch.empty(len(wanted))
-        for start in range(0, len(wanted), _CHUNK):
-            carved[start : start + _CHUNK] = silhouettes.carve(wanted[start : start + _CHUNK], wrong_masks)
-            progress((level + min(start + _CHUNK, len(wanted)) / len(wanted)) / (_LEVELS + 1))
+        for start in range(0, len(wanted), settings.chunk):
+            end = start + settings.chunk
+            carved[start:end] = silhouettes.carve(wanted[start:end], wrong_masks)
+            progress((level + min(end, len(wanted)) / len(wanted)) / (levels + 1))
         values[near] = carved
     return values.numpy(), np.asarray(box[0], np.float64), spacing
 
@@ -194,14 +205,17 @@ def carve_mesh(
     return extract_surface(distances, corner, spacing) if (distances < 0).any() else None
 
 
-def remove_strays(distances: Float[np.ndarray, "X Y Z"], keep: int | None = None) -> tuple[int, int]:
+def remove_strays(
+    distances: Float[np.ndarray, "X Y Z"], keep: int | None = None, min_volume: float = 0.02
+) -> tuple[int, int]:
     """Remove small components and fill enclosed voids, in place.
 
     Silhouettes cannot show voids, and the cones of few views also intersect in empty places.
 
     Args:
         distances: signed distances, negative inside.
-        keep: number of largest components to keep; by default all with 2 % of the volume of the largest one.
+        keep: number of largest components to keep; None keeps all of at least `min_volume`.
+        min_volume: smallest volume of a component, as a fraction of the volume of the largest one.
 
     Returns:
         Number of components before and after the removal.
@@ -214,7 +228,7 @@ def remove_strays(distances: Float[np.ndarray, "X Y Z"], keep: int | None = None
         return 0, 0
     sizes = np.bincount(parts.ravel())[1:]
     order = np.argsort(-sizes, kind="stable")
-    num_kept = int((sizes >= _MIN_VOLUME * sizes.max()).sum()) if keep is None else min(keep, num_parts)
+    num_kept = int((sizes >= min_volume * sizes.max()).sum()) if keep is None else min(keep, num_parts)
     strays = ~np.isin(parts, [0, *(order[:num_kept] + 1)])
     distances[strays] = np.abs(distances[strays])
     return num_parts, num_kept

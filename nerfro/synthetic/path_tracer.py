@@ -22,7 +22,7 @@ VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb", "scalar_rgb")
 # Hammersley points: at most one point lies in each row and column, which edges may be parallel to.
 SILHOUETTE_PLACES = [((k + 0.5) / 128, (int(f"{k:07b}"[::-1], 2) + 0.5) / 128) for k in range(128)]
 SAMPLES_PER_PASS = 6_000_000  # a wavefront of paths takes about 1 GB of memory per 10 million paths
-_TEXELS_PER_TASK, _EDGE_CONTRAST = 1 << 17, 0.1
+_TEXELS_PER_TASK = 1 << 17
 ROULETTE_DEPTH, MAX_DEPTH = (
     32,
     1024,
@@ -44,18 +44,18 @@ def load_mitsuba(variant: str = "auto") -> ModuleType:
         raise NerfroError(f"unknown Mitsuba variant '{variant}'; choose auto, {', '.join(VARIANTS)}")
     llvm.select_llvm()
     drjit, mitsuba = (optional(name, "synthesize", llvm.PURPOSE) for name in ("drjit", "mitsuba"))
-    chosen, reason = variant, llvm.missing_llvm()
+    selected, reason = variant, llvm.missing_llvm()
     if variant == "auto":
         cuda = drjit.has_backend(drjit.JitBackend.CUDA)
-        chosen = "llvm_ad_rgb" if reason is None else "cuda_ad_rgb" if cuda else "scalar_rgb"
-        if chosen == "scalar_rgb":
+        selected = "llvm_ad_rgb" if reason is None else "cuda_ad_rgb" if cuda else "scalar_rgb"
+        if selected == "scalar_rgb":
             print(f"nerfro: Mitsuba runs about seventy times slower, because {reason}; {llvm.HINT}", file=sys.stderr)
     elif variant == "llvm_ad_rgb" and reason is not None:
         raise NerfroError(f"variant=llvm_ad_rgb cannot run, because {reason}; {llvm.HINT}, or choose variant=auto")
     elif variant == "cuda_ad_rgb" and not drjit.has_backend(drjit.JitBackend.CUDA):
         raise NerfroError("variant=cuda_ad_rgb cannot run, because Dr.Jit finds no CUDA driver; choose variant=auto")
-    mitsuba.set_variant(chosen)
-    register_materials(chosen)
+    mitsuba.set_variant(selected)
+    register_materials(selected)
     return mitsuba
 
 
@@ -208,7 +208,7 @@ def envmap_texture(sky: Sky, height: int, to_world: np.ndarray) -> np.ndarray:
         right = np.abs(texture - np.roll(texture, -1, 1)).max(-1)
         below = np.pad(np.abs(np.diff(texture, axis=0)).max(-1), ((1, 1), (0, 0)))
         contrast = np.maximum.reduce([right, np.roll(right, 1, 1), below[:-1], below[1:]])
-        edges = np.argwhere(contrast > _EDGE_CONTRAST)
+        edges = np.argwhere(contrast > 0.1)
         tasks = np.array_split(edges, -(-9 * len(edges) // _TEXELS_PER_TASK) or 1)
         texture[edges[:, 0], edges[:, 1]] = np.concatenate(list(pool.map(refined, tasks)))
     return texture

@@ -189,7 +189,7 @@ def check_export(name: str) -> None:
     scene = TrainedScene(example_run().renderer.eval(), _ExampleData(), content=box)
     with tempfile.TemporaryDirectory() as folder:
         out = FilePath(folder, f"scene{endings[0]}")
-        config = OmegaConf.structured(ExportConfig(checkpoint="-", what=name, out=str(out)))
+        config = ExportConfig(checkpoint="-", what=name, out=str(out))
         with _named(f"what={name}"):
             text = export.write(scene, out, config)
         _require(isinstance(text, str) and text != "", "write returns a description of the file, which is printed")

@@ -11,7 +11,7 @@ from omegaconf import DictConfig
 
 from nerfro.cli.calls import Composition
 from nerfro.core.distributed import leave
-from nerfro.evaluation.metrics import prepared_metrics
+from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.results import RunMetrics
 from nerfro.evaluation.tables import write_scores
 from nerfro.evaluation.treatments import score_split
@@ -81,7 +81,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetr
     training, split = Training.start(config), config.evaluation.split
     test = training.views if split is None else training.source.load(split).checked()
     test = test.select(range(len(test))[: config.trainer.limit_test_batches])
-    metrics, renderer = prepared_metrics(), training.module.renderer
+    metrics, renderer = ImageMetrics(), training.module.renderer
     groups = training.module.parameter_groups()
     num_steps = require_same_run(folder, checkpoint, config, groups, training.views.cameras)
     throughput, interruption = Throughput(), StopOnSignal()

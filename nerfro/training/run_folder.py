@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from nerfro.core.cameras import Cameras
 from nerfro.core.errors import Interrupted, NerfroError, first_of, warn
 from nerfro.core.paths import PACKAGE_DIR, user_path
-from nerfro.core.provenance import command_line, versions
+from nerfro.core.provenance import AlgorithmSettings, command_line, versions
 from nerfro.files.atomic import require_room, write_atomically
 from nerfro.files.folder_lock import lock_folder, require_only
 from nerfro.files.foreign_config import foreign_config, read_foreign_config
@@ -117,7 +117,7 @@ def needed_bytes(renderer: Renderer) -> int:
 
 
 def record(folder: Path, config: DictConfig) -> None:
-    """Write the records of a run: config.yaml (resolved), run.json (command, versions, commit) and git.diff."""
+    """Write the records of a run: config.yaml (resolved), run.json (command, versions, algorithms), git.diff."""
     write_atomically(folder / CONFIG_FILE, OmegaConf.to_yaml(config, resolve=True))
     commit, diff, device = _git("rev-parse", "HEAD"), _git("diff", "HEAD"), training_device(config)
     facts = {
@@ -131,6 +131,7 @@ def record(folder: Path, config: DictConfig) -> None:
         "gpu": torch.cuda.get_device_name() if device == "cuda" else None,
         "fast_bfloat16": fast_bfloat16(device),
         "versions": versions(),
+        "algorithms": list(AlgorithmSettings.used.values()),
     }
     write_atomically(folder / "run.json", json.dumps(facts, indent=2) + "\n")
     if diff:

@@ -29,13 +29,6 @@ from nerfro.viewing.changes import absorption_of
 from nerfro.viewing.surface import body_on_grid
 from nerfro.viewing.volume import MIN_OPTICAL_DEPTH, Volume
 
-# Distances are stored up to this many cells from the surface, where the B-spline of the surface reads them. Farther
-# away, rays advance by the clearance of the blocks.
-_BAND = 3.5
-_MAX_OPTICAL_DEPTH = 30.0  # of one cell
-_BRICK = 8  # voxels per side of the bricks that are skipped if they are empty
-_CHUNK = 2**16  # texels that are evaluated at once
-
 
 @dataclass(frozen=True)
 class Baked:
@@ -75,7 +68,9 @@ def bake_surface(renderer: Renderer) -> Baked:
     on_grid = _on_same_grid(medium)
     solids, bodies = on_grid.packed(), range(len(on_grid.grids))
     spacing = 1 / solids.inverse_spacing
-    distance_units = _BAND * spacing.max(1) / 32767
+    # The B-spline of the surface reads distances up to 3.5 cells from the surface. Farther away, rays advance by the
+    # clearance of the blocks.
+    distance_units = 3.5 * spacing.max(1) / 32767
     clearance = np.stack([grid.coarse_clearance().double().numpy() for grid in on_grid.grids])
     clearance_units = clearance.max((1, 2, 3)).clip(min=1e-9) / 255
     coefficients = solids.coefficients.reshape(len(bodies), *solids.shape[0]).astype(np.float64)
@@ -122,7 +117,7 @@ def bake_sky(background: Background, device: torch.device) -> Baked:
     """Evaluate the background radiance at the texels of a cube map, seen from the centre of the scene."""
     size = background.face_resolution
     directions = cube_directions(size).to(device)
-    radiance = torch.cat([background(Exits(chunk)).float().cpu() for chunk in directions.split(_CHUNK)])
+    radiance = torch.cat([background(Exits(chunk)).float().cpu() for chunk in directions.split(2**16)])
     upper, rest = packing.shared_exponent(radiance.view(6, size, size, 3).double().numpy())
     return Baked({"size": size}, {"sky": upper, "sky_exponent": rest})
 
@@ -149,7 +144,7 @@ def bake_volume(volume: Volume, colour_space: ColourSpace) -> Baked:
     """
     sides = volume.box[1] - volume.box[0]
     cell = float((sides / (torch.tensor(volume.density.shape) - 1)).min())
-    min_density, span = MIN_OPTICAL_DEPTH / cell, math.log(_MAX_OPTICAL_DEPTH / MIN_OPTICAL_DEPTH)
+    min_density, span = MIN_OPTICAL_DEPTH / cell, math.log(30.0 / MIN_OPTICAL_DEPTH)
     levels = (volume.density.clamp(min=min_density) / min_density).log().div(span).clamp(max=1)
     radiance = to_srgb(volume.radiance) if colour_space is ColourSpace.SRGB else volume.radiance
     radiance = radiance.clamp(min=0)
@@ -176,7 +171,8 @@ def _occupied_bricks(levels: UInt8[np.ndarray, "Z Y X"]) -> UInt8[np.ndarray, "z
     """Mark the bricks of a grid that have a nonzero vertex, inside or among the neighbours used for interpolation."""
     occupied = levels > 0
     for axis, count in enumerate(levels.shape):
-        bounds = np.linspace(0, count - 1, math.ceil((count - 1) / _BRICK) + 1)
+        # Bricks of 8 voxels per side are skipped if they are empty.
+        bounds = np.linspace(0, count - 1, math.ceil((count - 1) / 8) + 1)
         bricks = [
             occupied.take(range(math.floor(low), math.ceil(high) + 1), axis).any(axis) for low, high in pairwise(bounds)
         ]

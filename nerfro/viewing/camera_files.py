@@ -91,8 +91,8 @@ def write_cameras(file: Path, camera: CameraModel, views: Views, origin: Float[n
     """
     if not camera.moves and camera.exposure is None:
         return
-    given, estimated = views.cameras, camera.estimated(views.cameras).to("cpu")
-    turned, shifted = (values.tolist() for values in motion_between(given.camera_to_world, estimated.camera_to_world))
+    initial, estimated = views.cameras, camera.estimated(views.cameras).to("cpu")
+    turned, shifted = (values.tolist() for values in motion_between(initial.camera_to_world, estimated.camera_to_world))
     gains = None if camera.exposure is None else camera.exposure.gains().tolist()
     rational = estimated.distortion is not None and bool(estimated.distortion[:, 6:].any())
     names = _RATIONAL if rational else _DISTORTION
@@ -111,7 +111,7 @@ def write_cameras(file: Path, camera: CameraModel, views: Views, origin: Float[n
             entry["gain"] = gains[view]
         frames.append(entry)
     model = "FULL_OPENCV" if rational else "OPENCV"
-    document = {"camera_model": model, "w": given.width, "h": given.height, "frames": frames}
+    document = {"camera_model": model, "w": initial.width, "h": initial.height, "frames": frames}
     write_atomically(file, json.dumps(document, indent=1) + "\n")
 
 

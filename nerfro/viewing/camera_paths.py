@@ -14,9 +14,6 @@ from torch.nn import functional
 from nerfro.core.cameras import Cameras, up_direction
 from nerfro.core.errors import NerfroError
 
-# Sine of the angle to the vertical below which a camera counts as directly above or below its target.
-_ABOVE = 1e-4
-
 
 @dataclass(frozen=True)
 class OrbitPosition:
@@ -81,7 +78,7 @@ class CaptureGeometry:
         right = torch.linalg.cross(self.up.expand_as(back), back)
         # A camera directly above has no upright orientation; any horizontal axis is as good as another.
         horizontal = torch.linalg.cross(self.up, torch.eye(3)[self.up.abs().argmin()])
-        above = torch.linalg.vector_norm(right, dim=-1, keepdim=True) < _ABOVE
+        above = torch.linalg.vector_norm(right, dim=-1, keepdim=True) < 1e-4
         right = functional.normalize(torch.where(above, horizontal, right), dim=-1)
         return self.cameras_at(torch.stack([right, torch.linalg.cross(back, right), back, positions], -1))
 

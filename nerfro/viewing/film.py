@@ -17,11 +17,6 @@ from nerfro.core.errors import NerfroError
 from nerfro.core.optional import optional
 from nerfro.files.atomic import atomic_file, write_atomically
 
-# Constant rate factor of H.264: 0 is lossless, 18 is visually lossless, 51 is the worst.
-_QUALITY = 18
-# Shortest duration of a frame of a GIF, in hundredths of a second; of faster films, some frames are left out.
-_MIN_GIF_DURATION = 2
-
 
 def write_film(file: Path, frames: Sequence[Path], seconds: float) -> None:
     """Encode frames as a film.
@@ -44,8 +39,8 @@ def find_ffmpeg() -> str:
     Raises:
         NerfroError: neither is installed.
     """
-    if (found := shutil.which("ffmpeg")) is not None:
-        return found
+    if (path := shutil.which("ffmpeg")) is not None:
+        return path
     purpose, alternative = "a film in .mp4 format needs ffmpeg", ", or install ffmpeg, or set film=[gif] or film=[]"
     try:
         return optional("imageio_ffmpeg", "video", purpose, alternative).get_ffmpeg_exe()
@@ -58,7 +53,8 @@ def _write_mp4(file: Path, frames: Sequence[Path], seconds: float) -> None:
     with tempfile.TemporaryDirectory() as folder:
         encoded = Path(folder, file.name)
         pixels = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(rate), "-i", "-"]
-        options = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", str(_QUALITY), "-movflags", "+faststart"]
+        # Constant rate factor of H.264: 0 is lossless, 18 is visually lossless, 51 is the worst.
+        options = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "18", "-movflags", "+faststart"]
         command = [find_ffmpeg(), "-loglevel", "error", *pixels, *options, str(encoded)]
         with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
             assert process.stdin is not None
@@ -75,7 +71,7 @@ def _write_mp4(file: Path, frames: Sequence[Path], seconds: float) -> None:
 def _write_gif(file: Path, frames: Sequence[Path], seconds: float) -> None:
     # The unit of the format is a hundredth of a second, and viewers replace durations below two units. The ends of the
     # frames are rounded and not the durations, whose errors would add up.
-    num_shown = max(1, min(len(frames), int(100 * seconds / _MIN_GIF_DURATION)))
+    num_shown = max(1, min(len(frames), int(100 * seconds / 2)))
     ends = np.round(100 * seconds * np.arange(num_shown + 1) / num_shown).astype(int)
     images = _quantized([frames[i * len(frames) // num_shown] for i in range(num_shown)])
     durations = [10 * int(duration) for duration in np.diff(ends)]  # milliseconds

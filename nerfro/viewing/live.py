@@ -10,11 +10,6 @@ from nerfro.viewing.page import assemble_page, bake_parts, static_parts
 from nerfro.viewing.server import PageServer
 from nerfro.viewing.trained_scene import TrainedScene
 
-_TIME_FRACTION = 0.02  # maximum share of the training time that updates take
-_UPDATE_SECONDS = 5.0  # target interval between updates; the resolution of the volume is adapted
-_RESOLUTIONS = 24, 128  # bounds of the adapted resolution
-_COMPRESSION = 1  # fastest level of zlib, because local connections are fast
-
 
 class LivePage:
     """Keeps the page of a server up to date with a scene. Updates run in the thread of the caller.
@@ -44,17 +39,18 @@ class LivePage:
             return
         self.show()
         duration = time.monotonic() - start
-        self._next = start + max(duration / _TIME_FRACTION, _UPDATE_SECONDS)
-        scale = (_TIME_FRACTION * _UPDATE_SECONDS / duration) ** (1 / 3)
-        low, high = _RESOLUTIONS
-        self._resolution = round(min(max(self._resolution * min(max(scale, 0.7), 1.3), low), high))
+        # Updates take at most 2 % of the time, and the resolution is adapted to an update every 5 seconds.
+        self._next = start + max(duration / 0.02, 5.0)
+        scale = (0.02 * 5.0 / duration) ** (1 / 3)
+        self._resolution = round(min(max(self._resolution * min(max(scale, 0.7), 1.3), 24), 128))
 
     def show(self) -> None:
         """Publish the current model."""
         medium = self._scene.renderer.scene.medium
         surface_changes = any(parameter.requires_grad for parameter in medium.parameters())
         parts = self._bake(surface=surface_changes)
-        arrays = {name: uri for part in parts.values() for name, uri in part.packed(_COMPRESSION).items()}
+        # The fastest level of zlib suffices, because local connections are fast.
+        arrays = {name: uri for part in parts.values() for name, uri in part.packed(1).items()}
         self._server.publish({name: part.metadata for name, part in parts.items()}, arrays)
 
     def _bake(self, surface: bool) -> dict[str, Baked]:

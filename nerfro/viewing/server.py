@@ -20,8 +20,6 @@ from urllib.parse import parse_qs, urlsplit
 from nerfro.core.errors import NerfroError
 
 _WATCHED_SECONDS = 10.0  # a page counts as watched for so long after a request
-_MAX_LOSSES = 500  # maximum number of points of the curve
-_MAX_BODY = 2**22  # bytes of a request
 # Placeholder until the page is complete; browsers reload the placeholder every two seconds.
 _PLACEHOLDER = b'<!DOCTYPE html><meta http-equiv="refresh" content="2"><title>nerfro</title><p>The page is being made.'
 
@@ -102,7 +100,8 @@ class PageServer:
         """Return the training curve, and the update for a page of version `after`, as JSON."""
         self._last_request = time.monotonic()
         with self._lock:
-            every = -(-len(self._losses) // _MAX_LOSSES) or 1
+            # The curve has at most 500 points.
+            every = -(-len(self._losses) // 500) or 1
             # Counted from the end, because the page states the last loss.
             losses = json.dumps(self._losses[::-every][::-1]).encode()
             update = self._update if self._version > after else b"null"
@@ -167,7 +166,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._answer(HTTPStatus.FORBIDDEN, _FOREIGN, "text/plain")
         elif self.path != "/answer":
             self._answer(HTTPStatus.NOT_FOUND, _NOT_FOUND, "text/plain")
-        elif not re.fullmatch(r"[0-9]{1,9}", length) or int(length) > _MAX_BODY:
+        elif not re.fullmatch(r"[0-9]{1,9}", length) or int(length) > 2**22:
             self._answer(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, b"the request is too large", "text/plain")
         else:
             status, body = page.answer(self.rfile.read(int(length)))

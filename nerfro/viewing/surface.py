@@ -14,8 +14,6 @@ from nerfro.media.base import Medium
 from nerfro.media.sdf_grid import SdfGrid
 from nerfro.media.solid import Solid
 
-_ANALYTIC_RESOLUTION = 128  # vertices per side of the grid on which distances in closed form are sampled
-
 
 @torch.no_grad()
 def surface_of(medium: Medium, triangles: bool) -> list[TriangleMesh]:
@@ -53,7 +51,8 @@ def _zero_level(medium: Solid, body: int) -> TriangleMesh:
 def body_on_grid(medium: Solid, body: int) -> tuple[Float[Tensor, "X Y Z"], Float[Tensor, "2 3"]]:
     """Sample `Solid.regions` of a body at the vertices of a grid, on the CPU; returns also the corners of the grid."""
     grid = medium.grids[body] if isinstance(medium, SdfGrid) else None
-    counts = [_ANALYTIC_RESOLUTION] * 3 if grid is None else grid.distances.shape
+    # Distances in closed form are sampled at 128 vertices per side.
+    counts = [128] * 3 if grid is None else grid.distances.shape
     box = (medium if grid is None else grid).box.cpu()
     axes = [torch.linspace(float(low), float(high), n) for low, high, n in zip(*box, counts, strict=True)]
     slabs = [torch.cartesian_prod(x[None], *axes[1:]).to(medium.box) for x in axes[0]]

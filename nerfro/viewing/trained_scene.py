@@ -29,8 +29,6 @@ from nerfro.samplers.subdivision import Subdivision
 from nerfro.viewing.changes import with_absorption, with_indices, with_sky, without_glass, without_inside
 from nerfro.viewing.surface import surface_of
 
-_MIN_SKY_HEIGHT = 512
-
 
 class RenderedViews(NamedTuple):
     """Images of V cameras, on the CPU.
@@ -116,10 +114,10 @@ class TrainedScene:
         return RenderedViews(*(torch.stack(images) for images in zip(*rendered, strict=True)))
 
     def _render_view(self, cameras: Cameras, view: int, subdivision: Subdivision) -> tuple[Tensor, ...]:
-        found = render_view(self.renderer, cameras.to(self.renderer.scene.device), view, subdivision)
+        rays = render_view(self.renderer, cameras.to(self.renderer.scene.device), view, subdivision)
         colour_space = self.renderer.scene.colour_space
-        rgb, radiance = colour_space.to_display(found.radiance), colour_space.to_linear(found.radiance)
-        values = rgb, found.depth, found.opacity, found.normals, found.exit_directions, radiance
+        rgb, radiance = colour_space.to_display(rays.radiance), colour_space.to_linear(rays.radiance)
+        values = rgb, rays.depth, rays.opacity, rays.normals, rays.exit_directions, radiance
         return tuple(value.float().cpu().view(cameras.height, cameras.width, *value.shape[1:]) for value in values)
 
     @property
@@ -130,7 +128,7 @@ class TrainedScene:
     @property
     def sky_height(self) -> int:
         """Number of rows of a lat-long image as fine as the background, at least 512."""
-        return max(_MIN_SKY_HEIGHT, 2 * self.renderer.scene.background.face_resolution)
+        return max(512, 2 * self.renderer.scene.background.face_resolution)
 
     def sky_of_height(self, height: int) -> Float[Tensor, "H 2*H 3"]:
         """Evaluate the background as a lat-long image with a given number of rows."""

@@ -1,10 +1,10 @@
-"""LPIPS as torchmetrics computes it, on a seeded random backbone; run as a program of its own.
+"""LPIPS as torchmetrics computes it; run as a program of its own.
 
     python reference_lpips.py INPUT.pt OUTPUT.pt
 
 torchmetrics takes the backbone from torchvision, which does not load beside a CPU build of torch. Here a module of
 that name that holds nothing but AlexNet stands in for it, which is why this cannot run inside the test process. INPUT
-holds predictions and targets [B, 3, H, W] in [0, 1]; OUTPUT the state dict of AlexNet, the distances and the distance
+holds predictions and targets [B, 3, H, W] in [0, 1] and the weights of AlexNet; OUTPUT the distances and the distance
 maps.
 """
 
@@ -16,11 +16,10 @@ from torch import nn
 
 
 class AlexNet(nn.Module):
-    """The feature layers of torchvision's AlexNet, in its numbering, with seeded He initialization."""
+    """The feature layers of torchvision's AlexNet, in its numbering."""
 
     def __init__(self):
         super().__init__()
-        torch.manual_seed(7)
         self.features = nn.Sequential(
             nn.Conv2d(3, 64, kernel_size=11, stride=4, padding=2),
             nn.ReLU(inplace=True),
@@ -36,14 +35,6 @@ class AlexNet(nn.Module):
             nn.ReLU(inplace=True),
             nn.MaxPool2d(kernel_size=3, stride=2),
         )
-        initialize(self.features)
-
-
-def initialize(layers):
-    for module in layers:
-        if isinstance(module, nn.Conv2d):
-            nn.init.kaiming_normal_(module.weight)
-            nn.init.normal_(module.bias, std=0.1)
 
 
 def main():
@@ -52,15 +43,16 @@ def main():
     # The stand-in comes after the import: were it there before, torchmetrics would look for the rest of torchvision.
     torchvision = types.ModuleType("torchvision")
     torchvision.models = types.ModuleType("torchvision.models")
-    torchvision.models.alexnet = lambda weights: AlexNet()
+    pictures, weights = torch.load(sys.argv[1])
+    backbone = AlexNet()
+    backbone.load_state_dict({name: value.float() for name, value in weights.items() if name.startswith("features")})
+    torchvision.models.alexnet = lambda weights: backbone
     torchvision.models.AlexNet_Weights = types.SimpleNamespace(DEFAULT=None)
     sys.modules["torchvision"] = torchvision
     sys.modules["torchvision.models"] = torchvision.models
     lpips._TORCHVISION_AVAILABLE = True
-    pictures = torch.load(sys.argv[1])
     distance, distance_map = (lpips._LPIPS(net="alex", spatial=spatial) for spatial in (False, True))
     results = {
-        "backbone": AlexNet().state_dict(),
         "distances": distance(*pictures, normalize=True).flatten(),
         "maps": distance_map(*pictures, normalize=True)[:, 0],
     }

@@ -2,12 +2,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from torch import Tensor
 
 from nerfro.evaluation.error_maps import squared_error_map, triptych
 from nerfro.evaluation.error_sheets import error_maps, write_error_sheet
-from nerfro.evaluation.image_metrics import ImageMetric, build_metrics, psnr
+from nerfro.evaluation.image_metrics import build_metrics, psnr
 from nerfro.evaluation.perceptual.flip import flip
+from nerfro.evaluation.perceptual.lpips import LpipsNetwork, published_weights
 from nerfro.evaluation.ssim import ssim
 from nerfro.files.drawing import magma
 from nerfro.files.images import load_png, round_to_8bit
@@ -16,28 +16,15 @@ from nerfro.registry.registration import discover
 discover()
 
 
-class Difference(torch.nn.Module):
-    """Stands in for a network of LPIPS."""
-
-    def distance_map(self, prediction: Tensor, target: Tensor) -> Tensor:
-        return (prediction - target).abs().mean(-1)
-
-
-def with_lpips() -> dict[str, ImageMetric]:
-    metrics = build_metrics()
-    metrics["lpips"].network, metrics["lpips"].missing = Difference(), None
-    return metrics
-
-
 @pytest.mark.usefixtures("unchecked")
 def test_means_of_the_maps_are_the_metrics() -> None:
     prediction, target = torch.rand(2, 40, 36, 3, generator=torch.Generator().manual_seed(0))
-    maps = {error.name: error for error in error_maps(prediction, target, with_lpips())}
+    maps = {error.name: error for error in error_maps(prediction, target, build_metrics())}
     assert list(maps) == ["squared_error", "ssim", "lpips", "flip"]
     assert all(error.values.shape == (40, 36) for error in maps.values())
     assert -10 * maps["squared_error"].values.mean().log10() == pytest.approx(psnr(prediction, target).item(), abs=1e-5)
     assert 1 - maps["ssim"].values.nanmean().item() == pytest.approx(ssim(prediction, target).item(), abs=1e-9)
-    assert maps["lpips"].values.mean().item() == pytest.approx((prediction - target).abs().mean().item(), abs=1e-6)
+    assert torch.equal(maps["lpips"].values, LpipsNetwork(published_weights()).distance_map(prediction, target))
     assert maps["flip"].values.mean().item() == pytest.approx(flip(prediction, target).item(), abs=1e-6)
 
 
@@ -54,7 +41,7 @@ def test_border_without_ssim_window_is_grey() -> None:
 @pytest.mark.usefixtures("unchecked")
 def test_maps_are_omitted_for_small_images() -> None:
     prediction, target = torch.rand(2, 10, 30, 3, generator=torch.Generator().manual_seed(0))
-    maps = error_maps(prediction, target, with_lpips())
+    maps = error_maps(prediction, target, build_metrics())
     assert [error.name for error in maps] == ["squared_error", "flip"]
 
 

@@ -5,14 +5,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfro.evaluation.perceptual import lpips, pretrained
-from nerfro.registry.registration import discover
-from tests.conftest import refused
+from nerfro.evaluation.perceptual.lpips import LpipsNetwork, published_weights
+from nerfro.files.images import load_png
 from tests.processes import printed_by
-
-discover()
-CONVOLUTIONS, Lpips, LpipsNetwork = lpips.CONVOLUTIONS, lpips.Lpips, lpips.LpipsNetwork
-load_lpips_network = lpips.load_lpips_network
 
 
 class Reference(NamedTuple):
@@ -22,32 +17,21 @@ class Reference(NamedTuple):
     results: dict[str, Tensor]
 
 
-def random_weights() -> dict[str, Tensor]:
-    generator = torch.Generator().manual_seed(3)
-    weights = {}
-    for layer in CONVOLUTIONS:
-        fan_in = layer.channels_in * layer.kernel**2
-        shape = (layer.channels, layer.channels_in, layer.kernel, layer.kernel)
-        weights[f"{layer.key}.weight"] = torch.randn(shape, generator=generator) * (2 / fan_in) ** 0.5
-        weights[f"{layer.key}.bias"] = 0.1 * torch.randn(layer.channels, generator=generator)
-    return weights
-
-
 @pytest.fixture(scope="module")
 def network() -> LpipsNetwork:
-    return load_lpips_network(random_weights())
+    return LpipsNetwork(published_weights())
 
 
 @pytest.fixture(scope="module")
 def reference(tmp_path_factory: pytest.TempPathFactory) -> Reference:
-    """The values of torchmetrics, and our network with the same backbone and the published heads."""
+    """The values of torchmetrics with the convolutions and heads that nerfro contains."""
     folder = tmp_path_factory.mktemp("published")
-    torch.save(pictures(), folder / "pictures.pt")
+    torch.save([pictures(), dict(published_weights())], folder / "input.pt")
     program = Path(__file__).with_name("reference_lpips.py")
-    printed_by(str(program), str(folder / "pictures.pt"), str(folder / "results.pt"))
+    printed_by(str(program), str(folder / "input.pt"), str(folder / "results.pt"))
     results = torch.load(folder / "results.pt", weights_only=True)
     predictions, targets = (images.movedim(1, -1) for images in pictures())
-    return Reference(load_lpips_network(results["backbone"]), predictions, targets, results)
+    return Reference(LpipsNetwork(published_weights()), predictions, targets, results)
 
 
 def pictures() -> tuple[Tensor, Tensor]:
@@ -81,24 +65,9 @@ def test_network_is_neither_trained_nor_saved_with_a_model(network: LpipsNetwork
     assert network.state_dict() == {}
 
 
-def test_missing_network_is_reported_with_the_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    monkeypatch.setattr(pretrained, "unreachable", lambda url: "no cable")
-    metric = Lpips()
-    metric.prepare()
-    reason = metric.missing
-    assert reason.startswith("no weights; AlexNet is not in the cache of torch, and there is no network (no cable)")
-    assert f" to {tmp_path}" in reason
-    assert "\n" not in reason
-    cache = tmp_path / "hub" / "checkpoints"
-    cache.mkdir(parents=True)
-    torch.save(random_weights(), cache / "alexnet-owt-7be5be79.pth")
-    metric.prepare()
-    assert metric.missing is None
-    assert isinstance(metric.network, LpipsNetwork)
-
-
-def test_weights_of_another_network_are_refused() -> None:
-    other = random_weights()
-    other["features.3.weight"] = other["features.3.weight"][:, :3]
-    refused(r"features\.3\.weight of shape \[192, 64, 5, 5\], found \[192, 3, 5, 5\]", load_lpips_network, other)
+@pytest.mark.parametrize(("prediction", "distance"), [("ex_p0", 0.72188), ("ex_p1", 0.13757)])
+def test_example_of_the_authors_has_its_distance(network: LpipsNetwork, prediction: str, distance: float) -> None:
+    """Values of the package lpips with AlexNet in single precision, for the images of its repository."""
+    folder = Path(__file__).parent / "lpips"
+    images = [load_png(folder / f"{name}.png") for name in (prediction, "ex_ref")]
+    assert network(*images).item() == pytest.approx(distance, abs=5e-5)

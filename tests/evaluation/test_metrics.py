@@ -16,7 +16,8 @@ import nerfro
 from nerfro.evaluation.image_metrics import psnr
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.perceptual import flip as flips
-from nerfro.evaluation.regions import crop_rectangle, mean_over, object_pixels
+from nerfro.evaluation.perceptual.lpips import Lpips
+from nerfro.evaluation.regions import crop_rectangle, object_pixels
 from nerfro.evaluation.results import EvaluationResult
 from nerfro.evaluation.ssim import ssim, ssim_map
 from nerfro.files.images import load_png, round_to_8bit, save_png
@@ -66,13 +67,6 @@ def test_scores_are_reproducible_from_the_written_images(tmp_path: Path) -> None
     assert result.mean("ssim") == pytest.approx(ssim(written, target).item())
 
 
-class HalfOfTheDifference(torch.nn.Module):
-    """Stands in for a network of LPIPS."""
-
-    def forward(self, prediction: Tensor, target: Tensor, inside: Tensor | None = None) -> Tensor:
-        return mean_over((prediction - target).abs().mean(-1), inside) / 2
-
-
 @pytest.mark.usefixtures("unchecked")
 def test_every_region_has_the_scores_of_its_pixels() -> None:
     prediction, target = pictures(height=190, width=200)
@@ -80,9 +74,7 @@ def test_every_region_has_the_scores_of_its_pixels() -> None:
     coverage[60:100, 80:95] = 0.7
     coverage[100:103, 80:95] = 0.3
     inside = coverage > 0.5
-    metrics, network = ImageMetrics(), HalfOfTheDifference()
-    metrics.metrics["lpips"].network, metrics.metrics["lpips"].missing = network, None
-    result = scored((prediction, target, coverage), metrics=metrics)
+    result = scored((prediction, target, coverage))
     crop = slice(60 - 17, 100 + 17), slice(80 - 17, 95 + 17)
     regions = {
         "full": (prediction, target, None),
@@ -90,7 +82,7 @@ def test_every_region_has_the_scores_of_its_pixels() -> None:
         "crop": (prediction[crop], target[crop], None),
     }
     assert result.regions == tuple(regions)
-    metric = {"psnr": psnr, "ssim": ssim, "lpips": network, "flip": flip}
+    metric = {"psnr": psnr, "ssim": ssim, "lpips": Lpips(), "flip": flip}
     for region, compared in regions.items():
         for name, function in metric.items():
             assert result.mean(name, region) == pytest.approx(function(*compared).item(), abs=1e-6), (name, region)
@@ -114,7 +106,10 @@ def test_missing_metrics_are_none_with_a_reason() -> None:
     assert result.mean("flip") is not None
     assert [row.scores["ssim"] is None for row in result.views] == [False, True]
     assert result.mean("ssim") is None
-    assert result.notes == {"ssim": "images, masks or crops below 11 pixels", "lpips": "no network was given"}
+    assert result.notes == {
+        "ssim": "images, masks or crops below 11 pixels",
+        "lpips": "images, masks or crops below 31 pixels",
+    }
 
 
 def test_evaluation_without_views_is_refused() -> None:

@@ -28,7 +28,6 @@ import numpy as np
 
 from nerfro.cli.failures import in_one_line
 from nerfro.core.errors import NerfroError
-from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.files import cache
 
 SECONDS = 60
@@ -84,8 +83,6 @@ class World:
         # Compiled kernels stay where they are.
         patches += [mock.patch.object(cache, "cache_dir", return_value=self.root / "cache")]
         patches += [mock.patch.object(tempfile, "tempdir", str(self.caught))]
-        if hasattr(module, "prepared_metrics"):
-            patches.append(mock.patch.object(module, "prepared_metrics", ImageMetrics))
         with contextlib.ExitStack() as stack:
             for patch in patches:
                 stack.enter_context(patch)

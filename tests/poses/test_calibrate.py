@@ -15,7 +15,7 @@ pytest.importorskip("pyapriltags")
 from nerfro.data.blender import OpenCVData
 from nerfro.poses import calibration, photographs
 from nerfro.poses.boards import TagBoard, TagDetections, tag_grid, twelve_faces
-from nerfro.poses.calibration import calibrate
+from nerfro.poses.calibration import calibrate_by_tags
 from nerfro.poses.photographs import luminance
 from tests.sheet_photographs import angle, around, photograph
 
@@ -120,7 +120,7 @@ def test_outlier_tags_are_removed() -> None:
     detections, poses = detections_of(board)
     detections["v2"].image_points[40:48] += [25, -40]  # two tags, seen through the glass
     detections["v5"].image_points[4:8] += [3, 2]
-    found = calibrate(detections, SIZE, "pinhole")
+    found = calibrate_by_tags(detections, SIZE, "pinhole")
     assert found.num_outliers == 12
     for view, pose in enumerate(poses):
         assert angle(found.poses[f"v{view}"].camera_to_world, pose) < 0.05
@@ -130,11 +130,10 @@ def test_outlier_tags_are_removed() -> None:
     assert found.intrinsics.focal_deviation < 1
 
 
-def test_outliers_of_the_last_estimate_are_not_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_outliers_of_the_last_estimate_are_not_counted() -> None:
     detections, _ = detections_of(twelve_faces())
     detections["v2"].image_points[40:48] += [25, -40]
-    monkeypatch.setattr(calibration, "_MAX_ESTIMATES", 1)
-    found = calibrate(detections, SIZE, "pinhole")
+    found = calibrate_by_tags(detections, SIZE, "pinhole", calibration.TagSettings(max_estimates=1))
     assert found.num_outliers == 0
     assert found.poses["v2"].num_observations == detections["v2"].num_tags
 
@@ -142,7 +141,7 @@ def test_outliers_of_the_last_estimate_are_not_counted(monkeypatch: pytest.Monke
 def test_distortion_is_estimated() -> None:
     truth = (-0.15, 0.05, 0.001, -0.002)
     detections, poses = detections_of(tag_grid(6, 6, 0.05), truth)
-    found, pinhole = (calibrate(detections, SIZE, model) for model in ("opencv", "pinhole"))
+    found, pinhole = (calibrate_by_tags(detections, SIZE, model) for model in ("opencv", "pinhole"))
     np.testing.assert_allclose(found.intrinsics.distortion, truth, atol=0.02)
     for view, pose in enumerate(poses):
         one = found.poses[f"v{view}"]

@@ -123,7 +123,9 @@ def test_features_on_and_near_the_object_are_ignored(tmp_path: Path) -> None:
     mask = np.zeros((60, 200), np.uint8)
     mask[20:40, 50:100] = 255
     Image.fromarray(mask).save(tmp_path / "mask_a.png")
-    structure_from_motion._write_ignored(tmp_path / "mask_a.png", tmp_path / "a.jpg.png")
+    structure_from_motion._write_ignored(
+        tmp_path / "mask_a.png", tmp_path / "a.jpg.png", structure_from_motion.SfmSettings()
+    )
     ignored = np.asarray(Image.open(tmp_path / "a.jpg.png")) == 0
     assert ignored[mask > 0].all()
     assert ignored[30, 48:102].all()  # 1 % of the width farther
@@ -224,5 +226,7 @@ def test_sequence_is_matched_densely_with_near_and_sparsely_with_far_frames() ->
 
 def test_pycolmap_does_not_change_the_handler_of_sigterm() -> None:
     program = "import signal; signal.signal(15, lambda *_: exit(130)); "
-    program += "import tests.poses.camera_calibration as made; made.require_pycolmap(); signal.raise_signal(15)"
+    program += (
+        "from nerfro.poses.structure_from_motion import require_pycolmap; require_pycolmap(); signal.raise_signal(15)"
+    )
     assert subprocess.run([sys.executable, "-c", program], stderr=subprocess.DEVNULL).returncode == 130

@@ -22,7 +22,7 @@ from nerfro.fields.base import Field
 from nerfro.fields.hash_grid import HashGridField
 from nerfro.training.build import build
 from nerfro.training.callbacks import steps_by_phase
-from nerfro.training.phases.background import BackgroundSteps
+from nerfro.training.phases.background import BackgroundSettings, BackgroundSteps
 from nerfro.training.phases.base import TrainingRun
 from nerfro.training.ray_batches import RayBatches
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
@@ -82,7 +82,7 @@ def test_fits_of_few_pixels_use_the_pixels_of_larger_fits(
         run = TrainingRun(module.renderer, data.batches, views, torch.optim.Adam(module.parameters()), 0.0)
         phase = BackgroundSteps(steps=2)
         state = phase.begin(run)
-        monkeypatch.setattr("nerfro.training.phases.background._MAX_FITTED_PIXELS", limit)
+        phase.settings = BackgroundSettings(max_fitted_pixels=limit)
         assert all(phase.step(run, number, state) for number in range(2))
         sky = module.renderer.scene.background(Exits(views.cameras.image_rays(0).directions)).detach()
         of_limit[limit] = torch.cat(used).sort().values, state["weights"].sum(), to_srgb(sky)

@@ -7,6 +7,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from nerfro.core.cameras import Cameras
 from nerfro.media.analytic import Vacuum
+from nerfro.registry.allowed import untyped
 from nerfro.registry.registration import discover, find
 from nerfro.training.angular_resolution import derive_angular_resolution
 from nerfro.training.config import TrainConfig
@@ -24,7 +25,7 @@ def around(num: int) -> Cameras:
 
 
 def of_all_space(**content: object) -> DictConfig:
-    config = OmegaConf.structured(TrainConfig)
+    config = OmegaConf.structured(untyped(TrainConfig()))
     config.medium = {}
     config.content.space = "all"
     config.content.update(content)
@@ -57,7 +58,7 @@ def test_parallel_cameras_have_a_default_depth() -> None:
 
 
 def test_content_in_a_box_needs_no_cameras() -> None:
-    config = OmegaConf.structured(TrainConfig)
+    config = OmegaConf.structured(untyped(TrainConfig()))
     config.content.box_min, config.content.box_max = [0.0] * 3, [1.0] * 3
     derive_content(config, Vacuum())
     assert config.content.radius is None

@@ -15,7 +15,6 @@ import OpenImageIO
 import pytest
 import torch
 import trimesh
-from omegaconf import OmegaConf
 from PIL import Image
 
 from nerfro.core.errors import NerfroError
@@ -32,8 +31,8 @@ CELL = 2.12 * RADIUS / 47  # of the box with its margin of air
 
 
 def write(scene: TrainedScene, what: str, out: Path, **options: object) -> str:
-    config = OmegaConf.structured(ExportConfig(checkpoint="-", what=what, out=str(out)))
-    return find_export(what, out).write(scene, out, OmegaConf.merge(config, {"resolution": 48, **options}))
+    config = ExportConfig(checkpoint="-", what=what, out=str(out), **{"resolution": 48, **options})
+    return find_export(what, out).write(scene, out, config)
 
 
 def test_glb_contains_glass_as_dielectric_and_the_content_as_emission(scene: TrainedScene, tmp_path: Path) -> None:

@@ -12,7 +12,6 @@ import numpy as np
 import OpenImageIO
 import pytest
 import torch
-from omegaconf import OmegaConf
 from PIL import Image
 
 from nerfro.core.cameras import Cameras
@@ -125,9 +124,7 @@ def test_field_of_view_is_that_of_the_rays_through_a_distorting_lens(
     monkeypatch.setattr(TrainedScene, "cameras", lambda self, split: cameras)
 
     def shots(**options: Any) -> Cameras:
-        return find_shots(
-            OmegaConf.structured(RenderConfig(checkpoint="a.ckpt", views="test", **options)), scene
-        ).cameras
+        return find_shots(RenderConfig(checkpoint="a.ckpt", views="test", **options), scene).cameras
 
     wide = shots(fov=60.0, resolution=24)
     both, sides = torch.zeros(2, dtype=torch.long), torch.tensor([0, 24])

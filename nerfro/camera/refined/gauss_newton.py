@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from nerfro.camera.refined.least_squares import (
+    TINY,
     PriorInformation,
     axes_across,
     normal_equations,
@@ -34,12 +35,6 @@ Render = Callable[[Rays, Int[Tensor, "R"]], Float[Tensor, "R 3"]]
 # Colours [R, 3] of pixels in the photographs.
 Photographed = Callable[[Int[Tensor, "R"]], Float[Tensor, "R 3"]]
 
-# Pixels with a smaller contrast to their neighbours (sRGB) carry no information about the pose.
-_MIN_CONTRAST = 0.03
-# Colour change per pixel of motion above which the weight decreases, because steep gradients hold over short distances.
-_STEEP_SLOPE = 0.1
-_TINY = 1e-9
-
 
 @dataclass(frozen=True)
 class Step:
@@ -50,12 +45,15 @@ class Step:
         scale: scale of the robust loss, see `robust_weights`, sRGB.
         max_pixels: maximum motion of a camera, and maximum change of the lens, in pixels.
         fraction: fraction of the step that is applied.
+        steep_slope: colour change per pixel of motion above which the weight decreases, because steep gradients hold
+            over short distances.
     """
 
     difference_pixels: float
     scale: float
     max_pixels: float
     fraction: float = 1.0
+    steep_slope: float = 0.1
 
 
 def gauss_newton_step(
@@ -79,21 +77,21 @@ def gauss_newton_step(
         priors: prior information about the cameras.
     """
     view = cameras.view_of(pixels)
-    given, target = pixel_rays(cameras, pixels), photographed(pixels)
-    rays = camera(given, view)
+    initial, target = pixel_rays(cameras, pixels), photographed(pixels)
+    rays = camera(initial, view)
     angle = step.difference_pixels / cameras.fx[view]
     distances = object_distances(cameras).to(angle)[view]
     rendered, by_origin, by_direction = _differences(render, rays, view, angle, distances)
-    slopes = camera.slopes(given, view, by_origin, by_direction)
+    slopes = camera.slopes(initial, view, by_origin, by_direction)
     error = rendered - target
     # A steep derivative is valid for small motions only, because colours are bounded.
-    weights = robust_weights(error, step.scale) / (1 + (slopes[..., :6] / _STEEP_SLOPE).square().sum((1, 2)))
+    weights = robust_weights(error, step.scale) / (1 + (slopes[..., :6] / step.steep_slope).square().sum((1, 2)))
     matrix, vector = normal_equations(slopes.double(), error.double(), weights.double(), view, len(cameras))
-    variance = (weights[:, None] * error.square()).sum() / (3 * weights.sum()).clamp(min=_TINY)
+    variance = (weights[:, None] * error.square()).sum() / (3 * weights.sum()).clamp(min=TINY)
     matrix, vector = with_priors(matrix, vector, camera.parameter_vector(), variance, priors)
     motion, lens = camera.split(-torch.linalg.solve(matrix, vector))
     motion, lens = (
-        change * (step.max_pixels / change.norm(dim=-1, keepdim=True).clamp(min=_TINY)).clamp(max=1)
+        change * (step.max_pixels / change.norm(dim=-1, keepdim=True).clamp(min=TINY)).clamp(max=1)
         for change in (motion, lens)
     )
     camera.move(step.fraction * motion.to(angle), step.fraction * lens.to(angle))
@@ -105,6 +103,7 @@ def informative_pixels(
     photographed: Photographed,
     cameras: Cameras,
     excluded: Bool[Tensor, "V M"] | None = None,
+    min_contrast: float = 0.03,
 ) -> Int[Tensor, "R"]:
     """Select pixels of each view for a Gauss-Newton step: candidates with contrast first, in the given order.
 
@@ -114,8 +113,9 @@ def informative_pixels(
         photographed: colours of pixels in the photographs.
         cameras: cameras of the data set.
         excluded: candidates that must not be selected.
+        min_contrast: pixels with a smaller contrast to their neighbours (sRGB) carry no information about the pose.
     """
-    flat = (contrast(photographed, cameras, candidates.flatten()) < _MIN_CONTRAST).view(candidates.shape)
+    flat = (contrast(photographed, cameras, candidates.flatten()) < min_contrast).view(candidates.shape)
     excluded = torch.zeros_like(flat) if excluded is None else excluded
     order = (flat + 2 * excluded).argsort(dim=1, stable=True)[:, :num_pixels]
     return candidates.gather(1, order)[~excluded.gather(1, order)]

@@ -13,9 +13,7 @@ from torch.nn.functional import normalize, one_hot
 
 from nerfro.core.robust import geman_mcclure_weight
 
-# Damping of the normal equations, relative to the mean of the diagonal.
-DAMPING = 1e-3
-_TINY = 1e-9
+TINY = 1e-9  # lower bound of divisors
 
 
 @dataclass(frozen=True)
@@ -54,7 +52,7 @@ def normal_equations(
     weights: Float[Tensor, "R"],
     view: Int[Tensor, "R"],
     num_views: int,
-    damping: float = DAMPING,
+    damping: float = 1e-3,
 ) -> tuple[Float[Tensor, "M M"], Float[Tensor, "M"]]:
     """Accumulate the normal equations of all cameras.
 
@@ -72,13 +70,13 @@ def normal_equations(
     num = slopes.shape[-1]
     squares = torch.einsum("r,rci,rcj->rij", weights, slopes, slopes)
     products = torch.einsum("r,rci,rc->ri", weights, slopes, error)
-    each = slopes.new_zeros(num_views, num, num).index_add(0, view, squares)
+    of_views = slopes.new_zeros(num_views, num, num).index_add(0, view, squares)
     gradient = slopes.new_zeros(num_views, num).index_add(0, view, products)
-    own, shared = each[:, :6, :6], each[:, 6:, 6:].sum(0)
-    added = damping * own.diagonal(dim1=1, dim2=2).mean(-1) + _TINY
+    own, shared = of_views[:, :6, :6], of_views[:, 6:, 6:].sum(0)
+    added = damping * own.diagonal(dim1=1, dim2=2).mean(-1) + TINY
     own = own + added[:, None, None] * torch.eye(6).to(own)
-    shared = shared + (damping * shared.trace() / max(len(shared), 1) + _TINY) * torch.eye(num - 6).to(shared)
-    mixed = each[:, :6, 6:].flatten(0, 1)
+    shared = shared + (damping * shared.trace() / max(len(shared), 1) + TINY) * torch.eye(num - 6).to(shared)
+    mixed = of_views[:, :6, 6:].flatten(0, 1)
     matrix = torch.cat([torch.block_diag(*own), mixed], 1)
     matrix = torch.cat([matrix, torch.cat([mixed.mT, shared], 1)])
     return matrix, torch.cat([gradient[:, :6].flatten(), gradient[:, 6:].sum(0)])

@@ -8,6 +8,7 @@ the distant surroundings do (`panorama`).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
@@ -17,6 +18,7 @@ from nerfro.camera.refined.least_squares import PriorInformation, normal_equatio
 from nerfro.camera.refined.refined import RefinedCamera
 from nerfro.core.cameras import Cameras
 from nerfro.core.progress import track
+from nerfro.core.provenance import AlgorithmSettings
 from nerfro.data.base import Views
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.media.base import Medium
@@ -25,21 +27,38 @@ from nerfro.silhouettes.rims import RimFinder
 from nerfro.silhouettes.silhouettes import PixelBlocks
 from nerfro.silhouettes.visual_hull import Silhouettes
 
-# Largest side of the reduced images in which outlines are compared, pixels.
-_MAX_PIXELS = 256
-_STEPS = 8
-_MAX_STEP = 2.0  # pixels
-# Accuracy of outlines in pixels, and number of neighbouring contour points with a common error.
-_ACCURACY, _CORRELATED = 0.02, 3.0
-# Standard deviation of the prior of each parameter, in pixels, which fixes parameters that outlines do not determine.
-_PRIOR_DEVIATION = 1.0
-# Largest final distance between the surface and its masks, in pixels of the reduced masks; otherwise mesh and masks
-# differ.
-_MAX_DISTANCE = 0.2
+
+@dataclass(frozen=True)
+class OutlineSettings(AlgorithmSettings):
+    """Settings of the alignment of cameras by the outlines of masks (`align_to_masks`).
+
+    Attributes:
+        max_pixels: largest side of the reduced images in which outlines are compared.
+        steps: number of Gauss-Newton steps.
+        max_step: longest step of a camera, in pixels.
+        accuracy: accuracy of outlines, in pixels.
+        correlated: number of neighbouring contour points with a common error.
+        prior_deviation: standard deviation of the prior of each parameter, in pixels, which fixes parameters that
+            outlines do not determine.
+        max_distance: largest final distance between the surface and its masks, in pixels of the reduced masks;
+            otherwise mesh and masks differ.
+    """
+
+    max_pixels: int = 256
+    steps: int = 8
+    max_step: float = 2.0
+    accuracy: float = 0.02
+    correlated: float = 3.0
+    prior_deviation: float = 1.0
+    max_distance: float = 0.2
 
 
 def align_to_masks(
-    camera: RefinedCamera, views: Views, medium: Medium, panorama: PriorInformation | None
+    camera: RefinedCamera,
+    views: Views,
+    medium: Medium,
+    panorama: PriorInformation | None,
+    settings: OutlineSettings = OutlineSettings(),
 ) -> PriorInformation | None:
     """Move cameras so that the outlines of the surface agree with the masks.
 
@@ -48,17 +67,18 @@ def align_to_masks(
         views: training views.
         medium: medium with the surface.
         panorama: prior of the camera rotations from the background; None without a panorama.
+        settings: steps and limits.
 
     Returns:
         Prior of the cameras from the outlines; None without masks or without a surface.
     """
     if not isinstance(medium, SdfGrid) or not medium.meshes or views.masks is None:
         return None
-    blocks = PixelBlocks(views.cameras, _MAX_PIXELS)
+    blocks = PixelBlocks(views.cameras, settings.max_pixels)
     masks = torch.stack([blocks.mean(mask) for mask in views.masks])
     silhouettes = Silhouettes.of(blocks.cameras(views.cameras), masks)
     priors = [] if panorama is None else [panorama]
-    return align_to_outlines(camera, views.cameras, blocks.cameras, silhouettes, medium.outline, priors)
+    return align_to_outlines(camera, views.cameras, blocks.cameras, silhouettes, medium.outline, priors, settings)
 
 
 @torch.no_grad()
@@ -69,6 +89,7 @@ def align_to_outlines(
     silhouettes: Silhouettes,
     mesh: TriangleMesh,
     priors: Sequence[PriorInformation] = (),
+    settings: OutlineSettings = OutlineSettings(),
 ) -> PriorInformation | None:
     """Move the cameras until the contours of a surface meet the outlines of the masks.
 
@@ -81,34 +102,37 @@ def align_to_outlines(
         silhouettes: silhouettes of all views.
         mesh: the surface.
         priors: prior information about the cameras.
+        settings: steps and limits.
 
     Returns:
         The information that the outlines give about the cameras. None if the surface does not fit its masks; the
         cameras are then unchanged.
     """
+    settings.use()
     initial = camera.parameter_vector()
-    weak = PriorInformation(initial, torch.eye(len(initial)).to(initial) / _PRIOR_DEVIATION**2)
+    weak = PriorInformation(initial, torch.eye(len(initial)).to(initial) / settings.prior_deviation**2)
     finder = RimFinder(mesh, silhouettes)
-    for step in track("outlines", range(_STEPS + 1)):
+    for step in track("outlines", range(settings.steps + 1)):
         slopes, error, weights, view = _observations(camera, cameras, downscaled, finder)
-        variance = float((weights * error[:, 0].square()).sum() / weights.sum()) + _ACCURACY**2
-        if step < _STEPS:
+        variance = float((weights * error[:, 0].square()).sum() / weights.sum()) + settings.accuracy**2
+        if step < settings.steps:
             matrix, vector = normal_equations(slopes, error, weights, view, len(cameras))
             matrix, vector = _without_width(matrix, vector)
             parameters = camera.parameter_vector()
-            matrix, vector = with_priors(matrix, vector, parameters, _CORRELATED * variance, [*priors, weak])
+            matrix, vector = with_priors(matrix, vector, parameters, settings.correlated * variance, [*priors, weak])
             motion, lens = camera.split(-torch.linalg.solve(matrix, vector).to(camera.motions.motion))
-            camera.move(motion * (_MAX_STEP / motion.norm(dim=-1, keepdim=True).clamp(min=_MAX_STEP)), lens)
+            longest = settings.max_step
+            camera.move(motion * (longest / motion.norm(dim=-1, keepdim=True).clamp(min=longest)), lens)
     distance = float((error - error.median()).abs().median())
-    if distance > _MAX_DISTANCE:
+    if distance > settings.max_distance:
         camera.restore(initial, torch.ones(len(cameras), dtype=torch.bool), lens=True)
         print(
-            f"outlines: the surface is {distance:.2f} pixels off its masks (of at most {_MAX_PIXELS} pixels), so the "
-            "cameras are not aligned"
+            f"outlines: the surface is {distance:.2f} pixels off its masks (of at most {settings.max_pixels} pixels), "
+            "so the cameras are not aligned"
         )
         return None
     matrix, vector = normal_equations(slopes, error, weights, view, len(cameras), damping=0.0)
-    information = _without_width(matrix, vector)[0] / (_CORRELATED * variance)
+    information = _without_width(matrix, vector)[0] / (settings.correlated * variance)
     return PriorInformation(camera.parameter_vector(), information.to(initial))
 
 
@@ -126,13 +150,13 @@ def _observations(
     rims = finder.find(estimated)
     device, views = camera.motions.motion.device, torch.from_numpy(rims.view)
     points, normals, misfits, weights, widths = (
-        torch.from_numpy(each).float() for each in (rims.points, rims.normal, rims.misfit, rims.weight, rims.width)
+        torch.from_numpy(values).float() for values in (rims.points, rims.normal, rims.misfit, rims.weight, rims.width)
     )
     of_views = points.split(torch.bincount(views, minlength=len(cameras)).tolist())
-    place = torch.cat([estimated.select([view]).project(each)[0][0] for view, each in enumerate(of_views)])
-    place = place * place.new_tensor([cameras.width / estimated.width, cameras.height / estimated.height])
-    pixel = place.floor()
-    rays = cameras.rays(views, pixel[:, 1], pixel[:, 0], place - pixel)
+    position = torch.cat([estimated.select([view]).project(part)[0][0] for view, part in enumerate(of_views)])
+    position = position * position.new_tensor([cameras.width / estimated.width, cameras.height / estimated.height])
+    pixel = position.floor()
+    rays = cameras.rays(views, pixel[:, 1], pixel[:, 0], position - pixel)
     # The ray of a fixed pixel that moves outwards misses the surface, as if the mask were larger.
     outwards = normals / widths[:, None]
     distances = (points - estimated.camera_to_world[views, :, 3]).norm(dim=-1, keepdim=True)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -19,38 +18,61 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 from torch.nn import functional as F
 
-from nerfro.camera.refined.least_squares import PriorInformation, axes_across, robust_weights
+from nerfro.camera.refined.least_squares import TINY, PriorInformation, axes_across, robust_weights
 from nerfro.camera.refined.refined import RefinedCamera
 from nerfro.core.cameras import Cameras
 from nerfro.core.light import to_linear
 from nerfro.core.progress import track
+from nerfro.core.provenance import AlgorithmSettings
 from nerfro.core.rays import Rays
 from nerfro.samplers.subdivision import pixel_rays
 
-# Photographs are downscaled to this width in pixels; the alignment is accurate to a few hundredths of a pixel.
-_WIDTH = 256
+
+@dataclass(frozen=True)
+class PanoramaLevel:
+    """Gauss-Newton steps with one blur of the photographs.
+
+    Attributes:
+        blur: standard deviation, as a fraction of the image width.
+        num_directions: number of directions that each photograph contributes.
+        repetitions: number of steps.
+    """
+
+    blur: float
+    num_directions: int
+    repetitions: int
 
 
-class _Level(NamedTuple):
-    """Gauss-Newton steps with one blur of the photographs."""
+@dataclass(frozen=True)
+class PanoramaSettings(AlgorithmSettings):
+    """Settings of the alignment of cameras by the panorama of the sky (`align`).
 
-    blur: float  # standard deviation, as a fraction of the image width
-    num_directions: int  # that each photograph contributes
-    repetitions: int  # number of steps
+    Attributes:
+        levels: steps from coarse to fine: the blur limits the details, and thereby the distance over which derivatives
+            are valid.
+        width: photographs are downscaled to this width in pixels; the alignment is accurate to a few hundredths of a
+            pixel.
+        min_blur: smallest standard deviation of the blur, in pixels.
+        min_sky: smallest fraction of sky in a blurred pixel.
+        scale: scale of the robust loss (see `robust_weights`), in square roots of linear radiance.
+        reweightings: number of estimates of the robust weights in each step.
+        damping: damping relative to the diagonal, which keeps cameras fixed that share no direction with others.
+        min_deviation: smallest standard deviation of colours: half an 8-bit level.
+    """
 
-
-# Coarse to fine: the blur limits the details, and thereby the distance over which derivatives are valid.
-_LEVELS = (_Level(1 / 32, 150, 4), _Level(1 / 64, 150, 3), _Level(1 / 128, 200, 3), _Level(0.0, 300, 3))
-_MIN_BLUR = 0.7  # pixels
-# Minimum fraction of sky in a blurred pixel, and scale of the robust loss (see `robust_weights`) in square roots of
-# linear radiance.
-_MIN_SKY, _SCALE = 0.9, 0.1
-_REWEIGHTINGS = 2
-# Damping relative to the diagonal, which keeps cameras fixed that share no direction with others.
-_DAMPING = 1e-2
-# Minimum variance of colours: the square of half an 8-bit level.
-_MIN_VARIANCE = (0.5 / 255) ** 2
-_TINY = 1e-9
+    levels: tuple[PanoramaLevel, ...] = (
+        PanoramaLevel(1 / 32, 150, 4),
+        PanoramaLevel(1 / 64, 150, 3),
+        PanoramaLevel(1 / 128, 200, 3),
+        PanoramaLevel(0.0, 300, 3),
+    )
+    width: int = 256
+    min_blur: float = 0.7
+    min_sky: float = 0.9
+    scale: float = 0.1
+    reweightings: int = 2
+    damping: float = 1e-2
+    min_deviation: float = 0.5 / 255
 
 
 @torch.no_grad()
@@ -59,6 +81,7 @@ def align(
     cameras: Cameras,
     photographed: Callable[[Int[Tensor, "R"]], Float[Tensor, "R 3"]],
     of_sky: Callable[[Rays], Bool[Tensor, "R"]],
+    settings: PanoramaSettings = PanoramaSettings(),
 ) -> PriorInformation | None:
     """Rotate the cameras, and adapt the common lens if it is refined, until photographs of the sky agree.
 
@@ -67,29 +90,33 @@ def align(
         cameras: cameras of the data set.
         photographed: colours of pixels in the photographs, sRGB in [0, 1].
         of_sky: whether rays reach the sky without meeting the object.
+        settings: steps and limits.
 
     Returns:
         Prior information about rotations and lens, except for a common rotation of all cameras. None if no two
         photographs show the same part of the sky.
     """
-    images = _downscaled_roots(cameras, photographed)
+    settings.use()
+    images = _downscaled_roots(cameras, photographed, settings.width)
     gains, generator = images.new_ones(len(cameras), 3), torch.Generator().manual_seed(0)
     information = None
-    steps = [level for level in _LEVELS for _ in range(level.repetitions)]
+    steps = [level for level in settings.levels for _ in range(level.repetitions)]
     for level in track("panorama", steps):
-        blur = max(level.blur * images.shape[-1], _MIN_BLUR)
-        overlap = _find_overlap(camera, cameras, images, of_sky, blur, level.num_directions, generator)
+        blur = max(level.blur * images.shape[-1], settings.min_blur)
+        usable_images = _blurred_sky(camera.estimated(cameras), images, of_sky, blur, settings.min_sky)
+        overlap = _find_overlap(camera, cameras, *usable_images, level.num_directions, generator)
         if overlap is None:
             continue  # if little sky is visible, strongly blurred pixels always contain other objects
-        matrix, vector, variance = _equations(overlap, gains, learn_gains=camera.exposure is not None)
+        matrix, vector, variance = _equations(overlap, gains, camera.exposure is not None, settings)
         num_rotations, num_lens = 3 * len(cameras), overlap.by_lens.shape[-1]
-        step = _solve(matrix, vector).to(images)
+        step = _solve(matrix, vector, settings.damping).to(images)
         rotations, lens, log_gains = step.split([num_rotations, num_lens, len(step) - num_rotations - num_lens])
         gains = gains * log_gains.exp().view(-1, 3) if len(log_gains) else gains
         rotations, max_pixels = rotations.view(-1, 3), 2 * blur * cameras.width / images.shape[-1]
-        rotations = rotations * (max_pixels / rotations.norm(dim=-1, keepdim=True).clamp(min=_TINY)).clamp(max=1)
+        rotations = rotations * (max_pixels / rotations.norm(dim=-1, keepdim=True).clamp(min=TINY)).clamp(max=1)
         camera.move(F.pad(rotations, (0, 3)), lens)
-        information = _marginalized(matrix, num_rotations + num_lens) / max(variance, _MIN_VARIANCE)
+        information = _marginalized(matrix, num_rotations + num_lens, settings.damping)
+        information = information / max(variance, settings.min_deviation**2)
     return None if information is None else _prior(camera, information)
 
 
@@ -102,28 +129,30 @@ def _prior(camera: RefinedCamera, information: Float[Tensor, "M M"]) -> PriorInf
     mean = camera.parameter_vector()
     motions, lens = camera.split(torch.arange(len(mean), device=information.device))
     index = torch.cat([motions[:, :3].flatten(), lens])
-    known = information.new_zeros(len(mean), len(mean))
-    known[index[:, None], index] = projection @ information @ projection
-    return PriorInformation(mean, known.to(mean))
+    of_all = information.new_zeros(len(mean), len(mean))
+    of_all[index[:, None], index] = projection @ information @ projection
+    return PriorInformation(mean, of_all.to(mean))
 
 
 def _solve(
-    matrix: Float[Tensor, "parameters parameters"], right: Float[Tensor, " parameters *columns"]
+    matrix: Float[Tensor, "parameters parameters"], right: Float[Tensor, " parameters *columns"], damping: float
 ) -> Float[Tensor, " parameters *columns"]:
     """Return the damped Gauss-Newton step for a normal matrix and a gradient."""
-    return -torch.linalg.solve(matrix + torch.diag(_DAMPING * matrix.diagonal() + _TINY), right)
+    return -torch.linalg.solve(matrix + torch.diag(damping * matrix.diagonal() + TINY), right)
 
 
-def _marginalized(matrix: Float[Tensor, "parameters parameters"], num: int) -> Float[Tensor, "M M"]:
+def _marginalized(matrix: Float[Tensor, "parameters parameters"], num: int, damping: float) -> Float[Tensor, "M M"]:
     """Return the information about the first `num` parameters, with the others eliminated (Schur complement)."""
     own, mixed = matrix[:num, :num], matrix[num:, :num]
-    return own + mixed.mT @ _solve(matrix[num:, num:], mixed) if len(mixed) else own
+    return own + mixed.mT @ _solve(matrix[num:, num:], mixed, damping) if len(mixed) else own
 
 
-def _downscaled_roots(cameras: Cameras, photographed: Callable[[Tensor], Tensor]) -> Float[Tensor, "V 3 h w"]:
-    """Return square roots of linear radiance, at most `_WIDTH` wide, in which exposures are factors as well."""
+def _downscaled_roots(
+    cameras: Cameras, photographed: Callable[[Tensor], Tensor], max_width: int
+) -> Float[Tensor, "V 3 h w"]:
+    """Return square roots of linear radiance, at most `max_width` wide, in which exposures are factors as well."""
     height, width = cameras.height, cameras.width
-    factor = min(1.0, _WIDTH / width)
+    factor = min(1.0, max_width / width)
     size = max(1, round(factor * height)), max(1, round(factor * width))
     pixels = torch.arange(height * width, device=cameras.device)
     images = []
@@ -165,8 +194,7 @@ def _find_overlap(
     camera: RefinedCamera,
     cameras: Cameras,
     images: Float[Tensor, "V 3 h w"],
-    of_sky: Callable[[Rays], Bool[Tensor, "R"]],
-    blur: float,
+    usable: Bool[Tensor, "V 1 h w"],
     num: int,
     generator: torch.Generator,
 ) -> _Overlap | None:
@@ -175,9 +203,8 @@ def _find_overlap(
     Args:
         camera: estimated cameras.
         cameras: cameras of the data set.
-        images: downscaled photographs.
-        of_sky: whether rays reach the sky without meeting the object.
-        blur: standard deviation of the blur, in pixels of these images.
+        images: downscaled and blurred photographs.
+        usable: whether pixels of these images show the sky.
         num: number of directions per photograph.
         generator: random numbers.
 
@@ -186,7 +213,6 @@ def _find_overlap(
     """
     height, width = images.shape[-2:]
     estimated = camera.estimated(cameras).resized(width, height)
-    images, usable = _blurred_sky(estimated, images, of_sky, blur)
     directions = _draw_directions(estimated, usable, num, generator)
     # The sky is infinitely far away, so the positions of the cameras do not matter.
     distant = replace(estimated, camera_to_world=F.pad(estimated.camera_to_world[..., :3], (0, 1)))
@@ -213,13 +239,18 @@ def _find_overlap(
 
 
 def _blurred_sky(
-    cameras: Cameras, images: Float[Tensor, "V 3 h w"], of_sky: Callable[[Rays], Bool[Tensor, "R"]], blur: float
+    cameras: Cameras,
+    images: Float[Tensor, "V 3 h w"],
+    of_sky: Callable[[Rays], Bool[Tensor, "R"]],
+    blur: float,
+    min_sky: float,
 ) -> tuple[Float[Tensor, "V 3 h w"], Bool[Tensor, "V 1 h w"]]:
     """Blur the sky in images without mixing it with the object; also returns which pixels show enough of the sky."""
+    cameras = cameras.resized(images.shape[-1], images.shape[-2])
     size = len(images), 1, *images.shape[-2:]
     sky = torch.stack([of_sky(cameras.image_rays(view)) for view in range(len(images))]).view(size)
     fraction = _blurred(sky.to(images), blur)
-    return _blurred(images * sky, blur) / fraction.clamp(min=_TINY), sky & (fraction > _MIN_SKY)
+    return _blurred(images * sky, blur) / fraction.clamp(min=TINY), sky & (fraction > min_sky)
 
 
 def _draw_directions(
@@ -258,7 +289,7 @@ def _sample(
 
 
 def _equations(
-    overlap: _Overlap, gains: Float[Tensor, "V 3"], learn_gains: bool
+    overlap: _Overlap, gains: Float[Tensor, "V 3"], learn_gains: bool, settings: PanoramaSettings
 ) -> tuple[Float[Tensor, "parameters parameters"], Float[Tensor, " parameters"], float]:
     """Compute matrix and gradient of the normal equations with the sky eliminated, and the variance of the colours.
 
@@ -276,12 +307,12 @@ def _equations(
     """
     view, direction, num = overlap.view, overlap.direction, len(overlap.view)
     colour, weight, num_directions = overlap.colour * gains[view], gains.new_ones(num), int(direction.max()) + 1
-    for _ in range(_REWEIGHTINGS):
-        total = weight.new_zeros(num_directions).index_add(0, direction, weight).clamp(min=_TINY)
+    for _ in range(settings.reweightings):
+        total = weight.new_zeros(num_directions).index_add(0, direction, weight).clamp(min=TINY)
         mean = colour.new_zeros(num_directions, 3).index_add(0, direction, weight[:, None] * colour) / total[:, None]
         error = colour - mean[direction]
-        weight = robust_weights(error, _SCALE)
-    total = weight.new_zeros(num_directions).index_add(0, direction, weight).clamp(min=_TINY)
+        weight = robust_weights(error, settings.scale)
+    total = weight.new_zeros(num_directions).index_add(0, direction, weight).clamp(min=TINY)
 
     of_view, num_lens = torch.arange(3, device=view.device) + 3 * view[:, None], overlap.by_lens.shape[-1]
     of_lens = 3 * overlap.num_views + torch.arange(num_lens, device=view.device)

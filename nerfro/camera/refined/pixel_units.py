@@ -15,18 +15,17 @@ from torch import Tensor
 from nerfro.core.cameras import Cameras
 from nerfro.geometry.lines import nearest_point
 
-_GRID = 9  # points along each side of an image
-_MIN_DISTANCE = 1e-3  # minimum object distance, as a fraction of the far bound
-_RANK_TOLERANCE = 1e-6  # relative to the largest singular value
-
 
 def object_distances(cameras: Cameras) -> Float[Tensor, "V"]:
-    """Return the distance of each camera from the point nearest to all optical axes, within near and far."""
+    """Return the distance of each camera from the point nearest to all optical axes, within near and far.
+
+    A distance is at least 0.1 % of the far bound.
+    """
     poses = cameras.camera_to_world.double().cpu()
     point = torch.from_numpy(nearest_point(poses[..., 3].numpy(), -poses[..., 2].numpy()))
     distances = (poses[..., 3] - point).norm(dim=-1)
     scale = cameras.far if math.isfinite(cameras.far) else float(distances.max()) or 1.0
-    return distances.clamp(min=max(cameras.near, _MIN_DISTANCE * scale), max=cameras.far)
+    return distances.clamp(min=max(cameras.near, 1e-3 * scale), max=cameras.far)
 
 
 def pixel_motions(cameras: Cameras, distances: Float[Tensor, "V"]) -> Float[Tensor, "V 7"]:
@@ -39,7 +38,8 @@ def pixel_motions(cameras: Cameras, distances: Float[Tensor, "V"]) -> Float[Tens
     Source:
         Park et al., "CamP: camera preconditioning for neural radiance fields", 2023, section 4 (diagonal).
     """
-    ticks = (torch.arange(_GRID, dtype=torch.float64) + 0.5) / _GRID
+    num_points = 9  # along each side of an image
+    ticks = (torch.arange(num_points, dtype=torch.float64) + 0.5) / num_points
     position = torch.cartesian_prod(ticks, ticks)
     fx, fy, cx, cy = (getattr(cameras, name).double().cpu()[:, None] for name in ("fx", "fy", "cx", "cy"))
     x, y = (position[:, 0] * cameras.width - cx) / fx, (cy - position[:, 1] * cameras.height) / fy
@@ -81,7 +81,7 @@ def gauge_basis(poses: Float[Tensor, "V 3 4"], weights: Float[Tensor, "V 6"]) ->
     motions = torch.cat([rotations, translations, torch.cat([zeros[:1], centres[None]], -1)])
     own = motions.unflatten(-1, (2, 3)) @ poses[..., :3]  # in camera axes
     u, values, _ = torch.linalg.svd((own.flatten(-2) * weights).flatten(1).T, full_matrices=False)
-    return u[:, values > _RANK_TOLERANCE * values.max()].T.unflatten(-1, (len(poses), 6))
+    return u[:, values > 1e-6 * values.max()].T.unflatten(-1, (len(poses), 6))
 
 
 def project_out_gauge(

@@ -58,7 +58,7 @@ class _Motions(PerView):
         pixels = pixel_motions(cameras, object_distances(cameras))
         weights = even_weights(pixels)
         distortion = torch.zeros(0, 9) if cameras.distortion is None else cameras.distortion
-        found = {
+        buffers = {
             "motion": torch.zeros(len(cameras), 6),
             "poses": poses,
             "focal": torch.stack([cameras.fx, cameras.fy], -1),
@@ -68,7 +68,7 @@ class _Motions(PerView):
             "gauge_basis": gauge_basis(poses, weights) if self.fix_gauge else weights.new_zeros(0, *weights.shape),
             "focal_unit": 1 / pixels[:, 6].square().mean().sqrt()[None],
         }
-        for name, tensor in found.items():
+        for name, tensor in buffers.items():
             setattr(self, name, tensor.to(getattr(self, name)))
 
     def forward(self) -> tuple[Float[Tensor, "V 3 3"], Float[Tensor, "V 3"]]:
@@ -155,13 +155,13 @@ class RefinedCamera(CameraModel):
         by_motion = torch.cat([by_rotation @ axes, by_origin @ axes], -1) * self.motions.units[view, None]
         if self.lens is None:
             return by_motion
-        kept, by_lens = self.lens.clone(), []
-        for number in range(len(kept)):  # central differences over one pixel
+        lens, by_lens = self.lens.clone(), []
+        for number in range(len(lens)):  # central differences over one pixel
             ends = []
             for half in (0.5, -0.5):
-                self.lens[number] = kept[number] + half
+                self.lens[number] = lens[number] + half
                 ends.append(self(rays, view).directions)
-            self.lens.copy_(kept)
+            self.lens.copy_(lens)
             by_lens.append((by_direction * (ends[0] - ends[1])[:, None]).sum(-1))
         return torch.cat([by_motion, torch.stack(by_lens, -1)], -1)
 
@@ -228,12 +228,12 @@ class RefinedCamera(CameraModel):
     @torch.no_grad()
     def measurements(self) -> dict[str, float]:
         motion = (self.motions.fixed() / self.motions.units).square().sum(-1).mean().sqrt()
-        found = super().measurements() | {"cameras.motion_pixels": float(motion)}
+        values = super().measurements() | {"cameras.motion_pixels": float(motion)}
         if self.lens is not None:
             growth, (x, y) = self._lens()
             named = {"focal_length_factor": growth, "principal_x": x, "principal_y": y}
-            found |= {f"cameras.{name}": float(value) for name, value in named.items()}
-        return found
+            values |= {f"cameras.{name}": float(value) for name, value in named.items()}
+        return values
 
 
 def rotation_matrices(vectors: Float[Tensor, "V 3"]) -> Float[Tensor, "V 3 3"]:

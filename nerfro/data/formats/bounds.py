@@ -15,13 +15,6 @@ from nerfro.registry.allowed import Coordinate
 
 _MAX_COORDINATE = get_args(Coordinate)[2].le  # world units
 
-# The cameras share a target if it lies in front of at least 90 % of them, within 30 degrees of the optical axis.
-_MIN_COSINE_TO_TARGET, _MIN_SHARE_OF_CAMERAS = 0.87, 0.9
-# Rays begin at this fraction of the distance between the target and the nearest camera.
-_NEAR_FRACTION = 0.1
-# Quantile of the distances at each end that counts as outliers.
-_OUTLIER_QUANTILE = 0.001
-
 
 def find_bounds(
     poses: Float[np.ndarray, "V 3 4"], edges: Float[np.ndarray, "V 2 2"], points: Float[np.ndarray, "points 3"]
@@ -45,19 +38,20 @@ def find_bounds(
     """
     centres, forward = poses[:, :, 3], -poses[:, :, 2]
     distances_in_view = [_distances_in_view(points, *camera) for camera in zip(poses, edges, strict=True)]
-    quantiles = [_OUTLIER_QUANTILE, 1 - _OUTLIER_QUANTILE]
-    ranges = np.array([np.quantile(each, quantiles) for each in distances_in_view if len(each)])
+    quantiles = [0.001, 1 - 0.001]  # outliers at both ends are left out
+    ranges = np.array([np.quantile(distances, quantiles) for distances in distances_in_view if len(distances)])
     if len(ranges):
         return 0.9 * float(ranges[:, 0].min()), 1.1 * float(ranges[:, 1].max())
     to_target = nearest_point(centres, forward) - centres
     distances = np.linalg.norm(to_target, axis=1)
-    sees_target = (to_target * forward).sum(1) > _MIN_COSINE_TO_TARGET * distances
-    if sees_target.mean() < _MIN_SHARE_OF_CAMERAS or not distances.min() > 0:
+    sees_target = (to_target * forward).sum(1) > 0.87 * distances
+    # The cameras share a target if it lies in front of at least 90 % of them, within 30 degrees of the optical axis.
+    if sees_target.mean() < 0.9 or not distances.min() > 0:
         raise NerfroError(
             "data.near and data.far cannot be found: the cameras have no common target, and the data set has no sparse "
             "points; set both, in world units"
         )
-    return _NEAR_FRACTION * float(distances.min()), 2 * float(distances.max())
+    return 0.1 * float(distances.min()), 2 * float(distances.max())
 
 
 def image_edges(lens: Lens, width: int, height: int) -> Float[np.ndarray, "2 2"]:

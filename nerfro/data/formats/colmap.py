@@ -81,10 +81,10 @@ class ColmapData(PosedImages):
 
     def _model_folder(self) -> Path:
         folders = [self.root / name for name in ((self.model,) if self.model is not None else MODEL_FOLDERS)]
-        found = find_model_folder(folders)
-        if found is None:
+        folder = find_model_folder(folders)
+        if folder is None:
             tried = ", ".join(map(str, folders))
             raise NerfroError(
                 f"there is no COLMAP model (cameras.bin or .txt) in {tried}; set data.model to its folder"
             )
-        return found
+        return folder

@@ -20,8 +20,6 @@ from nerfro.data.masks import find_mask
 from nerfro.files.reading import load_arrays, parse_matrix
 from nerfro.registry.registration import register
 
-_MAX_SKEW = 1e-3
-
 
 @register("data", "idr")
 class IdrData(PosedImages):
@@ -68,12 +66,12 @@ class IdrData(PosedImages):
         projections = (self._projection(arrays, i, file) for i in range(len(images)))
         cameras = [decompose(projection, f"{file}: world_mat_{i}") for i, projection in enumerate(projections)]
         poses, lenses = zip(*cameras, strict=True)
-        chosen = self.held_out(range(len(images)), self.test_every, split)
-        frames = [Frame(images[i].name, images[i], masks[i], poses[i]) for i in chosen]
+        indices = self.held_out(range(len(images)), self.test_every, split)
+        frames = [Frame(images[i].name, images[i], masks[i], poses[i]) for i in indices]
         # All views are considered, so that all splits have the same bounds.
         distance = np.linalg.norm(np.stack(poses)[:, :, 3], axis=-1)
         near, far = max(float(distance.min()) - 1, 0.0), float(distance.max()) + 1
-        return FrameSet(frames, [lenses[i] for i in chosen], "opencv", near, far)
+        return FrameSet(frames, [lenses[i] for i in indices], "opencv", near, far)
 
     def _projection(self, arrays: dict[str, np.ndarray], index: int, file: Path) -> Float[np.ndarray, "3 4"]:
         product = np.eye(4)
@@ -104,7 +102,7 @@ def decompose(projection: Float[np.ndarray, "3 4"], where: str) -> tuple[Float[n
     signs = np.diag(np.sign(np.diag(upper)))
     intrinsics, rotation = upper @ signs, signs @ rotation
     intrinsics /= intrinsics[2, 2]
-    lens = Lens.of_matrix(intrinsics, f"the camera matrix of {where}", _MAX_SKEW)
+    lens = Lens.of_matrix(intrinsics, f"the camera matrix of {where}", 1e-3)
     centre = -np.linalg.solve(square, projection[:, 3])
     return np.column_stack([rotation.T, centre]), replace(lens, cx=lens.cx + 0.5, cy=lens.cy + 0.5)
 

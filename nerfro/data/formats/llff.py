@@ -18,12 +18,6 @@ from nerfro.data.masks import find_mask
 from nerfro.files.reading import load_array
 from nerfro.registry.registration import register
 
-# LLFF scales the nearest depth to 1 / 0.75, which leaves a margin in front of the scene.
-_LLFF_BOUND_FACTOR = 0.75
-
-# Far bound of Eikonal Fields, in units of its rescaled world.
-_EIKONAL_FAR = 2.0
-
 
 @register("data", "llff")
 class LlffData(PosedImages):
@@ -61,7 +55,8 @@ class LlffData(PosedImages):
         # LLFF measures depths along the optical axis. The arc length to a depth is longest in the corner of the image.
         depths = depths * np.cbrt(np.linalg.det(transform[:3, :3]))
         height, width, focal = sizes.T
-        farthest = min(float(depths.max()), _EIKONAL_FAR if self.frame == "eikonal" else math.inf)
+        # Eikonal Fields has a far bound of 2, in units of its rescaled world.
+        farthest = min(float(depths.max()), 2.0 if self.frame == "eikonal" else math.inf)
         farthest *= float(np.sqrt(1 + 0.25 * (width**2 + height**2) / focal**2).max())
         folder = self.root
         if self.video is not None and split != "train":
@@ -74,12 +69,12 @@ class LlffData(PosedImages):
                 f"{folder / self.images} holds {len(files)} images but {folder / 'poses_bounds.npy'} has {len(poses)} "
                 "poses; images and poses are matched in the order of names, so restore the images that were calibrated"
             )
-        poses, chosen = map_poses(poses, transform), list(range(len(files)))
+        poses, indices = map_poses(poses, transform), list(range(len(files)))
         if self.video is None:
-            chosen = self.held_out(chosen, self.test_every, split)
-        frames = [Frame(files[i].name, files[i], find_mask(folder, files[i]), poses[i]) for i in chosen]
+            indices = self.held_out(indices, self.test_every, split)
+        frames = [Frame(files[i].name, files[i], find_mask(folder, files[i]), poses[i]) for i in indices]
         size, where = read_size(frames[0].image)[:2], f"{folder / 'poses_bounds.npy'}"
-        lenses = [Lens(f, f, 0.5 * w, 0.5 * h).resized((w, h), size, where) for h, w, f in sizes[chosen].tolist()]
+        lenses = [Lens(f, f, 0.5 * w, 0.5 * h).resized((w, h), size, where) for h, w, f in sizes[indices].tolist()]
         return FrameSet(frames, lenses, "opengl", 0.9 * float(depths.min()), farthest)
 
 
@@ -122,7 +117,8 @@ def frame_transform(
     """
     if frame == "file":
         return np.eye(4)
-    scale = 1 / (_LLFF_BOUND_FACTOR * depths.min() if frame == "llff" else depths.max() - depths.min())
+    # LLFF scales the nearest depth to 1 / 0.75, which leaves a margin in front of the scene.
+    scale = 1 / (0.75 * depths.min() if frame == "llff" else depths.max() - depths.min())
     transform = np.diag([scale, scale, scale, 1.0])
     transform = _recentre(map_poses(poses, transform)) @ transform
     if frame == "eikonal":

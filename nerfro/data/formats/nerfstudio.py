@@ -66,11 +66,11 @@ class NerfstudioData(PosedImages):
 
     def read(self, split: str) -> FrameSet:
         manifest = self._manifest(split)
-        chosen = self._choose(manifest, split) if self._is_single else list(range(len(manifest.frames)))
+        indices = self._choose(manifest, split) if self._is_single else list(range(len(manifest.frames)))
         entries: Any = manifest.document["frames"]
-        frames, stated = [manifest.frames[i] for i in chosen], [entries[i].get("mask_path") for i in chosen]
+        frames, stated = [manifest.frames[i] for i in indices], [entries[i].get("mask_path") for i in indices]
         usable = [path and find_mask(self.root, frame.image, path) for path, frame in zip(stated, frames, strict=True)]
-        return FrameSet(frames, manifest.lenses(chosen), "opengl", *self._bounds(split), usable=usable)
+        return FrameSet(frames, manifest.lenses(indices), "opengl", *self._bounds(split), usable=usable)
 
     def _bounds(self, split: str) -> tuple[float, float]:
         """Return the bounds, which are estimated from the training cameras for all splits."""
@@ -97,12 +97,12 @@ class NerfstudioData(PosedImages):
                 f"{manifest.path} lists the files of other splits but has no '{split}_filenames'; "
                 "add it, or remove all lists"
             )
-        known = {manifest.frames[i].name: i for i in by_name}
+        index_of = {manifest.frames[i].name: i for i in by_name}
         names = [PurePosixPath(name.replace("\\", "/")).as_posix() for name in names]
-        unknown = [name for name in names if name not in known and name not in manifest.skipped]
+        unknown = [name for name in names if name not in index_of and name not in manifest.skipped]
         if unknown:
             raise NerfroError(f"{manifest.path}: {split}_filenames lists '{unknown[0]}', but no frame has this name")
-        chosen = [known[name] for name in names if name in known]
-        if not chosen:
+        indices = [index_of[name] for name in names if name in index_of]
+        if not indices:
             raise NerfroError(f"{manifest.path}: no image of {split}_filenames exists; restore {names[0]}")
-        return chosen
+        return indices

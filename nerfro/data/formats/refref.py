@@ -22,9 +22,7 @@ from nerfro.files.reading import parse_matrix, reading
 from nerfro.registry.allowed import Distance
 from nerfro.registry.registration import register
 
-# Constants of RefRef's refref_dataparser.py: horizontal field of view, half side of the scene box, views per split.
-_CAMERA_ANGLE_X = 1.1656107902526855
-_HALF_SIDE = 7.3
+# Views per split, field of view and half side of the scene box as in RefRef's refref_dataparser.py.
 _VIEWS_PER_SPLIT = 100
 
 _COLUMNS = ["image", "mask", "transform_matrix"]
@@ -59,7 +57,7 @@ class RefRefData(PosedImages):
         folder = Path(tempfile.mkdtemp(dir=_unpacked().name))
         frames = [_unpack(row, number, folder, files[0]) for number, row in rows]
         width, height, _ = read_size(frames[0].image)
-        lenses = [Lens.of_angle(_CAMERA_ANGLE_X, width, height)] * len(frames)
+        lenses = [Lens.of_angle(1.1656107902526855, width, height)] * len(frames)
         return FrameSet(frames, lenses, "opengl", far=farthest)
 
     def _files(self) -> list[Path]:
@@ -87,7 +85,7 @@ def _find_far(files: list[Path]) -> float:
     """Compute the default far bound, which is the same for all splits."""
     rows = _read_rows(files, range(len(SPLITS) * _VIEWS_PER_SPLIT), ["transform_matrix"])
     distance = max(float(np.linalg.norm(_pose(row, f"{files[0].name}: row {number}")[:, 3])) for number, row in rows)
-    return distance + math.sqrt(3) * _HALF_SIDE
+    return distance + math.sqrt(3) * 7.3
 
 
 def _read_rows(files: list[Path], numbers: range, columns: list[str]) -> list[tuple[int, dict[str, Any]]]:

@@ -1,8 +1,9 @@
 """Learned perceptual image patch similarity (LPIPS v0.1) with features of AlexNet.
 
 The packages torchmetrics and lpips load the network from torchvision, whose published builds do not work beside a CPU
-build of torch. Therefore this module implements the network. The linear heads are those of the package lpips (see the
-licence beside the file), and the values agree with both packages.
+build of torch, and download 233 MB of weights. Therefore this module implements the network, and nerfro contains the
+five convolutions, in half precision, and the linear heads of the package lpips (see the licences beside the files). The
+values agree with both packages.
 
 Source:
     Zhang et al., "The unreasonable effectiveness of deep features as a perceptual metric", CVPR 2018.
@@ -10,7 +11,8 @@ Source:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -23,11 +25,11 @@ from nerfro.core.errors import NerfroError
 from nerfro.core.paths import ASSETS_DIR
 from nerfro.evaluation.error_maps import ErrorMap
 from nerfro.evaluation.image_metrics import ImageMetric
-from nerfro.evaluation.perceptual.pretrained import load_weights
 from nerfro.evaluation.regions import mean_over, require_images
 from nerfro.registry.registration import register
 
-_HEADS = ASSETS_DIR / "_lpips/heads.npz"  # arrays alex<l> of lpips v0.1
+# Arrays features.<i>.weight and features.<i>.bias of torchvision, and alex<l> of lpips v0.1.
+_CONVOLUTIONS, _HEADS = ASSETS_DIR / "_lpips/alexnet.npz", ASSETS_DIR / "_lpips/heads.npz"
 MIN_SIZE = 31  # pixels; in smaller images, the last pooling has an empty input
 
 
@@ -35,20 +37,17 @@ class Convolution(NamedTuple):
     """One convolution of AlexNet, followed by a ReLU."""
 
     key: str
-    channels_in: int
-    channels: int
-    kernel: int = 3
     stride: int = 1
     padding: int = 1
     pooling: bool = False  # whether a max pooling of 3 x 3 pixels with stride 2 precedes the convolution
 
 
 CONVOLUTIONS = (
-    Convolution("features.0", 3, 64, kernel=11, stride=4, padding=2),
-    Convolution("features.3", 64, 192, kernel=5, padding=2, pooling=True),
-    Convolution("features.6", 192, 384, pooling=True),
-    Convolution("features.8", 384, 256),
-    Convolution("features.10", 256, 256),
+    Convolution("features.0", stride=4, padding=2),
+    Convolution("features.3", padding=2, pooling=True),
+    Convolution("features.6", pooling=True),
+    Convolution("features.8"),
+    Convolution("features.10"),
 )
 
 
@@ -63,26 +62,21 @@ class LpipsNetwork(nn.Module):
     shift: Tensor
     scale: Tensor
 
-    def __init__(self, weights: dict[str, Tensor], heads: Sequence[Float[Tensor, "..."]]) -> None:
+    def __init__(self, weights: Mapping[str, Tensor]) -> None:
         """Create the network.
 
         Args:
-            weights: state dict of AlexNet.
-            heads: channel weights of each layer.
-
-        Raises:
-            NerfroError: a weight is missing or has the wrong shape.
+            weights: convolutions under the names of AlexNet in torchvision, and the channel weights `alex<l>` of the
+                layers.
         """
         super().__init__()
         for i, layer in enumerate(CONVOLUTIONS):
-            shape = (layer.channels, layer.channels_in, layer.kernel, layer.kernel)
-            self._register(f"kernel{i}", weights, f"{layer.key}.weight", shape)
-            self._register(f"bias{i}", weights, f"{layer.key}.bias", (layer.channels,))
-        for i, head in enumerate(heads):
-            self.register_buffer(f"head{i}", head.view(1, -1, 1, 1), persistent=False)
+            self._register(f"kernel{i}", weights[f"{layer.key}.weight"])
+            self._register(f"bias{i}", weights[f"{layer.key}.bias"])
+            self._register(f"head{i}", weights[f"alex{i}"].view(1, -1, 1, 1))
         # Mean and standard deviation of ImageNet colours, for inputs in [-1, 1].
-        self.register_buffer("shift", torch.tensor([-0.030, -0.088, -0.188]).view(1, 3, 1, 1), persistent=False)
-        self.register_buffer("scale", torch.tensor([0.458, 0.448, 0.450]).view(1, 3, 1, 1), persistent=False)
+        self._register("shift", torch.tensor([-0.030, -0.088, -0.188]).view(1, 3, 1, 1))
+        self._register("scale", torch.tensor([0.458, 0.448, 0.450]).view(1, 3, 1, 1))
 
     def forward(
         self,
@@ -115,14 +109,8 @@ class LpipsNetwork(nn.Module):
         enlarged = [F.interpolate(layer, size=size, mode="bilinear", align_corners=False) for layer in layers]
         return torch.stack(enlarged).sum(0)[0, 0]
 
-    def _register(self, name: str, weights: dict[str, Tensor], key: str, shape: tuple[int, ...]) -> None:
-        if key not in weights or tuple(weights[key].shape) != shape:
-            found = list(weights[key].shape) if key in weights else "none"
-            raise NerfroError(
-                f"LPIPS weights: expected {key} of shape {list(shape)}, found {found}; "
-                "use the published file of AlexNet"
-            )
-        self.register_buffer(name, weights[key].detach().float().clone(), persistent=False)
+    def _register(self, name: str, weights: Tensor) -> None:
+        self.register_buffer(name, weights.detach().float().clone(), persistent=False)
 
     def _layer_distances(self, prediction: Tensor, target: Tensor) -> list[Float[Tensor, "1 1 _ _"]]:
         require_images(prediction, target)
@@ -155,11 +143,14 @@ def unit_length(features: Float[Tensor, "1 C h w"]) -> Float[Tensor, "1 C h w"]:
     return features / (features.square().sum(dim=1, keepdim=True).sqrt() + 1e-10)
 
 
-def load_lpips_network(weights: dict[str, Tensor]) -> LpipsNetwork:
-    """Build a network with the weights of AlexNet and the published heads, on the CPU."""
-    with np.load(_HEADS, allow_pickle=False) as file:
-        heads = [torch.from_numpy(file[f"alex{i}"]) for i in range(len(CONVOLUTIONS))]
-    return LpipsNetwork(weights, heads)
+@functools.cache
+def published_weights() -> Mapping[str, Tensor]:
+    """Read the convolutions of AlexNet and the linear heads that nerfro contains."""
+    weights = {}
+    for file in (_CONVOLUTIONS, _HEADS):
+        with np.load(file, allow_pickle=False) as arrays:
+            weights.update({name: torch.from_numpy(arrays[name]) for name in arrays.files})
+    return weights
 
 
 @register("metric", "lpips")
@@ -172,20 +163,10 @@ class Lpips(ImageMetric):
 
     def __init__(self) -> None:
         super().__init__()
-        self.missing = "no network was given"
-        self.network: LpipsNetwork | None = None
-
-    def prepare(self) -> None:
-        """Load the network, or keep the reason why its weights are not available."""
-        try:
-            self.network, self.missing = load_lpips_network(load_weights()), None
-        except NerfroError as error:
-            self.missing = str(error)
+        self.network = LpipsNetwork(published_weights())
 
     def forward(self, prediction: Tensor, target: Tensor, inside: Tensor | None = None) -> Tensor:
-        assert self.network is not None
         return self.network(prediction, target, inside)
 
     def error_map(self, prediction: Tensor, target: Tensor) -> ErrorMap:
-        assert self.network is not None
         return ErrorMap("lpips", "LPIPS", self.network.distance_map(prediction, target), 1.0)

@@ -150,16 +150,16 @@ def sky(directions: np.ndarray) -> np.ndarray:
 
 def _snow(directions: np.ndarray) -> np.ndarray:
     depth = np.maximum(-directions[..., 2], 0.03)
-    place = directions[..., :2] / depth[..., None]
-    drift = fractal_noise(np.concatenate([1.5 * place, 0 * place[..., :1]], -1), 5, seed=61)
+    ground = directions[..., :2] / depth[..., None]
+    drift = fractal_noise(np.concatenate([1.5 * ground, 0 * ground[..., :1]], -1), 5, seed=61)
     colour = mix(np.array([0.66, 0.74, 0.90]), np.array([0.97, 0.97, 0.98]), smoothstep(0.3, 0.65, drift))
-    path = np.abs(place[..., 1] - 0.5 * np.sin(1.3 * place[..., 0]))
-    slab = np.floor(place / 0.13).astype(int)
+    path = np.abs(ground[..., 1] - 0.5 * np.sin(1.3 * ground[..., 0]))
+    slab = np.floor(ground / 0.13).astype(int)
     stone = chosen(CABINS * 0.7 + 0.25, hashed(slab, 62))
-    inside = np.abs(place / 0.13 - slab - 0.5).max(-1) < 0.42
+    inside = np.abs(ground / 0.13 - slab - 0.5).max(-1) < 0.42
     colour = np.where(((path < 0.35) & inside)[..., None], stone, colour)
-    cell = np.floor(place / 0.45).astype(int)
-    shrub = np.linalg.norm(place / 0.45 - cell - 0.5, axis=-1) + 0.3 * (drift - 0.5)
+    cell = np.floor(ground / 0.45).astype(int)
+    shrub = np.linalg.norm(ground / 0.45 - cell - 0.5, axis=-1) + 0.3 * (drift - 0.5)
     bush = mix(np.array([0.70, 0.18, 0.16]), np.array([0.16, 0.36, 0.24]), smoothstep(0.10, 0.14, shrub))
     grows = (shrub < 0.28) & (hashed(cell, 63) < 0.4) & (path > 0.5)
     colour = np.where(grows[..., None], bush, colour)

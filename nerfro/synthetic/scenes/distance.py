@@ -63,13 +63,13 @@ def star(points: np.ndarray, outer: float, inner: float, tips: int) -> np.ndarra
     angle = np.arctan2(points[..., 0], points[..., 2])
     folded = np.abs((angle + sector) % (2 * sector) - sector)
     radius = np.hypot(points[..., 0], points[..., 2])
-    place = np.stack([radius * np.cos(folded), radius * np.sin(folded)], -1)
+    folded_point = np.stack([radius * np.cos(folded), radius * np.sin(folded)], -1)
     tip, notch = np.array([outer, 0.0]), inner * np.array([np.cos(sector), np.sin(sector)])
     edge = notch - tip
-    along = np.clip((place - tip) @ edge / (edge @ edge), 0.0, 1.0)
-    distance = np.linalg.norm(place - tip - along[..., None] * edge, axis=-1)
+    along = np.clip((folded_point - tip) @ edge / (edge @ edge), 0.0, 1.0)
+    distance = np.linalg.norm(folded_point - tip - along[..., None] * edge, axis=-1)
     # The origin is on the positive side of the directed edge from tip to notch, and so is the inside.
-    inside = edge[0] * (place - tip)[..., 1] - edge[1] * (place - tip)[..., 0] > 0
+    inside = edge[0] * (folded_point - tip)[..., 1] - edge[1] * (folded_point - tip)[..., 0] > 0
     return np.where(inside, -distance, distance)
 
 
@@ -97,10 +97,10 @@ def triangulate(distance: Distance, low: Vector, high: Vector, spacing: float) -
     middle, reach = 0.5 * (_BLOCK - 1) * spacing, (0.5 * np.sqrt(3) * _BLOCK + 2) * spacing
     for corner in np.ndindex(*blocks):
         start = np.asarray(corner) * _BLOCK
-        place = origin + start * spacing
+        corner_point = origin + start * spacing
         here = tuple(slice(first, first + _BLOCK) for first in start)
-        centre = float(distance((place + middle)[None])[0])
-        values[here] = distance(place + cell) if abs(centre) < reach else centre
+        centre = float(distance((corner_point + middle)[None])[0])
+        values[here] = distance(corner_point + cell) if abs(centre) < reach else centre
     vertices, faces, _, _ = marching_cubes(values, 0.0, gradient_direction="descent")
     vertices = origin + vertices * spacing
     for _ in range(3):

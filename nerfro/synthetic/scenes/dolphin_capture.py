@@ -33,10 +33,8 @@ WATER = 1.33
 GLOBE_RADIUS, GLOBE_FOOT, GLOBE_ROUNDING, GLOBE_SPACING = 0.62, 0.48, 0.06, 0.012  # foot: depth of the flat below
 BOARD_SCALE = 4.0  # world units per board unit: the block is 1.08 high, the square 3.24 wide
 BOARD_HEIGHT = 0.02  # of the printed sheets above the table
-MODULE_PIXELS = 12
 BLOCK_TOP = BOARD_SCALE * 0.27 + BOARD_HEIGHT
 CENTRE = np.array([0.0, 0.0, BLOCK_TOP + GLOBE_FOOT + 0.01])  # of the globe; air below it, for it must not touch
-TABLE_HALF_SIDE = 2.7
 ROOM_SCALE, ROOM_CENTRE = 4.4, np.array([0.0, 0.0, 1.7])
 AIM = np.array([0.0, 0.0, 1.15])  # of the photographer
 
@@ -136,7 +134,7 @@ def board_panels(board: TagBoard) -> list[Panel]:
     for face in board.faces:
         corner, upper_right, _, lower_left = board_to_world(board.face_corners(face))
         # Paper is not quite white, and ink not quite black.
-        print_ = 0.08 + 0.84 * board.draw(face, MODULE_PIXELS).astype(np.float32)[..., None].repeat(3, -1) / 255
+        print_ = 0.08 + 0.84 * board.draw(face, 12).astype(np.float32)[..., None].repeat(3, -1) / 255
         panels.append(Panel(corner, upper_right - corner, lower_left - corner, print_, smooth=False))
     return panels
 
@@ -163,8 +161,8 @@ def wood(points: np.ndarray, tone: Vector, seed: int) -> np.ndarray:
     """Return sRGB [..., 3] of planks along x."""
     plank = np.floor(points[..., 1:2] / 0.45).astype(int)
     shift = 9 * hashed(plank, seed)[..., None]
-    place = np.concatenate([points[..., :1] * 1.5 + shift, points[..., 1:2] * 22, 0 * shift], -1)
-    grain = fractal_noise(place, 4, seed)
+    position = np.concatenate([points[..., :1] * 1.5 + shift, points[..., 1:2] * 22, 0 * shift], -1)
+    grain = fractal_noise(position, 4, seed)
     seam = np.abs(points[..., 1] / 0.45 % 1 - 0.5) > 0.485
     colour = np.asarray(tone) * (0.55 + 0.6 * grain + 0.25 * (hashed(plank, seed + 1) - 0.5))[..., None]
     return np.where(seam[..., None], 0.4 * colour, colour)
@@ -201,7 +199,7 @@ def build(spacing: float) -> SyntheticScene:
         painted(sea, sea_colours, (-0.56, -0.56, -0.56), (0.56, 0.56, -0.2), fine),
     ]
     glass = distance.triangulate(globe, (-GLOBE_RADIUS,) * 3, (GLOBE_RADIUS,) * 3, GLOBE_SPACING)
-    table = wooden(TABLE_HALF_SIDE, 0.0, (0.62, 0.42, 0.28), 41)
+    table = wooden(2.7, 0.0, (0.62, 0.42, 0.28), 41)
     top = wooden(0.5 * BOARD_SCALE * 0.27, BLOCK_TOP, (0.80, 0.72, 0.60), 43)
     return SyntheticScene(
         ior=WATER,

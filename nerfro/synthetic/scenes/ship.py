@@ -132,14 +132,14 @@ def sky(directions: np.ndarray) -> np.ndarray:
 
 def _sea(directions: np.ndarray) -> np.ndarray:
     depth = np.maximum(-directions[..., 2], 1e-3)
-    place = directions[..., :2] / np.maximum(depth, 0.04)[..., None]
-    swirl = fractal_noise(np.concatenate([2.2 * place, 0 * place[..., :1]], -1), 4, seed=41)
-    wave = 0.5 + 0.5 * np.sin(9 * place[..., 0] + 4 * place[..., 1] + 9 * swirl)
+    surface = directions[..., :2] / np.maximum(depth, 0.04)[..., None]
+    swirl = fractal_noise(np.concatenate([2.2 * surface, 0 * surface[..., :1]], -1), 4, seed=41)
+    wave = 0.5 + 0.5 * np.sin(9 * surface[..., 0] + 4 * surface[..., 1] + 9 * swirl)
     water = mix(np.array([0.06, 0.32, 0.44]), np.array([0.22, 0.60, 0.66]), wave)
     foam = smoothstep(0.80, 0.88, wave) * (swirl > 0.48)
     water = mix(water, np.array([0.93, 0.97, 0.96]), foam)
-    cell = np.floor(place / 0.5).astype(int)
-    offset = place / 0.5 - cell - 0.5
+    cell = np.floor(surface / 0.5).astype(int)
+    offset = surface / 0.5 - cell - 0.5
     buoy = np.linalg.norm(offset - 0.3 * (hashed(cell, 42) - 0.5)[..., None], axis=-1)
     hue = chosen(HOUSES * [1, 0.7, 0.5], hashed(cell, 43))
     painted_buoy = np.where((buoy < 0.05)[..., None], np.array([0.98, 0.95, 0.88]), hue)

@@ -18,7 +18,6 @@ ROOM_LOW, ROOM_HIGH = np.array([-1.7, -1.4, -1.0]), np.array([1.7, 1.4, 1.2])
 BOOKS = np.array(
     [[0.7, 0.2, 0.18], [0.16, 0.33, 0.52], [0.88, 0.7, 0.28], [0.22, 0.46, 0.33], [0.9, 0.86, 0.76], [0.45, 0.26, 0.48]]
 )
-GLASS_SPACING = 0.010
 
 
 def star_prism(points: np.ndarray) -> np.ndarray:
@@ -78,13 +77,13 @@ def _bookcase(y: np.ndarray, z: np.ndarray) -> np.ndarray:
     shelf = np.floor((z + 1.0) / 0.36).astype(int)
     height = (z + 1.0) / 0.36 - shelf
     number = np.floor((y + 1.4) / 0.075).astype(int)
-    place = (y + 1.4) / 0.075 - number
+    across = (y + 1.4) / 0.075 - number
     key = np.stack([shelf, number], -1)
     top = 0.55 + 0.3 * hashed(key, 1)
     book = chosen(BOOKS, hashed(key, 2)) * (0.75 + 0.25 * hashed(key, 3))[..., None]
-    label = (np.abs(height - 0.4) < 0.07) & (np.abs(place - 0.5) < 0.3)
+    label = (np.abs(height - 0.4) < 0.07) & (np.abs(across - 0.5) < 0.3)
     book = np.where(label[..., None], np.array([0.95, 0.90, 0.72]), book)
-    book = np.where((place < 0.08)[..., None], 0.4 * book, book)
+    book = np.where((across < 0.08)[..., None], 0.4 * book, book)
     colour = np.where((height < top)[..., None], book, np.array([0.24, 0.17, 0.12]))
     return np.where((height > 0.9)[..., None], np.array([0.58, 0.40, 0.24]), colour)
 
@@ -142,5 +141,5 @@ def build(spacing: float) -> SyntheticScene:
     planet = distance.painted(ball, planet_colours, -extent, extent, spacing)
     extent = np.full(3, 1.1 * RING_RADII[1])
     rings = distance.painted(ring, ring_colours, -extent, extent, min(spacing, 0.006))
-    glass = distance.triangulate(star_prism, (-OUTER, -HALF_DEPTH, -OUTER), (OUTER, HALF_DEPTH, OUTER), GLASS_SPACING)
+    glass = distance.triangulate(star_prism, (-OUTER, -HALF_DEPTH, -OUTER), (OUTER, HALF_DEPTH, OUTER), 0.010)
     return SyntheticScene(ior=1.5, glass=glass, interior=distance.join([planet, rings]), sky=sky)

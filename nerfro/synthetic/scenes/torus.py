@@ -49,9 +49,9 @@ def sky(directions: np.ndarray) -> np.ndarray:
 
 def _paving(directions: np.ndarray) -> np.ndarray:
     depth = np.maximum(-directions[..., 2], 1e-3)
-    place = directions[..., :2] / depth[..., None] / 0.34
-    cell = np.floor(place).astype(np.int64)
-    inside = np.abs(place - cell - 0.5).max(-1) < 0.46
+    tiles = directions[..., :2] / depth[..., None] / 0.34
+    cell = np.floor(tiles).astype(np.int64)
+    inside = np.abs(tiles - cell - 0.5).max(-1) < 0.46
     checker = ((cell.sum(-1) % 2) == 0)[..., None]
     colour = chosen(PAVING, hashed(cell, 8))
     colour = np.where(checker, colour, 0.25 + 0.6 * colour)

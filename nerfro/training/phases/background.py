@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 import torch
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from nerfro.backgrounds.envmap import EnvironmentMap, Observed
 from nerfro.core.errors import warn
+from nerfro.core.provenance import AlgorithmSettings
 from nerfro.core.rays import Rays
 from nerfro.core.types import Exits
 from nerfro.fields.base import Field
@@ -21,20 +23,29 @@ from nerfro.rendering import Renderer
 from nerfro.samplers.subdivision import DIVERGENT, divergence, main_exits, neighbour_rays, pixel_rays
 from nerfro.training.phases.base import Phase, TrainingRun
 
-# Largest number of pixels of a pass beside the object, relative to the texels of the finest level.
-_MAX_PIXELS = 8
-# Largest number of pixels of one fit, which bounds the memory.
-_MAX_FITTED_PIXELS = 2**21
-# Largest number of rays of a pass through the object: relative to the pixels of all training steps so far, which bounds
-# the share of the time, and absolute, which bounds the duration of a step.
-_SHARE, _MAX_RAYS = 0.15, 2**19
-# Rays through the object count if at least this fraction of their light is background.
-_BACKGROUND = 0.7
-# Rays that are made together, which bounds the memory.
-_CHUNK = 2**18
-# Turns between background and exposures in the first step.
-_TURNS = 10
 _WITH_MAP, _WITH_BOX = OnlyWith("background", ("envmap",)), OnlyWith("content.space", ("box",))
+
+
+@dataclass(frozen=True)
+class BackgroundSettings(AlgorithmSettings):
+    """Settings of the fits of the background (`BackgroundSteps`).
+
+    Attributes:
+        max_pixels: largest number of pixels of a pass beside the object, relative to the texels of the finest level.
+        max_fitted_pixels: largest number of pixels of one fit, which bounds the memory.
+        share: largest number of rays of a pass through the object, relative to the pixels of all training steps so far,
+            which bounds the share of the time.
+        max_rays: largest number of these rays, which bounds the duration of a step.
+        min_background: rays through the object count if at least this fraction of their light is background.
+        turns: number of turns between background and exposures in the first step.
+    """
+
+    max_pixels: int = 8
+    max_fitted_pixels: int = 2**21
+    share: float = 0.15
+    max_rays: int = 2**19
+    min_background: float = 0.7
+    turns: int = 10
 
 
 @register("phase", "background")
@@ -58,7 +69,12 @@ class BackgroundSteps(Phase):
         time_share: largest fraction of `trainer.max_time` for the pass before training, so that short runs train the
             scene, too.
         start: training step of the first pass that also uses rays through the object; None for no such pass.
+
+    Attributes:
+        settings: tuned numbers of the fits.
     """
+
+    settings = BackgroundSettings()
 
     def __init__(
         self,
@@ -67,6 +83,7 @@ class BackgroundSteps(Phase):
         start: Annotated[Count | None, _WITH_MAP, _WITH_BOX, OnlyWith("steps")] = 250,
     ) -> None:
         self.steps, self.time_share, self.start = steps, time_share, start
+        self.settings.use()
 
     def begin(self, run: TrainingRun) -> dict[str, Any]:
         """Return the weights of the observations of each texel in the current pass."""
@@ -96,22 +113,23 @@ class BackgroundSteps(Phase):
         state["weights"] = state["weights"].to(background.texels.device)
         if part == 0:
             state["weights"].zero_()
-        num_pixels = run.batches.num_pixels
-        most_pixels = min(num_pixels, _MAX_PIXELS * background.levels.sizes[-1])
-        fits_per_step = math.ceil(most_pixels / (self.steps * _MAX_FITTED_PIXELS))
+        num_pixels, settings = run.batches.num_pixels, self.settings
+        most_pixels = min(num_pixels, settings.max_pixels * background.levels.sizes[-1])
+        fits_per_step = math.ceil(most_pixels / (self.steps * settings.max_fitted_pixels))
         num_fits = self.steps * fits_per_step  # of the pass
         num_parts = num_fits * num_pixels // most_pixels
         for fit in range(part * fits_per_step, (part + 1) * fits_per_step):
             pixels = run.batches.rows(fit * num_parts // num_fits, num_parts)
             beside, rays, crossing = _divided(run, pixels, box)
             if number_of_pass == fit == 0 and run.renderer.scene.camera.exposure is not None:
-                for turn in range(_TURNS):
+                for turn in range(settings.turns):
                     observed_pixels = _observe_beside_object(run, beside, rays, fits_gains=turn > 0)
                     background.fit(observed_pixels, torch.zeros_like(state["weights"]))
             observed = [_observe_beside_object(run, beside, rays)]
             if number_of_pass > 0 and not run.renderer.scene.medium.disperses:
-                chosen = crossing[:: self._spacing(run, len(crossing) * num_fits, number_of_pass)]
-                observed += [_observe_through_object(run, chunk) for chunk in chosen.split(run.renderer.chunk_size)]
+                used = crossing[:: self._spacing(run, len(crossing) * num_fits, number_of_pass)]
+                chunks = used.split(run.renderer.chunk_size)
+                observed += [_observe_through_object(run, chunk, settings.min_background) for chunk in chunks]
             state["weights"] += background.fit(Observed.joined(observed), state["weights"])
         return True
 
@@ -119,7 +137,7 @@ class BackgroundSteps(Phase):
         """Return the spacing of the used pixels among `num_crossing` pixels of a pass through the object."""
         assert self.start is not None
         num_trained = self.start * 2 ** (number_of_pass - 1) * run.batches.batch_size
-        return max(1, math.ceil(num_crossing / min(_SHARE * num_trained, _MAX_RAYS)))
+        return max(1, math.ceil(num_crossing / min(self.settings.share * num_trained, self.settings.max_rays)))
 
 
 def _divided(
@@ -127,7 +145,7 @@ def _divided(
 ) -> tuple[Int[Tensor, " beside"], Rays, Int[Tensor, " crossing"]]:
     """Return the pixels whose rays miss a box, with their rays, and the other pixels."""
     beside, rays, crossing = [], [], []
-    for chunk in pixels.split(_CHUNK):
+    for chunk in pixels.split(2**18):
         of_chunk = _rays(run, chunk)
         beside_box = misses(box, of_chunk)
         beside.append(chunk[beside_box])
@@ -136,7 +154,7 @@ def _divided(
     return torch.cat(beside), Rays.joined(rays), torch.cat(crossing)
 
 
-def _observe_through_object(run: TrainingRun, pixels: Int[Tensor, "Q"]) -> Observed:
+def _observe_through_object(run: TrainingRun, pixels: Int[Tensor, "Q"], min_background: float) -> Observed:
     """Observe the background along those rays of pixels that cross hardly any content."""
     batches, renderer, scene = run.batches, run.renderer, run.renderer.scene
     view = batches.cameras.view_of(pixels)
@@ -149,10 +167,10 @@ def _observe_through_object(run: TrainingRun, pixels: Int[Tensor, "Q"]) -> Obser
     fraction, exits = path.main_polyline(rendering.background_fraction), main_exits(path)
     rgb = batches.photographed(pixels)
     difference = _photographed(run, rgb, view) - rendering.radiance
-    radiance = scene.background(Exits(exits)) + difference / fraction.clamp(min=_BACKGROUND)
+    radiance = scene.background(Exits(exits)) + difference / fraction.clamp(min=min_background)
     widths = widths / batches.cameras.fx[view]
     observed = Observed(exits, radiance, rgb >= 1, fraction.square().mean(-1), widths)
-    return observed[fraction.amin(-1) >= _BACKGROUND]
+    return observed[fraction.amin(-1) >= min_background]
 
 
 def _observe_beside_object(run: TrainingRun, pixels: Int[Tensor, "Q"], rays: Rays, fits_gains: bool = True) -> Observed:

@@ -45,7 +45,7 @@ class TrainingRun:
         """
         learned = {name: own for name, own in self.renderer.parameters_by_name().items() if own.requires_grad}
         require_matches("the patterns of a phase", patterns, learned)
-        return [own for name, own in learned.items() if any(fnmatchcase(name, each) for each in patterns)]
+        return [own for name, own in learned.items() if any(fnmatchcase(name, pattern) for pattern in patterns)]
 
     def descend(self, loss: Float[Tensor, ""], parameters: Sequence[nn.Parameter]) -> None:
         """Take a step of the optimizer with some parameters.
