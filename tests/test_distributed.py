@@ -19,6 +19,7 @@ from lightning.pytorch import LightningModule, Trainer
 from omegaconf import OmegaConf
 
 from nerfro.core.types import Batch
+from nerfro.registry.allowed import untyped
 from nerfro.training.build import build
 from nerfro.training.callbacks import Checkpoints, SharedTimer, StopOnSignal, Throughput
 from nerfro.training.config import TrainConfig

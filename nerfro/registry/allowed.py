@@ -138,7 +138,7 @@ def validate(schema: type[Settings], values: object, prefix: str = "") -> Settin
     """
     if not isinstance(values, Mapping):
         raise NerfroError(f"{prefix[:-1]}={values} is not a set of settings; write {prefix}NAME=VALUE")
-    hints, fields = hints_of(schema), {field.name: field for field in dataclasses.fields(cast(Any, schema))}
+    hints, fields = hints_of(cast(Any, schema)), {field.name: field for field in dataclasses.fields(cast(Any, schema))}
     require_names(prefix, fields, values)
     own = {str(name): value for name, value in values.items() if not is_missing(value)}
     for name, field in fields.items():

@@ -18,7 +18,7 @@ from nerfro.files.drawing import magma
 from nerfro.files.templates import fill_template
 from nerfro.report.comparison import Comparison
 from nerfro.report.runs import EvaluatedRun, device, duration, shown
-from nerfro.report.views import JPEG_QUALITY, PNG_SIDE, SceneImages, Selection, embed_image, scene_images
+from nerfro.report.views import PNG_SIDE, SceneImages, Selection, embed_image, scene_images
 
 _TEMPLATES = PACKAGE_DIR / "report"
 
@@ -85,7 +85,7 @@ def report_page(compared: Sequence[tuple[Comparison, Table]], unfinished: Sequen
         error_ramp=embed_image(ramp),
         error_limit=SQUARED_ERROR_LIMIT,
         png_side=PNG_SIDE,
-        jpeg_quality=JPEG_QUALITY,
+        jpeg_quality=95,
     )
 
 

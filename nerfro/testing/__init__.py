@@ -19,7 +19,6 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from omegaconf import OmegaConf
 
 from nerfro.backgrounds.base import Background
 from nerfro.backgrounds.constant import ConstantBackground

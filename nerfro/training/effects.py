@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from typing import Any, get_args
@@ -11,7 +10,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
-from nerfro.registry.allowed import OnlyWith, hints_of, untyped
+from nerfro.registry.allowed import OnlyWith, hints_of, schema_of, untyped
 from nerfro.registry.registration import SEVERAL, Plugin, find, plugin_of
 from nerfro.training.config import TrainConfig
 from nerfro.training.settings import flat
@@ -88,6 +87,6 @@ def _described(node: DictConfig, place: list[str]) -> tuple[Mapping[str, Any], M
     else:
         schema: Any = TrainConfig
         for key in place:
-            schema = hints_of(schema).get(key) if dataclasses.is_dataclass(schema) else None
-        return ({}, {}) if not dataclasses.is_dataclass(schema) else (hints_of(schema), vars(untyped(schema())))
+            schema = None if schema is None else schema_of(hints_of(schema).get(key))
+        return ({}, {}) if schema is None else (hints_of(schema), vars(untyped(schema())))
     return plugin.hints, plugin.node
