@@ -6,7 +6,8 @@ from typing import Annotated, Literal
 import pytest
 from annotated_types import Gt, Le
 
-from nerfro.registry.allowed import AnyNumber, Count, Positive, corners_of_box, validated
+from nerfro.geometry.box import corners_of_box
+from nerfro.registry.allowed import AnyNumber, Count, Positive, validated
 from nerfro.registry.registration import create, discover, find
 from tests.conftest import refused
 

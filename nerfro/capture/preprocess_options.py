@@ -21,10 +21,11 @@ from nerfro.core.paths import EMBEDDED_PREFIX, resolve_path, user_path
 from nerfro.data.base import DataSource
 from nerfro.data.frames import require_root
 from nerfro.files.atomic import refuse_existing
+from nerfro.geometry.box import corners_of_box
 from nerfro.geometry.mesh import TriangleMesh, load_mesh, local_origin, num_decimals
 from nerfro.media.base import Medium
 from nerfro.media.bodies import ordered_settings
-from nerfro.registry.allowed import Count, Natural, NotNegative, corners_of_box, refuse_unused
+from nerfro.registry.allowed import Count, Natural, NotNegative, refuse_unused
 from nerfro.registry.registration import build
 from nerfro.rendering.scene_file import SCENE, SceneFile, take_bodies
 from nerfro.silhouettes.overlaps import REPORT, SHEET

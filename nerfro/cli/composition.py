@@ -11,6 +11,7 @@ from dataclasses import dataclass, is_dataclass
 from pathlib import Path
 from typing import Any, cast
 
+from hydra import version
 from hydra._internal.core_plugins.file_config_source import FileConfigSource
 from hydra._internal.hydra import Hydra
 from hydra._internal.sources_registry import SourcesRegistry
@@ -89,6 +90,7 @@ class Composer:
         for folder in folders:
             path = f"file://{os.path.abspath(folder)}"
             search_path.prepend("command-line", path, SearchPathQuery(provider="schema"))
+        version.setbase("1.3")  # jobs stay in the current directory
         current = GlobalHydra.instance()
         outer = current.hydra
         current.hydra = Hydra(self.command, _ConfigLoader(self.require_valid, search_path))

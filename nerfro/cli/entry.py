@@ -70,7 +70,7 @@ def _run(composer: Composer, task: Task, arguments: list[str]) -> None:
         described = describe_command(command, composer.schema)
         remember(command, described)
         described.answer(arguments)
-    overrides = [] if asks_hydra else composer.overrides(flags.overrides)
+    flags.overrides = overrides = [] if asks_hydra else composer.overrides(flags.overrides)
     name = flags.config_name or command
     with composer.hydra([flags.config_dir] if flags.config_dir else []) as hydra, _run_folder():
         if asks_hydra or flags.hydra_help:

@@ -20,9 +20,10 @@ from nerfro.fields.base import Field
 from nerfro.fields.networks import radiance
 from nerfro.fields.observed_space import NUM_CELLS, observed_cells
 from nerfro.fields.selection import evaluate_selected, inside_box
+from nerfro.geometry.box import corners_of_box
 from nerfro.geometry.contraction import contract, contracted_box, contraction_scale
 from nerfro.kernels.available import fast_bfloat16
-from nerfro.registry.allowed import Depth, Positive, Width, corners_of_box
+from nerfro.registry.allowed import Depth, Positive, Width
 from nerfro.registry.registration import register
 
 # Number of features that the density network passes to the colour network.

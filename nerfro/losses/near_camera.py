@@ -9,8 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.core.types import Batch, Rendering
+from nerfro.geometry.box import corners_of_box
 from nerfro.losses.base import Loss
-from nerfro.registry.allowed import corners_of_box
 from nerfro.registry.registration import register
 from nerfro.rendering import Scene
 

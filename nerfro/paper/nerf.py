@@ -14,9 +14,10 @@ from torch import Tensor
 from nerfro.core.types import FieldValues, Samples
 from nerfro.fields.base import Field
 from nerfro.fields.selection import evaluate_selected, inside_box
+from nerfro.geometry.box import corners_of_box
 from nerfro.paper.encoding import DIRECTION_DEGREE, positional_encoding
 from nerfro.paper.mlp import RadianceMLP, in_blocks
-from nerfro.registry.allowed import AnyNumber, Depth, Positive, Width, corners_of_box
+from nerfro.registry.allowed import AnyNumber, Depth, Positive, Width
 from nerfro.registry.registration import register
 
 

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from nerfro.core.errors import NerfroError
 from nerfro.files.cache import cached_arrays, content_hash
+from nerfro.geometry.box import corners_of_box
 from nerfro.geometry.interpolation import neighbours, smooth, trilinear
 from nerfro.geometry.mesh import local_origin, require_inside
 from nerfro.geometry.occupancy import occupancy_fraction
@@ -24,7 +25,7 @@ from nerfro.kernels.constants import constant
 from nerfro.media.base import Medium, Scalars, Vectors
 from nerfro.media.grid_box import BYTES_PER_VERTEX, check_margin
 from nerfro.media.surface import MeshSurface
-from nerfro.registry.allowed import Positive, Resolution, corners_of_box
+from nerfro.registry.allowed import Positive, Resolution
 from nerfro.registry.registration import register
 
 # Part of the cache key. Increase it when the same mesh and settings give different fractions.

@@ -15,9 +15,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
-import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
-from jaxtyping import Float
 from omegaconf import MISSING, DictConfig, OmegaConf
 from pydantic import AllowInfNan, BeforeValidator, TypeAdapter, ValidationError
 
@@ -63,7 +61,7 @@ class OnlyWith:
     attribute: str | None = None
 
 
-_FURTHEST = 10**7  # world units, as in georeferenced data
+FURTHEST = 10**7  # world units, as in georeferenced data
 
 AnyNumber = Annotated[float, AllowInfNan(True)]  # including infinity and NaN
 Count = Annotated[int, Ge(1)]
@@ -77,8 +75,8 @@ Positive = Annotated[float, Gt(0)]
 NotNegative = Annotated[float, Ge(0)]
 Factor = Annotated[float, Ge(1)]
 Share = Annotated[float, Gt(0), Lt(1)]
-Coordinate = Annotated[float, Ge(-_FURTHEST), Le(_FURTHEST)]  # world units
-Distance = Annotated[float, Ge(0), Le(_FURTHEST)]  # world units
+Coordinate = Annotated[float, Ge(-FURTHEST), Le(FURTHEST)]  # world units
+Distance = Annotated[float, Ge(0), Le(FURTHEST)]  # world units
 
 _TEXT = "float_parsing"  # type of pydantic's errors about text instead of a number
 _LONGEST = 100  # characters of a value in a message
@@ -345,27 +343,6 @@ def default_of(field: dataclasses.Field) -> Any:
     if field.default_factory is not dataclasses.MISSING:
         return field.default_factory()
     return MISSING if field.default is dataclasses.MISSING else field.default
-
-
-def corners_of_box(
-    box_min: Sequence[float], box_max: Sequence[float], bounded: bool = True
-) -> Float[np.ndarray, "2 3"]:
-    """Return the corners of a box as an array.
-
-    Args:
-        box_min, box_max: lower and upper corner, world units.
-        bounded: refuse corners farther than 10^7 units from the origin.
-
-    Raises:
-        NerfroError: a corner does not have three numbers, or the lower corner is not below the upper one.
-    """
-    box = np.array([box_min, box_max], np.float64) if len(box_min) == len(box_max) == 3 else np.zeros((2, 3))
-    if not (box[1] > box[0]).all() or (bounded and not (np.abs(box) <= _FURTHEST).all()):
-        raise NerfroError(
-            f"box_min={list(box_min)}, box_max={list(box_max)} is not a box; give three numbers each, min below max, "
-            f"and none beyond {_FURTHEST}"
-        )
-    return box
 
 
 def is_missing(value: object) -> bool:

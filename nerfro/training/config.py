@@ -20,6 +20,7 @@ from nerfro.core.paths import CONF_DIR, resolve_path, scene_name
 from nerfro.data.base import DataSource, Views
 from nerfro.data.validation_views import WithValidationViews
 from nerfro.evaluation.results import Region
+from nerfro.geometry.box import corners_of_box
 from nerfro.media.analytic import Vacuum
 from nerfro.media.bodies import origin_of
 from nerfro.registry.allowed import (
@@ -32,7 +33,6 @@ from nerfro.registry.allowed import (
     Positive,
     Refused,
     Resolution,
-    corners_of_box,
     plain,
     untyped,
     validate,

@@ -15,6 +15,7 @@ from torch import Tensor
 from nerfro.core.draws import Draws
 from nerfro.core.types import Path, Rendering, Samples
 from nerfro.fields.base import Field
+from nerfro.geometry.box import corners_of_box
 from nerfro.geometry.contraction import (
     FAR,
     contract,
@@ -25,7 +26,7 @@ from nerfro.geometry.contraction import (
     world_length,
 )
 from nerfro.kernels.arrays import arrays
-from nerfro.registry.allowed import Count, NotNegative, Positive, Share, corners_of_box
+from nerfro.registry.allowed import Count, NotNegative, Positive, Share
 from nerfro.registry.registration import register
 from nerfro.samplers.base import PointSampler
 from nerfro.samplers.points.stepfun import invert_cdf, midpoints, spread_uniform, volume_weights
