@@ -23,9 +23,10 @@ from nerfro.core.paths import ASSETS_DIR
 from nerfro.core.types import Path as RayPath
 from nerfro.data.blender import BlenderData
 from nerfro.files import lat_long
-from nerfro.geometry.contraction import contract
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
-from nerfro.media.sdf_grid import SdfGrid
+from nerfro.geometry.space import Box, Contracted
+from nerfro.media.bodies import Bodies
+from nerfro.media.body_settings import make_bodies
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.samplers.points.stratified import Stratified
@@ -44,7 +45,7 @@ def main() -> None:
     parser.add_argument("--downscale", type=float, default=1, help="factor of the photographs of the index search")
     options = parser.parse_args()
     folder = options.folder
-    medium = SdfGrid(str(MESH), 1.5, resolution=64)
+    medium = make_bodies(str(MESH), 1.5, resolution=64)
     with torch.no_grad():
         draw_exits(medium, folder / "concept_background.png")
         draw_samples(medium, folder / "concept_sampling.png")
@@ -58,7 +59,7 @@ def canvas(width: float, height: float) -> Figure:
     return figure
 
 
-def row_of_view(medium: SdfGrid, row: int) -> RayPath:
+def row_of_view(medium: Bodies, row: int) -> RayPath:
     """Trace the rays of a row of the embedded test view."""
     cameras = BlenderData().load("test").cameras
     columns = torch.arange(cameras.width)
@@ -66,7 +67,7 @@ def row_of_view(medium: SdfGrid, row: int) -> RayPath:
     return Snell()(rays, medium)
 
 
-def draw_exits(medium: SdfGrid, file: Path) -> None:
+def draw_exits(medium: Bodies, file: Path) -> None:
     """Show three rows of pixels, and the directions in which their rays leave the scene."""
     figure = canvas(11, 3.7)
     photograph, sky = figure.subplots(1, 2, width_ratios=(1, 2))
@@ -87,15 +88,15 @@ def draw_exits(medium: SdfGrid, file: Path) -> None:
     figure.savefig(file, dpi=90)
 
 
-def draw_samples(medium: SdfGrid, file: Path) -> None:
+def draw_samples(medium: Bodies, file: Path) -> None:
     """Compare samples of the density grid with even samples on a bent path through a torus of known density."""
-    sampler = DensityGridSampler(num_samples=32, box_min=BOX[0], box_max=BOX[1], uniform=0.2)
+    sampler = DensityGridSampler(Box(BOX), num_samples=32, uniform=0.2)
     cells = sampler.resolution
     centres = (torch.arange(cells) + 0.5) / cells * 1.6 - 0.8
     sampler.density.copy_(density(torch.stack(torch.meshgrid(centres, centres, centres, indexing="ij"), -1)))
     path = row_of_view(medium, 64)[torch.tensor([56])]
     drawn = {
-        "even samples": Stratified(num_samples=32, box_min=BOX[0], box_max=BOX[1])(path, None),
+        "even samples": Stratified(num_samples=32, space=Box(BOX))(path, None),
         "density grid": sampler(path, None),
     }
     near, far = float(drawn["even samples"].edges[0, 0]), float(drawn["even samples"].edges[0, -1])
@@ -116,22 +117,23 @@ def density(x: torch.Tensor) -> torch.Tensor:
     return 30 * (ring.square() + x[..., 2].square() < 0.15**2)
 
 
-def draw_contraction(medium: SdfGrid, file: Path) -> None:
+def draw_contraction(medium: Bodies, file: Path) -> None:
     """Show a square grid and bent rays before and after contraction."""
     figure = canvas(9, 4.5)
     world, contracted = figure.subplots(1, 2)
-    ticks, fine, centre, radius = np.arange(-16, 16.1, 0.5), torch.linspace(-16, 16, 2001), torch.zeros(3), 1.0
+    ticks, fine, radius = np.arange(-16, 16.1, 0.5), torch.linspace(-16, 16, 2001), 1.0
+    space = Contracted([[-radius] * 3, [radius] * 3], radius)
     for tick in ticks:
         fixed = torch.full_like(fine, float(tick))
         for x, y in ((fine, fixed), (fixed, fine)):
             line = torch.stack([x, y, torch.zeros_like(x)], -1)
-            for axes, points in ((world, line), (contracted, contract(line, centre, radius))):
+            for axes, points in ((world, line), (contracted, space.contract(line))):
                 axes.plot(points[:, 0], points[:, 1], color="0.75", linewidth=0.5)
     path = row_of_view(medium, 64)[torch.arange(30, 100, 10)]
     s = torch.cat([torch.linspace(0, 20, 800), torch.logspace(math.log10(20), 4, 200)]).expand(len(path.s), -1)
     points = path.at(s)[0]
     points = points * torch.tensor([1.0, 1.0, 0.0])
-    for axes, shown in ((world, points), (contracted, contract(points, centre, radius))):
+    for axes, shown in ((world, points), (contracted, space.contract(points))):
         axes.plot(shown[..., 0].T, shown[..., 1].T, color="tab:red", linewidth=0.9)
         axes.add_patch(Circle((0, 0), radius, fill=False, color="tab:blue"))
         axes.set_aspect("equal")
@@ -153,7 +155,7 @@ def draw_index_search(data: BlenderData, file: Path) -> None:
         for name, scale in (("true surface", 1.0), ("surface larger by 3 %", 1.03)):
             scaled = Path(folder) / f"{scale}.ply"
             TriangleMesh(scale * mesh.vertices, mesh.faces).save(scaled)
-            found = find_indices(SdfGrid(str(scaled), 1.5, cache=False), through, surroundings)
+            found = find_indices(make_bodies(str(scaled), 1.5, cache=False), through, surroundings)
             label = f"{name}: {found.values[0]:.3f} ± {found.standard_errors[0]:.3f}"
             axes.plot(*found.coarse.T, "o-", markersize=3, linewidth=1, label=label)
     axes.set(xlabel="candidate index", ylabel="mean robust error")

@@ -15,7 +15,8 @@ from nerfro.camera.similarity import Similarity
 from nerfro.core.paths import resolve_path
 from nerfro.data.base import Views
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
-from nerfro.media.sdf_grid import SdfGrid
+from nerfro.media.bodies import Bodies
+from nerfro.media.body_settings import make_bodies
 from nerfro.registry.registration import discover, find
 from nerfro.samplers.paths.snell import Snell
 from nerfro.silhouettes.silhouettes import pixel_stride
@@ -83,7 +84,7 @@ def measure(mesh: TriangleMesh, true: TriangleMesh, views: Views, ior: float) ->
     }
 
 
-def normal_errors(mesh: TriangleMesh, exact: SdfGrid) -> tuple[Float[np.ndarray, "F"], Float[np.ndarray, "F"]]:
+def normal_errors(mesh: TriangleMesh, exact: Bodies) -> tuple[Float[np.ndarray, "F"], Float[np.ndarray, "F"]]:
     """Return the angle of each triangle to the nearest true surface in degrees, and its area."""
     a, b, c = mesh.triangles.swapaxes(0, 1)
     gradient = exact.signed_distances(torch.from_numpy(mesh.triangles.mean(1)).float())[1][:, 0].double().numpy()
@@ -91,10 +92,10 @@ def normal_errors(mesh: TriangleMesh, exact: SdfGrid) -> tuple[Float[np.ndarray,
     return _degrees(normals, gradient), 0.5 * np.linalg.norm(normals, axis=1)
 
 
-def _medium(mesh: TriangleMesh, box: Float[np.ndarray, "2 3"], ior: float) -> SdfGrid:
+def _medium(mesh: TriangleMesh, box: Float[np.ndarray, "2 3"], ior: float) -> Bodies:
     with tempfile.TemporaryDirectory() as folder:
         mesh.save(file := Path(folder) / "mesh.ply")
-        return SdfGrid(str(file), ior, box_min=box[0].tolist(), box_max=box[1].tolist(), cache=False)
+        return make_bodies(str(file), ior, box_min=box[0].tolist(), box_max=box[1].tolist(), cache=False)
 
 
 def _degrees(first: Float[np.ndarray, "N 3"], second: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N"]:

@@ -20,11 +20,10 @@ from nerfro.core.types import Rays
 from nerfro.evaluation.path_plot import plot_paths
 from nerfro.files import lat_long
 from nerfro.media.base import Medium
-from nerfro.media.sdf_grid import SdfGrid
-from nerfro.media.shapes import Ball
+from nerfro.media.bodies import Bodies
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.subdivision import part_rays
-from tests.closed_forms import RoundedBox, angle, ball_exits, make_rays
+from tests.closed_forms import Ball, RoundedBox, angle, ball_exits, make_rays, sampled
 from tests.paper import Eikonal, VoxelGrid
 
 TILT = np.radians(33)
@@ -65,10 +64,10 @@ def draw_light(folder: Path, side: int) -> None:
     splitting = Snell(branches="all", least_weight=0.002)
     clear, green, flint = (
         cube_of_distances(**options)
-        for options in ({}, {"absorption": [1.2, 0.25, 0.8]}, {"abbe": [8.0]})  # type: ignore[arg-type]
+        for options in ({}, {"absorption": [1.2, 0.25, 0.8]}, {"abbe": 8.0})  # type: ignore[arg-type]
     )
     ball = Ball(RADIUS, N_BALL).double()
-    flint_ball = SdfGrid.from_distances(grid_distances(ball, 128), BOX, [N_BALL], 0.02, abbe=[8.0])
+    flint_ball = sampled(grid_distances(ball, 128), BOX, [N_BALL], 0.02, abbe=8.0)
     pictures: dict[str, tuple[RayPath, Medium, dict[str, np.ndarray]]] = {
         "optics_branches.png": (splitting(beam, ball), ball, {
             "one path": picture(Snell(), clear, side),
@@ -98,13 +97,13 @@ def draw_light(folder: Path, side: int) -> None:
         figure.savefig(folder / name, dpi=90, bbox_inches="tight")
 
 
-def cube_of_distances(**options: list[float]) -> SdfGrid:
+def cube_of_distances(**options: object) -> Bodies:
     """A rounded cube of glass on a grid, for the compiled kernel."""
     values = grid_distances(RoundedBox(0.7, 0.1).double(), 128)
-    return SdfGrid.from_distances(values, BOX, [1.5], 0.02, **options)
+    return sampled(values, BOX, [1.5], 0.02, **options)
 
 
-def picture(sampler: Snell, medium: SdfGrid, side: int, parts: int = 3) -> np.ndarray:
+def picture(sampler: Snell, medium: Bodies, side: int, parts: int = 3) -> np.ndarray:
     """The medium under the sky of the scene `torus`, several rays a pixel, sRGB."""
     cameras = view(side).crop(central_window(side, side, 0.75))
     radiance_of_sky = lat_long.load_lat_long(ASSETS_DIR / "torus" / "sky.png")
@@ -158,7 +157,7 @@ def draw_errors(voxels: VoxelGrid, file: Path, resolution: int) -> None:
         ("eikonal, the same voxels", exits(Eikonal(), voxels)),
     ]
     for shell in (0.5, 0.1):
-        solid = SdfGrid.from_distances(distances, BOX, [N_BALL], shell * spacing)
+        solid = sampled(distances, BOX, [N_BALL], shell * spacing)
         curves.append((f"eikonal, signed distance, shell {shell} voxels", exits(Eikonal(), solid)))
     curves.append(("snell, signed distance", exits(Snell(), solid)))
     curves.append(("snell, analytic", exits(Snell(), Ball(RADIUS, N_BALL).double())))

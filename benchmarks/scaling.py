@@ -130,9 +130,9 @@ def write_bodies(folder: Path, count: int) -> list[str]:
     for number in range(count):
         files.append(str(folder / f"body_{number}.ply"))
         TriangleMesh(outer.vertices * 0.9**number, outer.faces).save(Path(files[-1]))
-    iors = [1.33 if number % 2 else 1.5 for number in range(1, count)]
-    inner = [f"medium.inner_meshes=[{','.join(files[1:])}]", f"medium.inner_iors={iors}"] if count > 1 else []
-    return [f"medium.mesh={files[0]}", "medium.ior=1.5", *inner]
+    iors = [1.33 if number % 2 else 1.5 for number in range(count)]
+    bodies = [f"body_{number}: {{mesh: {file}, ior: {iors[number]}}}" for number, file in enumerate(files)]
+    return [f"medium.bodies={{{', '.join(bodies)}}}"]
 
 
 class Quality(pl.Callback):

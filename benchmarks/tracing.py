@@ -24,10 +24,10 @@ from torch import Tensor
 
 from nerfro.core.cameras import Cameras
 from nerfro.core.types import Rays
-from nerfro.media.sdf_grid import SdfGrid
-from nerfro.media.shapes import Ball
+from nerfro.media.bodies import Bodies
+from nerfro.media.body_settings import make_bodies
 from nerfro.samplers.paths.snell import Snell
-from tests.closed_forms import RoundedBox, angle, ball_exits, make_rays
+from tests.closed_forms import Ball, RoundedBox, angle, ball_exits, make_rays, sampled
 from tests.paper import Eikonal, VoxelGrid
 
 RADIUS, N_BALL = 0.8, 1.5
@@ -59,19 +59,19 @@ def main() -> None:
         rounded_cube_mesh().export(cube)
         if arguments.branches:
             solids = {"sphere": (ball, N_BALL), "cube": (cube, N_CUBE)}
-            branches({name: SdfGrid(str(mesh), n, resolution=arguments.resolution, cache=False)
+            branches({name: make_bodies(str(mesh), n, resolution=arguments.resolution, cache=False)
                       for name, (mesh, n) in solids.items()}, arguments.side)  # fmt: skip
             return
         print(f"{torch.get_num_threads()} threads; ball of {len(sphere.faces)} faces\n")
         start = time.perf_counter()
         voxels = VoxelGrid(str(ball), N_BALL, arguments.euler_resolution, cache=False)
         built = time.perf_counter()
-        mesh_ball = SdfGrid(str(ball), N_BALL, resolution=arguments.resolution, cache=False)
+        mesh_ball = make_bodies(str(ball), N_BALL, resolution=arguments.resolution, cache=False)
         print(
             f"building from the mesh: {arguments.euler_resolution}^3 voxel grid {built - start:.1f} s, "
             f"{arguments.resolution}^3 signed distance {time.perf_counter() - built:.1f} s (compilation included)\n"
         )
-        mesh_cube = SdfGrid(str(cube), N_CUBE, resolution=arguments.resolution, cache=False)
+        mesh_cube = make_bodies(str(cube), N_CUBE, resolution=arguments.resolution, cache=False)
         sphere_errors(voxels, mesh_ball, arguments.resolution, arguments.rays)
         cube_errors(mesh_cube, arguments.resolution, 3 * arguments.rays // 8)
         coarse = VoxelGrid(str(ball), N_BALL, arguments.resolution, cache=False)
@@ -80,7 +80,7 @@ def main() -> None:
     print("\nThe compiled kernels trace on the CPU for rays on any device, so there are no separate times for a GPU.")
 
 
-def sphere_errors(voxels: VoxelGrid, mesh_ball: SdfGrid, resolution: int, num: int) -> None:
+def sphere_errors(voxels: VoxelGrid, mesh_ball: Bodies, resolution: int, num: int) -> None:
     """Print errors of the exit direction against 2 (asin(b / R) - asin(b / (n R))), for rays of random directions."""
     generator = np.random.default_rng(0)
     d = generator.normal(size=(num, 3))
@@ -91,7 +91,7 @@ def sphere_errors(voxels: VoxelGrid, mesh_ball: SdfGrid, resolution: int, num: i
     rays = make_rays(u * share[:, None] * RADIUS - 4 * d, d, NEAR, FAR)
     exact = ball_exits(rays, RADIUS, N_BALL)
     analytic = Ball(RADIUS, N_BALL).double()
-    exact_grid = SdfGrid.from_distances(grid_distances(analytic, resolution), BOX, [N_BALL], mesh_ball.shell)
+    exact_grid = sampled(grid_distances(analytic, resolution), BOX, [N_BALL], mesh_ball.shell)
     rows: list[tuple[str, Trace, tuple[float, ...] | None]] = [
         (
             f"euler, {NUM_EULER_STEPS} steps, {voxels.table.shape[0]}^3 voxels 9/1 (the paper's)",
@@ -117,7 +117,7 @@ def sphere_errors(voxels: VoxelGrid, mesh_ball: SdfGrid, resolution: int, num: i
         print(f"| {name} | {' | '.join(cells)} | {limit} | {met} |", flush=True)
 
 
-def cube_errors(mesh_cube: SdfGrid, resolution: int, num: int) -> None:
+def cube_errors(mesh_cube: Bodies, resolution: int, num: int) -> None:
     """Print errors of the exit direction behind the rounded cube against the independent tracer.
 
     A ray is well-conditioned if its neighbours at 1e-4 units have as many reflections and leave within 0.5 degrees.
@@ -139,7 +139,7 @@ def cube_errors(mesh_cube: SdfGrid, resolution: int, num: int) -> None:
     sound = same & (moved < 0.5).numpy()
     rays = make_rays(x, d, near=0.0, far=14.0)  # reflected paths are long
     analytic = RoundedBox(HALF_SIDE, EDGE, N_CUBE).double()
-    grid = SdfGrid.from_distances(grid_distances(analytic, resolution), BOX, [N_CUBE], mesh_cube.shell)
+    grid = sampled(grid_distances(analytic, resolution), BOX, [N_CUBE], mesh_cube.shell)
     print(
         f"\n### Exit direction behind a rounded glass cube (half side {HALF_SIDE}, edge {EDGE}, n {N_CUBE}), degrees\n"
     )
@@ -160,7 +160,7 @@ def cube_errors(mesh_cube: SdfGrid, resolution: int, num: int) -> None:
         print(f"| {name} | {median:.5f} | {high:.4f} | {bound} | {met} |", flush=True)
 
 
-def speed(baselines: list[VoxelGrid], solids: dict[str, SdfGrid], side: int) -> None:
+def speed(baselines: list[VoxelGrid], solids: dict[str, Bodies], side: int) -> None:
     """Print rays per second over all rays of a view, against Euler steps in the same kind of compiled kernel.
 
     The cost of Euler steps does not depend on the object. A smaller grid is faster, because more of it stays in caches.
@@ -189,7 +189,7 @@ def speed(baselines: list[VoxelGrid], solids: dict[str, SdfGrid], side: int) -> 
             )
 
 
-def branches(solids: dict[str, SdfGrid], side: int) -> None:
+def branches(solids: dict[str, Bodies], side: int) -> None:
     """Print the cost of light that splits for the same rays, in processor time because cores may be shared."""
     print(f"\n### Light that splits, all {side}x{side} rays of a view\n")
     print("| object | branches, least weight | paths a ray that meets it | ms | million rays/s | against one path |")

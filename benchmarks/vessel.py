@@ -15,8 +15,9 @@ import torch
 import trimesh
 
 from nerfro.core.rays import Rays
-from nerfro.media.sdf_grid import SdfGrid
-from nerfro.media.vessel import SdfVessel
+from nerfro.media.bodies import Bodies
+from nerfro.media.body_settings import make_bodies
+from nerfro.media.vessel import make_vessel
 from nerfro.samplers.paths.snell import Snell
 from tests.closed_forms import angle, make_rays
 
@@ -41,8 +42,8 @@ def main() -> None:
         grid = {"resolution": given.resolution, "box_min": BOX[0], "box_max": BOX[1], "cache": False}
         lengths = {"wall": WALL, "foot": FOOT, "level": LEVEL}
 
-        def vessel(**changed: float) -> SdfVessel:
-            return SdfVessel(str(mesh), **(lengths | changed), height=HEIGHT, **grid)
+        def vessel(**changed: float) -> Bodies:
+            return make_vessel(str(mesh), **(lengths | changed), height=HEIGHT, **grid)
 
         true = vessel()
         rays = rays_at(given.rays)
@@ -54,8 +55,8 @@ def main() -> None:
         )
         print(f"through the water, and of {int(dry.sum())} through the wall alone")
         for name, medium in {
-            "solid of water, 1.333": SdfGrid(str(mesh), 1.333, **grid),
-            "solid of glass, 1.5": SdfGrid(str(mesh), 1.5, **grid),
+            "solid of water, 1.333": make_bodies(str(mesh), 1.333, **grid),
+            "solid of glass, 1.5": make_bodies(str(mesh), 1.5, **grid),
             "full to the brim": vessel(level=HEIGHT),
             "empty": vessel(liquid_ior=1.0),
             "wall thicker by 10 %": vessel(wall=1.1 * WALL),

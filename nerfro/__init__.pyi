@@ -8,10 +8,14 @@ from .data.blender import BlenderData
 from .data.capture import Capture
 from .evaluation.collection import metrics
 from .fields.hash_grid import HashGridField
+from .geometry.space import Box, Contracted
 from .losses.photometric import Photometric
 from .masks.segment import segment
-from .media.sdf_grid import SdfGrid
-from .media.shapes import Ball
+from .media.bodies import Bodies, Body, GridSettings
+from .media.body_settings import make_bodies
+from .media.material import Material
+from .media.surface import MeshSurface
+from .media.surfaces.ball import BallSurface
 from .models.refractive import RefractiveModel
 from .pipeline.evaluate import evaluate
 from .pipeline.export import export
@@ -35,15 +39,22 @@ from .viewing.trained_scene import TrainedScene
 
 __version__: str
 __all__ = [
-    "Ball",
+    "BallSurface",
     "BlenderData",
+    "Bodies",
+    "Body",
+    "Box",
     "Cameras",
     "Capture",
     "Components",
     "ConstantBackground",
+    "Contracted",
     "EnvironmentMap",
+    "GridSettings",
     "GroupConfig",
     "HashGridField",
+    "Material",
+    "MeshSurface",
     "OptimizerConfig",
     "Photometric",
     "RayBatches",
@@ -52,7 +63,6 @@ __all__ = [
     "RefractiveModel",
     "Run",
     "SceneFile",
-    "SdfGrid",
     "Snell",
     "Straight",
     "Stratified",
@@ -65,6 +75,7 @@ __all__ = [
     "evaluate",
     "export",
     "load",
+    "make_bodies",
     "metrics",
     "polylines",
     "preprocess",

@@ -17,9 +17,12 @@ from nerfro.evaluation.image_metrics import ImageMetric
 from nerfro.fields.base import Field
 from nerfro.files.atomic import write_atomically
 from nerfro.files.reading import load_arrays
+from nerfro.geometry.space import Box, Contracted, Space, Unbounded
 from nerfro.losses.base import Loss
 from nerfro.media.base import Medium, Scalars, Vectors
-from nerfro.media.surface import Grid, Surface
+from nerfro.media.bodies import Bodies, Body, GridSettings
+from nerfro.media.material import Material
+from nerfro.media.surface import Grid, MeshSurface, Surface
 from nerfro.models.refractive import RefractiveModel
 from nerfro.registry.allowed import Count, Distance, Natural, NotNegative, Positive
 from nerfro.registry.registration import register
@@ -32,10 +35,11 @@ from nerfro.viewing.exports import EXPORTS, Export, ExportConfig
 from nerfro.viewing.trained_scene import TrainedScene
 
 __all__ = [
-    "EXPORTS", "Background", "Batch", "CameraModel", "Cameras", "Components", "Count", "DataSource", "Distance",
-    "Draws", "Exits", "Export", "ExportConfig", "Field", "FieldValues", "Ge", "Grid", "Gt", "ImageMetric", "Le", "Loss",
-    "Lt", "Medium", "Natural", "NerfroError", "NotNegative", "Path", "PathSampler", "Phase", "PointSampler", "Positive",
-    "Rays", "RefractiveModel", "Renderer", "Rendering", "Samples", "Scalars", "Scene", "Stratified", "Surface",
-    "TrainedScene", "TrainingRun", "Vectors", "Views", "invert_cdf", "load_arrays", "point_samples", "register",
-    "resolve_path", "spread_uniform", "write_atomically",
+    "EXPORTS", "Background", "Batch", "Bodies", "Body", "Box", "CameraModel", "Cameras", "Components", "Contracted",
+    "Count", "DataSource", "Distance", "Draws", "Exits", "Export", "ExportConfig", "Field", "FieldValues", "Ge",
+    "Grid", "GridSettings", "Gt", "ImageMetric", "Le", "Loss", "Lt", "Material", "Medium", "MeshSurface", "Natural",
+    "NerfroError", "NotNegative", "Path", "PathSampler", "Phase", "PointSampler", "Positive", "Rays",
+    "RefractiveModel", "Renderer", "Rendering", "Samples", "Scalars", "Scene", "Space", "Stratified", "Surface",
+    "TrainedScene", "TrainingRun", "Unbounded", "Vectors", "Views", "invert_cdf", "load_arrays", "point_samples",
+    "register", "resolve_path", "spread_uniform", "write_atomically",
 ]  # fmt: skip

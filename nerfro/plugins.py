@@ -27,7 +27,7 @@ from nerfro.registry.registration import Plugin, discover, find, plugins
 
 
 def main() -> None:
-    """List all plugins, or those of the types (`medium`) or options (`medium=ball`) on the command line.
+    """List all plugins, or those of the types (`medium`) or options (`medium=vacuum`) on the command line.
 
     The type `material` stands for the catalogue of materials, and `settings` for the tuned numbers of algorithms.
     """

@@ -20,7 +20,6 @@ from nerfro.files.atomic import refuse_existing
 from nerfro.files.cache import save_arrays
 from nerfro.registry.registration import build
 from nerfro.rendering.scene_file import with_scene
-from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.paths.thin_walls import warn_of_thin_walls
 from nerfro.samplers.paths.traced_file import TraceConfig, leave_box, make_rays, read_rays
 
@@ -39,11 +38,8 @@ def main(config: DictConfig) -> None:
     medium = build(config.medium)
     warn_of_thin_walls(sampler, medium)
     rays = make_rays(origins, directions, medium, config.near, config.far)
-    if isinstance(sampler, Snell):
-        trace = sampler.trace(rays, medium)
-        path, num_exceeded = trace.path, int(trace.exceeded.sum())
-    else:
-        path, num_exceeded = sampler(rays, medium), 0
+    trace = sampler.trace(rays, medium)
+    path, num_exceeded = trace.path, int(trace.exceeded.sum())
     positions, lengths = (path.end_positions, path.far) if config.far is not None else leave_box(path, medium)
     arrays = {
         "exit_positions": positions + torch.from_numpy(medium.origin),

@@ -7,12 +7,14 @@ Examples:
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from omegaconf import DictConfig
 
 import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
 from nerfro.cli.calls import Composition
 from nerfro.cli.entry import entry_point
-from nerfro.evaluation.results import optimized
+from nerfro.evaluation.results import RunMetrics, optimized
 from nerfro.rendering.scene_file import with_scene
 from nerfro.training.build import warn_without_effect
 from nerfro.training.config import TrainConfig, check_run
@@ -25,7 +27,11 @@ def main(config: DictConfig) -> float | None:
     """Train one experiment, evaluate it, and return `optimized_metric`, which sweepers of Hydra optimize."""
     composition = Composition.of_job(config)
     warn_without_effect(composition)
-    scores = run_cell(config, composition.folder, lambda: run_training(composition).scores)
+
+    def train(config: DictConfig) -> RunMetrics | None:
+        return run_training(replace(composition, config=config)).scores
+
+    scores = run_cell(config, composition.folder, train)
     return None if scores is None else optimized(scores.result, config.optimized_metric)
 
 

@@ -17,11 +17,11 @@ from nerfro.core.types import Exits
 from nerfro.data.base import Views
 from nerfro.files.images import save_png
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.media.sdf_grid import SdfGrid
+from nerfro.media.bodies import Bodies
 from nerfro.samplers.paths.snell import Snell
 from nerfro.silhouettes.silhouettes import mesh_silhouettes
 from tests.cameras_at import cameras_at, poses_towards_origin
-from tests.closed_forms import grid_points
+from tests.closed_forms import grid_points, sampled
 
 SIZE, NUM_VIEWS, RADIUS, INNER = 40, 30, 0.7, 0.35
 SHARES = 5  # pixels of masks are divided by so many, each way
@@ -72,8 +72,8 @@ def ball(radius: float) -> Tensor:
     return (points.norm(dim=-1) - radius).float()
 
 
-def solid(iors: list[float], inner: float = INNER) -> SdfGrid:
-    return SdfGrid.from_distances(torch.stack([ball(RADIUS), ball(inner)][: len(iors)]), BOX, iors, 0.01)
+def solid(iors: list[float], inner: float = INNER) -> Bodies:
+    return sampled(torch.stack([ball(RADIUS), ball(inner)][: len(iors)]), BOX, iors, 0.01)
 
 
 def photographs(iors: list[float], opaque: bool = False, inner: float = INNER) -> Views:
@@ -82,7 +82,7 @@ def photographs(iors: list[float], opaque: bool = False, inner: float = INNER) -
 
 
 def photographs_of(
-    medium: SdfGrid, opaque: bool = False, around: Callable[[Exits], Tensor] = lambda exits: sky(exits.directions)
+    medium: Bodies, opaque: bool = False, around: Callable[[Exits], Tensor] = lambda exits: sky(exits.directions)
 ) -> Views:
     """What a medium shows of what is around it, the sky."""
     taken, images = cameras(), []

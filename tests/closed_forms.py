@@ -1,15 +1,18 @@
 """Media with rays in closed form, and helpers of the tests of optics. Lengths are in world units."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from nerfro.core.types import Rays
 from nerfro.media.base import Medium
-from nerfro.media.solid import Solid
+from nerfro.media.bodies import Bodies
+from nerfro.media.distance_grid import DistanceGrid, DistanceGrids
+from nerfro.media.material import Abbe, Material
 
 Squared = Callable[[Tensor], tuple[Tensor, Tensor]]
 
@@ -42,7 +45,71 @@ class Luneburg(Medium):
         return n, torch.where(inside[..., None], gradient / (2 * n[..., None]), 0.0)
 
 
-class RoundedBox(Solid):
+class FreeBodies(Bodies):
+    """Bodies whose signed distances a test sets: a subclass in closed form, or `sampled` on grids.
+
+    Args:
+        iors: refractive index of each body.
+        shell: half width of the smooth shells.
+        box: lower and upper corner.
+        absorption: coefficients of each body and channel, or one number for all.
+        abbe: Abbe number of all bodies.
+        learn: learned quantities.
+    """
+
+    def __init__(
+        self,
+        iors: Sequence[float],
+        shell: float,
+        box: Tensor,
+        absorption: Sequence[float] = (0.0,),
+        abbe: float | None = None,
+        learn: Sequence[str] = (),
+    ) -> None:
+        Medium.__init__(self)
+        self.nested, self.shell, self.meshes, self.grids = False, shell, [], DistanceGrids([])
+        names = ["object"] if len(iors) == 1 else [str(number + 1) for number in range(len(iors))]
+        sigma = np.broadcast_to(np.reshape(absorption, (-1, min(3, len(absorption)))), (len(iors), 3)).tolist()
+        dispersion = None if abbe is None else Abbe(abbe)
+        self._set_materials(names, [Material(n, row, dispersion, learn) for n, row in zip(iors, sigma, strict=True)])
+        self.register_buffer("box", box, persistent=False)
+
+    @property
+    def content_box(self) -> Tensor:
+        return self.box
+
+
+def sampled(
+    distances: Iterable[Tensor],
+    boxes: Tensor | Sequence[Tensor],
+    iors: Sequence[float],
+    shell: float,
+    **material: object,
+) -> FreeBodies:
+    """Bodies on grids, from signed distances at the vertices, and the corners of each grid or of all."""
+    boxes = [boxes] * len(iors) if isinstance(boxes, Tensor) else boxes
+    medium = FreeBodies(iors, shell, boxes[0], **material)
+    medium._set_grids(DistanceGrid(values, box) for values, box in zip(distances, boxes, strict=True))
+    for body, box in zip(medium.materials, boxes, strict=True):
+        body.scale_absorption(0.5 * float((box[1] - box[0]).max()))
+    return medium
+
+
+class Ball(FreeBodies):
+    """A ball around the origin."""
+
+    def __init__(self, radius: float = 0.8, ior: float = 1.5, shell: float = 0.002, **material: object) -> None:
+        side = 1.05 * radius + shell
+        super().__init__([ior], shell, torch.tensor([[-side] * 3, [side] * 3]), **material)
+        self.radius = radius
+        self.materials[0].scale_absorption(radius)
+
+    def signed_distances(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        distance = torch.linalg.vector_norm(positions, dim=-1, keepdim=True)
+        return distance - self.radius, functional.normalize(positions, dim=-1)[..., None, :]
+
+
+class RoundedBox(FreeBodies):
     """A cube around the origin with rounded edges and corners: a smaller cube, grown by the radius of the edges."""
 
     def __init__(
@@ -51,12 +118,11 @@ class RoundedBox(Solid):
         edge_radius: float = 0.08,
         ior: float = 1.52,
         shell: float = 0.002,
-        abbe: list[float] = [],  # noqa: B006 (never changed)
+        **material: object,
     ) -> None:
-        super().__init__([ior], shell, abbe=abbe)
-        self.half_side, self.edge_radius = half_side, edge_radius
         side = 1.05 * half_side + shell
-        self.register_buffer("box", torch.tensor([[-side] * 3, [side] * 3]), persistent=False)
+        super().__init__([ior], shell, torch.tensor([[-side] * 3, [side] * 3]), **material)
+        self.half_side, self.edge_radius = half_side, edge_radius
 
     def signed_distances(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         q = positions.abs() - (self.half_side - self.edge_radius)
@@ -68,14 +134,13 @@ class RoundedBox(Solid):
         return distance, (direction * positions.sign())[..., None, :]
 
 
-class Slab(Solid):
+class Slab(FreeBodies):
     """A wide plate across the z axis."""
 
     def __init__(self, thickness: float = 0.5, ior: float = 1.5, shell: float = 0.002) -> None:
-        super().__init__([ior], shell)
-        self.thickness = thickness
         corner = torch.tensor([10.0, 10.0, 0.55 * thickness + shell])
-        self.register_buffer("box", torch.stack([-corner, corner]), persistent=False)
+        super().__init__([ior], shell, torch.stack([-corner, corner]))
+        self.thickness = thickness
 
     def signed_distances(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         z = positions[..., 2:]

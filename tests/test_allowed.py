@@ -7,7 +7,7 @@ import pytest
 from annotated_types import Gt, Le
 
 from nerfro.geometry.box import corners_of_box
-from nerfro.registry.allowed import AnyNumber, Count, Positive, validated
+from nerfro.registry.allowed import Count, Positive, validated
 from nerfro.registry.registration import create, discover, find
 from tests.conftest import refused
 
@@ -21,14 +21,13 @@ class Component:
         radius: Positive | None = None,
         sizes: list[Count] = (),  # type: ignore[assignment]
         mode: Literal["fast", "exact"] = "fast",
-        anything: AnyNumber = 0.0,
         finite: float = 0.0,
     ) -> None:
         self.count = count
 
 
 def test_allowed_values_pass() -> None:
-    assert Component(1, rate=2, radius=None, sizes=[1, 2], mode="exact", anything=math.nan).count == 1
+    assert Component(1, rate=2, radius=None, sizes=[1, 2], mode="exact").count == 1
 
 
 @pytest.mark.parametrize(
@@ -59,13 +58,11 @@ MESH = "embedded:torus/mesh.ply"
         ("background", "envmap", {"resolutions": [4, 0]}, r"resolutions=\[4, 0\] is not allowed; take at least 1"),
         ("data", "opencv", {"root": ".", "eval_crop": 0.0}, "eval_crop=0.0 is not allowed"),
         ("data", "opencv", {"root": ".", "eval_crop": 1.2}, "eval_crop=1.2 is not allowed"),
-        ("field", "hash_grid", {"box_min": [0.0] * 3, "box_max": [1.0, 0.0, 1.0]}, "min below max"),
-        ("field", "hash_grid", {"box_min": [0.0, 0.0]}, "three numbers"),
         ("loss", "backdrop", {"colour": [1.0]}, "three numbers in"),
         ("loss", "backdrop", {"colour": [255.0] * 3}, "three numbers in"),
         ("loss", "photometric", {"ramp": -1}, "ramp=-1 is not allowed; take at least 0"),
         ("loss", "photometric", {"start": -1}, "start=-1 is not allowed; take at least 0"),
-        ("loss", "photometric", {"weight": -1}, "weight=-1 is not allowed; take at least 0"),
+        ("loss", "photometric", {"weight": -1}, "weight=-1.0 is not allowed; take at least 0"),
         ("loss", "smoothness", {"tile_size": 1}, "tile_size=1 is not allowed; take at least 2"),
         ("loss", "total_variation", {"angle": 0.0}, "more than 0 and less than 90"),
         ("medium", "ball", {"ior": 0.0}, "ior=0.0 is not allowed; take more than 0"),

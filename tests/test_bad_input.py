@@ -166,15 +166,15 @@ def test_field_missed_by_all_rays_is_refused_before_training(
     sky = "background=skybox", "background.width=8"
     run = [text for text in tiny_run if text not in sky]
     run += ["trainer.max_steps=1", "evaluation.every=0", "background=constant"]
-    away = ["field.box_min=[50,50,50]", "field.box_max=[51,51,51]"]
+    away = ["content.box_min=[50,50,50]", "content.box_max=[51,51,51]"]
     refused = train_here(*run, *away, f"hydra.run.dir={tmp_path / 'away'}", code=1).error
     assert "no ray of the training views meets the field's box from [50.0, 50.0, 50.0]" in refused
     assert "set content.box_min" in refused
     assert not list((tmp_path / "away").rglob("*"))
-    small = ["field.box_min=[-0.3,-0.3,-0.3]", "field.box_max=[0.3,0.3,0.3]"]
+    small = ["content.box_min=[-0.3,-0.3,-0.3]", "content.box_max=[0.3,0.3,0.3]"]
     finished = train_here(*run, *small, f"hydra.run.dir={tmp_path / 'small'}")
     assert "% of the rays pass the field's box from [-0.3, -0.3, -0.3]" in finished.out
-    whole = ["field.box_min=[-9,-9,-9]", "field.box_max=[9,9,9]"]
+    whole = ["content.box_min=[-9,-9,-9]", "content.box_max=[9,9,9]"]
     assert "pass the field's box" not in train_here(*run, *whole, f"hydra.run.dir={tmp_path / 'whole'}").out
 
 

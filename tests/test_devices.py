@@ -6,10 +6,11 @@ import pytest
 
 from nerfro.evaluation.render_view import render_view
 from nerfro.kernels.constants import constant
-from nerfro.media.sdf_grid import SdfGrid
+from nerfro.media.bodies import Bodies
 from nerfro.registry.registration import build
 from nerfro.samplers.subdivision import Subdivision
-from nerfro.training.config import build_model
+from nerfro.training.config import build_medium, build_model
+from nerfro.training.derivation import derived
 from nerfro.training.module import TrainingModule
 from nerfro.training.ray_batches import RayBatches
 from nerfro.viewing.baking import bake_surface
@@ -23,7 +24,7 @@ STEP = 100_000
 # Rays are traced on the CPU, and travel there and back.
 TRACING = ("kernels/arrays.py", "samplers/paths/compiled.py", "paper/compiled.py", "paper/eikonal.py")
 TRACING += ("samplers/paths/snell.py", "samplers/paths/polylines.py", "samplers/paths/wavefront.py")
-TRACING += ("geometry/intersection.py", "media/sdf_grid.py")
+TRACING += ("geometry/intersection.py", "media/bodies.py")
 
 ADAPTIVE = ["sampler.path.integrator=adaptive", "sampler.path.max_steps=60", "sampler.points.draw=arc_length"]
 
@@ -55,7 +56,9 @@ def test_training_and_rendering_stay_on_the_gpu(
     monkeypatch.setattr(TrainingModule, "global_step", STEP)
     overrides = [f"+experiment={experiment[0]}", *experiment[1:], *SMALL, "data.downscale=16"]
     config = composed(*overrides, *shrunk(composed(*overrides)))
-    renderer, views = build_model(config), build(config.data).load("train")
+    views = build(config.data).load("train")
+    config = derived(config, build_medium(config), views)
+    renderer = build_model(config)
     module = TrainingModule.of(renderer, config)
     # What is computed and kept while the model is on the CPU must move with it.
     renderer.render(views.cameras.image_rays(0))
@@ -71,7 +74,7 @@ def test_training_and_rendering_stay_on_the_gpu(
         renderer.point_sampler.update(list(renderer.scene.fields), batch.draws)
         assert {wait for wait in gpu.waits if not wait.startswith(TRACING)} == waits
         rendered = render_view(renderer, cameras, 0, Subdivision())
-        if isinstance(renderer.scene.medium, SdfGrid):
+        if isinstance(renderer.scene.medium, Bodies):
             assert bake_surface(renderer).voxels
     assert isinstance(loss, OnGpu)
     assert isinstance(rendered.radiance, OnGpu)

@@ -17,8 +17,8 @@ from nerfro.data.base import Views
 from nerfro.fields.base import Field
 from nerfro.files import lat_long
 from nerfro.files.images import save_png
+from nerfro.geometry.space import Box
 from nerfro.media.base import Medium
-from nerfro.media.shapes import Ball
 from nerfro.paper.eikonal import Eikonal
 from nerfro.paper.nerf import NerfField
 from nerfro.registry.registration import discover, find
@@ -30,6 +30,7 @@ from nerfro.training.module import TrainingModule
 from nerfro.training.optimizer import OptimizerConfig
 from nerfro.training.run_folder import load_checkpoint, restore
 from tests.ball_photographs import save
+from tests.closed_forms import Ball
 from tests.conftest import QUIET, Runner, refused
 from tests.exact_silhouettes import cameras_around
 
@@ -120,8 +121,9 @@ def make_model(make_field: Callable[[], Field] = Slanted, **fields: Any) -> Rend
         point_sampler=Stratified(64),
         make_field=make_field,
         background=ConstantBackground([0.2, 0.3, 0.4]),
+        space=Box([[-5.0] * 3, [5.0] * 3]),
     )
-    return EikonalFields(parts, **{"resolution": 16, "box_min": [-5.0] * 3, "box_max": [5.0] * 3, **fields})
+    return EikonalFields(parts, **{"resolution": 16, **fields})
 
 
 def test_stages_split_the_budget() -> None:

@@ -14,8 +14,9 @@ from torch.nn.utils import parameters_to_vector
 from nerfro.evaluation.render_view import render_view
 from nerfro.registry.registration import build
 from nerfro.samplers.subdivision import Subdivision
-from nerfro.training.config import build_model
+from nerfro.training.config import build_medium, build_model
 from nerfro.training.data_module import traced
+from nerfro.training.derivation import derived
 from nerfro.training.module import TrainingModule
 from nerfro.training.ray_batches import RayBatches
 from tests.conftest import composed
@@ -33,7 +34,9 @@ def step_on(device: str, overrides: list[str]) -> tuple[float, Tensor, Tensor]:
     config = composed(*overrides)
     torch.manual_seed(0)
     views = build(config.data).load("train")
-    renderer = build_model(config, views)
+    config = derived(config, build_medium(config), views)
+    renderer = build_model(config)
+    renderer.scene.begin(views.cameras)
     module = TrainingModule.of(renderer, config).to(device)
     module.log = lambda *values, **options: None  # type: ignore[method-assign]
     batches = traced(RayBatches(views, 256, config.batches.batching), renderer, config).to(device)

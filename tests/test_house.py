@@ -114,8 +114,8 @@ PLUGINS = {str(file.relative_to(PLUGINS_DIR)): file for file in PLUGINS_DIR.rglo
 # Requirement that provides an imported package with another name.
 PROVIDED_BY = {
     "PIL": "pillow", "annotated_types": "annotated-types",
-    "flip_evaluator": "flip-evaluator", "OpenImageIO": "openimageio", "hydra": "hydra-core",
-    "markupsafe": "jinja2", "omegaconf": "hydra-core", "skimage": "scikit-image", "yaml": "hydra-core",
+    "flip_evaluator": "flip-evaluator", "OpenImageIO": "openimageio", "hydra": "hydra-core", "markupsafe": "jinja2",
+    "omegaconf": "hydra-core", "skimage": "scikit-image", "yaml": "hydra-core",
 }  # fmt: skip
 
 
@@ -174,11 +174,11 @@ FUNCTIONS = [
     if isinstance(node, ast.FunctionDef)
 ]
 MAX_LINES, MAX_ARGUMENTS = 60, 8
-# Objects of other libraries and nodes of configurations, which have no methods of ours.
+# Objects of other libraries, which have no methods of ours.
 FOREIGN = {
-    "bar", "config", "content", "ctx", "hydra_config", "job", "log_gain", "logger", "loss", "main", "node", "numba",
-    "options", "pairing", "parameter", "parent", "parser", "pycolmap", "reader", "sampled", "session", "spec", "sys",
-    "tensor", "trained", "trainer", "hydra", "BoundedFiles",
+    "bar", "ctx", "extraction", "hydra_config", "log_gain", "logger", "main", "mapping", "matching", "numba",
+    "pairing", "parameter", "parent", "parser", "pycolmap", "reader", "sampled", "session", "spec", "sys", "tensor",
+    "trained", "trainer", "hydra", "BoundedFiles",
 }  # fmt: skip
 
 

@@ -15,15 +15,23 @@ from nerfro.core.types import Exits, FieldValues, Path
 from nerfro.files import lat_long
 from nerfro.losses.background import BackgroundRegularizer
 from nerfro.losses.base import Loss
+from nerfro.losses.distortion import Distortion
 from nerfro.losses.photometric import Photometric
 from nerfro.models.refractive import RefractiveModel
 from nerfro.paper.hierarchical import Hierarchical
-from nerfro.registry.registration import find
 from nerfro.rendering import composite
 from nerfro.samplers.paths.straight import straight_path
 from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.samplers.points.stratified import Stratified
-from nerfro.testing import NUM_RAYS, example_batch, example_components, example_draws, example_path, example_rays
+from nerfro.testing import (
+    NUM_RAYS,
+    example_batch,
+    example_components,
+    example_draws,
+    example_path,
+    example_rays,
+    example_space,
+)
 from nerfro.training.module import TrainingModule
 from nerfro.training.optimizer import GroupConfig, OptimizerConfig
 
@@ -66,7 +74,7 @@ def test_opacity_and_depth_belong_to_rays() -> None:
     assert torch.equal(rendering.exit_directions, path.exit_directions[::2])
 
 
-@pytest.mark.parametrize("sampler", [Stratified(8), Hierarchical(8, 8), DensityGridSampler(8, 16)])
+@pytest.mark.parametrize("sampler", [Stratified(8), Hierarchical(8, 8), DensityGridSampler(example_space(), 8, 16)])
 def test_random_numbers_are_drawn_for_each_ray(sampler: Stratified | Hierarchical | DensityGridSampler) -> None:
     same = straight_path(example_rays())
     rows = torch.arange(NUM_RAYS).repeat_interleave(2)
@@ -76,7 +84,7 @@ def test_random_numbers_are_drawn_for_each_ray(sampler: Stratified | Hierarchica
     assert torch.equal(samples.s[::2], sampler(same, None, example_draws()).s), "and splitting changes nobody's"
 
 
-@pytest.mark.parametrize("loss", [Photometric(), BackgroundRegularizer(), find("loss", "distortion").cls()])
+@pytest.mark.parametrize("loss", [Photometric(), BackgroundRegularizer(), Distortion()])
 def test_losses_accept_rays_that_split(loss: Loss) -> None:
     model, batch = RefractiveModel(example_components()).eval(), example_batch()
     with torch.no_grad():
@@ -89,7 +97,7 @@ def test_samples_follow_the_gradients_of_their_path() -> None:
     path = example_path()
     positions = path.positions.clone().requires_grad_()
     moving = replace(path, positions=positions)
-    for sampler in (Stratified(8), DensityGridSampler(8, 16)):
+    for sampler in (Stratified(8), DensityGridSampler(example_space(), 8, 16)):
         samples = sampler(moving, None)
         assert not samples.s.requires_grad
         (gradient,) = torch.autograd.grad(samples.positions.sum(), positions)

@@ -16,7 +16,7 @@ from nerfro.capture.refinement import DescentStage, RefinementSettings
 from nerfro.data.base import Frame, Views
 from nerfro.geometry.mesh import load_mesh
 from nerfro.masks.mask_files import save_mask
-from nerfro.media.bodies import BodySettings
+from nerfro.media.body_settings import BodySettings
 from nerfro.rendering.scene_file import read_scene_file
 from nerfro.silhouettes.silhouettes import mesh_silhouettes
 from tests.ball_photographs import NUM_VIEWS, RADIUS, SIZE, cameras, mesh, photographs, save

@@ -8,7 +8,7 @@ import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from nerfro.core.provenance import AlgorithmSettings
-from nerfro.media.bodies import BodySettings
+from nerfro.media.body_settings import BodySettings
 from nerfro.rendering.scene_file import Provenance, SceneFile, read_scene_file, with_scene
 from tests.conftest import refused
 
@@ -78,10 +78,8 @@ def test_command_line_has_precedence_over_the_scene_file(tmp_path: Path, capsys:
 def test_bodies_with_materials_keep_their_names(tmp_path: Path) -> None:
     bodies: dict[str, Any] = {"glass": {"mesh": "a b.ply", "ior": 1.5}, "water": {"mesh": "c.ply", "ior": 1.33}}
     file = write(tmp_path / "scene.json", data=DATA, bodies=bodies)
-    short = settings(f"scene={file}")
-    assert short["medium.mesh"] == str(tmp_path / "a b.ply")
-    assert short["medium.inner_meshes"] == [str(tmp_path / "c.ply")]
-    assert (short["medium.ior"], short["medium.inner_iors"]) == (1.5, [1.33])
+    places = {name: body | {"mesh": str(tmp_path / body["mesh"])} for name, body in bodies.items()}
+    assert settings(f"scene={file}")["medium.bodies"] == places
     bodies["water"] = {"mesh": "c.ply", "material": "water", "learn": ["absorption"]}
     bodies["glass"]["learn"] = []  # nothing, whatever `medium.learn_ior` is
     offset = {"name": "offset", "surface": {"name": "mesh", "file": "d.ply"}, "distance": -0.5}

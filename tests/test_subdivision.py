@@ -12,7 +12,6 @@ from nerfro.core.types import Batch
 from nerfro.data.base import Views
 from nerfro.evaluation.render_view import render_view
 from nerfro.media.analytic import Vacuum
-from nerfro.media.shapes import Ball
 from nerfro.models.refractive import RefractiveModel
 from nerfro.paper.hierarchical import Hierarchical
 from nerfro.paper.nerf import NerfField
@@ -22,7 +21,7 @@ from nerfro.samplers.subdivision import Subdivision, contrast, divergence, neigh
 from nerfro.testing import example_batch, example_components
 from nerfro.training.ray_batches import RayBatches
 from tests.cameras_at import cameras_at, random_poses
-from tests.closed_forms import RoundedBox
+from tests.closed_forms import Ball, RoundedBox
 
 NUM_VIEWS, HEIGHT, WIDTH = 3, 8, 10
 SIDE, FOCAL = 33, 60.0

@@ -10,9 +10,10 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from nerfro.core.types import Exits
+from nerfro.data.component import Component
 
 
-class Background(nn.Module, ABC):
+class Background(Component, nn.Module, ABC):
     """Background radiance, C'(d) (paper, Eqn. 5): radiance that arrives from outside of the volume.
 
     It is in the colour space of the model: linear, or sRGB with `model.colour=srgb`.
@@ -33,6 +34,11 @@ class Background(nn.Module, ABC):
     def face_resolution(self) -> int:
         """Number of samples along 90 degrees with which exports represent the background."""
         return 256
+
+    @property
+    def detail(self) -> float:
+        """Angle in degrees of the finest detail that gradient descent learns."""
+        return 0.35
 
 
 def background_radiance(

@@ -11,13 +11,16 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
+from omegaconf import DictConfig
 from torch import Tensor, nn
 
 from nerfro.backgrounds import cube_map
 from nerfro.backgrounds.base import Background
 from nerfro.core.errors import NerfroError
 from nerfro.core.types import Exits
+from nerfro.data.base import Views
 from nerfro.files import lat_long
+from nerfro.geometry.space import Space
 from nerfro.registry.allowed import Count
 from nerfro.registry.registration import register
 
@@ -30,6 +33,11 @@ _DARKEST = 1 / 255 / 12.92
 _MAX_TEXELS = 2.0
 # Texels along each side of a face of the levels, if neither a list nor photographs define them.
 _RESOLUTIONS = (4, 8, 16, 32, 64, 128, 256)
+# Bounds of the finest level that is derived from photographs.
+_MIN_RESOLUTION, _MAX_RESOLUTION = 64, 1024
+# Bounds of the finest level of gradient descent, whose optimizer visits all texels in each step: with and without finer
+# levels that `phase=background` fits.
+_MAX_BESIDE_FITS, _MAX_ALONE = 256, 512
 
 
 @dataclass(frozen=True)
@@ -67,7 +75,8 @@ class EnvironmentMap(Background):
 
     Args:
         resolutions: texels along each side of a face (90 degrees) of each level. None derives the finest level from the
-            width of a pixel of the photographs.
+            width of a pixel of the photographs. If a volume covers all of space, the background shows only what is far
+            behind the photographed scene, and None has levels from 4 to 256 texels.
         fitted_resolutions: the same of finer levels, which only the fits of `phase=background` change. Gradient descent
             would visit all their texels in each step. None derives the levels from the photographs, too.
         image: initial equirectangular image with z up (.png, .jpg, .hdr or .exr); None for grey.
@@ -103,6 +112,18 @@ class EnvironmentMap(Background):
             self.set_lat_long(lat_long.load_lat_long(image))
 
     @classmethod
+    def derive(cls, settings: DictConfig, views: Views, space: Space) -> dict[str, Any]:
+        if space.infinite or settings.background.resolutions is not None:
+            return {}
+        fits = settings.phase.get("background", {}).get("steps", 0) > 0
+        pixels = 0.5 * math.pi * float(views.cameras.fx.double().median())
+        limit = _MAX_RESOLUTION if fits else _MAX_ALONE
+        finest = min(max(2 ** round(math.log2(pixels)), _MIN_RESOLUTION), limit)
+        levels = [2**level for level in range(int(math.log2(_RESOLUTIONS[0])), int(math.log2(finest)) + 1)]
+        descent = [n for n in levels if n <= _MAX_BESIDE_FITS or not fits]
+        return {"resolutions": descent, "fitted_resolutions": levels[len(descent) :]}
+
+    @classmethod
     def of_texels(cls, radiance: Float[Tensor, "T 3"]) -> EnvironmentMap:
         """Make a map with fixed linear radiance at the `cube_map.texel_directions` of one level."""
         sky = cls([math.isqrt(len(radiance) // 6)])
@@ -116,6 +137,10 @@ class EnvironmentMap(Background):
     @property
     def face_resolution(self) -> int:
         return self.levels.resolutions[-1]
+
+    @property
+    def detail(self) -> float:
+        return 90 / max(self._groups[0].resolutions)
 
     def _raw_at(self, face: Int[Tensor, "P"], coordinates: Float[Tensor, "P 2"]) -> Float[Tensor, "P 3"]:
         raw = torch.zeros_like(coordinates[:, :1])
@@ -165,17 +190,17 @@ class EnvironmentMap(Background):
         for n, (values, of_level), earlier in levels:
             wide = observed.widths > _MAX_TEXELS * 0.5 * math.pi / n
             weights = observed.weights.masked_fill(wide, 0)[:, None].expand(-1, 3)
-            place, level = (face, coordinates), cube_map.CubeLevels((n,))
+            positions, level = (face, coordinates), cube_map.CubeLevels((n,))
             with torch.enable_grad():
                 change = torch.zeros_like(values, requires_grad=True)
-                changed = self._looked_up(*place, change, of_level, level)
+                changed = self._looked_up(*positions, change, of_level, level)
             sums, counts = (
                 torch.autograd.grad(changed, change, gradient, retain_graph=True)[0]
                 for gradient in (weights * residual, weights)
             )
             change = sums / (counts + earlier[:, None] + 1)
             values += change
-            residual -= self._looked_up(*place, change, of_level, level)
+            residual -= self._looked_up(*positions, change, of_level, level)
             total.append(counts[:, 0])
         return torch.cat(total)
 

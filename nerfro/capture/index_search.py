@@ -36,7 +36,8 @@ from nerfro.core.provenance import AlgorithmSettings
 from nerfro.core.robust import geman_mcclure, geman_mcclure_weight
 from nerfro.files.atomic import write_atomically
 from nerfro.media.base import Medium
-from nerfro.media.solid import Solid, body_names
+from nerfro.media.bodies import Bodies
+from nerfro.media.body_settings import expanded
 from nerfro.rendering.scene_file import Provenance
 from nerfro.samplers.paths.snell import Snell
 
@@ -132,7 +133,7 @@ class Estimate:
 
 
 def find_indices(
-    medium: Solid,
+    medium: Bodies,
     through: Pixels,
     surroundings: Surroundings,
     progress: Callable[[float], None] = lambda done: None,
@@ -154,8 +155,8 @@ def find_indices(
     num_bodies = len(medium.iors)
     if num_bodies > len(settings.plans):
         raise NerfroError(
-            f"the medium has {num_bodies} bodies, and at most two indices are searched for; set medium.ior= and "
-            "medium.inner_iors=, or ior or material of each of bodies="
+            f"the medium has {num_bodies} bodies, and at most two indices are searched for; set medium.ior=, or ior "
+            "or material of each of bodies="
         )
     plan = settings.plans[num_bodies - 1]
     if isinstance(surroundings.background, Room):
@@ -281,7 +282,7 @@ class _Search:
 
     def __init__(
         self,
-        medium: Solid,
+        medium: Bodies,
         through: Pixels,
         surroundings: Surroundings,
         progress: Callable[[int], None],
@@ -405,7 +406,7 @@ def initial_medium(request: Request, location: str, settings: dict[str, object])
     """
     config, settings = request.config.medium, settings | {"mesh": location}
     if request.searches_index:
-        names = [*(config.get("bodies") or body_names(1 + len(config.get("inner_meshes", []))))]
+        names = [*expanded({name: config.get(name) for name in ("mesh", "bodies")} | settings)]
         settings |= index_settings(config, names, [1.5] * len(names))
     return build_medium(request, settings)
 
@@ -420,14 +421,15 @@ def find_medium(request: Request, observations: Observations, medium: Medium) ->
     """
     if not request.searches_index:
         return FoundMedium(medium)
-    if not isinstance(medium, Solid):
+    bodies = medium.bodies
+    if bodies is None:
         raise NerfroError("the index of this type of medium cannot be searched for; set medium.ior=, or medium=object")
-    estimate = _search_index(observations, medium, request.folder)
-    searched = medium.with_indices(torch.from_numpy(estimate.values))
-    return FoundMedium(searched, estimate, index_settings(request.config.medium, medium.names, estimate.values))
+    estimate = _search_index(observations, bodies, request.folder)
+    searched = bodies.with_indices(torch.from_numpy(estimate.values))
+    return FoundMedium(searched, estimate, index_settings(request.config.medium, bodies.names, estimate.values))
 
 
-def _search_index(observations: Observations, medium: Solid, folder: Path) -> Estimate:
+def _search_index(observations: Observations, medium: Bodies, folder: Path) -> Estimate:
     """Search the indices of the bodies of a medium, print the result, and write index.json.
 
     Args:

@@ -14,7 +14,7 @@ from nerfro.capture.surroundings import Observations, robust_scale
 from nerfro.core.provenance import AlgorithmSettings
 from nerfro.core.robust import geman_mcclure
 from nerfro.media.base import Medium
-from nerfro.media.solid import Solid
+from nerfro.media.bodies import Bodies
 from nerfro.samplers.paths.snell import Snell
 
 # Indices of water and of soda-lime glass, for photographs that do not determine the index.
@@ -87,9 +87,9 @@ class ObjectErrors:
 
 def unsupported_bodies(
     observations: Observations,
-    solid: Solid,
+    solid: Bodies,
     index_is_doubtful: bool,
-    vessel: Solid | None,
+    vessel: Bodies | None,
     settings: ObjectErrorSettings = ObjectErrorSettings(),
 ) -> list[str]:
     """Print the errors of bodies, and return the names of those that are not worth a training.
@@ -123,5 +123,5 @@ def unsupported_bodies(
     return [name for name in bodies if name not in supported]
 
 
-def _with_index(solid: Solid, ior: float) -> Solid:
+def _with_index(solid: Bodies, ior: float) -> Bodies:
     return solid.with_indices(torch.full_like(solid.indices, ior))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import cast
 
 import torch
 
@@ -22,7 +21,6 @@ from nerfro.data.capture import Capture
 from nerfro.data.masks import EVIDENCE, REVOLUTION, masked_views, method_of, with_other_splits
 from nerfro.files.folder_lock import lock_folder
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.media.sdf_grid import SdfGrid
 from nerfro.rendering.scene_file import SceneFile, with_scene
 from nerfro.silhouettes.overlaps import choose_wrong_masks, report_overlaps
 from nerfro.silhouettes.pose_conventions import require_consistent_poses
@@ -87,7 +85,8 @@ def _preprocess(request: Request) -> SceneFile:
             indexed = find_medium(request, observations, medium)
     vessel, unsupported = dict[str, object](), list[str]()
     if config.vessel:
-        solid = cast(SdfGrid, indexed.medium)  # see Request.check
+        solid = indexed.medium.bodies
+        assert solid is not None  # see Request.check
         vessel, fitted = find_vessel(solid, location, mesh, observations)
         unsupported = unsupported_bodies(observations, solid, indexed.is_doubtful, fitted)
     estimated = settings | {"mesh": location} | indexed.index_settings

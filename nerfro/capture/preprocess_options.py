@@ -24,7 +24,7 @@ from nerfro.files.atomic import refuse_existing
 from nerfro.geometry.box import corners_of_box
 from nerfro.geometry.mesh import TriangleMesh, load_mesh, local_origin, num_decimals
 from nerfro.media.base import Medium
-from nerfro.media.bodies import ordered_settings
+from nerfro.media.body_settings import expanded
 from nerfro.registry.allowed import Count, Natural, NotNegative, refuse_unused
 from nerfro.registry.registration import build
 from nerfro.rendering.scene_file import SCENE, SceneFile, take_bodies
@@ -109,9 +109,11 @@ class Request:
     def searches_index(self) -> bool:
         """Whether to search the index. The materials of a vessel are known, and those of named bodies if one is."""
         medium = self.config.medium
+        if "wall" in medium:
+            return False
         if medium.get("bodies") is not None:
-            return not any(body.ior or body.material for _, body in ordered_settings(medium.bodies))
-        return not (is_given("medium.ior", self.overrides) or "wall" in medium)
+            return not any(body.ior or body.material for body in expanded({"bodies": medium.bodies}).values())
+        return not is_given("medium.ior", self.overrides)
 
     @property
     def files(self) -> list[Path]:
@@ -151,7 +153,7 @@ class Request:
         if config.vessel and ("shell_voxels" not in config.medium or "wall" in config.medium):
             raise NerfroError("vessel=true estimates the lengths of a vessel; set medium=object, or remove vessel=true")
         if (config.refine or config.vessel) and config.medium.get("bodies") is not None:
-            name, first = ordered_settings(config.medium.bodies)[0]
+            name, first = next(iter(expanded({"bodies": config.medium.bodies}).items()))
             if first.mesh or first.surface:
                 raise NerfroError(
                     "refine=true and vessel=true change the first body, which must have the surface that preprocess "
@@ -220,12 +222,11 @@ def build_medium(request: Request, settings: dict[str, object]) -> Medium:
 
 def index_settings(medium: DictConfig, names: Iterable[str], iors: Iterable[float]) -> dict[str, object]:
     """Return the settings of the medium for the indices of its bodies, given the names of the bodies."""
-    first, *inner = values = [round(float(ior), 4) for ior in iors]
-    bodies = medium.get("bodies")
-    if bodies is not None:
-        settings = typing.cast(dict[str, dict[str, Any]], OmegaConf.to_container(bodies, resolve=True))
-        return {"bodies": {name: settings[name] | {"ior": ior} for name, ior in zip(names, values, strict=True)}}
-    return {"ior": first} | ({"inner_iors": inner} if inner else {})
+    values = [round(float(ior), 4) for ior in iors]
+    if medium.get("bodies") is None:
+        return {"ior": values[0]}
+    bodies = typing.cast(dict[str, dict[str, Any]], OmegaConf.to_container(medium.bodies, resolve=True))
+    return {"bodies": {name: bodies[name] | {"ior": ior} for name, ior in zip(names, values, strict=True)}}
 
 
 def write_scene(request: Request, estimated: SceneFile, cameras: Cameras, mesh: TriangleMesh) -> SceneFile:

@@ -42,7 +42,7 @@ from nerfro.files.atomic import write_atomically
 from nerfro.geometry.interpolation import bspline_basis, smooth
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.media.base import Medium
-from nerfro.media.sdf_grid import SdfGrid
+from nerfro.media.bodies import Bodies
 from nerfro.samplers.paths.snell import Snell
 from nerfro.silhouettes.pose_conventions import overlap
 from nerfro.silhouettes.rims import RimFinder
@@ -128,7 +128,7 @@ class RefinementProblem:
     """
 
     mesh: TriangleMesh
-    medium: SdfGrid
+    medium: Bodies
     silhouettes: Silhouettes
     through: Pixels
     surroundings: Surroundings
@@ -147,7 +147,7 @@ class Refined:
     """
 
     mesh: TriangleMesh
-    medium: SdfGrid
+    medium: Bodies
     steps: list[int]
     errors: list[float]
 
@@ -218,14 +218,15 @@ def refine(
         The refined surface; the given one without a significant improvement, or if the refinement is impossible.
     """
     through, surroundings, cameras = observations.through, observations.surroundings, observations.views.cameras
-    assert isinstance(medium, SdfGrid)  # see Request.check
+    bodies = medium.bodies
+    assert bodies is not None  # see Request.check
     start, settings = mesh.relative_to(observations.shift), RefinementSettings()
     if silhouettes is None:
         settings = replace(settings, max_overlap_loss=math.inf)
         silhouettes = Silhouettes.of(cameras, mesh_silhouettes(start, cameras, 1).float())
     else:
         silhouettes = replace(silhouettes, cameras=silhouettes.cameras.relative_to(observations.shift))
-    problem = RefinementProblem(start, medium, silhouettes, through, surroundings)
+    problem = RefinementProblem(start, bodies, silhouettes, through, surroundings)
     try:
         with fraction_bar("surface") as progress:
             refined = refine_surface(problem, learn_index, progress, settings)
@@ -308,11 +309,11 @@ class _Descent:
         self.panorama = panorama_of(background, medium, middle) if isinstance(background, Room) else background
 
     @torch.no_grad()
-    def medium(self) -> SdfGrid:
+    def medium(self) -> Bodies:
         """Return the current medium, without gradients."""
         return self._medium()
 
-    def _medium(self) -> SdfGrid:
+    def _medium(self) -> Bodies:
         return self.start.grown(self.offsets()).with_indices(self.iors)
 
     def values(self) -> list[Tensor]:
@@ -359,7 +360,7 @@ class _Descent:
         return error
 
     @torch.no_grad()
-    def smoothed(self, medium: SdfGrid, error: float) -> tuple[SdfGrid, float]:
+    def smoothed(self, medium: Bodies, error: float) -> tuple[Bodies, float]:
         """Smooth the first body as far as the validation error decreases and the outlines stay.
 
         Args:
@@ -377,7 +378,7 @@ class _Descent:
                 best, error = candidate, new
         return best, error
 
-    def keeps_outlines(self, medium: SdfGrid) -> bool:
+    def keeps_outlines(self, medium: Bodies) -> bool:
         """Test that the overlap with the masks falls by at most `max_overlap_loss`."""
         if self.settings.max_overlap_loss == math.inf:
             return True
@@ -389,7 +390,7 @@ class _Descent:
         """Mean robust error of the validation pixels for the given surface."""
         return float(self.initial_errors.mean())
 
-    def validation_error(self, medium: SdfGrid) -> float:
+    def validation_error(self, medium: Bodies) -> float:
         """Compute the mean robust error of the validation pixels.
 
         Pixels with unknown surroundings for the new surface keep their initial error, so that a surface cannot
@@ -399,7 +400,7 @@ class _Descent:
         return float(torch.where(is_valid, errors, self.initial_errors).mean())
 
     @torch.no_grad()
-    def _validation_errors(self, medium: SdfGrid) -> tuple[Float[Tensor, "Q"], Bool[Tensor, "Q"]]:
+    def _validation_errors(self, medium: Bodies) -> tuple[Float[Tensor, "Q"], Bool[Tensor, "Q"]]:
         """Compute the robust errors of the validation pixels, and whether their surroundings are known."""
         trace = self.sampler.trace(self.validation.rays, medium)
         radiance, known = self.problem.surroundings.radiance(trace.path.exits())
@@ -407,7 +408,7 @@ class _Descent:
         return errors, known & ~trace.exceeded & trace.path.refracted
 
     @torch.no_grad()
-    def _traced(self, pixels: Pixels, medium: SdfGrid) -> tuple[Path, Tensor]:
+    def _traced(self, pixels: Pixels, medium: Bodies) -> tuple[Path, Tensor]:
         """Trace pixels, and select refracted paths with known surroundings and reliable derivatives."""
         trace = self.sampler.trace(pixels.rays, medium)
         usable = self.problem.surroundings.known(trace.path.exits()) & ~trace.exceeded & trace.path.refracted
@@ -431,7 +432,7 @@ def _blurred(panorama: EnvironmentMap | RoomPanorama, degrees: float, settings: 
     return RoomPanorama(panorama.middle, blurred, panorama.distances) if isinstance(panorama, RoomPanorama) else blurred
 
 
-def _project_onto(mesh: TriangleMesh, medium: SdfGrid) -> TriangleMesh:
+def _project_onto(mesh: TriangleMesh, medium: Bodies) -> TriangleMesh:
     """Move the vertices of a mesh onto the zero level of the first body, by Newton's method."""
     vertices = torch.from_numpy(mesh.vertices).float()
     grid = medium.grids[0]

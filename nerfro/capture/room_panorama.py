@@ -16,7 +16,7 @@ from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.capture.surroundings import Room
 from nerfro.core.rays import Rays
 from nerfro.core.types import Exits
-from nerfro.media.sdf_grid import SdfGrid
+from nerfro.media.bodies import Bodies
 from nerfro.samplers.paths.snell import Snell
 
 
@@ -62,7 +62,7 @@ class RoomPanorama(Background):
 
 
 @torch.no_grad()
-def panorama_of(room: Room, medium: SdfGrid, middle: Float[Tensor, "3"], side: int = 192) -> RoomPanorama:
+def panorama_of(room: Room, medium: Bodies, middle: Float[Tensor, "3"], side: int = 192) -> RoomPanorama:
     """Render a panorama of near surroundings from the surface of an object outwards.
 
     Args:

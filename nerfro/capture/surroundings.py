@@ -28,6 +28,7 @@ from nerfro.core.types import WORLD_ORIGIN, Exits
 from nerfro.data.base import Views
 from nerfro.fields.hash_grid import HashGridField
 from nerfro.geometry.mesh import TriangleMesh
+from nerfro.geometry.space import Contracted
 from nerfro.rendering import composite
 from nerfro.samplers.paths.straight import straight_path
 from nerfro.samplers.points.density_grid import DensityGridSampler
@@ -282,14 +283,13 @@ class Room(Background):
 
     def __init__(self, bounds: Float[np.ndarray, "2 3"], radius: float) -> None:
         super().__init__()
-        low, high = bounds.tolist()
-        self.radius = radius
+        self.radius, space = radius, Contracted(bounds, radius)
         with torch.random.fork_rng(devices=[]):
             torch.default_generator.manual_seed(0)
             self.field = HashGridField(
-                low, high, radius, finest_resolution=512, log2_table_size=17, direction_bands=1, initial_depth=3.0
+                space, finest_resolution=512, log2_table_size=17, direction_bands=1, initial_depth=3.0
             )
-        self.sampler = DensityGridSampler(box_min=low, box_max=high, radius=radius, update_fraction=0.25, decay=0.6)
+        self.sampler = DensityGridSampler(space, update_fraction=0.25, decay=0.6)
 
     def forward(self, exits: Exits, draws: Draws | None = None) -> Float[Tensor, "P 3"]:
         return self.seen(exits, draws)[0]

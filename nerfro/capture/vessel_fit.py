@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from nerfro.capture.grid_search import mean_errors, parabola_minimum, standard_error
 from nerfro.capture.object_errors import COMMON_INDICES, ObjectErrors, ObjectErrorSettings
@@ -20,8 +20,10 @@ from nerfro.core.errors import NerfroError, warn
 from nerfro.core.progress import fraction_bar
 from nerfro.core.provenance import AlgorithmSettings
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.media.sdf_grid import SdfGrid
-from nerfro.media.vessel import SdfVessel
+from nerfro.media.bodies import Bodies, GridSettings
+from nerfro.media.material import Material
+from nerfro.media.surface import MeshSurface, direction
+from nerfro.media.vessel import VesselLengths, extent, vessel, with_lengths
 from nerfro.silhouettes.upright import find_up
 
 _GLASS, _WATER = COMMON_INDICES["glass"], COMMON_INDICES["water"]
@@ -75,12 +77,12 @@ class VesselFit:
 
 
 def find_vessel(
-    medium: SdfGrid,
+    medium: Bodies,
     location: str,
     mesh: TriangleMesh,
     observations: Observations,
     settings: VesselFitSettings = VesselFitSettings(),
-) -> tuple[dict[str, object], SdfVessel | None]:
+) -> tuple[dict[str, object], Bodies | None]:
     """Fit a vessel to the photographs, print its lengths, and return the settings of the medium, and the medium.
 
     Args:
@@ -93,29 +95,25 @@ def find_vessel(
     Returns:
         Settings of the vessel except its mesh, and the vessel; none if the surface leaves no cavity.
     """
-    estimate = find_up(observations.views.cameras, mesh)
-    up = [0.0, 0.0, 1.0] if estimate is None else [round(float(x), 4) for x in estimate[0]]
+    upright = find_up(observations.views.cameras, mesh)
+    up = [0.0, 0.0, 1.0] if upright is None else [round(float(x), 4) for x in upright[0]]
     across = mesh.vertices - np.outer(mesh.vertices @ np.array(up), up)
-    grid = medium.grids[0]
-    box = (grid.box.double().numpy() + medium.origin).tolist()
+    first = medium.grids[0]
+    low, high = (first.box.double().numpy() + medium.origin).tolist()
+    grid, outer = GridSettings(len(first.distances), low, high), MeshSurface(location)
 
-    def build(**options: Any) -> SdfVessel:
-        return SdfVessel(
-            location,
-            up=up,
-            ior=_GLASS,
-            box_min=box[0],
-            box_max=box[1],
-            resolution=len(grid.distances),
-            **options,
-        )
+    lowest, highest = extent(outer, direction("up", up))
+    height = highest - lowest
+
+    def build(lengths: VesselLengths) -> Bodies:
+        liquid = None if lengths.level is None else Material(_WATER)
+        return vessel(outer, lengths, Material(_GLASS), liquid, up, grid=grid)
 
     try:
         with fraction_bar("vessel") as progress:
-            fit = fit_vessel(build, float(np.ptp(across, axis=0).max()), observations, progress, settings)
-        lengths = {name: float(f"{length:.4g}") for name, length in fit.lengths.items()}
-        liquid_ior = _WATER if "level" in lengths else 1.0
-        vessel = build(liquid_ior=liquid_ior, **lengths)
+            fit = fit_vessel(build, float(np.ptp(across, axis=0).max()), height, observations, progress, settings)
+        rounded = {name: float(f"{length:.4g}") for name, length in fit.lengths.items()}
+        fitted = build(VesselLengths(**rounded))
     except NerfroError as error:
         warn(f"no vessel is fitted: {error}")
         return {}, None
@@ -123,15 +121,17 @@ def find_vessel(
         f"{name} {value:.3g}" + ("" if name in fit.unknown else f" +- {fit.standard_errors[name]:.2g}")
         for name, value in fit.lengths.items()
     ]
-    print(f"vessel, {'with a liquid' if liquid_ior > 1 else 'empty'}: {', '.join(values)}, height {vessel.height:.3g}")
+    liquid_ior = _WATER if "level" in rounded else 1.0
+    print(f"vessel, {'with a liquid' if liquid_ior > 1 else 'empty'}: {', '.join(values)}, height {height:.3g}")
     if fit.unknown:
         warn(f"typical values of {' and '.join(fit.unknown)} are kept, because the photographs do not determine them")
-    return {"up": up, "ior": _GLASS, "liquid_ior": liquid_ior} | lengths, vessel
+    return {"up": up, "ior": _GLASS, "liquid_ior": liquid_ior} | rounded, fitted
 
 
 def fit_vessel(
-    build: Callable[..., SdfVessel],
+    build: Callable[[VesselLengths], Bodies],
     width: float,
+    height: float,
     observations: Observations,
     progress: Callable[[float], None] = lambda done: None,
     settings: VesselFitSettings = VesselFitSettings(),
@@ -139,8 +139,8 @@ def fit_vessel(
     """Fit wall, foot, fillet and level of an open vessel.
 
     Args:
-        build: constructor of the vessel, which takes the lengths and the index of the liquid.
-        width: width of the outer surface, world units.
+        build: makes the vessel from its lengths, with water if they have a level.
+        width, height: size of the outer surface, world units.
         observations: observations of the object and its surroundings.
         progress: called with the completed fraction.
         settings: typical lengths, candidates and limits.
@@ -148,26 +148,28 @@ def fit_vessel(
     settings.use()
     typical = {name: getattr(settings, name) * width for name in ("wall", "foot", "fillet")}
     widest = typical | {"fillet": settings.max_fillet * width}  # distances are exact up to this depth
-    empty = build(**widest, liquid_ior=1.0)
-    filled = build(**widest, liquid_ior=_WATER, level=0.5 * empty.height)
+    empty, filled = build(VesselLengths(**widest)), build(VesselLengths(**widest, level=0.5 * height))
     work = 1 + len(settings.levels) + len(settings.rounds) * (len(typical) + 1) * settings.num_candidates
     search = ObjectErrors(observations, lambda count: progress(min(1.0, count / work)), settings.errors)
-    levels: list[dict[str, float]] = [{}, *({"level": level * empty.height} for level in settings.levels)]
-    errors = [search.of((filled if level else empty).with_lengths(typical | level)) for level in levels]
+    levels: list[dict[str, float]] = [{}, *({"level": level * height} for level in settings.levels)]
+
+    def error_of(lengths: dict[str, float]) -> Float[np.ndarray, "V"]:
+        return search.of(with_lengths(filled if "level" in lengths else empty, VesselLengths(**lengths)))
+
+    errors = [error_of(typical | level) for level in levels]
     best = int(np.argmin([search.mean(error) for error in errors]))
-    vessel = filled if best and search.decreases(errors[0], errors[best], settings.num_errors) else empty
-    typical |= levels[best] if vessel is filled else {}
+    typical |= levels[best] if best and search.decreases(errors[0], errors[best], settings.num_errors) else {}
     lengths, standard_errors = dict(typical), dict[str, float]()
-    highest = settings.max_level * empty.height
+    highest = settings.max_level * height
     offsets = np.linspace(-1, 1, settings.num_candidates)
     for factor, fraction in settings.rounds:
         for name in typical:
             is_level = name == "level"
-            half_width = fraction * empty.height if is_level else np.log(factor)
+            half_width = fraction * height if is_level else np.log(factor)
             middle = lengths[name] if is_level else np.log(lengths[name])
             grid = middle + half_width * offsets
             values = grid.clip(max=highest) if is_level else np.exp(grid)
-            sums = np.stack([search.of(vessel.with_lengths(lengths | {name: value})) for value in values.tolist()])
+            sums = np.stack([error_of(lengths | {name: value}) for value in values.tolist()])
             # Robust errors have narrow minima, which a quadratic function through all candidates would miss.
             minimum = parabola_minimum(grid, mean_errors(sums, search.counts))[0]
             minima = parabola_minimum(grid, mean_errors(sums, search.counts, search.samples))

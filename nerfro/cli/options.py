@@ -241,7 +241,7 @@ def plugin_options(plugin: Plugin, prefix: str, values: Mapping[str, Any] | None
         values: values that replace the defaults.
     """
     explained: dict[str, str] = {}
-    for base in plugin.cls.__mro__:
+    for base in getattr(plugin.cls, "__mro__", (plugin.cls,)):
         for documented in (vars(base).get("__init__"), base):
             explained = google_docstring(inspect.cleandoc(documented.__doc__ or ""))[1] | explained
     changed = {name: "required" if is_missing(value) else value for name, value in (values or {}).items()}

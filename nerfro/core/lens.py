@@ -9,13 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-# Newton's method doubles the number of digits in each step; eight steps suffice for single precision.
-_NEWTON_STEPS = 8
-# Length of the last step, at unit depth: the next step would be below single precision.
-_LAST_STEP = 1e-5
 # Angles from the optical axis at which `fold_radius` searches, and the largest one in degrees.
 _NUM_ANGLES, _MAX_ANGLE = 1024, 89.9
-_FAR = 1e6  # radius at unit depth in place of infinity
 
 
 def coefficients(
@@ -83,7 +78,8 @@ def distort_without_fold(
     """
     radius = torch.linalg.vector_norm(points, dim=-1, keepdim=True)
     fold = fold_radius(lens)[:, None, None]
-    inner = points * torch.where(radius > fold, fold.clamp(max=_FAR) / radius.clamp(min=1e-12), 1.0)
+    # A large radius replaces infinity.
+    inner = points * torch.where(radius > fold, fold.clamp(max=1e6) / radius.clamp(min=1e-12), 1.0)
     distorted, _ = distort(inner.flatten(0, 1), lens.repeat_interleave(points.shape[1], 0))
     return distorted.view_as(points) + (points - inner)
 
@@ -112,7 +108,8 @@ def undistort(
         wrong, beyond the radius at which the lens model folds back.
     """
     ideal = points
-    for _ in range(_NEWTON_STEPS):
+    # Newton's method doubles the number of digits in each step; eight steps suffice for single precision.
+    for _ in range(8):
         distorted, derivatives = distort(ideal, lens)
         xx, xy, yy = derivatives.unbind(-1)
         error = points - distorted
@@ -120,7 +117,8 @@ def undistort(
         step_y = xx * error[:, 1] - xy * error[:, 0]
         step = torch.stack([step_x, step_y], -1) / (xx * yy - xy * xy)[:, None]
         ideal = ideal + step
-        if bool((step.abs() < _LAST_STEP).all()):
+        # The next step would be below single precision.
+        if bool((step.abs() < 1e-5).all()):
             break
     xx, xy, yy = distort(ideal, lens)[1].unbind(-1)
     return ideal, 1 / (xx * yy - xy * xy)

@@ -23,10 +23,10 @@ def resolve_path(location: str | Path) -> Path:
     if not location.startswith(EMBEDDED_PREFIX):
         return user_path(location)
     name = location.removeprefix(EMBEDDED_PREFIX)
-    known = sorted(path.name for path in ASSETS_DIR.iterdir() if path.is_dir() and not path.name.startswith("_"))
-    if not set(Path(name).parts[:1]) & set(known):
+    scenes = sorted(path.name for path in ASSETS_DIR.iterdir() if path.is_dir() and not path.name.startswith("_"))
+    if not set(Path(name).parts[:1]) & set(scenes):
         raise NerfroError(
-            f"'{location}' is not embedded; embedded scenes: {', '.join(known)}; give a folder of your own instead"
+            f"'{location}' is not embedded; embedded scenes: {', '.join(scenes)}; give a folder of your own instead"
         )
     return ASSETS_DIR / name
 

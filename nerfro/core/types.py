@@ -59,7 +59,7 @@ class Path:
         splits: whether rays may have several polylines. If not, `ray` counts from 0 and `throughput` is 1 everywhere.
         ray: ray of each polyline, non-decreasing; every ray has at least one polyline.
         throughput: linear factor of the light of the polyline; the factors of a ray sum to at most 1.
-        body: body of the segment after each vertex (`Solid.deciding_body`), numbered from 1; 0 in air, or if the index
+        body: body of the segment after each vertex (`Bodies.deciding_body`), numbered from 1; 0 in air, or if the index
             varies continuously.
         surface_body: body on whose surface each vertex lies, numbered as `body`; 0 for vertices on no sharp surface,
             such as both ends.

@@ -37,10 +37,11 @@ _VERTICES, _INDICES = 34962, 34963  # ARRAY_BUFFER and ELEMENT_ARRAY_BUFFER (glT
 
 def _encode_glb(scene: TrainedScene, glass: list[trimesh.Trimesh], inside: trimesh.Trimesh | None) -> bytes:
     meshes, materials = {}, {}
-    bodies = getattr(scene.renderer.scene.medium, "materials", [])
+    bodies = scene.renderer.scene.medium.bodies
+    bodies_materials = [] if bodies is None else bodies.materials
     for number, (mesh, absorption) in enumerate(zip(glass, absorption_of(scene.renderer.scene), strict=True)):
         meshes[f"glass_{number}"] = mesh
-        dispersion = bodies[number].dispersion
+        dispersion = bodies_materials[number].dispersion
         materials[f"glass_{number}"] = _glass_material(mesh, float(scene.ior[number]), absorption.numpy(), dispersion)
     if inside is not None:
         meshes["inside"] = inside

@@ -12,7 +12,6 @@ from torch.nn import functional
 from nerfro.geometry.bodies import bodies_of
 from nerfro.geometry.interpolation import trilinear
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.media.solid import Solid
 from nerfro.viewing.surface import level_set
 from nerfro.viewing.trained_scene import TrainedScene
 from nerfro.viewing.volume import POINTS_AT_ONCE, RESOLUTION, sample_field
@@ -20,7 +19,7 @@ from nerfro.viewing.volume import POINTS_AT_ONCE, RESOLUTION, sample_field
 
 def glass_meshes(scene: TrainedScene) -> list[trimesh.Trimesh]:
     """Triangulate the surface of each body, with vertex normals; returns an empty list without bodies."""
-    if not isinstance(scene.renderer.scene.medium, Solid):
+    if scene.renderer.scene.medium.bodies is None:
         return []
     return [_with_vertex_normals(mesh) for mesh in scene.surface]
 
@@ -53,8 +52,8 @@ def inside_mesh(scene: TrainedScene, resolution: int | None, half_depth: float |
     # The padding closes surfaces at the faces of the box. A logarithm of the density is closer to linear across a
     # surface than the density.
     values = functional.pad(volume.density, (1,) * 6).clamp(min=1e-3 * level).log()
-    spacing = (volume.box[1] - volume.box[0]) / (torch.tensor(volume.density.shape) - 1)
-    box = volume.box + torch.stack([-spacing, spacing])
+    spacing = (volume.space.box[1] - volume.space.box[0]) / (torch.tensor(volume.density.shape) - 1)
+    box = volume.space.box + torch.stack([-spacing, spacing])
     if not values.max() > math.log(level):
         return None
     mesh = largest_components(level_set(values, box, math.log(level)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -19,7 +19,6 @@ from nerfro.core.errors import NerfroError, warn
 from nerfro.exports.meshes import glass_meshes, inside_mesh
 from nerfro.files.atomic import refuse_existing, write_atomically
 from nerfro.files.deep_images import write_radiance
-from nerfro.media.solid import Solid
 from nerfro.synthetic.path_tracer import envmap_texture
 from nerfro.viewing.changes import absorption_of
 from nerfro.viewing.exports import EXPORTS, Export, ExportConfig
@@ -99,9 +98,10 @@ def write_mitsuba(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
 
 def _require_apart(scene: TrainedScene, glass: list[trimesh.Trimesh]) -> None:
     """Refuse bodies that lie inside others or overlap, which a `dielectric` of Mitsuba cannot describe."""
-    medium = cast(Solid, scene.renderer.scene.medium)
+    bodies = scene.renderer.scene.medium.bodies
+    assert bodies is not None
     for body, mesh in enumerate(glass):
-        phi, _ = medium.signed_distances(torch.from_numpy(np.asarray(mesh.vertices)).to(medium.box))
+        phi, _ = bodies.signed_distances(torch.from_numpy(np.asarray(mesh.vertices)).to(bodies.box))
         phi[:, body] = torch.inf
         if (phi < 0).any():
             raise NerfroError(

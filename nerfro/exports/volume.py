@@ -13,7 +13,7 @@ from nerfro.viewing.volume import RESOLUTION, sample_field
 def write_volume(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
     """Write density, linear radiance and the corners of the grid as .npz."""
     volume = sample_field(scene, options.resolution or RESOLUTION)
-    arrays = {"density": volume.density, "rgb": volume.radiance, "box": volume.box}
+    arrays = {"density": volume.density, "rgb": volume.radiance, "box": volume.space.box}
     save_arrays(out, {name: values.numpy() for name, values in arrays.items()})
     return f"the inside: {'x'.join(map(str, volume.density.shape))} vertices with density and linear rgb"
 

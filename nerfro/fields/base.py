@@ -10,9 +10,10 @@ from torch import Tensor, nn
 
 from nerfro.core.cameras import Cameras
 from nerfro.core.types import FieldValues, Samples
+from nerfro.data.component import Component
 
 
-class Field(nn.Module, ABC):
+class Field(Component, nn.Module, ABC):
     """Density and colour of a volume; subclasses implement `forward`.
 
     Positions and densities are in world units, and directions are unit vectors. Colours are linear radiance, or sRGB

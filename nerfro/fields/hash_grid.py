@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
 from dataclasses import replace
 from itertools import pairwise
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from annotated_types import Ge, Le
 from jaxtyping import Bool, Float
+from omegaconf import DictConfig
 from torch import Tensor, nn
 
 from nerfro.core.cameras import Cameras
 from nerfro.core.types import FieldValues, Samples
+from nerfro.data.base import Views
 from nerfro.fields import hash_encoding
 from nerfro.fields import spherical_harmonics as harmonics
 from nerfro.fields.base import Field
 from nerfro.fields.networks import radiance
-from nerfro.fields.observed_space import NUM_CELLS, observed_cells
-from nerfro.fields.selection import evaluate_selected, inside_box
-from nerfro.geometry.box import corners_of_box
-from nerfro.geometry.contraction import contract, contracted_box, contraction_scale
+from nerfro.fields.selection import evaluate_selected
+from nerfro.geometry.space import Space
 from nerfro.kernels.available import fast_bfloat16
 from nerfro.registry.allowed import Depth, Positive, Width
 from nerfro.registry.registration import register
@@ -35,21 +35,25 @@ _MAX_EXPONENT = 15.0
 # Cells of the coarsest level along the box's longest side, as in Instant-NGP.
 _COARSEST_RESOLUTION = 16
 
+# A detail of one pixel needs two cells of the finest grid along each side (sampling theorem).
+_CELLS_PER_PIXEL = 2
+# Bounds of the number of cells that is derived from the cameras; memory limits the upper one.
+_MIN_CELLS, _MAX_CELLS = 128, 4096
+
 
 @register("field", "hash_grid")
 class HashGridField(Field):
     """Hash encoding with a density MLP and a view-dependent colour MLP (Instant-NGP, sections 3 and 5.4).
 
     Density is exp(raw), scaled so that a ray across the box initially has an optical depth of about `initial_depth`.
-    The field is empty outside the box, and samples there are not evaluated. With a `radius`, the field covers all of
-    space, contracted outside a ball (mip-NeRF 360, Eqn. 10), and the box is the cube around contracted space.
+    The field is empty outside a box, and samples there are not evaluated. In contracted space, the field covers all of
+    space, and cells grow with the distance.
 
     Args:
-        box_min, box_max: opposite corners of the content's bounds, world units.
-        radius: radius of a ball around the centre of the box, world units, within which the resolution is finest.
-            Outside, cells grow with the distance. None if the scene is empty outside the box.
+        space: space that the field covers; it has a box.
         num_levels: number of levels of the encoding, with 2 features each.
-        finest_resolution: number of cells of the finest level along the longest side of the box.
+        finest_resolution: number of cells of the finest level along the longest side of the box. None derives it from
+            the cameras, so that a cell at the centre is half a pixel wide.
         log2_table_size: base-2 logarithm of the largest number of entries of a level.
         width: width of the hidden layers.
         direction_bands: number of bands of spherical harmonics of the direction; 1 for view-independent colour.
@@ -61,17 +65,14 @@ class HashGridField(Field):
             bfloat16, else float32.
     """
 
-    box_min: Float[Tensor, "3"]
-    box_max: Float[Tensor, "3"]
+    needs_box = True
     observed: Bool[Tensor, "cells cells cells"] | None
 
     def __init__(
         self,
-        box_min: Sequence[float] = (-1.0, -1.0, -1.0),
-        box_max: Sequence[float] = (1.0, 1.0, 1.0),
-        radius: Positive | None = None,
+        space: Space,
         num_levels: Depth = 12,
-        finest_resolution: Annotated[int, Ge(_COARSEST_RESOLUTION)] = 256,
+        finest_resolution: Annotated[int, Ge(_COARSEST_RESOLUTION)] | None = 256,
         log2_table_size: Annotated[int, Ge(4), Le(24)] = 15,
         width: Width = 64,
         direction_bands: Annotated[int, Ge(1), Le(harmonics.MAX_BANDS)] = 4,
@@ -80,15 +81,11 @@ class HashGridField(Field):
         precision: Literal["bfloat16", "float32"] | None = None,
     ) -> None:
         super().__init__()
-        box = torch.from_numpy(corners_of_box(box_min, box_max))
-        self.radius, box = radius, box if radius is None else contracted_box(box, radius)
-        self.register_buffer("box_min", box[0].float(), persistent=False)
-        self.register_buffer("box_max", box[1].float(), persistent=False)
-        self.side = float((box[1] - box[0]).max())
-        observed = None if radius is None else torch.ones(NUM_CELLS, NUM_CELLS, NUM_CELLS, dtype=torch.bool)
-        self.register_buffer("observed", observed)
-        self.initial_density = initial_depth / self.side
+        self.space = space
+        self.register_buffer("observed", space.observed())
+        self.initial_density = initial_depth / space.side
         self.direction_bands, self.shortcut, self.precision = direction_bands, shortcut, precision
+        finest_resolution = 256 if finest_resolution is None else finest_resolution
         self.levels = hash_encoding.grid_levels(num_levels, _COARSEST_RESOLUTION, finest_resolution, log2_table_size)
         self.table = nn.Parameter(torch.empty(self.levels.num_entries, hash_encoding.NUM_FEATURES))
         nn.init.uniform_(self.table, -1e-4, 1e-4)
@@ -96,24 +93,32 @@ class HashGridField(Field):
         self.density_mlp = _mlp(hash_encoding.NUM_FEATURES * num_levels, width, 1, _GEOMETRY_FEATURES)
         self.colour_mlp = _mlp(_GEOMETRY_FEATURES + num_harmonics, width, 2, 3)
 
+    @classmethod
+    def derive(cls, settings: DictConfig, views: Views, space: Space) -> dict[str, Any]:
+        cameras = views.cameras
+        distances = (cameras.camera_to_world[:, :, 3].double() - space.centre).norm(dim=-1)
+        pixel = float((distances / cameras.fx.double()).quantile(0.5))
+        cells = math.ceil(_CELLS_PER_PIXEL * space.side / pixel)
+        return {"finest_resolution": min(max(cells, _MIN_CELLS), _MAX_CELLS)}
+
     @property
     def bounds(self) -> Float[Tensor, "2 3"] | None:
-        return torch.stack([self.box_min, self.box_max]) if self.radius is None else None
+        return self.space.bounds
 
     def forward(self, samples: Samples) -> FieldValues:
-        if self.radius is None:
-            return evaluate_selected(self.decode, samples, inside_box(samples.positions, self.box_min, self.box_max))
-        # In training, about 92 % of the samples are occupied, and their selection costs more than it saves.
-        return evaluate_selected(self._decode_world, replace(samples, occupied=None) if self.training else samples)
+        inside = self.space.inside(samples.positions)
+        if inside is None and self.training:
+            # About 92 % of the samples are occupied, and their selection costs more than it saves.
+            samples = replace(samples, occupied=None)
+        return evaluate_selected(self._decode_world, samples, inside)
 
     def _decode_world(
         self, positions: Float[Tensor, "points 3"], directions: Float[Tensor, "points 3"]
     ) -> tuple[Float[Tensor, " points"], Float[Tensor, "points 3"]]:
-        """Evaluate density per world unit and colour at positions in world space that is contracted."""
-        assert self.radius is not None
-        places = contract(positions, self.centre, self.radius)
-        density, colour = self.decode(places, directions)
-        return self._world_density(density, positions, places), colour
+        """Evaluate density per world unit and colour at positions in the space."""
+        contracted = self.space.contract(positions)
+        density, colour = self.decode(contracted, directions)
+        return self._world_density(density, positions, contracted), colour
 
     def decode(
         self, positions: Float[Tensor, "points 3"], directions: Float[Tensor, "points 3"]
@@ -126,38 +131,37 @@ class HashGridField(Field):
         return self._to_density(geometry), radiance(raw)
 
     def density(self, positions: Float[Tensor, "points 3"]) -> Float[Tensor, " points"]:
-        if self.radius is None:
-            density = self._to_density(self.apply_mlp(self.density_mlp, self.encode(positions)))
-            return torch.where(inside_box(positions, self.box_min, self.box_max), density, 0.0)
-        places = contract(positions, self.centre, self.radius)
-        density = self._to_density(self.apply_mlp(self.density_mlp, self.encode(places)))
-        return self._world_density(density, positions, places)
+        contracted = self.space.contract(positions)
+        density = self._to_density(self.apply_mlp(self.density_mlp, self.encode(contracted)))
+        density, inside = self._world_density(density, positions, contracted), self.space.inside(positions)
+        return density if inside is None else torch.where(inside, density, 0.0)
 
     def begin(self, cameras: Cameras) -> None:
-        if self.radius is not None:
-            self.observed = observed_cells(cameras, self.centre, self.radius)
+        self.observed = self.space.observed(cameras)
 
     def _world_density(
-        self, density: Float[Tensor, " points"], positions: Float[Tensor, "points 3"], places: Float[Tensor, "points 3"]
+        self,
+        density: Float[Tensor, " points"],
+        positions: Float[Tensor, "points 3"],
+        contracted: Float[Tensor, "points 3"],
     ) -> Float[Tensor, " points"]:
-        """Convert the density at contracted places to one per world unit, which is zero in cells not observed."""
-        assert self.observed is not None
-        assert self.radius is not None
-        cells = self.observed.shape[0]
-        x, y, z = ((places.detach() - self.box_min) / self.side * cells).long().clamp(0, cells - 1).unbind(-1)
-        density = density * self.observed.view(-1)[(x * cells + y) * cells + z]
-        return density * contraction_scale(positions, self.centre, self.radius)
+        """Convert the density at contracted positions to one per world unit, which is zero in cells not observed."""
+        if self.observed is not None:
+            cells = self.observed.shape[0]
+            x, y, z = (self._unit(contracted.detach()) * cells).long().clamp(0, cells - 1).unbind(-1)
+            density = density * self.observed.view(-1)[(x * cells + y) * cells + z]
+        return density * self.space.scale(positions)
 
-    @property
-    def centre(self) -> Float[Tensor, "3"]:
-        return 0.5 * (self.box_min + self.box_max)
+    def _unit(self, contracted: Float[Tensor, "points 3"]) -> Float[Tensor, "points 3"]:
+        """Map contracted positions to the unit cube of the encoding."""
+        return (contracted - self.space.box[0]) / self.space.side
 
     def _to_density(self, geometry: Float[Tensor, "points G"]) -> Float[Tensor, " points"]:
         return self.initial_density * torch.exp(geometry[:, 0].float().clamp(max=_MAX_EXPONENT))
 
     def encode(self, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points F"]:
-        """Encode positions in single precision, on the CPU by a compiled kernel."""
-        unit = (positions - self.box_min) / self.side
+        """Encode contracted positions in single precision, on the CPU by a compiled kernel."""
+        unit = self._unit(positions)
         if unit.device.type == "cpu":
             from nerfro.fields.hash_encoding_cpu import hash_encode  # compiled, hence imported late
         else:

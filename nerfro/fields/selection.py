@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from torch import Tensor
 
 from nerfro.core.types import FieldValues, Samples
@@ -35,10 +35,3 @@ def evaluate_selected(decoder: Decoder, samples: Samples, selected: Bool[Tensor,
     all_density = density.new_zeros(selected.numel()).index_copy(0, index, density)
     all_radiance = radiance.new_zeros(selected.numel(), 3).index_copy(0, index, radiance)
     return FieldValues(all_density.view(selected.shape), all_radiance.view(*selected.shape, 3))
-
-
-def inside_box(
-    positions: Float[Tensor, "*batch 3"], box_min: Float[Tensor, "3"], box_max: Float[Tensor, "3"]
-) -> Bool[Tensor, "*batch"]:
-    """Return whether positions lie in an axis-aligned box, including the faces."""
-    return ((positions >= box_min) & (positions <= box_max)).all(-1)

@@ -44,7 +44,7 @@ def require_separate(mesh: TriangleMesh) -> None:
         if others.are_crossed(own) or not others.leave_on_one_side(own):
             raise NerfroError(
                 "closed surfaces of the mesh cross, so their inside is not defined; unite them (boolean union), "
-                "or give bodies inside others as medium.inner_meshes"
+                "or give each body inside another in bodies={NAME: {mesh: FILE, ior: 1.33}}"
             )
 
 

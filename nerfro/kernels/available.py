@@ -57,10 +57,10 @@ def _control_groups() -> Iterator[tuple[Path, str, str]]:
 def number_in(file: Path, pattern: str, unit: int = 1, default: float = 0) -> float:
     """Return the first match of a pattern in a system file as a number, or the default without a match."""
     try:
-        found = re.search(pattern, file.read_text(), re.MULTILINE)
+        match = re.search(pattern, file.read_text(), re.MULTILINE)
     except OSError:
         return default
-    return default if found is None else int(found[1]) * unit
+    return default if match is None else int(match[1]) * unit
 
 
 def fast_bfloat16(device: str) -> bool:

@@ -64,9 +64,9 @@ def _compile(function: Function, parallel: bool, allocates: bool = True) -> Func
     options: dict[str, Any] = {"parallel": parallel, "nogil": True, "fastmath": {"contract"}, "error_model": "numpy"}
     if not allocates:
         options["_nrt"] = False  # Numba's run time, which allocates and counts references
-    chosen = numba.config.CACHE_DIR  # type: ignore[attr-defined]
+    configured = numba.config.CACHE_DIR  # type: ignore[attr-defined]
     # The installed package may be read-only, and Numba does not tell the two forms of a function apart.
-    base = Path(chosen) if chosen else cache_dir() / "kernels"
+    base = Path(configured) if configured else cache_dir() / "kernels"
     folder = base / _fingerprint(function.__module__) / ("parallel" if parallel else "serial")
     try:
         # Numba would try __pycache__ next, where machine code of other versions of imported files may lie.
@@ -78,10 +78,10 @@ def _compile(function: Function, parallel: bool, allocates: bool = True) -> Func
         return numba.njit(cache=True, **options)(function)
     except (RuntimeError, OSError) as error:
         reason = getattr(error, "strerror", None) or str(error)
-        _warn_of_compiling(base, "NUMBA_CACHE_DIR" if chosen else "NERFRO_CACHE", reason)
+        _warn_of_compiling(base, "NUMBA_CACHE_DIR" if configured else "NERFRO_CACHE", reason)
         return numba.njit(**options)(function)
     finally:
-        numba.config.CACHE_DIR = chosen  # type: ignore[attr-defined]
+        numba.config.CACHE_DIR = configured  # type: ignore[attr-defined]
 
 
 @functools.cache

@@ -19,7 +19,7 @@ _UINT = np.uintp
 
 
 class Solids(NamedTuple):
-    """Bodies of constant index with distance grids, as kernels take them (`media.solid`, `media.distance_grid`).
+    """Bodies of constant index with distance grids, as kernels take them (`media.bodies`, `media.distance_grid`).
 
     The grids of all bodies follow each other in flat arrays.
     """

@@ -77,10 +77,10 @@ def _start_threads() -> None:
     with contextlib.suppress(ValueError):
         numba.threading_layer()
         return  # The threads run already.
-    chosen = numba.config.THREADING_LAYER  # type: ignore[attr-defined]
+    configured = numba.config.THREADING_LAYER  # type: ignore[attr-defined]
     try:
-        if chosen == "default":
+        if configured == "default":
             numba.config.THREADING_LAYER = "workqueue"  # type: ignore[attr-defined]
         numba.get_num_threads()  # Numba reads its configuration and starts the threads at the first such call.
     finally:
-        numba.config.THREADING_LAYER = chosen  # type: ignore[attr-defined]
+        numba.config.THREADING_LAYER = configured  # type: ignore[attr-defined]

@@ -11,9 +11,6 @@ from nerfro.losses.base import Loss
 from nerfro.registry.registration import register
 from nerfro.rendering import Scene
 
-# Pixels count if their final transmittance is above this value, as in the paper.
-_MIN_TRANSMITTANCE = 0.5
-
 
 @register("loss", "background")
 class BackgroundRegularizer(Loss):
@@ -36,7 +33,8 @@ class BackgroundRegularizer(Loss):
     def forward(self, renderings: list[Rendering], batch: Batch, scene: Scene) -> Float[Tensor, ""]:
         fine = renderings[-1]
         path = fine.path
-        counted = batch.per_pixel(path.sum_polylines(fine.transmittance.detach())) > _MIN_TRANSMITTANCE
+        # Pixels count if their final transmittance is above one half, as in the paper.
+        counted = batch.per_pixel(path.sum_polylines(fine.transmittance.detach())) > 0.5
         if self.refracted_only:
             counted = counted & (batch.per_pixel(path.main_polyline(path.refracted).to(fine.radiance)) > 0.5)
         background = path.sum_polylines(fine.transmittance[:, None] * fine.background_radiance.detach())

@@ -9,11 +9,12 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerfro.core.types import Batch, Rendering
+from nerfro.data.component import Component
 from nerfro.registry.allowed import Natural, NotNegative
 from nerfro.rendering import Scene
 
 
-class Loss(nn.Module, ABC):
+class Loss(Component, nn.Module, ABC):
     """Term of the training objective.
 
     Every loss has the settings `loss.NAME.weight`, `start` and `ramp`. The registry sets these attributes after

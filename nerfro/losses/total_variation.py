@@ -17,8 +17,8 @@ from nerfro.rendering import Scene
 
 # Random pairs of directions for each step.
 _NUM_PAIRS = 1024
-# Angle in degrees, if neither a setting nor photographs define it.
-_ANGLE = 0.7
+# Angle between two directions, in texels or details of the background.
+_NUM_DETAILS = 2
 
 
 @register("loss", "total_variation")
@@ -29,20 +29,21 @@ class TotalVariation(Loss):
     and Fatemi, 1992), and covers the whole sphere, including directions in which no training ray leaves.
 
     Args:
-        angle: angle between the two directions in degrees. None derives it from the photographs: two texels of the
-            finest level of the background that gradient descent learns.
+        angle: angle between the two directions in degrees. None takes two texels of the finest level of the background
+            that gradient descent learns.
     """
 
     weight = 1e-3
 
     def __init__(self, angle: Annotated[float, Gt(0), Lt(90)] | None = None) -> None:
         super().__init__()
-        self.angle = _ANGLE if angle is None else angle
+        self.angle = angle
 
     def forward(self, renderings: list[Rendering], batch: Batch, scene: Scene) -> Float[Tensor, ""]:
         index = torch.arange(_NUM_PAIRS, device=batch.rgb.device)
         numbers = batch.draws.uniform(index, 3, "total variation")
-        first, second = direction_pairs(numbers, math.radians(self.angle))
+        angle = _NUM_DETAILS * scene.background.detail if self.angle is None else self.angle
+        first, second = direction_pairs(numbers, math.radians(angle))
         rgb = scene.colour_space.to_srgb(scene.background(Exits(torch.cat([first, second]))))
         return (rgb[_NUM_PAIRS:] - rgb[:_NUM_PAIRS]).abs().mean()
 

@@ -12,6 +12,8 @@ from nerfro.registry.registration import register
 class Vacuum(Medium):
     """Vacuum: n = 1 everywhere, and every ray is straight."""
 
+    is_vacuum = True
+
     def __init__(self) -> None:
         super().__init__()
         self.register_buffer("box", torch.zeros(2, 3), persistent=False)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -11,6 +13,10 @@ from torch import Tensor, nn
 
 from nerfro.core.errors import NerfroError
 from nerfro.core.types import WORLD_ORIGIN, Path
+
+if TYPE_CHECKING:
+    from nerfro.geometry.mesh import TriangleMesh
+    from nerfro.media.bodies import Bodies
 
 Scalars = Float[Tensor, "*batch"]
 Vectors = Float[Tensor, "*batch 3"]
@@ -29,10 +35,14 @@ class Medium(nn.Module, ABC):
         box: lower and upper corner of the medium [2, 3], world units. Outside of the box, n = 1 and grad n = 0.
         origin: world coordinates of the origin of all positions. Objects far from the origin of the world have a
             separate origin, because single precision would not be enough.
+        is_vacuum: whether the index is 1 everywhere, so that all rays are straight.
+        names: name of each body; empty for media without bodies.
     """
 
     box: Float[Tensor, "2 3"]
     origin: Float[np.ndarray, "3"] = WORLD_ORIGIN
+    is_vacuum = False
+    names: Sequence[str] = ()
 
     @abstractmethod
     def forward(self, positions: Vectors) -> tuple[Scalars, Vectors]:
@@ -46,9 +56,24 @@ class Medium(nn.Module, ABC):
         """
 
     @property
+    def bodies(self) -> Bodies | None:
+        """The bodies, if the medium consists of bodies with sharp surfaces; None otherwise."""
+        return None
+
+    @property
+    def outline(self) -> TriangleMesh | None:
+        """Triangles of all surfaces, whose projection is the silhouette of the medium; None if unknown."""
+        return None
+
+    @property
+    def iors(self) -> Float[Tensor, "K"]:
+        """Refractive index of each body, with gradients, in double precision; empty for media without bodies."""
+        return torch.empty(0, dtype=torch.float64)
+
+    @property
     def indices(self) -> Float[Tensor, "K"]:
-        """Refractive index of each body; empty for media without bodies."""
-        return torch.empty(0)
+        """Refractive index of each body, without gradients."""
+        return self.iors.detach()
 
     def with_indices(self, indices: Float[Tensor, "K"]) -> Medium:
         """Return the same bodies with other refractive indices.
@@ -57,6 +82,17 @@ class Medium(nn.Module, ABC):
             NerfroError: the medium does not consist of bodies.
         """
         raise NerfroError(f"the index of {type(self).__name__} cannot be changed; take a medium of bodies")
+
+    def with_absorption_coefficients(self, absorption: Float[Tensor, "K 3"]) -> Medium:
+        """Return the same bodies with other absorption coefficients, per world unit.
+
+        Raises:
+            NerfroError: the medium does not consist of bodies.
+        """
+        raise NerfroError(
+            f"{type(self).__name__} has no bodies of constant absorption; leave absorption out, or train with "
+            "medium=sdf_grid"
+        )
 
     @property
     def content_box(self) -> Float[Tensor, "2 3"]:

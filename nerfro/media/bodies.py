@@ -1,157 +1,338 @@
-"""Bodies of a medium by name, as configurations describe them."""
+"""Bodies of constant index with sharp surfaces, which the Eikonal equation sees as thin smooth shells."""
 
 from __future__ import annotations
 
-import dataclasses
-import typing
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
 
 from nerfro.core.errors import NerfroError
-from nerfro.core.paths import resolve_path
-from nerfro.geometry.mesh import local_origin, origin_of_file
-from nerfro.media.material import Abbe, Material, find_material
-from nerfro.media.surface import make_surface
-from nerfro.registry.allowed import NotNegative, Positive, validate
+from nerfro.core.types import Path
+from nerfro.core.variants import variant
+from nerfro.geometry.intersection import LayeredIntersector, Triangles
+from nerfro.geometry.mesh import TriangleMesh, local_origin
+from nerfro.kernels.available import require_bytes
+from nerfro.kernels.constants import constant
+from nerfro.kernels.tolerances import MIN_COSINE, SAFE_SHARE, STEPS_PER_SHELL
+from nerfro.media.base import Medium, Scalars, Vectors
+from nerfro.media.distance_grid import DistanceGrid, DistanceGrids
+from nerfro.media.grid_box import BYTES_PER_VERTEX, grid_box
+from nerfro.media.material import Material
+from nerfro.media.surface import Grid, Surface
+from nerfro.registry.allowed import Positive, Resolution
 
-_LEARNED = ("ior", "absorption")
+if TYPE_CHECKING:
+    from nerfro.kernels.lookup import Solids
 
-
-@dataclass
-class BodySettings:
-    """Settings of a body, `bodies.NAME`.
-
-    Attributes:
-        mesh: closed triangle mesh, world units; by default `medium.mesh`.
-        surface: name and settings of another surface (`python -m nerfro.plugins surface`), in place of a mesh.
-        ior: refractive index, of the d line if the body disperses light.
-        material: material of the catalogue (`python -m nerfro.plugins material`), with its dispersion.
-        abbe: Abbe number; without one, the index of a body with `ior` is the same for all colours.
-        absorption: coefficients of red, green and blue per world unit, or one for all.
-        priority: where bodies overlap, the one with the highest priority decides; of equal ones the last.
-        learn: quantities that are learned in training: `ior`, `absorption`; an empty list for none. By default those of
-            `medium.learn_ior` and `medium.learn_absorption`.
-    """
-
-    mesh: str | None = None
-    surface: Any = None
-    ior: Positive | None = None
-    material: str | None = None
-    abbe: Positive | None = None
-    absorption: list[NotNegative] = dataclasses.field(default_factory=list)
-    priority: int = 0
-    learn: list[str] | None = None
+_COLOURS = ("red", "green", "blue")
+# Paths record bodies as 8-bit integers.
+_MAX_BODIES = 127
 
 
 @dataclass(frozen=True)
 class Body:
-    """A body.
+    """A body of constant index.
 
     Attributes:
-        surface: name and settings of the surface, see `media.surface.make_surface`.
+        name: name of the body in messages and in the names of parameters.
+        surface: closed surface.
+        material: refractive index, dispersion and absorption.
+        priority: where bodies overlap, the one with the highest priority decides; of equal ones the last.
     """
 
     name: str
-    surface: Mapping[str, Any]
+    surface: Surface
     material: Material
+    priority: int = 0
 
 
-def read_bodies(bodies: Any, mesh: str | None, learn: Sequence[str] = ()) -> list[Body]:
-    """Read the bodies of a configuration in the order of `ordered_settings`.
+@dataclass(frozen=True)
+class GridSettings:
+    """Settings of the grids of signed distances, one for each body.
+
+    Attributes:
+        resolution: vertices along each side of a grid.
+        box_min, box_max: corners of all grids, world units; None for the bounds of each surface and a margin of air.
+        shell_voxels: half width of the smooth interface that the Eikonal equation sees, voxels.
+        cache: whether the distances are kept in the cache folder.
+    """
+
+    resolution: Resolution = 128
+    box_min: Sequence[float] | None = None
+    box_max: Sequence[float] | None = None
+    shell_voxels: Positive = 0.1
+    cache: bool = True
+
+    def box(self, surface: Surface) -> Float[np.ndarray, "2 3"]:
+        """Return the corners of the grid of a surface, world units."""
+        return grid_box(self.box_min, self.box_max, surface.bounds, self.resolution)
+
+    def require_memory(self, num_bodies: int) -> None:
+        """Refuse grids that need more memory than is available."""
+        require_bytes(num_bodies * BYTES_PER_VERTEX * self.resolution**3, f"medium.resolution={self.resolution}")
+
+
+class Bodies(Medium):
+    """Bodies of constant index, which are sharp for `snell` and thin shells for `eikonal`.
+
+    Each body has a grid of signed distances in its own box, so bodies may be nested, apart, or overlap. Bodies have
+    an order, from the lowest priority to the highest, and the last body at a point decides there (Schmidt and Budge
+    2002, "Simple Nested Dielectrics in Ray Traced Images").
+
+    For the Eikonal equation the surface is a shell of half width w around the zero level. In the shell the index rises
+    as a cubic step of the signed distance phi: S = t^2 (3 - 2 t), t = (1 - phi / w) / 2. The bodies are applied in
+    order, n <- n + (ior - n) S; a `nested` medium uses the product of all steps so far in place of S.
 
     Args:
-        bodies: settings of each body by name, see `BodySettings`.
-        mesh: mesh of bodies without one.
-        learn: learned quantities of bodies without `learn`.
+        bodies: at least one body.
+        nested: whether a body exists only where all bodies before it exist. A nested body may then reach beyond the
+            others and touch them without a gap, and a clear body of index 1 is air, as outside. Otherwise a point
+            belongs to the last body that contains it.
+        grid: settings of the grids.
+
+    Attributes:
+        names: name of each body.
+        materials: material of each body.
+        grids: signed distances of each body.
+        meshes: triangles of each surface, relative to `origin`; empty if a surface has none.
+        shell: half width w of the smooth shells, world units.
 
     Raises:
-        NerfroError: a setting is unknown, missing or not allowed.
+        NerfroError: there are too many bodies, or a surface does not fit its grid.
     """
-    ordered = ordered_settings(bodies)
-    return [Body(name, _surface(name, given, mesh), _material(name, given, learn)) for name, given in ordered]
 
+    materials: Sequence[Material]
+    grids: DistanceGrids
 
-def ordered_settings(bodies: Any) -> list[tuple[str, BodySettings]]:
-    """Read names and settings of bodies, in ascending order of their priorities.
+    def __init__(self, bodies: Sequence[Body], nested: bool = False, grid: GridSettings = GridSettings()) -> None:
+        super().__init__()
+        bodies = sorted(bodies, key=lambda body: body.priority)
+        grid.require_memory(len(bodies))
+        surfaces = [body.surface for body in bodies]
+        self.origin, self.nested = local_origin(surfaces[0].bounds), nested
+        self._set_materials([body.name for body in bodies], [body.material for body in bodies])
+        boxes = [grid.box(surface) for surface in surfaces]
+        self.shell = grid.shell_voxels * min(float((box[1] - box[0]).min()) for box in boxes) / (grid.resolution - 1)
+        meshes = [surface.mesh.relative_to(self.origin) for surface in surfaces if surface.mesh is not None]
+        self.meshes = meshes if len(meshes) == len(surfaces) else []
+        bounds = np.stack([surface.bounds for surface in surfaces], 1) - self.origin
+        self._content_box = torch.from_numpy(np.stack([bounds[0].min(0), bounds[1].max(0)])).float()
+        self._set_grids(self._sampled(body, box, grid) for body, box in zip(bodies, boxes, strict=True))
+        for body in bodies:  # so that the training is independent of the world unit
+            body.material.scale_absorption(0.5 * float(np.ptp(body.surface.bounds, 0).max()))
 
-    The last body at a point decides there. The order therefore expresses priorities (Schmidt and Budge 2002, "Simple
-    Nested Dielectrics in Ray Traced Images").
+    def _sampled(self, body: Body, box: Float[np.ndarray, "2 3"], grid: GridSettings) -> DistanceGrid:
+        relative = torch.from_numpy(box - self.origin).float()  # rounded before the distances are computed
+        vertices = Grid(relative.double().numpy() + self.origin, grid.resolution, cache=grid.cache)
+        sampled = body.surface.sampled(vertices, relative)
+        if not (self.nested or (sampled.distances < 0).any()):
+            raise NerfroError(
+                f"no vertex of the grid lies inside the body {body.name}; make it thicker than a voxel, or raise "
+                "medium.resolution"
+            )
+        return sampled
 
-    Raises:
-        NerfroError: a setting is unknown or not allowed.
-    """
-    if not isinstance(bodies, Mapping):
-        raise NerfroError(f"bodies={bodies} is not a mapping; write bodies={{NAME: {{mesh: FILE, ior: 1.5}}}}")
-    settings = {str(name): _settings(str(name), given) for name, given in bodies.items()}
-    if not settings:
-        raise NerfroError("bodies={} has no body; write bodies={NAME: {mesh: FILE, ior: 1.5}}")
-    return sorted(settings.items(), key=lambda item: item[1].priority)
+    def _set_materials(self, names: Sequence[str], materials: Sequence[Material]) -> None:
+        if len(materials) > _MAX_BODIES:
+            raise NerfroError(f"the medium has {len(materials)} bodies; at most {_MAX_BODIES} are allowed")
+        if "ior" in materials[0].learned() and materials[0].ior.item() == 1:
+            raise NerfroError(
+                "the refractive index of the first body is learned from 1, the index of air, where its surface bends "
+                "no ray and the index has no gradient; start from another value, such as 1.3"
+            )
+        self.names, self.materials = list(names), nn.ModuleList(materials)  # type: ignore[assignment]
 
+    def _set_grids(self, grids: Iterable[DistanceGrid]) -> None:
+        self.grids = DistanceGrids(grids)
+        low, high = torch.stack([grid.box for grid in self.grids], 1).unbind()
+        self.register_buffer("box", torch.stack([low.amin(0), high.amax(0)]), persistent=False)
 
-def surfaces_of(medium: Any) -> list[Mapping[str, Any]]:
-    """Return the surface of each body in the configuration of a medium."""
-    if not isinstance(medium, Mapping):
-        return []
-    bodies, mesh = medium.get("bodies"), medium.get("mesh")
-    if bodies is not None:
-        return [body.surface for body in read_bodies(bodies, mesh)]
-    return [] if mesh is None else [mesh_surface(mesh)]
+    def with_grids(self, grids: Iterable[DistanceGrid]) -> Bodies:
+        """Return bodies of the same materials with other surfaces, which have no triangles."""
+        changed = variant(self, meshes=[])
+        changed._set_grids(grids)
+        return changed
 
+    def grown(self, outwards: Float[Tensor, "X Y Z"]) -> Bodies:
+        """Return the same bodies with the surface of the first body displaced.
 
-def origin_of(medium: Any) -> Float[np.ndarray, "3"]:
-    """Return the origin of positions, from the configuration of a medium; see `Medium.origin`."""
-    surfaces = surfaces_of(medium)
-    if not surfaces:
-        return np.zeros(3)
-    if surfaces[0].get("name") == "mesh" and "file" in surfaces[0]:
-        return origin_of_file(resolve_path(surfaces[0]["file"]))
-    return local_origin(make_surface(surfaces[0]).bounds)
+        The displacement is subtracted from the distances, so the distances are exact only for small displacements.
 
+        Args:
+            outwards: outward displacement at the vertices of the first body's grid, world units.
+        """
+        first, *others = self.grids
+        moved = DistanceGrid(first.distances - outwards, first.box)
+        return self.with_grids([moved, *(grid.following(outwards) for grid in others)])
 
-def mesh_surface(file: str) -> dict[str, Any]:
-    """Return the settings of a mesh surface."""
-    return {"name": "mesh", "file": str(file)}
+    def packed(self) -> Solids:
+        """Return the bodies as kernels take them."""
+        from nerfro.kernels.lookup import Solids
 
+        low, high = self.box.double().cpu().numpy()
+        indices, absorbs = self.indices.double().cpu().numpy(), self.absorbs.cpu().numpy()
+        return Solids._make((*self.grids.packed, indices, absorbs, self.nested, self.shell, low, high))
 
-def _settings(name: str, given: Any) -> BodySettings:
-    where = f"bodies.{name}"
-    if not isinstance(given, Mapping):
-        raise NerfroError(f"{where}={given} is not a set of settings; write {where}={{mesh: FILE, ior: 1.5}}")
-    settings = validate(BodySettings, given, f"{where}.")
-    if len(settings.absorption) not in (0, 1, 3):
-        raise NerfroError(f"{where}.absorption={settings.absorption} is not allowed; give red, green and blue, or one")
-    unknown = [quantity for quantity in settings.learn or [] if quantity not in _LEARNED]
-    if unknown:
-        raise NerfroError(f"{where}.learn={settings.learn} is not allowed; choose {' and '.join(_LEARNED)}")
-    return settings
+    @property
+    def bodies(self) -> Bodies:
+        return self
 
+    @property
+    def content_box(self) -> Float[Tensor, "2 3"]:
+        """Bounds of the surfaces, world units."""
+        return self._content_box
 
-def _surface(name: str, given: BodySettings, mesh: str | None) -> Mapping[str, Any]:
-    file = given.mesh or mesh
-    if given.surface is None:
-        if file is None:
-            raise NerfroError(f"bodies.{name} needs a mesh; add bodies.{name}.mesh=FILE")
-        return mesh_surface(file)
-    if given.mesh is not None or not isinstance(given.surface, Mapping):
-        raise NerfroError(f"bodies.{name} needs one of mesh and surface; write surface: {{name: ball, radius: 1}}")
-    return given.surface
+    @cached_property
+    def triangles(self) -> Triangles:
+        """Triangles of all meshes."""
+        return Triangles.of(self.meshes)
 
+    @cached_property
+    def intersector(self) -> LayeredIntersector:
+        """Intersector of `triangles`."""
+        assert self.outline is not None
+        return LayeredIntersector(self.triangles.corners, self.outline.faces)
 
-def _material(name: str, given: BodySettings, learn: Sequence[str]) -> Material:
-    if (given.ior is None) == (given.material is None):
-        raise NerfroError(f"bodies.{name} needs one of ior and material; write ior: 1.5, or material: water")
-    learn = learn if given.learn is None else given.learn
-    absorption = given.absorption * 3 if len(given.absorption) == 1 else given.absorption or [0.0] * 3
-    if given.material is None:
-        dispersion = None if given.abbe is None else Abbe(given.abbe)
-        return Material(typing.cast(float, given.ior), absorption, dispersion, learn)
-    if given.abbe is not None:
-        raise NerfroError(
-            f"bodies.{name}.abbe={given.abbe} contradicts its material, which has a dispersion; remove it"
-        )
-    formula = find_material(given.material)
-    return Material(formula.ior, absorption, formula, learn)
+    @property
+    def outline(self) -> TriangleMesh | None:
+        if not self.meshes:
+            return None
+        starts = np.cumsum([0, *(len(mesh.vertices) for mesh in self.meshes)])
+        faces = [mesh.faces + start for mesh, start in zip(self.meshes, starts, strict=False)]
+        return TriangleMesh(np.concatenate([mesh.vertices for mesh in self.meshes]), np.concatenate(faces))
+
+    def __repr__(self) -> str:
+        size = " x ".join(f"{side:.3g}" for side in (self.box[1] - self.box[0]).tolist())
+        return f"{type(self).__name__}(ior={[round(n, 4) for n in self.indices.tolist()]}, box of {size})"
+
+    @property
+    def iors(self) -> Float[Tensor, "K"]:
+        return torch.stack([material.ior for material in self.materials])
+
+    def with_indices(self, indices: Float[Tensor, "K"]) -> Bodies:
+        return self._with_materials([{"ior": ior} for ior in indices.to(self.iors).unbind()])
+
+    @property
+    def absorption(self) -> Float[Tensor, "K 3"] | None:
+        """Absorption coefficients of each body and colour channel, per world unit; None if all bodies are clear."""
+        if not any(material.absorbs for material in self.materials):
+            return None
+        return torch.stack([material.absorption for material in self.materials])
+
+    @property
+    def absorbs(self) -> Bool[Tensor, "K"]:
+        """Whether each body may absorb light."""
+        return constant(tuple(material.absorbs for material in self.materials), self.box.device, torch.bool)
+
+    def with_absorption_coefficients(self, absorption: Float[Tensor, "K 3"]) -> Bodies:
+        return self._with_materials([{"_absorption": values if values.any() else None} for values in absorption])
+
+    @property
+    def disperses(self) -> bool:
+        return any(material.dispersion is not None for material in self.materials)
+
+    def achromatic(self) -> Bodies:
+        """Return the same bodies with the index of the d line at all wavelengths."""
+        return self._with_materials([{"dispersion": None}] * len(self.materials))
+
+    def at_wavelength(self, wavelength: float) -> Bodies:
+        """Return the same bodies with their indices at a wavelength in nm; gradients reach the original indices."""
+        same: dict[str, object] = {"dispersion": None}
+        changes = [same | {"ior": material.ior_at(wavelength)} for material in self.materials]
+        return self._with_materials(changes)
+
+    def _with_materials(self, changes: Sequence[dict[str, object]]) -> Bodies:
+        changed = [variant(material, **change) for material, change in zip(self.materials, changes, strict=True)]
+        return variant(self, materials=nn.ModuleList(changed))
+
+    def with_absorption(self, path: Path) -> Path:
+        of_bodies = self.absorption
+        if of_bodies is None:
+            return path
+        return replace(path, absorption=torch.cat([torch.zeros_like(of_bodies[:1]), of_bodies]).to(path.s))
+
+    def parameters_by_name(self) -> dict[str, nn.Parameter]:
+        others = super().parameters_by_name()
+        parameters = {name: others[name] for name in others if not name.startswith("medium.materials.")}
+        for name, material in zip(self.names, self.materials, strict=True):
+            learned = material.learned().items()
+            parameters |= {f"bodies.{name}.material.{quantity}": parameter for quantity, parameter in learned}
+        return parameters
+
+    def measurements(self) -> dict[str, float]:
+        values: dict[str, float] = {}
+        for body, material in zip(self.names, self.materials, strict=True):
+            for quantity in material.learned():
+                name, value = f"bodies.{body}.material.{quantity}", getattr(material, quantity).tolist()
+                by_colour = zip(_COLOURS, value, strict=True) if quantity == "absorption" else ()
+                values |= {f"{name}.{colour}": coefficient for colour, coefficient in by_colour} or {name: value}
+        return values
+
+    def signed_distances(self, positions: Vectors) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K 3"]]:
+        """Interpolate the signed distance to the surface of each body, negative inside, and its exact gradient.
+
+        Far from a surface, the value is a lower bound of the distance.
+        """
+        splines = [grid(positions) for grid in self.grids]
+        return torch.stack([phi for phi, _ in splines], -1), torch.stack([gradient for _, gradient in splines], -2)
+
+    def regions(self, positions: Vectors) -> tuple[Float[Tensor, "*batch K"], Float[Tensor, "*batch K 3"]]:
+        """Evaluate `signed_distances`; in a `nested` medium, of the part of each body inside all bodies before it."""
+        phi, gradients = self.signed_distances(positions)
+        if not self.nested:
+            return phi, gradients
+        phi, body = phi.cummax(-1)
+        return phi, gradients.gather(-2, body[..., None].expand_as(gradients))
+
+    def deciding_body(self, inside: Bool[Tensor, "*batch K"]) -> Int[Tensor, "*batch"]:
+        """Return the number of the body that decides the index and absorption at a point, from 1; 0 in air.
+
+        Args:
+            inside: whether the surface of each body encloses the point.
+        """
+        numbers = torch.arange(inside.shape[-1] + 1, device=inside.device)
+        if self.nested:
+            # Air in a vessel is the air outside: a ray passes between them without an event.
+            numbers[1:] *= (self.iors != 1) | self.absorbs
+            return numbers[inside.long().cumprod(-1).sum(-1)]
+        return torch.where(inside, numbers[1:], 0).amax(-1)
+
+    def forward(self, positions: Vectors) -> tuple[Scalars, Vectors]:
+        """Evaluate the refractive index of the smooth shells and its exact gradient."""
+        phi, normals = self.signed_distances(positions)
+        in_box = ((positions >= self.box[0]) & (positions <= self.box[1])).all(-1)
+        n, gradient = torch.ones_like(phi[..., 0]), torch.zeros_like(positions)
+        within, rise = (
+            torch.ones_like(n)[..., None],
+            torch.zeros_like(positions),
+        )  # product of steps, its gradient
+        for body, ior in enumerate(self.iors.unbind()):
+            t = (0.5 - 0.5 * phi[..., body] / self.shell).clamp(0, 1)
+            step = (t * t * (3 - 2 * t))[..., None]
+            slope = (6 * t * (1 - t) * (-0.5 / self.shell))[..., None] * normals[..., body, :]
+            if self.nested:
+                step, slope = within * step, rise * step + within * slope
+                within, rise = step, slope
+            gradient = gradient * (1 - step) + (ior - n)[..., None] * slope
+            n = n + (ior - n) * step[..., 0]
+        return torch.where(in_box, n, 1.0), torch.where(in_box[..., None], gradient, 0.0)
+
+    def clearance(self, positions: Vectors) -> Scalars:
+        """Return a lower bound of the distance to the nearest shell, world units."""
+        phi, _ = self.signed_distances(positions)
+        return (SAFE_SHARE * phi.abs().amin(-1) - self.shell).clamp(min=0)
+
+    def step_length(self, directions: Vectors, gradients: Vectors) -> Scalars:
+        """Return the width of the shell over `STEPS_PER_SHELL`, divided by the cosine of incidence."""
+        slope = torch.linalg.vector_norm(gradients, dim=-1)
+        # Dividing by a gradient of zero would make derivatives nan.
+        varies = slope > 0
+        cosine = ((directions * gradients).sum(-1) / torch.where(varies, slope, 1.0)).abs()
+        cosine = torch.where(varies, cosine, 1.0)
+        return 2 * self.shell / STEPS_PER_SHELL / cosine.clamp(min=MIN_COSINE)

@@ -72,6 +72,16 @@ class DistanceGrid(nn.Module):
         along = torch.where(beyond == 0, phi[..., None] * gradients, beyond) / distance[..., None]
         return torch.where(outside, distance, phi), torch.where(outside[..., None], along, gradients)
 
+    def following(self, outwards: Float[Tensor, "X Y Z"]) -> DistanceGrid:
+        """Return the distances after a displacement of the surface of the first body.
+
+        Surfaces that are made from the first one follow; see `media.vessel`. By default, the surface stays.
+
+        Args:
+            outwards: outward displacement of the first surface at the vertices, world units.
+        """
+        return self
+
     def coarse_clearance(self) -> Float[Tensor, "x y z"]:
         """Return a lower bound of the distance to the surface from each block of `BLOCK`^3 cells, for the page."""
         blocks = torch.tensor(self.distances.shape).sub(1).div(BLOCK, rounding_mode="floor").add(1).tolist()
@@ -98,9 +108,9 @@ class DistanceGrid(nn.Module):
             slopes = values.diff(dim=axis) / spacing[axis]
             windows = [SURFACE_BLOCK + 3 - (other == axis) for other in range(3)]
             bounds.append(torch.stack(_extremes(slopes, windows), -1))
-        found = torch.stack(bounds, -2)
-        found[self._border_blocks()] = found.new_tensor([-torch.inf, torch.inf])
-        return found
+        ranges = torch.stack(bounds, -2)
+        ranges[self._border_blocks()] = ranges.new_tensor([-torch.inf, torch.inf])
+        return ranges
 
     def empty_blocks(self) -> Int8[Tensor, "x y z"]:
         """Bound the Chebyshev distance to the next block of `SURFACE_BLOCK`^3 cells that may hold the surface.

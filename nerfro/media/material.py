@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from nerfro.core.errors import NerfroError, nearest_of
-from nerfro.registry.allowed import OnlyWith
+from nerfro.registry.allowed import NotNegative, OnlyWith, Positive, validated
 
 # Whether training learns a quantity of the medium, which only some path samplers trace.
 Learns = Annotated[bool, OnlyWith("sampler.path", attribute="needs_medium")]
@@ -162,6 +162,7 @@ def find_material(name: str) -> Formula:
     return MATERIALS[name]
 
 
+@validated("material")
 class Material(nn.Module):
     """Refractive index, dispersion and absorption of a body.
 
@@ -183,8 +184,8 @@ class Material(nn.Module):
 
     def __init__(
         self,
-        ior: float,
-        absorption: Sequence[float] = (0.0, 0.0, 0.0),
+        ior: Positive,
+        absorption: Sequence[NotNegative] = (0.0, 0.0, 0.0),
         dispersion: Dispersion | None = None,
         learn: Sequence[str] = (),
     ) -> None:
@@ -192,17 +193,17 @@ class Material(nn.Module):
         self.dispersion = dispersion
         # Double precision, as the kernels need; scalar tensors do not promote float32 operands.
         index = torch.tensor(ior, dtype=torch.float64)
-        given = torch.tensor(absorption, dtype=torch.float32)
+        coefficients = torch.tensor(absorption, dtype=torch.float32)
         if "ior" in learn:
             self.ior = nn.Parameter(index)
         else:
             self.register_buffer("ior", index, persistent=False)
         if "absorption" in learn:
-            self._absorption, self._given_absorption = nn.Parameter(given.clone()), given
+            self._absorption, self._initial_absorption = nn.Parameter(coefficients.clone()), coefficients
             self.register_buffer("absorption_length", torch.tensor(1.0))
             self.scale_absorption(1.0)
         else:
-            self.register_buffer("_absorption", given if given.any() else None, persistent=False)
+            self.register_buffer("_absorption", coefficients if coefficients.any() else None, persistent=False)
 
     @torch.no_grad()
     def scale_absorption(self, length: float) -> None:
@@ -212,7 +213,7 @@ class Material(nn.Module):
             length: half of the longest side of the body, world units.
         """
         if isinstance(self._absorption, nn.Parameter):
-            depth = (self._given_absorption * length).clamp(min=_ALMOST_CLEAR)
+            depth = (self._initial_absorption * length).clamp(min=_ALMOST_CLEAR)
             self._absorption.copy_(depth + torch.log(-torch.expm1(-depth)))  # inverse of softplus
             self.absorption_length.fill_(length)
 
@@ -247,34 +248,3 @@ class Material(nn.Module):
 def learned_quantities(ior: bool, absorption: bool) -> list[str]:
     """Return the names of the learned quantities of a material, see `Material`."""
     return ["ior"] * ior + ["absorption"] * absorption
-
-
-def materials_of(
-    iors: Sequence[float],
-    absorption: Sequence[float],
-    learn_absorption: bool,
-    abbe: Sequence[float],
-    learn_ior: bool,
-) -> list[Material]:
-    """Make the materials of several bodies from lists of numbers; see `media.solid.Solid` for the arguments.
-
-    Raises:
-        NerfroError: a list has a wrong length.
-    """
-    num_bodies = len(iors)
-    if len(abbe) not in (0, 1, num_bodies):
-        raise NerfroError(f"medium.abbe={list(abbe)} has {len(abbe)} numbers; give one for each body, or for all")
-    if len(absorption) not in (0, 1, 3 * num_bodies):
-        raise NerfroError(
-            f"medium.absorption={list(absorption)} has {len(absorption)} numbers; give red, green and blue of each "
-            f"body ({3 * num_bodies} numbers), or one for all"
-        )
-    dispersions: list[Abbe | None] = [Abbe(number) for number in abbe] if abbe else [None]
-    coefficients = list(absorption) or [0.0]
-    if len(coefficients) == 1:
-        coefficients *= 3 * num_bodies
-    learn = learned_quantities(learn_ior, learn_absorption)
-    return [
-        Material(ior, coefficients[3 * body : 3 * body + 3], dispersions[body % len(dispersions)], learn)
-        for body, ior in enumerate(iors)
-    ]

@@ -8,7 +8,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float
+from torch import Tensor
 
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import resolve_path
@@ -16,7 +18,7 @@ from nerfro.files.cache import cached_arrays, content_hash
 from nerfro.geometry.bodies import require_separate
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.geometry.signed_distance import signed_distance_grid
-from nerfro.media.distance_grid import BAND
+from nerfro.media.distance_grid import BAND, DistanceGrid
 from nerfro.registry.registration import create, discover, find, register
 
 # Part of the cache key. Increase it when the same mesh and settings give different distances.
@@ -70,6 +72,15 @@ class Surface(ABC):
 
         Farther from the surface than `grid.band` voxels, the value may be closer to zero, down to this distance.
         """
+
+    def sampled(self, grid: Grid, box: Float[Tensor, "2 3"]) -> DistanceGrid:
+        """Sample the distances at the vertices of a grid.
+
+        Args:
+            grid: the vertices.
+            box: corners of the grid, relative to the origin of the medium.
+        """
+        return DistanceGrid(torch.from_numpy(self.distances(grid)).float(), box)
 
 
 def make_surface(settings: Mapping[str, Any], accept_open_mesh: bool = False) -> Surface:

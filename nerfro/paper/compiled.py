@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import torch
@@ -11,7 +11,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from nerfro.core.types import Path, Rays
-from nerfro.media.sdf_grid import SdfGrid
+from nerfro.media.bodies import Bodies
 from nerfro.paper.voxel_grid import VoxelGrid
 from nerfro.samplers.paths.compiled import ray_arrays
 
@@ -23,13 +23,14 @@ _CAPACITY = 18
 
 
 def eikonal_on_grid(
-    rays: Rays, medium: VoxelGrid | SdfGrid, step: float, tolerance: float, max_steps: int
+    rays: Rays, medium: VoxelGrid | Bodies, step: float, tolerance: float, max_steps: int
 ) -> tuple[Path, Bool[Tensor, "R"]]:
     """Evaluate `eikonal.march_adaptive` by the compiled kernel, on the CPU for rays on any device."""
     from nerfro.paper.eikonal_cpu import march_adaptive
     from nerfro.paper.index_cpu import NO_SOLIDS, NO_VOXELS
 
-    packed = (NO_VOXELS, medium.packed()) if isinstance(medium, SdfGrid) else (_voxels(medium), NO_SOLIDS)
+    bodies = medium.bodies
+    packed = (_voxels(cast(VoxelGrid, medium)), NO_SOLIDS) if bodies is None else (NO_VOXELS, bodies.packed())
     settings = step, tolerance, max_steps
     *columns, counts, refracted, exceeded = march_adaptive(*ray_arrays(rays), *packed, settings, _CAPACITY)
     width = max(int(counts.max(initial=2)), 2)

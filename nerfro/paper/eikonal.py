@@ -15,7 +15,6 @@ from nerfro.core.types import Path, Rays
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.kernels.tolerances import STEPS_PER_SHELL
 from nerfro.media.base import Medium
-from nerfro.media.sdf_grid import SdfGrid
 from nerfro.paper.compiled import eikonal_on_grid, uniform_on_grid
 from nerfro.paper.integrators import Integrator, RayState, euler, leapfrog
 from nerfro.paper.tolerances import MIN_TURN, REACHED
@@ -64,9 +63,9 @@ class Eikonal(PathSampler):
         tolerance = self.tolerance * float(torch.linalg.vector_norm(medium.box[1] - medium.box[0]))
         if isinstance(medium, VoxelGrid):
             return eikonal_on_grid(rays, medium, 0.5 * float(medium.spacing.min()), tolerance, self.max_steps)[0]
-        if isinstance(medium, SdfGrid):
-            step = 2 * medium.shell / STEPS_PER_SHELL
-            return eikonal_on_grid(rays, medium, step, tolerance, self.max_steps)[0]
+        if medium.bodies is not None:
+            step = 2 * medium.bodies.shell / STEPS_PER_SHELL
+            return eikonal_on_grid(rays, medium.bodies, step, tolerance, self.max_steps)[0]
         return march_adaptive(rays, medium, tolerance, self.max_steps)[0]
 
     def replay(self, path: Path, rays: Rays, medium: Medium) -> Path:
@@ -83,7 +82,7 @@ class Eikonal(PathSampler):
         return replace(path, **columns)
 
     def releases_gil(self, medium: Medium) -> bool:
-        return isinstance(medium, VoxelGrid) or (self.integrator == "adaptive" and isinstance(medium, SdfGrid))
+        return isinstance(medium, VoxelGrid) or (self.integrator == "adaptive" and medium.bodies is not None)
 
 
 def march_uniform(rays: Rays, medium: Medium, integrator: Integrator, num_steps: int) -> Path:

@@ -145,7 +145,7 @@ def _look_up(voxels, solids, x, y, z):
 
 @compiled
 def _step_length(solids, step, dx, dy, dz, gx, gy, gz):
-    """Return the length of the next step, which depends on the slant in a shell (`media.solid.Solid.step_length`)."""
+    """Return the length of the next step, which depends on the slant in a shell (`media.bodies.Bodies.step_length`)."""
     if len(solids.iors) == 0:
         return step
     slope = math.sqrt(gx * gx + gy * gy + gz * gz)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import torch
@@ -12,6 +11,7 @@ from torch import Tensor
 
 from nerfro.core.draws import Draws
 from nerfro.core.types import Path, Rendering, Samples
+from nerfro.geometry.space import Space
 from nerfro.registry.registration import register
 from nerfro.samplers.base import PointSampler
 from nerfro.samplers.points.stepfun import invert_cdf, midpoints, spread_uniform
@@ -32,7 +32,7 @@ class Hierarchical(PointSampler):
     Args:
         num_coarse: number of coarse samples, N_c.
         num_fine: number of fine samples, N_f.
-        draw, cast, offset, box_min, box_max: options of the coarse samples, see `stratified`.
+        draw, cast, offset, space: options of the coarse samples, see `stratified`.
     """
 
     num_levels = 2
@@ -44,11 +44,10 @@ class Hierarchical(PointSampler):
         draw: Literal["arc_length", "vertices"] = "arc_length",
         cast: Literal["points", "cones"] = "points",
         offset: Annotated[float, Ge(0), Lt(1)] = 0.5,
-        box_min: Sequence[float] = (),
-        box_max: Sequence[float] = (),
+        space: Space | None = None,
     ) -> None:
         super().__init__()
-        self.coarse = Stratified(num_coarse, draw, cast, offset, box_min, box_max)
+        self.coarse = Stratified(num_coarse, draw, cast, offset, space)
         self.num_fine, self.cast = num_fine, cast
 
     def forward(self, path: Path, previous: Rendering | None, draws: Draws | None = None) -> Samples:

@@ -1,6 +1,6 @@
 """Refractive index at a point for kernels, from a voxel grid or from bodies with thin shells.
 
-The mathematics is that of `geometry.interpolation` and `media.solid`, for one point at a time.
+The mathematics is that of `geometry.interpolation` and `media.bodies`, for one point at a time.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def voxel_index(table, low, inverse_spacing, x, y, z):
 
 @compiled
 def solid_index(solids, x, y, z):
-    """Return index, gradient of the index and clearance of bodies with smooth shells (`media.solid`)."""
+    """Return index, gradient of the index and clearance of bodies with smooth shells (`media.bodies`)."""
     shell, nested = solids.shell, solids.nested
     n, gx, gy, gz, clearance = 1.0, 0.0, 0.0, 0.0, math.inf
     within, rx, ry, rz = 1.0, 0.0, 0.0, 0.0

@@ -6,7 +6,6 @@ frustums, and of `model=mip_nerf`.
 
 from __future__ import annotations
 
-from math import inf
 from typing import Literal
 
 from jaxtyping import Bool, Float
@@ -14,25 +13,23 @@ from torch import Tensor
 
 from nerfro.core.draws import Draws
 from nerfro.core.types import FieldValues, Path, Rendering, Samples
-from nerfro.fields.selection import inside_box
+from nerfro.geometry.space import Space
 from nerfro.paper.encoding import DIRECTION_DEGREE, integrated_positional_encoding, positional_encoding
 from nerfro.paper.mlp import RadianceMLP, in_blocks
-from nerfro.paper.nerf import FieldInBox
-from nerfro.registry.allowed import AnyNumber, Depth, Positive, Width
+from nerfro.paper.nerf import EncodedField
+from nerfro.registry.allowed import Depth, Positive, Width
 from nerfro.registry.registration import register
 from nerfro.rendering import Components, Renderer, composite
 
 
 @register("field", "mip_nerf")
-class MipNerfField(FieldInBox):
+class MipNerfField(EncodedField):
     """8x256 MLP on the expected encoding of each sample's frustum (mip-NeRF, section 3); needs `cast=cones`.
 
     Args:
         width, depth, skip, view_width: shape of the MLP, see `RadianceMLP`.
         position_degree: number of octaves of the integrated encoding, which damps octaves finer than the frustum.
-        box_min, box_max: opposite corners of the bounds of the scene, world units. The field is empty outside. With
-            infinite corners, it covers all of space.
-        unit: see `field=nerf`.
+        unit, space: see `field=nerf`.
     """
 
     def __init__(
@@ -42,19 +39,17 @@ class MipNerfField(FieldInBox):
         skip: int = 5,
         view_width: Width = 128,
         position_degree: Depth = 16,
-        box_min: list[AnyNumber] = (-inf, -inf, -inf),  # type: ignore[assignment]
-        box_max: list[AnyNumber] = (inf, inf, inf),  # type: ignore[assignment]
         unit: Positive | None = 1.0,
+        space: Space | None = None,
     ) -> None:
-        super().__init__(box_min, box_max, unit)
+        super().__init__(unit, space)
         self.position_degree = position_degree
         num_position, num_direction = 6 * position_degree, 3 * (1 + 2 * DIRECTION_DEGREE)
         self.mlp = RadianceMLP(num_position, num_direction, width, depth, skip, view_width)
 
     def forward(self, samples: Samples) -> FieldValues:
         density, radiance = in_blocks(self._decode_block, *frustum_gaussians(samples), samples.directions)
-        if not self.everywhere:
-            inside = inside_box(samples.positions, *self.box)
+        if (inside := self.space.inside(samples.positions)) is not None:
             density, radiance = density * inside, radiance * inside[..., None]
         return FieldValues(density, radiance)
 

@@ -2,58 +2,58 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from math import inf
-from typing import Annotated
+from typing import Annotated, Any
 
-import torch
 from annotated_types import Ge, Le
 from jaxtyping import Float
+from omegaconf import DictConfig
 from torch import Tensor
 
 from nerfro.core.types import FieldValues, Samples
+from nerfro.data.base import Views
 from nerfro.fields.base import Field
-from nerfro.fields.selection import evaluate_selected, inside_box
-from nerfro.geometry.box import corners_of_box
+from nerfro.fields.selection import evaluate_selected
+from nerfro.geometry.space import Space, Unbounded
 from nerfro.paper.encoding import DIRECTION_DEGREE, positional_encoding
 from nerfro.paper.mlp import RadianceMLP, in_blocks
-from nerfro.registry.allowed import AnyNumber, Depth, Positive, Width
+from nerfro.registry.allowed import Depth, Positive, Width
 from nerfro.registry.registration import register
 
+# Distance from near to far in the scenes of NeRF, for whose world unit its encoding of positions is made.
+_RANGE_OF_RAYS = 4.0
 
-class FieldInBox(Field):
-    """A field that is empty outside of a box.
+
+class EncodedField(Field):
+    """A field that encodes positions in world coordinates.
 
     Args:
-        box_min, box_max: opposite corners, world units; with infinite corners, the field covers all of space.
-        unit: length of the encoded positions and of the density, world units.
+        unit: length of the encoded positions and of the density, world units. The authors use 1. In a configuration,
+            None takes a quarter of the distance from near to far, so that the world unit is irrelevant.
+        space: space that the field covers; None for all of space.
     """
 
-    box: Float[Tensor, "2 3"]
-
-    def __init__(self, box_min: Sequence[float], box_max: Sequence[float], unit: float | None = 1.0) -> None:
+    def __init__(self, unit: float | None = 1.0, space: Space | None = None) -> None:
         super().__init__()
         self.unit = 1.0 if unit is None else unit
-        box = corners_of_box(box_min, box_max, bounded=False)
-        self.register_buffer("box", torch.from_numpy(box).float(), persistent=False)
-        self.everywhere = not self.box.isfinite().any()
+        self.space = Unbounded() if space is None else space
+
+    @classmethod
+    def derive(cls, settings: DictConfig, views: Views, space: Space) -> dict[str, Any]:
+        return {"unit": (views.cameras.far - views.cameras.near) / _RANGE_OF_RAYS}
 
     @property
     def bounds(self) -> Float[Tensor, "2 3"] | None:
-        return None if self.everywhere else self.box
+        return self.space.bounds
 
 
 @register("field", "nerf")
-class NerfField(FieldInBox):
+class NerfField(EncodedField):
     """8x256 MLP on positional encodings of position and local direction (paper, section 2; NeRF, section 5).
 
     Args:
         width, depth, skip, view_width: shape of the MLP, see `RadianceMLP`.
         position_degree: number of octaves of the encoding of positions.
-        box_min, box_max: opposite corners of the bounds of the scene, world units. The field is empty outside, and
-            samples there are not evaluated. With infinite corners, all samples are evaluated, as in the authors' code.
-        unit: length of the encoded positions and of the density, world units. The authors use 1. In a configuration,
-            None takes a quarter of the distance from near to far, so that the world unit is irrelevant.
+        unit, space: see `EncodedField`. The field is empty outside a box, and samples there are not evaluated.
     """
 
     def __init__(
@@ -63,19 +63,16 @@ class NerfField(FieldInBox):
         skip: int = 5,
         view_width: Width = 128,
         position_degree: Annotated[int, Ge(0), Le(64)] = 10,
-        box_min: list[AnyNumber] = (-inf, -inf, -inf),  # type: ignore[assignment]
-        box_max: list[AnyNumber] = (inf, inf, inf),  # type: ignore[assignment]
         unit: Positive | None = 1.0,
+        space: Space | None = None,
     ) -> None:
-        super().__init__(box_min, box_max, unit)
+        super().__init__(unit, space)
         self.position_degree = position_degree
         num_position, num_direction = 3 * (1 + 2 * position_degree), 3 * (1 + 2 * DIRECTION_DEGREE)
         self.mlp = RadianceMLP(num_position, num_direction, width, depth, skip, view_width)
 
     def forward(self, samples: Samples) -> FieldValues:
-        if self.everywhere:
-            return FieldValues(*self.decode(samples.positions, samples.directions))
-        return evaluate_selected(self.decode, samples, inside_box(samples.positions, *self.box))
+        return evaluate_selected(self.decode, samples, self.space.inside(samples.positions))
 
     def decode(
         self, positions: Float[Tensor, "*batch 3"], directions: Float[Tensor, "*batch 3"]

@@ -25,6 +25,7 @@ from nerfro.training.config import build_data, check_trained
 from nerfro.training.load import checkpoint_of, scene_of
 from nerfro.training.run import Run
 from nerfro.training.run_folder import CONFIG_FILE, load_checkpoint
+from nerfro.training.settings import with_values
 
 
 def evaluate(
@@ -101,8 +102,7 @@ def _names_in_run(file: Path, root: str | None) -> dict[str, str]:
     if not file.is_file():
         return {}
     config = check_trained(read_foreign_config(file), file)
-    if root is not None:
-        config.data.root = root
+    config = config if root is None else with_values(config, {"data.root": root})
     split = config.evaluation.split
     names = build_data(config).load(split).names
     return {Path(name).stem: f"{split}_{number:03d}" for number, name in enumerate(names)}

@@ -7,11 +7,6 @@ from dataclasses import dataclass
 from nerfro.capture.object_errors import COMMON_INDICES, SOLID, STRAIGHT, VESSEL
 from nerfro.rendering.scene_file import SceneFile
 
-# Number of training photographs that score the hypotheses.
-_NUM_VALIDATION_VIEWS = 5
-# Steps of straight rays in the processor time of one step of bent rays (docs/lab/simulated_glassware.md).
-_STRAIGHT_SPEED = 1.25
-
 
 @dataclass(frozen=True)
 class Hypothesis:
@@ -45,7 +40,7 @@ class Hypothesis:
         return [
             f"trainer.max_steps={round(self.speed * steps)}",
             "trainer.max_time=null",
-            f"batches.num_validation_views={_NUM_VALIDATION_VIEWS}",
+            "batches.num_validation_views=5",
             "evaluation.split=val",
             "evaluation.every=0",
             "logger=none",
@@ -63,7 +58,8 @@ def hypotheses(scene: SceneFile) -> list[Hypothesis]:
         scene: content of the scene file.
     """
     near = scene.surroundings == "near"
-    straight = Hypothesis(STRAIGHT, ["+experiment=straight"], speed=_STRAIGHT_SPEED)
+    # One step of bent rays takes the processor time of 1.25 steps of straight rays (docs/lab/simulated_glassware.md).
+    straight = Hypothesis(STRAIGHT, ["+experiment=straight"], speed=1.25)
     known_materials = f"+experiment={'glass_room' if near else 'glass'}"
     if "wall" in scene.medium:  # the materials of a vessel are known
         return [straight, Hypothesis(VESSEL, [known_materials])]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from nerfro.core.errors import NerfroError
 from nerfro.core.provenance import AlgorithmSettings
@@ -155,12 +155,16 @@ def calibrate_by_tags(
         # The median of 2-D normal errors is 1.18 standard deviations.
         deviation = float(np.median(np.concatenate(list(errors.values())))) / 1.18
         limit = max(settings.min_outlier_error, settings.outlier_deviations * deviation)
-        outliers = {name: _outliers(kept[name], error, limit) for name, error in errors.items()}
-        if number == settings.max_estimates or not any(removed.any() for removed in outliers.values()):
+        # A tag is an outlier if the error of a corner exceeds the limit and half the largest error of the image. One
+        # misread tag disturbs the whole pose, so smaller errors are judged again after the largest are removed.
+        outliers = {
+            name: kept[name].of_same_tags(error > max(limit, 0.5 * error.max())) for name, error in errors.items()
+        }
+        if number == settings.max_estimates or not any(outlying.any() for outlying in outliers.values()):
             break
-        for name, removed in outliers.items():
-            num_outliers[name] += int(removed.sum())
-        current = {name: kept[name].select(~removed) for name, removed in outliers.items()}
+        for name, outlying in outliers.items():
+            num_outliers[name] += int(outlying.sum())
+        current = {name: kept[name].select(~outlying) for name, outlying in outliers.items()}
     poses = {}
     for name, (rotation, translation) in located.items():
         camera_axes = opencv().Rodrigues(rotation)[0].T
@@ -168,16 +172,6 @@ def calibrate_by_tags(
         pose = np.column_stack([camera_axes, -camera_axes @ translation])
         poses[name] = Pose(pose, kept[name].num_tags, error)
     return Calibration(intrinsics, poses, skipped, sum(num_outliers.values()))
-
-
-def _outliers(
-    detections: TagDetections, errors: Float[np.ndarray, " corners"], limit: float
-) -> Bool[np.ndarray, " corners"]:
-    """Select all corners of the tags of which an error exceeds the limit and half the largest error of the image.
-
-    One misread tag disturbs the whole pose, so smaller errors are judged again after the largest ones are removed.
-    """
-    return detections.of_same_tags(errors > max(limit, 0.5 * errors.max()))
 
 
 def _estimate(

@@ -184,8 +184,8 @@ def _extract(
     for image, mask in zip(images, masks, strict=True):
         if mask is not None:
             _write_ignored(mask, masked / f"{image.name}.png", settings)
-    reader, options = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
-    reader.camera_model, options.num_threads = _CAMERAS[settings.lens], threads
+    reader, extraction = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
+    reader.camera_model, extraction.num_threads = _CAMERAS[settings.lens], threads
     if any(mask is not None for mask in masks):
         reader.mask_path = masked
     for chunk in _chunks([image.name for image in images], 4, "finding features"):
@@ -195,7 +195,7 @@ def _extract(
             image_names=chunk,
             camera_mode=pycolmap.CameraMode.SINGLE,
             reader_options=reader,
-            extraction_options=options,
+            extraction_options=extraction,
         )
         reader.existing_camera_id = 1  # created by the first chunk
 
@@ -206,24 +206,24 @@ def _match(pycolmap: Any, database: Path, pairs: Sequence[tuple[str, str]], thre
     COLMAP reads pairs from a text file, which cannot contain names with spaces. Therefore, the images in the database
     have numbers as names while they are matched.
     """
-    options, pairing = pycolmap.FeatureMatchingOptions(), pycolmap.ImportedPairingOptions()
-    options.num_threads, pairing.match_list_path = threads, database.with_name("pairs.txt")
+    matching, pairing = pycolmap.FeatureMatchingOptions(), pycolmap.ImportedPairingOptions()
+    matching.num_threads, pairing.match_list_path = threads, database.with_name("pairs.txt")
     with closing(sqlite3.connect(database)) as connection, connection:
         numbers = dict(connection.execute("SELECT name, image_id FROM images"))
         connection.execute("UPDATE images SET name = image_id")
     for chunk in _chunks(pairs, 100, f"matching {len(pairs)} pairs"):
         lines = [f"{numbers[one]} {numbers[other]}\n" for one, other in chunk]
         pairing.match_list_path.write_text("".join(lines), encoding="utf-8")
-        pycolmap.match_image_pairs(database, matching_options=options, pairing_options=pairing)
+        pycolmap.match_image_pairs(database, matching_options=matching, pairing_options=pairing)
     with closing(sqlite3.connect(database)) as connection, connection:
         connection.executemany("UPDATE images SET name = ? WHERE image_id = ?", numbers.items())
 
 
 def _map(pycolmap: Any, database: Path, images: Sequence[Path], threads: int) -> dict[int, Any]:
     """Register the images one after the other and write models beside the database; returns the models by number."""
-    options = pycolmap.IncrementalPipelineOptions()
-    options.ba_refine_principal_point = False
-    options.random_seed, options.num_threads = 0, threads
+    mapping = pycolmap.IncrementalPipelineOptions()
+    mapping.ba_refine_principal_point = False
+    mapping.random_seed, mapping.num_threads = 0, threads
     folder = database.with_name(_MODELS)
     folder.mkdir(exist_ok=True)
     with progress_bar("registering images", len(images)) as progress:
@@ -236,7 +236,7 @@ def _map(pycolmap: Any, database: Path, images: Sequence[Path], threads: int) ->
             database,
             images[0].parent,
             folder,
-            options,
+            mapping,
             initial_image_pair_callback=lambda: advance(2),
             next_image_callback=advance,
         )

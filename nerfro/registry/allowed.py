@@ -1,7 +1,6 @@
 """Settings with annotated types, checked and converted by pydantic.
 
-The limits of numbers are those of annotated-types, such as `Annotated[int, Ge(1), Le(8)]`. Numbers must be finite,
-except with the annotation `AnyNumber`.
+The limits of numbers are those of annotated-types, such as `Annotated[int, Ge(1), Le(8)]`. Numbers must be finite.
 """
 
 from __future__ import annotations
@@ -63,7 +62,6 @@ class OnlyWith:
 
 FURTHEST = 10**7  # world units, as in georeferenced data
 
-AnyNumber = Annotated[float, AllowInfNan(True)]  # including infinity and NaN
 Count = Annotated[int, Ge(1)]
 NumRays = Annotated[int, Ge(1), Le(2**22)]  # computed in one chunk
 Side = Annotated[int, Ge(1), Le(32)]  # number of rays along each side of a pixel
@@ -184,25 +182,29 @@ def schema_of(hint: Any) -> Any:
     return hint if dataclasses.is_dataclass(hint) else None
 
 
-def validated(where: str) -> Callable[[type[Class]], type[Class]]:
-    """Decorate a class with a constructor that checks and converts all arguments with a setting's annotation.
+def validated(where: str) -> Callable[[Class], Class]:
+    """Decorate a class or a function so that its constructor or call checks and converts all settings among arguments.
 
     Args:
-        where: start of the error message, such as `medium=ball`.
+        where: start of the error message, such as `medium=vacuum`.
     """
 
-    def wrap(cls: type[Class]) -> type[Class]:
-        constructor = cls.__init__  # type: ignore[misc]
-        signature = inspect.signature(constructor)
+    def guarded(function: Any) -> Any:
+        signature = inspect.signature(function)
 
-        @functools.wraps(constructor)
-        def init(self: Any, *arguments: Any, **named: Any) -> None:
-            bound = signature.bind(self, *arguments, **named)
-            bound.arguments |= convert(f"{where}: ", hints_of(constructor), bound.arguments)
-            constructor(*bound.args, **bound.kwargs)
+        @functools.wraps(function)
+        def call(*arguments: Any, **named: Any) -> Any:
+            bound = signature.bind(*arguments, **named)
+            bound.arguments |= convert(f"{where}: ", hints_of(function), bound.arguments)
+            return function(*bound.args, **bound.kwargs)
 
-        cls.__init__ = init  # type: ignore[misc,method-assign]
-        return cls
+        return call
+
+    def wrap(target: Class) -> Class:
+        if not isinstance(target, type):
+            return guarded(target)
+        target.__init__ = guarded(target.__init__)  # type: ignore[misc]
+        return target
 
     return wrap
 
@@ -219,7 +221,7 @@ def setting_type(hint: Any) -> Any:
         return hint
     if origin is Annotated:
         limits = [BeforeValidator(limit.refuse) if isinstance(limit, Refused) else limit for limit in args[1:]]
-        if args[0] is float and AllowInfNan(True) not in limits:
+        if args[0] is float:
             limits.append(AllowInfNan(False))
         if args[0] in _CONVERSIONS:
             limits.append(BeforeValidator(_CONVERSIONS[args[0]]))

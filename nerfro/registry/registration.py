@@ -17,7 +17,7 @@ import types
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
@@ -78,7 +78,7 @@ class Plugin:
     Attributes:
         kind: plugin type and configuration group, such as `sampler/path`.
         name: name of the option in the group, such as `eikonal`.
-        cls: the class.
+        cls: the class, or a function that returns an instance.
         hints: annotations of the settings, see `nerfro.registry.allowed`.
         defaults: defaults of the settings; `MISSING` for required ones.
         parts: other constructor parameters; the caller of `build` passes the values.
@@ -86,7 +86,7 @@ class Plugin:
 
     kind: str
     name: str
-    cls: type
+    cls: Any
     hints: Mapping[str, Any]
     defaults: Mapping[str, Any]
     parts: frozenset[str]
@@ -125,12 +125,12 @@ CHECKS: dict[str, Callable[[str, type], None]] = {}
 _discovered: set[str] = set()
 
 
-def register(kind: str, name: str) -> Callable[[type[Part]], type[Part]]:
-    """Register a class as option `name` of a plugin type; used as a decorator.
+def register(kind: str, name: str) -> Callable[[Part], Part]:
+    """Register a class, or a function that returns an instance, as option `name` of a plugin type.
 
-    The signature of the constructor becomes the configuration. Parameters annotated with int, float, bool, str, their
-    optional, list and dict forms or `Literal` are configuration. The caller of `build` passes all other parameters.
-    Values outside the annotated ranges are refused (`nerfro.registry.allowed`).
+    The signature of the constructor or function becomes the configuration. Parameters annotated with int, float, bool,
+    str, their optional, list and dict forms or `Literal` are configuration. The caller of `build` passes all other
+    parameters. Values outside the annotated ranges are refused (`nerfro.registry.allowed`).
 
     Args:
         kind: plugin type, one of `KINDS`.
@@ -141,14 +141,14 @@ def register(kind: str, name: str) -> Callable[[type[Part]], type[Part]]:
     """
     _require_kind(kind)
 
-    def wrap(cls: type[Part]) -> type[Part]:
+    def wrap(cls: Part) -> Part:
         add(kind, name, cls)
         return validated(f"{kind}={name}")(cls)
 
     return wrap
 
 
-def add(kind: str, name: str, cls: type) -> None:
+def add(kind: str, name: str, cls: Any) -> None:
     """Register a class of another package under a name; see `register`."""
     _require_kind(kind)
     taken = _plugins.get((kind, name))
@@ -206,18 +206,15 @@ def build(node: object, **parts: object) -> Any:
     return create(plugin, node, **{name: parts[name] for name in plugin.parts if name in parts})
 
 
-def check_node(node: object) -> type:
-    """Check the configuration node of a plugin, except for unresolved interpolations, and return the plugin class.
+def check_node(node: object) -> Any:
+    """Check the configuration node of a plugin, and return the plugin class.
 
     Raises:
         NerfroError: as `build`.
     """
     node = _settings_of(node)
     plugin = plugin_of(node)
-    written = cast(dict[str, Any], OmegaConf.to_container(node))
-    derived = {name for name in written if OmegaConf.is_interpolation(node, name)}
-    values = settings_of(plugin, written | dict.fromkeys(derived))
-    convert(f"{plugin.kind}={plugin.name}: ", plugin.hints, {name: values[name] for name in values.keys() - derived})
+    configure(plugin, node)
     return plugin.cls
 
 
@@ -276,7 +273,7 @@ def create(plugin: Plugin, node: DictConfig | Mapping[str, object], **parts: obj
     return made
 
 
-def _attributes(cls: type) -> tuple[str, ...]:
+def _attributes(cls: Any) -> tuple[str, ...]:
     """Names of configurable class attributes, such as the weight of a loss."""
     return getattr(cls, "SETTINGS", ())
 
@@ -299,7 +296,7 @@ def _targets(node: object) -> Iterator[object]:
 
 
 def configure(plugin: Plugin, node: DictConfig | Mapping[str, object]) -> dict[str, Any]:
-    """Check the configuration node of a plugin without unresolved interpolations, and return the converted settings.
+    """Check the configuration node of a plugin, and return the converted settings.
 
     Raises:
         NerfroError: a setting is unknown or missing, or its value is not allowed.
@@ -401,7 +398,7 @@ def _import_plugin(module: str, where: str) -> None:
         raise NerfroError(f"plugin {where} cannot be imported: {type(error).__name__}: {error}") from error
 
 
-def _make_plugin(kind: str, name: str, cls: type) -> Plugin:
+def _make_plugin(kind: str, name: str, cls: Any) -> Plugin:
     hints, defaults, parts = {}, {}, set()
     for parameter, hint in _parameters(cls):
         if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
@@ -417,12 +414,14 @@ def _make_plugin(kind: str, name: str, cls: type) -> Plugin:
     return Plugin(kind, name, cls, hints, defaults, frozenset(parts))
 
 
-def _parameters(cls: type) -> list[tuple[inspect.Parameter, Any]]:
-    """Return the parameters of a constructor with their annotations.
+def _parameters(cls: Any) -> list[tuple[inspect.Parameter, Any]]:
+    """Return the parameters of a constructor or function with their annotations.
 
     A constructor with `**options` also has the parameters of the base class constructor.
     """
     parameters: dict[str, tuple[inspect.Parameter, Any]] = {}
+    if not isinstance(cls, type):
+        return [(own, hints_of(cls).get(name)) for name, own in inspect.signature(cls).parameters.items()]
     for base in inspect.getmro(cls):
         # Classes without their own constructor have no configuration; the signature of nn.Module is generic. The class
         # is compared by name, because this module must not import torch.

@@ -18,8 +18,10 @@ from nerfro.camera.given import GivenCamera
 from nerfro.core.draws import Draws
 from nerfro.core.rays import Rays
 from nerfro.core.types import Exits, Path, Rendering
+from nerfro.data.component import Component
 from nerfro.fields.base import Field
 from nerfro.geometry.interpolation import intersect_box
+from nerfro.geometry.space import Space, Unbounded
 from nerfro.media.base import Medium
 from nerfro.registry.allowed import validated
 from nerfro.rendering.colour_space import ColourSpace
@@ -39,6 +41,7 @@ class Components:
         make_field: makes a new radiance field; a model with several sampling levels has a field for each.
         background: background radiance, from beyond the volume.
         camera: estimate of the training cameras.
+        space: space that fields and samples cover.
         chunk_size: number of rays rendered at once in evaluation, which limits the memory.
     """
 
@@ -48,6 +51,7 @@ class Components:
     make_field: Callable[[], Field]
     background: Background
     camera: CameraModel = dataclasses.field(default_factory=GivenCamera)
+    space: Space = dataclasses.field(default_factory=Unbounded)
     chunk_size: int = 8192
 
 
@@ -71,7 +75,7 @@ class RenderedRays:
 
 
 @validated("model")
-class Renderer(nn.Module, ABC):
+class Renderer(Component, nn.Module, ABC):
     """Render rays through a scene. Models derive from this class and implement `render_path`.
 
     Args:
@@ -95,7 +99,7 @@ class Renderer(nn.Module, ABC):
         super().__init__()
         fields = [components.make_field() for _ in range(num_fields)]
         medium, background, camera = components.medium, components.background, components.camera
-        self.scene = Scene(medium, fields, background, camera, ColourSpace(colour))
+        self.scene = Scene(medium, fields, background, camera, ColourSpace(colour), components.space)
         self.path_sampler, self.point_sampler = components.path_sampler, components.point_sampler
         self.chunk_size = components.chunk_size
 

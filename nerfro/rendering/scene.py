@@ -10,8 +10,10 @@ from torch import nn
 from nerfro.backgrounds.base import Background
 from nerfro.camera.base import CameraModel
 from nerfro.camera.given import GivenCamera
+from nerfro.core.cameras import Cameras
 from nerfro.core.errors import NerfroError
 from nerfro.fields.base import Field
+from nerfro.geometry.space import Space, Unbounded
 from nerfro.media.base import Medium
 from nerfro.rendering.colour_space import ColourSpace
 
@@ -25,6 +27,7 @@ class Scene(nn.Module):
         background: background radiance, from beyond the volume.
         camera: estimate of the training cameras; by default the cameras of the data set.
         colour_space: colour space of the radiance of fields and background.
+        space: space that the fields cover.
 
     Raises:
         NerfroError: exposures are learned, which needs linear radiance, but the colour space is sRGB.
@@ -37,8 +40,10 @@ class Scene(nn.Module):
         background: Background,
         camera: CameraModel | None = None,
         colour_space: ColourSpace = ColourSpace.LINEAR,
+        space: Space | None = None,
     ) -> None:
         super().__init__()
+        self.space = Unbounded() if space is None else space
         self.camera = GivenCamera() if camera is None else camera
         self.medium, self.fields, self.background = medium, nn.ModuleList(fields), background
         self.colour_space = colour_space
@@ -53,6 +58,12 @@ class Scene(nn.Module):
             f"Scene(medium={self.medium}, fields=[{fields}], background={type(self.background).__name__}, "
             f"camera={type(self.camera).__name__}, {self.colour_space.value}, {num_parameters:,} parameters)"
         )
+
+    def begin(self, cameras: Cameras) -> None:
+        """Prepare cameras and fields for training on photographs of these cameras of the data set."""
+        self.camera.begin(cameras)
+        for field in self.fields:
+            field.begin(cameras)  # type: ignore[operator]
 
     @property
     def device(self) -> torch.device:
@@ -72,13 +83,14 @@ class Scene(nn.Module):
             `cameras.exposure`, and further parameters of cameras.
         """
         parts = {"fields": self.fields, "background": self.background}
-        found = {f"{part}.{name}": own for part, module in parts.items() for name, own in module.named_parameters()}
-        return found | self.medium.parameters_by_name() | self.camera.parameters_by_name()
+        own = {f"{part}.{name}": value for part, module in parts.items() for name, value in module.named_parameters()}
+        return own | self.medium.parameters_by_name() | self.camera.parameters_by_name()
 
     def path_parameters(self) -> list[nn.Parameter]:
         """Return the parameters on which paths depend: of the cameras, and of the index and surfaces of the medium."""
-        found = self.medium.parameters_by_name() | self.camera.parameters_by_name()
-        return [own for name, own in found.items() if not name.endswith((".material.absorption", "cameras.exposure"))]
+        parameters = self.medium.parameters_by_name() | self.camera.parameters_by_name()
+        fixed = ".material.absorption", "cameras.exposure"
+        return [value for name, value in parameters.items() if not name.endswith(fixed)]
 
     def measurements(self) -> dict[str, float]:
         """Return learned physical quantities, such as refractive indices, by name, for the log."""

@@ -17,7 +17,7 @@ from nerfro.core.paths import EMBEDDED_PREFIX, user_path
 from nerfro.core.provenance import AlgorithmSettings, command_line, versions
 from nerfro.files.atomic import write_atomically
 from nerfro.files.reading import read_json
-from nerfro.media.bodies import BodySettings
+from nerfro.media.body_settings import BodySettings, expanded
 from nerfro.registry.allowed import Count, validate
 
 SCENE = "scene.json"
@@ -69,15 +69,9 @@ class SceneFile:
 
     @property
     def short(self) -> dict[str, object] | None:
-        """Settings of the medium if every body has only mesh and index; None for other bodies."""
-        plain = [BodySettings(mesh=body.mesh, ior=body.ior) for body in self.bodies.values()]
-        if plain != list(self.bodies.values()) or any(body.ior is None for body in plain[1:]):
-            return None
-        outer, inner = plain[:1], plain[1:]
-        settings: dict[str, object] = {name: value for body in outer for name, value in _given(body).items()}
-        if inner:
-            settings |= {"inner_meshes": [body.mesh for body in inner], "inner_iors": [body.ior for body in inner]}
-        return settings
+        """Settings of the medium for at most one body that has only mesh and index; None for other bodies."""
+        settings = [_given(body) for body in self.bodies.values()] or [{}]
+        return settings[0] if len(settings) == 1 and settings[0].keys() <= {"mesh", "ior"} else None
 
     def settings(self, *, data_type: str | None = None, medium: str | None = None) -> dict[str, object]:
         """Return the settings of the groups `data` and `medium` by their full names.
@@ -154,16 +148,7 @@ class SceneFile:
 
 def take_bodies(medium: dict[str, Any]) -> dict[str, BodySettings]:
     """Remove the bodies from the settings of a medium, and return them."""
-    mesh, ior, inner, iors = (medium.pop(name, None) for name in ("mesh", "ior", "inner_meshes", "inner_iors"))
-    named = medium.pop("bodies", None)
-    if named is not None:
-        return {
-            name: BodySettings(**({} if "surface" in body else {"mesh": mesh}) | body) for name, body in named.items()
-        }
-    bodies = {"object": BodySettings(mesh=mesh, ior=ior)}
-    for number, (mesh, ior) in enumerate(zip(inner or [], iors or [], strict=True), 1):
-        bodies[f"inner_{number}"] = BodySettings(mesh=mesh, ior=ior)
-    return bodies
+    return expanded({name: medium.pop(name, None) for name in ("mesh", "ior", "bodies")})
 
 
 def read_scene_file(path: Path) -> SceneFile:

@@ -137,17 +137,14 @@ def _view(
     metric, name, reference = image_metrics()[selection.metric], references.names[index], references.images[index]
     predictions, errors = {}, {}
     for number, run in runs.items():
-        image, title = _prediction(run, index), titles[number]
+        image = load_png(run.scores / "images" / f"{run.metrics.result.views[index].name}.png")
+        title = titles[number]
         value = _score(run, index, selection)
         score = f"{metric.title} {MISSING if value is None else f'{value:.{metric.decimals}f}'}"
         error = squared_error_colours(image, reference)
         predictions[number] = PageImage(f"{title}, view {index}", score, embed_image(image))
         errors[number] = PageImage(f"squared error of {title}, view {index}", score, embed_image(error))
     return View(index, name, PageImage(f"reference, view {index}", "", embed_image(reference)), predictions, errors)
-
-
-def _prediction(run: EvaluatedRun, index: int) -> Float[Tensor, "H W 3"]:
-    return load_png(run.scores / "images" / f"{run.metrics.result.views[index].name}.png")
 
 
 def embed_image(rgb: Float[Tensor, "H W 3"]) -> str:

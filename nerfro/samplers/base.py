@@ -11,9 +11,11 @@ from torch import Tensor, nn
 
 from nerfro.core.draws import Draws
 from nerfro.core.types import Path, Rays, Rendering, Samples
+from nerfro.data.component import Component
 from nerfro.fields.base import Field
 from nerfro.media.base import Medium
 from nerfro.samplers.paths.branching import ONE_PATH
+from nerfro.samplers.paths.polylines import SnellTrace
 
 
 class PathSampler(nn.Module, ABC):
@@ -21,11 +23,16 @@ class PathSampler(nn.Module, ABC):
 
     Attributes:
         needs_medium: whether the sampler queries the medium; otherwise no medium is built.
+        traces_triangles: whether the sampler intersects the triangles of bodies instead of their signed distances.
         branching: rule that selects the branches of partly reflected light.
+        max_events, wavelengths: settings of the interactive page, which traces rays as `snell` does.
     """
 
     needs_medium = True
+    traces_triangles = False
     branching = ONE_PATH
+    max_events = 16
+    wavelengths: Sequence[float] = (610.0, 550.0, 465.0)
 
     @abstractmethod
     def forward(self, rays: Rays, medium: Medium) -> Path:
@@ -38,6 +45,12 @@ class PathSampler(nn.Module, ABC):
         Returns:
             P polylines, at least one for each ray. Bent paths end outside of the medium, beyond far if necessary.
         """
+
+    def trace(self, rays: Rays, medium: Medium) -> SnellTrace:
+        """Trace rays, and count the events of each polyline; samplers without sharp surfaces count none."""
+        path = self(rays, medium)
+        none = torch.zeros_like(path.ray)
+        return SnellTrace(path, none, none.bool())
 
     def trace_main(self, rays: Rays, medium: Medium) -> Path:
         """Trace only the first polyline of each ray, which is enough to find the exit directions."""
@@ -59,7 +72,7 @@ class PathSampler(nn.Module, ABC):
         return False
 
 
-class PointSampler(nn.Module, ABC):
+class PointSampler(Component, nn.Module, ABC):
     """Choose arc lengths on a path.
 
     Attributes:

@@ -12,6 +12,7 @@ import itertools
 import math
 import pickle
 import tempfile
+import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path as FilePath
@@ -31,10 +32,13 @@ from nerfro.data.base import DataSource, Views
 from nerfro.evaluation.image_metrics import ImageMetric
 from nerfro.fields.base import Field
 from nerfro.fields.hash_grid import HashGridField
+from nerfro.geometry.space import Box
 from nerfro.losses.base import Loss
 from nerfro.media.base import Medium
-from nerfro.media.shapes import Ball
+from nerfro.media.bodies import Bodies, Body, GridSettings
+from nerfro.media.material import Material
 from nerfro.media.surface import Grid, Surface
+from nerfro.media.surfaces.ball import BallSurface
 from nerfro.models.refractive import RefractiveModel
 from nerfro.registry.registration import Plugin, build
 from nerfro.rendering import Components, Renderer, composite
@@ -67,10 +71,12 @@ def check(plugin: Plugin, fields: Mapping[str, object] | None = None) -> None:
     """
     _require(bool(plugin.summary), "the class has no docstring, which `python -m nerfro.plugins` shows")
     base, check_contract = _CONTRACTS[plugin.kind]
-    _require(issubclass(plugin.cls, base), f"a {plugin.kind} derives from {base.__module__}.{base.__name__}")
-    missing = sorted(getattr(plugin.cls, "__abstractmethods__", ()))
+    made = plugin.cls if isinstance(plugin.cls, type) else typing.get_type_hints(plugin.cls)["return"]
+    _require(issubclass(made, base), f"a {plugin.kind} derives from {base.__module__}.{base.__name__}")
+    missing = sorted(getattr(made, "__abstractmethods__", ()))
     _require(not missing, f"{plugin.cls.__name__} lacks {', '.join(missing)}")
-    built = build({"_target_": plugin.target, **(fields or {})}, components=example_components())
+    node = {"_target_": plugin.target, **(fields or {})}
+    built = build(node, components=example_components(), space=example_space())
     with _named(f"{plugin.kind}={plugin.name}"):
         check_contract(built)
 
@@ -87,6 +93,11 @@ def _named(plugin: str) -> Iterator[None]:
         raise ContractError(f"contract broken: {plugin} raised {type(error).__name__}: {first_line}") from error
 
 
+def example_space() -> Box:
+    """Return a cube of side 2 around the origin."""
+    return Box([[-1.0] * 3, [1.0] * 3])
+
+
 def example_rays(num_rays: int = NUM_RAYS) -> Rays:
     """Return rays from around the unit cube towards the cube; many meet a ball of radius 0.8."""
     generator = torch.Generator().manual_seed(7)
@@ -97,9 +108,14 @@ def example_rays(num_rays: int = NUM_RAYS) -> Rays:
     return Rays(origins, directions, 1e-3 * like, 2 * like, 6 * like)
 
 
+def _example_ball() -> Bodies:
+    ball = Body("ball", BallSurface(0.8), Material(1.5))
+    return Bodies([ball], grid=GridSettings(resolution=32))
+
+
 def example_path(num_rays: int = NUM_RAYS, branches: Literal["none", "all"] = "none") -> Path:
     """Return paths through a glass ball; with `branches="all"`, rays split at its surface."""
-    return Snell(branches=branches)(example_rays(num_rays), Ball())
+    return Snell(branches=branches)(example_rays(num_rays), _example_ball())
 
 
 def example_samples(path: Path | None = None) -> Samples:
@@ -184,8 +200,7 @@ def check_export(name: str) -> None:
         not isinstance(endings, str) and len(endings) > 0 and all(e == e.lower() and e[:1] == "." for e in endings),
         f"suffixes={endings!r} are not a tuple of endings in lower case with a dot, such as ('.csv',)",
     )
-    box = torch.tensor([[-1.0] * 3, [1.0] * 3])
-    scene = TrainedScene(example_run().renderer.eval(), _ExampleData(), content=box)
+    scene = TrainedScene(example_run().renderer.eval(), _ExampleData())
     with tempfile.TemporaryDirectory() as folder:
         out = FilePath(folder, f"scene{endings[0]}")
         config = ExportConfig(checkpoint="-", what=name, out=str(out))
@@ -260,7 +275,7 @@ def _check_camera(camera: CameraModel) -> None:
 
 def _check_path_sampler(sampler: PathSampler) -> None:
     rays = example_rays()
-    path = sampler(rays, Ball())
+    path = sampler(rays, _example_ball())
     _require_type(path, Path)
     num_vertices = path.s.shape[1]
     _require(num_vertices >= 2, "a path has two vertices or more")
@@ -455,13 +470,14 @@ _CONTRACTS: dict[str, tuple[type, Callable[[Any], None]]] = {
 def example_components() -> Components:
     """Return the components of a small model with straight rays and a black background."""
     return Components(
-        medium=Ball(),
+        medium=_example_ball(),
         path_sampler=Straight(),
         point_sampler=Stratified(8),
         make_field=lambda: HashGridField(
-            num_levels=2, log2_table_size=8, width=16, initial_depth=1.0, precision="float32"
+            example_space(), num_levels=2, log2_table_size=8, width=16, initial_depth=1.0, precision="float32"
         ),
         background=ConstantBackground(),
+        space=example_space(),
     )
 
 

@@ -18,8 +18,17 @@ from nerfro.data.base import DataSource, Views
 from nerfro.rendering import Renderer
 from nerfro.rendering.scene_file import SceneFile, with_scene
 from nerfro.samplers.paths.thin_walls import warn_of_thin_walls
-from nerfro.training.config import TrainConfig, build_data, build_each, build_model, check_run, resolve_trainer_options
+from nerfro.training.config import (
+    TrainConfig,
+    build_data,
+    build_each,
+    build_medium,
+    build_model,
+    check_run,
+    resolve_trainer_options,
+)
 from nerfro.training.data_module import RayDataModule, traced
+from nerfro.training.derivation import derived
 from nerfro.training.effects import settings_without_effect
 from nerfro.training.memory import require_memory
 from nerfro.training.module import TrainingModule
@@ -84,12 +93,14 @@ class Training:
     Attributes:
         source: the data set.
         views: its training views.
+        config: complete configuration of the run.
         module: the module, which contains the model as `module.renderer`.
         data: batches of training pixels, and validation views.
     """
 
     source: DataSource
     views: Views
+    config: DictConfig
     module: TrainingModule
     data: RayDataModule
 
@@ -104,17 +115,20 @@ class Training:
             NerfroError: a component cannot be built, or medium and data set have different origins.
         """
         seed_everything(config.seed, verbose=False)
-        resolve_trainer_options(config)
+        config = resolve_trainer_options(config)
         source = build_data(config)
         views = source.load("train")
         return cls(source, views, *_build(config, source, views))
 
 
-def _build(config: DictConfig, source: DataSource, training: Views) -> tuple[TrainingModule, RayDataModule]:
+def _build(config: DictConfig, source: DataSource, training: Views) -> tuple[DictConfig, TrainingModule, RayDataModule]:
+    """Build the module and the data of a run, and derive its missing settings."""
     validation = source.load("val").checked() if config.evaluation.every > 0 and "val" in source.splits else None
     batches = RayBatches.of(training, config)
-    renderer = build_model(config, training)
-    medium = renderer.scene.medium
+    medium = build_medium(config)
+    config = derived(config, medium, training)
+    renderer = build_model(config, medium)
+    renderer.scene.begin(training.cameras)
     if renderer.path_sampler.needs_medium and (medium.origin != source.origin).any():
         raise NerfroError(
             f"{type(medium).__name__} has its origin at {medium.origin.tolist()}, and the data set at "
@@ -124,7 +138,7 @@ def _build(config: DictConfig, source: DataSource, training: Views) -> tuple[Tra
         traced(batches, renderer, config), validation, config.evaluation.every, config.trainer.overfit_batches
     )
     schedule = Schedule(build_each("phase", config.phase), training)
-    return TrainingModule.of(renderer, config, [schedule], training.cameras), data
+    return config, TrainingModule.of(renderer, config, [schedule], training.cameras), data
 
 
 def check_before_training(renderer: Renderer, batches: RayBatches, device: torch.device) -> str:

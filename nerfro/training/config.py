@@ -17,12 +17,13 @@ from omegaconf.errors import OmegaConfBaseException
 
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import CONF_DIR, resolve_path, scene_name
-from nerfro.data.base import DataSource, Views
+from nerfro.data.base import DataSource
 from nerfro.data.validation_views import WithValidationViews
 from nerfro.evaluation.results import Region
 from nerfro.geometry.box import corners_of_box
 from nerfro.media.analytic import Vacuum
-from nerfro.media.bodies import origin_of
+from nerfro.media.base import Medium
+from nerfro.media.body_settings import origin_of
 from nerfro.registry.allowed import (
     Count,
     Names,
@@ -37,13 +38,21 @@ from nerfro.registry.allowed import (
     untyped,
     validate,
 )
-from nerfro.registry.registration import build, check_node, configure, create, find, plugins, require_lightning
+from nerfro.registry.registration import (
+    build,
+    check_node,
+    configure,
+    create,
+    find,
+    plugin_of,
+    plugins,
+    require_lightning,
+)
 from nerfro.rendering import Components, Renderer
 from nerfro.samplers.subdivision import Subdivision
-from nerfro.training.angular_resolution import derive_angular_resolution
-from nerfro.training.backdrop import derive_backdrop
-from nerfro.training.content import ContentConfig, derive_content, derive_unit, require_contraction
+from nerfro.training.content import ContentConfig, require_box, space_of
 from nerfro.training.optimizer import OptimizerConfig
+from nerfro.training.settings import with_values
 
 MetricName = Annotated[str, Names(lambda: [plugin.name for plugin in plugins("metric")])]  # of a region: mask.NAME
 
@@ -272,7 +281,7 @@ def check_trained(config: DictConfig, origin: Path) -> DictConfig:
         validate(TrainConfig, plain(typed))
         content = typed.content
         if content.box_min is not None or content.box_max is not None:
-            corners_of_box(content.box_min or [], content.box_max or [], bounded=False)
+            corners_of_box(content.box_min or [], content.box_max or [])
     except (OmegaConfBaseException, OverflowError, NerfroError) as error:
         reason = " ".join(str(error).split())
         raise NerfroError(f"{origin} has a configuration that nerfro.train does not write: {reason}") from error
@@ -300,17 +309,16 @@ def check_run(config: DictConfig) -> None:
     for name, node in config.callbacks.items():
         configure(find("callbacks", str(name)), node or {})
     for plugin_type in ("loss", "phase"):
-        build_each(plugin_type, config[plugin_type], known=False)
+        build_each(plugin_type, config[plugin_type])
     for node in (config.data, config.camera, config.sampler.points, config.field, config.background, config.model):
         check_node(node)
     if check_node(config.sampler.path).needs_medium:  # type: ignore[attr-defined]
         check_node(config.medium)
-    require_contraction(config)
+    require_box(config)
     if config.background.get("image") and config.model.get("colour") == "srgb":
         raise NerfroError(
             "background.image holds linear radiance, but fields and background have sRGB values with "
-            "model.colour=srgb; "
-            "take model.colour=linear"
+            "model.colour=srgb; take model.colour=linear"
         )
     if limit is None and config.trainer.max_steps < 0 and not (config.debug or config.trainer.fast_dev_run):
         raise NerfroError("the run would never end; set trainer.max_time, such as 5m, trainer.max_steps, or both")
@@ -334,19 +342,18 @@ def clock_time(duration: object) -> object:
     return f"{seconds // 86400:02d}:{seconds // 3600 % 24:02d}:{seconds // 60 % 60:02d}:{seconds % 60:02d}"
 
 
-def resolve_trainer_options(config: DictConfig) -> None:
+def resolve_trainer_options(config: DictConfig) -> DictConfig:
     """Convert `max_time`, and shorten the run to a few steps and one scored view for `debug` or `fast_dev_run`."""
-    config.trainer.max_time = clock_time(config.trainer.max_time)
+    values: dict[str, Any] = {"trainer.max_time": clock_time(config.trainer.max_time)}
     fast = config.trainer.fast_dev_run
-    if not (config.debug or fast):
-        return
-    steps = 10 if config.debug else int(fast)
-    config.trainer.max_steps, config.trainer.limit_test_batches = steps, 1
-    for phase in config.phase.values():
-        if phase and "steps" in phase:
-            phase["steps"] = min(phase["steps"], steps)
-    config.evaluation.every = steps
-    config.evaluation.subdivision.side = 1
+    if config.debug or fast:
+        steps = 10 if config.debug else int(fast)
+        values |= {"trainer.max_steps": steps, "trainer.limit_test_batches": 1}
+        values |= {"evaluation.every": steps, "evaluation.subdivision.side": 1}
+        for name, phase in config.phase.items():
+            if phase and "steps" in phase:
+                values[f"phase.{name}.steps"] = min(phase["steps"], steps)
+    return with_values(config, values)
 
 
 def training_device(config: DictConfig) -> str:
@@ -373,13 +380,12 @@ def build_data(config: DictConfig) -> DataSource:
     return WithValidationViews(source, number) if number else source
 
 
-def build_each(plugin_type: str, nodes: DictConfig, known: bool = True) -> dict[str, Any]:
+def build_each(plugin_type: str, nodes: DictConfig) -> dict[str, Any]:
     """Build the plugins of a type of which a run may have several, from the nodes `TYPE.<registered name>`.
 
     Args:
         plugin_type: type of the plugins, such as `loss`.
         nodes: configuration nodes of all plugins.
-        known: whether interpolations in the nodes can be resolved; otherwise such settings keep their defaults.
 
     Raises:
         NerfroError: there is no loss, or a node does not fit its plugin.
@@ -394,44 +400,37 @@ def build_each(plugin_type: str, nodes: DictConfig, known: bool = True) -> dict[
             raise NerfroError(
                 f"{plugin_type}.{name}={node} is not a set of settings; write {plugin_type}.{name}.{setting}={node}"
             )
-        if not known:
-            node = {field: node[field] for field in node if not OmegaConf.is_interpolation(node, field)}
         built[name] = create(find(plugin_type, name), node)
     return built
 
 
-def build_model(config: DictConfig, training: Views | None = None) -> Renderer:
-    """Compose the model of a configuration, and derive missing settings from the data.
+def build_medium(config: DictConfig) -> Medium:
+    """Build the medium of a run, which is empty if the path sampler needs none."""
+    needs_medium = plugin_of(config.sampler.path).cls.needs_medium  # type: ignore[attr-defined]
+    medium: Medium = build(config.medium) if needs_medium else Vacuum()
+    return medium
+
+
+def build_model(config: DictConfig, medium: Medium | None = None) -> Renderer:
+    """Compose the model of a complete configuration, see `derivation.derived`.
 
     Args:
-        config: configuration of the run, see `TrainConfig`; it is changed.
-        training: training views; None to restore a checkpoint, which contains the estimated cameras and exposures.
+        config: configuration of the run, see `TrainConfig`.
+        medium: medium of the run; None to build it.
 
     Raises:
         NerfroError: a component cannot be built.
     """
-    path_sampler = build(config.sampler.path)
-    medium = build(config.medium) if path_sampler.needs_medium else Vacuum()
-    # The order matters: the field is built for the derived space, and a plain backdrop replaces the background whose
-    # resolution would be derived.
-    derive_content(config, medium, None if training is None else training.cameras)
-    camera = build(config.camera)
-    if training is not None:
-        derive_backdrop(config, training.images)
-        derive_angular_resolution(config, training.cameras)
-        derive_unit(config, training.cameras)
-        camera.begin(training.cameras)
+    space = space_of(config.content)
     components = Components(
-        medium=medium,
-        path_sampler=path_sampler,
-        point_sampler=build(config.sampler.points),
-        make_field=lambda: build(config.field),
+        medium=build_medium(config) if medium is None else medium,
+        path_sampler=build(config.sampler.path),
+        point_sampler=build(config.sampler.points, space=space),
+        make_field=lambda: build(config.field, space=space),
         background=build(config.background),
-        camera=camera,
+        camera=build(config.camera),
+        space=space,
         chunk_size=config.evaluation.chunk_size,
     )
-    renderer = build(config.model, components=components)
-    if training is not None:
-        for field in renderer.scene.fields:
-            field.begin(training.cameras)
+    renderer: Renderer = build(config.model, components=components)
     return renderer

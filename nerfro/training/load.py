@@ -14,6 +14,7 @@ from nerfro.registry.registration import discover
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.training.config import build_data
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint, restore
+from nerfro.training.settings import with_values
 from nerfro.viewing.trained_scene import TrainedScene
 
 
@@ -30,8 +31,7 @@ def load(run: str | Path, device: str = "auto", root: str | Path | None = None) 
     """
     discover()
     checkpoint, config = load_checkpoint(checkpoint_of(run))
-    if root is not None:
-        config.data.root = str(root)
+    config = config if root is None else with_values(config, {"data.root": str(root)})
     return scene_of(checkpoint, config, find_device(device))
 
 
@@ -44,8 +44,4 @@ def checkpoint_of(run: str | Path) -> Path:
 def scene_of(checkpoint: dict[str, Any], config: DictConfig, device: torch.device) -> TrainedScene:
     """Build the scene of a checkpoint from a configuration, whose data and evaluation may differ from training."""
     renderer = restore(checkpoint, config).to(device)
-    corners = [config.content.box_min, config.content.box_max]  # derived by `build_model`
-    content = None if None in corners else torch.tensor([list(corner) for corner in corners])
-    return TrainedScene(
-        renderer, build_data(config), Subdivision(**config.evaluation.subdivision), config.name, content
-    )
+    return TrainedScene(renderer, build_data(config), Subdivision(**config.evaluation.subdivision), config.name)

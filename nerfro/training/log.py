@@ -23,7 +23,6 @@ from nerfro.evaluation.error_maps import triptych
 from nerfro.evaluation.path_plot import image_of_paths
 from nerfro.files.lat_long import directions
 from nerfro.files.reading import reading
-from nerfro.media.analytic import Vacuum
 from nerfro.rendering import Scene
 from nerfro.training.module import TrainingModule
 
@@ -112,7 +111,7 @@ class TrainingLog(Callback):
             "val/depth_opacity": _to_8bit(maps),
             "val/sky": sky(renderer.scene),
         }
-        if not isinstance(renderer.scene.medium, Vacuum):
+        if not renderer.scene.medium.is_vacuum:
             shown = torch.linspace(0, len(rays) - 1, min(_NUM_PATHS, len(rays))).long().to(rays.origins.device)
             images["val/paths"] = image_of_paths(renderings[-1].path.select_rays(shown), renderer.scene.medium)
         for logger in loggers:

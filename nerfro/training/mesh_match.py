@@ -19,7 +19,6 @@ from nerfro.geometry.lines import nearest_point
 from nerfro.geometry.mesh import TriangleMesh, num_decimals
 from nerfro.geometry.orientation import area_vectors
 from nerfro.media.base import Medium
-from nerfro.media.sdf_grid import SdfGrid
 from nerfro.silhouettes.silhouettes import PixelBlocks
 
 _NUM_VIEWS, _MAX_PIXELS = 8, 32
@@ -54,9 +53,9 @@ def require_match(medium: Medium, views: Views) -> None:
     """
     indices, _ = medium(views.cameras.camera_to_world[:, :, 3].to(medium.box))
     inside = bool((indices != 1).all())
-    comparison = None
-    if isinstance(medium, SdfGrid) and medium.meshes and views.masks is not None:
-        comparison = _Comparison.of(medium.outline, views, medium.origin)
+    comparison, outline = None, medium.outline
+    if outline is not None and views.masks is not None:
+        comparison = _Comparison.of(outline, views, medium.origin)
     agreement = 1.0 if comparison is None else comparison.agreement(_SAME)
     if not inside and agreement >= _DOUBTFUL:
         return
@@ -97,10 +96,10 @@ class _Comparison(NamedTuple):
     @classmethod
     def of(cls, mesh: TriangleMesh, views: Views, origin: Float[np.ndarray, "3"]) -> _Comparison | None:
         """Reduce the masks of some views; None if all are empty or full, or without Embree."""
-        chosen = views.select(views.spread(_NUM_VIEWS))
-        blocks = PixelBlocks(chosen.cameras, _MAX_PIXELS)
-        assert chosen.masks is not None
-        masks = torch.stack([blocks.mean(mask).flatten() for mask in chosen.masks]) > 0.5
+        compared = views.select(views.spread(_NUM_VIEWS))
+        blocks = PixelBlocks(compared.cameras, _MAX_PIXELS)
+        assert compared.masks is not None
+        masks = torch.stack([blocks.mean(mask).flatten() for mask in compared.masks]) > 0.5
         useful = (masks.any(1) & ~masks.all(1)).nonzero()[:, 0].tolist()
         if not useful:
             return None
@@ -108,7 +107,7 @@ class _Comparison(NamedTuple):
             intersector = MeshIntersector(mesh.triangles)
         except NerfroError:
             return None
-        cameras = blocks.cameras(chosen.cameras).select(useful)
+        cameras = blocks.cameras(compared.cameras).select(useful)
         rays = [cameras.image_rays(view) for view in range(len(cameras))]
         origins, directions = (torch.cat([getattr(ray, name) for ray in rays]) for name in ("origins", "directions"))
         return cls(mesh, -origin, intersector, cameras, origins, directions, masks[useful])

@@ -54,7 +54,7 @@ def require_reach(renderer: Renderer, batches: RayBatches, first: Batch) -> None
         if missed < 1:
             break
     box = f"the field's box from {_rounded(bounds[0])} to {_rounded(bounds[1])}"
-    advice = "set content.box_min and content.box_max (or those of field) around what the cameras see"
+    advice = "set content.box_min and content.box_max around what the cameras see"
     if missed == 1:
         raise NerfroError(
             f"no ray of the training views meets {box}, and nothing is outside of it; check that unit, axes and place "

@@ -78,7 +78,8 @@ def run_training(composition: Composition) -> Run:
 def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetrics | None:
     """Train and evaluate; everything that can be refused is refused before training starts."""
     quieten_lightning()
-    training, split = Training.start(config), config.evaluation.split
+    training = Training.start(config)
+    config, split = training.config, config.evaluation.split
     test = training.views if split is None else training.source.load(split).checked()
     test = test.select(range(len(test))[: config.trainer.limit_test_batches])
     metrics, renderer = ImageMetrics(), training.module.renderer

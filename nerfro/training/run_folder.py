@@ -28,8 +28,9 @@ from nerfro.files.foreign_config import foreign_config, read_foreign_config
 from nerfro.files.reading import reading
 from nerfro.kernels.available import fast_bfloat16
 from nerfro.rendering import Renderer
-from nerfro.training import backdrop, content
 from nerfro.training.config import build_model, check_trained, training_device
+from nerfro.training.content import describe
+from nerfro.training.derivation import describe_backdrop
 from nerfro.training.inputs import changed_file, require_same_inputs
 from nerfro.training.settings import RESUMING, first_difference, settings
 
@@ -93,8 +94,8 @@ def begin(folder: Path, config: DictConfig, renderer: Renderer, has_steps: bool)
     for scores in (*folder.glob("metrics.*"), *folder.glob("evaluate_*/metrics.*")) if has_steps else ():
         scores.unlink()
     record(folder, config)
-    found = f"{content.describe(config.content)}{backdrop.describe(config)}"
-    print(f"nerfro: {config.name} on {config.data.root} -> {folder}\n{found}", end="", flush=True)
+    from_data = f"{describe(config)}{describe_backdrop(config)}"
+    print(f"nerfro: {config.name} on {config.data.root} -> {folder}\n{from_data}", end="", flush=True)
 
 
 def next_steps(folder: Path, split: str | None) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from enum import Enum, auto
 from typing import Any
@@ -71,6 +72,14 @@ def role(name: str) -> Role:
 def settings(config: DictConfig | Mapping[str, Any], roles: frozenset[Role]) -> dict[str, Any]:
     """Return the settings of some roles by full name: `{"field": {"width": 64}}` becomes `{"field.width": 64}`."""
     return {name: value for name, value in flat(config, "").items() if role(name) in roles}
+
+
+def with_values(config: DictConfig, values: Mapping[str, Any]) -> DictConfig:
+    """Return a copy of a configuration with other values, by the full names of the settings."""
+    changed = copy.deepcopy(config)
+    for name, value in values.items():
+        OmegaConf.update(changed, name, value, merge=False, force_add=True)
+    return changed
 
 
 def first_difference(old: Mapping[str, Any], new: Mapping[str, Any]) -> str | None:

@@ -26,7 +26,7 @@ from nerfro.files.folder_lock import lock_folder
 from nerfro.files.reading import read_json
 from nerfro.training.inputs import file_hashes
 from nerfro.training.run_folder import CELL_FILE, CONFIG_FILE, in_sweep
-from nerfro.training.settings import RESULT, first_difference, settings
+from nerfro.training.settings import RESULT, first_difference, settings, with_values
 
 # Larger data files are identified by name and size, because reading them would take minutes.
 _MAX_HASHED = 64 * 2**20  # bytes
@@ -47,21 +47,21 @@ def identity_of(config: DictConfig, sweep: Path | None = None) -> dict[str, Any]
     return {"settings": settings(config, RESULT), "data": data, "files": file_hashes(config)}
 
 
-def run_cell(config: DictConfig, folder: Path, train: Callable[[], RunMetrics | None]) -> RunMetrics | None:
+def run_cell(config: DictConfig, folder: Path, train: Callable[[DictConfig], RunMetrics | None]) -> RunMetrics | None:
     """Return the metrics of a run. In a sweep, a finished run in the folder is not trained again.
 
     A cell of a sweep that was interrupted resumes from its checkpoint.
 
     Args:
-        config: configuration of the run; `ckpt_path` is set if the cell resumes.
+        config: configuration of the run.
         folder: folder of the run.
-        train: trains and scores the run.
+        train: trains and scores the run of a configuration, in which `ckpt_path` is set if the cell resumes.
 
     Raises:
         NerfroError: the folder holds a run with other settings or data, or another process trains the cell.
     """
     if not in_sweep():
-        return train()
+        return train(config)
     identity = identity_of(config, Path(HydraConfig.get().sweep.dir))
     with lock_folder(folder, "hydra.sweep.dir"):
         if (folder / CONFIG_FILE).is_file():
@@ -69,10 +69,10 @@ def run_cell(config: DictConfig, folder: Path, train: Callable[[], RunMetrics | 
             if (folder / "metrics.json").is_file():
                 print(f"nerfro: {folder.name} is finished", flush=True)
                 return read_metrics_json(folder / "metrics.json")
-            config.ckpt_path = "last"
+            config = with_values(config, {"ckpt_path": "last"})
         _record(folder, identity)
         try:
-            return train()
+            return train(config)
         except Exception as error:
             _record(folder, {**identity, "reason": in_one_line(error)})
             raise

@@ -16,8 +16,6 @@ from nerfro.viewing.live import LivePage
 from nerfro.viewing.server import PageServer
 from nerfro.viewing.trained_scene import TrainedScene
 
-_LOSS_SECONDS = 1.0  # interval between points of the loss curve; on a GPU, each point waits for the step
-
 
 class Viewer(Callback):
     """Serve the page to this machine if `viewer` is set, with current weights and losses.
@@ -56,7 +54,8 @@ class Viewer(Callback):
     ) -> None:
         if self._server is None or self._live is None:
             return
-        if time.monotonic() - self._last_loss_time > _LOSS_SECONDS:
+        # The loss curve has a point each second; on a GPU, each point waits for the step.
+        if time.monotonic() - self._last_loss_time > 1.0:
             self._last_loss_time = time.monotonic()
             self._server.add_loss(trainer.global_step, float(outputs["loss"]))
         self._live.update()

@@ -17,16 +17,10 @@ from nerfro.backgrounds.base import Background
 from nerfro.core.errors import NerfroError
 from nerfro.core.light import to_srgb
 from nerfro.core.types import Exits
-from nerfro.media.analytic import Vacuum
-from nerfro.media.base import Medium
 from nerfro.media.distance_grid import BLOCK
-from nerfro.media.sdf_grid import SdfGrid
-from nerfro.media.solid import Solid
 from nerfro.rendering import ColourSpace, Renderer
-from nerfro.samplers.paths.snell import Snell
 from nerfro.viewing import packing
 from nerfro.viewing.changes import absorption_of
-from nerfro.viewing.surface import body_on_grid
 from nerfro.viewing.volume import MIN_OPTICAL_DEPTH, Volume
 
 
@@ -48,12 +42,13 @@ def bake_surface(renderer: Renderer) -> Baked:
     Raises:
         NerfroError: the medium has no surface.
     """
-    medium: Medium = renderer.scene.medium
-    if isinstance(medium, Vacuum):
+    medium, sampler = renderer.scene.medium, renderer.path_sampler
+    if medium.is_vacuum:
         return Baked({"iors": [], "dispersion": [], "nested": False, "absorption": [], "numVertices": [2, 2, 2],
                       "low": [[0, 0, 0]], "high": [[1, 1, 1]], "distanceUnits": [1.0], "clearanceUnits": [1.0],
                       "blockCells": BLOCK, "minStep": 1.0, "maxEvents": 0})  # fmt: skip
-    if not isinstance(medium, Solid):
+    bodies = medium.bodies
+    if bodies is None:
         raise NerfroError(
             f"an interactive page shows bodies with a surface, and the index of {type(medium).__name__} varies "
             "in space; render a film of this run, or train with medium=sdf_grid"
@@ -62,29 +57,29 @@ def bake_surface(renderer: Renderer) -> Baked:
     # - Light splits only at the first event, also with `branches: all`. Both parts are followed, whatever their weight.
     # - Surfaces are always the zero levels of signed distances, also with `interface: mesh`.
     # - Each colour channel is traced at one wavelength.
-    snell = renderer.path_sampler if isinstance(renderer.path_sampler, Snell) else Snell()
-    wavelengths = np.reshape(snell.wavelengths, (3, -1))
+    wavelengths = np.reshape(sampler.wavelengths, (3, -1))
     colours = wavelengths[:, wavelengths.shape[1] // 2].tolist()  # the middle band of each channel
-    on_grid = _on_same_grid(medium)
-    solids, bodies = on_grid.packed(), range(len(on_grid.grids))
+    solids, count = bodies.packed(), len(bodies.grids)
     spacing = 1 / solids.inverse_spacing
     # The B-spline of the surface reads distances up to 3.5 cells from the surface. Farther away, rays advance by the
     # clearance of the blocks.
     distance_units = 3.5 * spacing.max(1) / 32767
-    clearance = np.stack([grid.coarse_clearance().double().numpy() for grid in on_grid.grids])
+    clearance = np.stack([grid.coarse_clearance().double().numpy() for grid in bodies.grids])
     clearance_units = clearance.max((1, 2, 3)).clip(min=1e-9) / 255
-    coefficients = solids.coefficients.reshape(len(bodies), *solids.shape[0]).astype(np.float64)
+    coefficients = solids.coefficients.reshape(count, *solids.shape[0]).astype(np.float64)
     # The grids of all bodies follow each other along z.
-    slices = np.concatenate([np.round(coefficients[body] / distance_units[body]).transpose(2, 1, 0) for body in bodies])
+    slices = np.concatenate(
+        [np.round(coefficients[body] / distance_units[body]).transpose(2, 1, 0) for body in range(count)]
+    )
     slices = slices.clip(-32767, 32767).astype(np.int64)
     blocks = np.concatenate(
-        [np.floor(clearance[body] / clearance_units[body] + 1e-9).transpose(2, 1, 0) for body in bodies]
+        [np.floor(clearance[body] / clearance_units[body] + 1e-9).transpose(2, 1, 0) for body in range(count)]
     )
     return Baked(
         {
             "iors": [float(ior) for ior in medium.indices],
-            "dispersion": [[body.dispersion_at(colour) for colour in colours] for body in medium.materials],
-            "nested": medium.nested,
+            "dispersion": [[body.dispersion_at(colour) for colour in colours] for body in bodies.materials],
+            "nested": bodies.nested,
             "absorption": absorption_of(renderer.scene).tolist(),
             "numVertices": solids.shape[0].tolist(),
             "gridSize": list(slices.shape[::-1]),
@@ -95,21 +90,10 @@ def bake_surface(renderer: Renderer) -> Baked:
             "clearanceUnits": clearance_units.tolist(),
             "blockCells": BLOCK,
             "minStep": float(solids.min_step.min()),
-            "maxEvents": snell.max_events,
+            "maxEvents": sampler.max_events,
         },
         {"distances": packing.two_bytes(slices), "clearance": blocks[..., None].astype(np.uint8)},
     )
-
-
-def _on_same_grid(medium: Solid) -> SdfGrid:
-    """Return the bodies on grids with equal numbers of vertices; samples distances in closed form."""
-    if isinstance(medium, SdfGrid) and len({grid.distances.shape for grid in medium.grids}) == 1:
-        return medium
-    if isinstance(medium, SdfGrid):
-        raise NerfroError("an interactive page needs bodies with equal numbers of vertices; build them alike")
-    grids = [body_on_grid(medium, body) for body in range(len(medium.iors))]
-    distances, boxes = ([values.to(medium.box) for values in column] for column in zip(*grids, strict=True))
-    return SdfGrid.from_distances(distances, boxes, medium.indices.tolist(), medium.shell)
 
 
 @torch.inference_mode()
@@ -142,7 +126,7 @@ def bake_volume(volume: Volume, colour_space: ColourSpace) -> Baked:
         volume: samples of the radiance field, with linear radiance.
         colour_space: space in which the model adds up the radiance of a ray.
     """
-    sides = volume.box[1] - volume.box[0]
+    sides = volume.space.box[1] - volume.space.box[0]
     cell = float((sides / (torch.tensor(volume.density.shape) - 1)).min())
     min_density, span = MIN_OPTICAL_DEPTH / cell, math.log(30.0 / MIN_OPTICAL_DEPTH)
     levels = (volume.density.clamp(min=min_density) / min_density).log().div(span).clamp(max=1)
@@ -154,14 +138,14 @@ def bake_volume(volume: Volume, colour_space: ColourSpace) -> Baked:
     occupied = _occupied_bricks(slices[..., 3])
     return Baked(
         {
-            "low": volume.box[0].tolist(),
-            "high": volume.box[1].tolist(),
+            "low": volume.space.box[0].tolist(),
+            "high": volume.space.box[1].tolist(),
             "size": list(volume.density.shape),
             "occupiedSize": list(occupied.shape[::-1]),
             "logDensity": [math.log(min_density), span],
             "maxRadiance": max_radiance,
             "marchStep": 0.7 * cell,
-            "contractionRadius": volume.radius or 0.0,
+            "contractionRadius": volume.space.radius,
         },
         {"colour": slices[..., :3], "density": slices[..., 3:], "occupied": occupied[..., None]},
     )

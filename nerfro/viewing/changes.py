@@ -13,7 +13,6 @@ from nerfro.core.types import FieldValues, Samples
 from nerfro.core.variants import variant
 from nerfro.fields.base import Field
 from nerfro.media.analytic import Vacuum
-from nerfro.media.solid import Solid
 from nerfro.rendering import ColourSpace, Renderer, Scene
 from nerfro.samplers.paths.straight import Straight
 
@@ -52,19 +51,16 @@ def with_indices(renderer: Renderer, ior: Float[Tensor, "*K"]) -> Renderer:
 def with_absorption(renderer: Renderer, absorption: Float[Tensor, "*K 3"]) -> Renderer:
     """Replace the absorption coefficients: three for each body, or three for the first body."""
     medium = renderer.scene.medium
-    if not (isinstance(medium, Solid) and hasattr(medium, "absorption")):
-        raise NerfroError(
-            f"{type(medium).__name__} has no bodies of constant absorption; leave absorption out, or train with "
-            "medium=sdf_grid"
-        )
-    given = _of_bodies(absorption, absorption_of(renderer.scene), "absorption")
-    return with_changed_scene(renderer, medium=medium.with_absorption_coefficients(given.to(renderer.scene.device)))
+    coefficients = absorption_of(renderer.scene)
+    if medium.bodies is not None:
+        absorption = _of_bodies(absorption, coefficients, "absorption").to(renderer.scene.device)
+    return with_changed_scene(renderer, medium=medium.with_absorption_coefficients(absorption))
 
 
 def absorption_of(scene: Scene) -> Float[Tensor, "K 3"]:
     """Return the absorption of red, green and blue in each body, per world unit, on the CPU."""
-    known = getattr(scene.medium, "absorption", None)
-    return torch.zeros(len(scene.medium.indices), 3) if known is None else known.detach().float().cpu()
+    absorption = scene.medium.absorption
+    return torch.zeros(len(scene.medium.indices), 3) if absorption is None else absorption.detach().float().cpu()
 
 
 def without_glass(renderer: Renderer) -> Renderer:
@@ -78,14 +74,15 @@ def without_inside(renderer: Renderer) -> Renderer:
     return with_changed_scene(renderer, fields=nn.ModuleList(EmptyField() for _ in renderer.scene.fields))
 
 
-def _of_bodies(given: Tensor, known: Tensor, name: str) -> Tensor:
+def _of_bodies(values: Tensor, current: Tensor, name: str) -> Tensor:
     """Complete values that are given for each body, or for the first body alone, to values for all bodies."""
-    given = given.to(known)
-    if not len(known):
+    values = values.to(current)
+    if not len(current):
         raise NerfroError(f"{name} cannot be set: the model has no bodies on which rays bend; leave {name} out")
-    if given.shape == known.shape[1:]:
-        given = torch.cat([given[None], known[1:]])
-    allowed, kind = (given > 0, "positive numbers") if name == "ior" else (given >= 0, "numbers that are not negative")
-    if given.shape != known.shape or not (torch.isfinite(given) & allowed).all():
-        raise NerfroError(f"{name}={given.tolist()} is not allowed; give {list(known.shape)} {kind}")
-    return given
+    if values.shape == current.shape[1:]:
+        values = torch.cat([values[None], current[1:]])
+    wanted = "positive numbers" if name == "ior" else "numbers that are not negative"
+    allowed = values > 0 if name == "ior" else values >= 0
+    if values.shape != current.shape or not (torch.isfinite(values) & allowed).all():
+        raise NerfroError(f"{name}={values.tolist()} is not allowed; give {list(current.shape)} {wanted}")
+    return values

@@ -19,6 +19,7 @@ from nerfro.data.base import DataSource, Views
 from nerfro.files.atomic import write_atomically
 from nerfro.files.images import data_uri, to_8bit
 from nerfro.files.templates import fill_template
+from nerfro.geometry.space import Box, Space
 from nerfro.rendering import ColourSpace
 from nerfro.viewing.baking import Baked, bake_sky, bake_surface, bake_volume
 from nerfro.viewing.exports import EXPORTS, Export, ExportConfig
@@ -55,7 +56,7 @@ def bake_parts(
     """Convert everything that training may change: sky, volume and, if `surface` is set, the bodies."""
     renderer = scene.renderer
     parts = {"surface": bake_surface(renderer)} if surface else {}
-    volume = sample_field(scene, resolution, volume_bounds(scene, cameras), progress, contraction_radius(scene))
+    volume = sample_field(scene, resolution, volume_space(scene, cameras), progress)
     return {
         **parts,
         "volume": bake_volume(volume, renderer.scene.colour_space),
@@ -76,14 +77,12 @@ def assemble_page(title: str, static: dict[str, Any], parts: dict[str, Baked], l
 
 def static_parts(scene: TrainedScene, views: Views, split: str) -> dict[str, Any]:
     """Collect the data that is constant during training: cameras, photographs, and the position of the scene."""
-    renderer, cameras, contraction = scene.renderer, views.cameras, contraction_radius(scene)
-    box = renderer.scene.medium.content_box.float().cpu()
+    renderer, cameras = scene.renderer, views.cameras
+    space, box = renderer.scene.space, renderer.scene.medium.content_box.float().cpu()
     if not (box[1] > box[0]).all():
-        box = volume_bounds(scene, cameras)
-        if contraction is not None:  # the undistorted region is half as wide as contracted space
-            box = box.mean(0) + 0.5 * (box - box.mean(0))
+        box = scene.bounds if space.has_box else volume_space(scene, cameras).box
     # Arc length at which the integration along a ray begins.
-    near = float(cameras.near) if contraction is None else float(renderer.point_sampler.near)  # type: ignore[arg-type]
+    near = float(cameras.near if space.near is None else space.near)
     with_photograph = set(range(len(views)))
     if len(views) > _MAX_PHOTOGRAPHS:
         with_photograph = {i * len(views) // _MAX_PHOTOGRAPHS for i in range(_MAX_PHOTOGRAPHS)}
@@ -119,39 +118,29 @@ def _thumbnail(rgb: Float[Tensor, "H W 3"]) -> str:
     return data_uri(np.asarray(image), "JPEG", quality=90)
 
 
-def volume_bounds(scene: TrainedScene, cameras: Cameras) -> Float[Tensor, "2 3"]:
-    """Return the bounds of the volume on the page.
-
-    They are the box of the point sampler or, without one, the box of the dense cells among the cameras. If space
-    is contracted, they are the cube around contracted space.
+def volume_space(scene: TrainedScene, cameras: Cameras) -> Space:
+    """Return the space of the volume on the page: that of the scene, or the box of the dense cells among the cameras.
 
     Raises:
-        NerfroError: the point sampler has no box, and all cameras are at one position.
+        NerfroError: the space of the scene has no box, and all cameras are at one position.
     """
-    box = getattr(scene.renderer.point_sampler, "box", None)
-    if isinstance(box, Tensor):
-        return box.float().cpu()
+    if scene.renderer.scene.space.has_box:
+        return scene.renderer.scene.space
     eyes = cameras.camera_to_world[..., 3].float().cpu()
     centre, half = (eyes.amax(0) + eyes.amin(0)) / 2, float((eyes.amax(0) - eyes.amin(0)).max()) / 2
     if half == 0:
         raise NerfroError(
-            "the position of the scene is unknown: the point sampler has no box, and all cameras are at one position; "
+            "the position of the scene is unknown: its space has no box, and all cameras are at one position; "
             "train with content.box_min and content.box_max"
         )
     box = torch.stack([centre - half, centre + half])
-    density = sample_field(scene, _SEARCH_RESOLUTION, box, progress=False).density
+    density = sample_field(scene, _SEARCH_RESOLUTION, Box(box), progress=False).density
     cell = 2 * half / (_SEARCH_RESOLUTION - 1)
     dense = (density * cell > MIN_OPTICAL_DEPTH).nonzero()
     if not len(dense):
-        return box
+        return Box(box)
     corners = box[0] + cell * torch.stack([dense.amin(0) - 1, dense.amax(0) + 1])
-    return torch.maximum(torch.minimum(corners, box[1]), box[0])
-
-
-def contraction_radius(scene: TrainedScene) -> float | None:
-    """Return the radius beyond which the point sampler contracts space, or None if samples lie in a box."""
-    radius: float | None = getattr(scene.renderer.point_sampler, "radius", None)
-    return radius
+    return Box(torch.maximum(torch.minimum(corners, box[1]), box[0]))
 
 
 def _write(scene: TrainedScene, out: Path, options: ExportConfig) -> str:

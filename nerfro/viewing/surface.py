@@ -11,8 +11,7 @@ from nerfro.core.errors import NerfroError
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.geometry.normals import corner_normals
 from nerfro.media.base import Medium
-from nerfro.media.sdf_grid import SdfGrid
-from nerfro.media.solid import Solid
+from nerfro.media.bodies import Bodies
 
 
 @torch.no_grad()
@@ -20,25 +19,26 @@ def surface_of(medium: Medium, triangles: bool) -> list[TriangleMesh]:
     """Triangulate the surface of each body, with the normals at which rays bend; world units.
 
     Args:
-        medium: medium of solid bodies.
+        medium: medium of bodies.
         triangles: whether rays intersect the triangles of the medium instead of the zero levels of its distances.
     """
-    if not isinstance(medium, Solid):
+    bodies = medium.bodies
+    if bodies is None:
         raise NerfroError(
             f"{type(medium).__name__} has no surface, because its index varies continuously or is 1; "
             "train with medium=sdf_grid"
         )
-    if triangles and isinstance(medium, SdfGrid):
-        return [TriangleMesh(mesh.vertices, mesh.faces, corner_normals(mesh)) for mesh in medium.meshes]
-    return [_zero_level(medium, body) for body in range(len(medium.iors))]
+    if triangles:
+        return [TriangleMesh(mesh.vertices, mesh.faces, corner_normals(mesh)) for mesh in bodies.meshes]
+    return [_zero_level(bodies, number) for number in range(len(bodies.names))]
 
 
-def _zero_level(medium: Solid, body: int) -> TriangleMesh:
+def _zero_level(medium: Bodies, body: int) -> TriangleMesh:
     """Triangulate with marching cubes, then improve each vertex by a Newton step on the distance of the medium.
 
     The step is needed because marching cubes interpolates linearly, and the medium does not.
     """
-    values, box = body_on_grid(medium, body)
+    values, box = _region_on_grid(medium, body)
     mesh = level_set(-values, box, 0.0)
     vertices = torch.from_numpy(mesh.vertices).to(medium.box)
     phi, gradient = (value[:, body] for value in medium.regions(vertices))
@@ -47,13 +47,11 @@ def _zero_level(medium: Solid, body: int) -> TriangleMesh:
     return TriangleMesh(vertices.double().cpu().numpy(), mesh.faces, normals[mesh.faces])
 
 
-@torch.no_grad()
-def body_on_grid(medium: Solid, body: int) -> tuple[Float[Tensor, "X Y Z"], Float[Tensor, "2 3"]]:
-    """Sample `Solid.regions` of a body at the vertices of a grid, on the CPU; returns also the corners of the grid."""
-    grid = medium.grids[body] if isinstance(medium, SdfGrid) else None
-    # Distances in closed form are sampled at 128 vertices per side.
-    counts = [128] * 3 if grid is None else grid.distances.shape
-    box = (medium if grid is None else grid).box.cpu()
+def _region_on_grid(medium: Bodies, body: int) -> tuple[Float[Tensor, "X Y Z"], Float[Tensor, "2 3"]]:
+    """Sample `Bodies.regions` of a body at the vertices of its grid, on the CPU; returns also the corners."""
+    grid = medium.grids[body]
+    box = grid.box.cpu()
+    counts = grid.distances.shape
     axes = [torch.linspace(float(low), float(high), n) for low, high, n in zip(*box, counts, strict=True)]
     slabs = [torch.cartesian_prod(x[None], *axes[1:]).to(medium.box) for x in axes[0]]
     return torch.stack([medium.regions(slab)[0][..., body].cpu() for slab in slabs]).view(*counts), box

@@ -24,7 +24,6 @@ from nerfro.files import lat_long
 from nerfro.files.images import data_uri, to_8bit
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.rendering import Renderer
-from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.viewing.changes import with_absorption, with_indices, with_sky, without_glass, without_inside
 from nerfro.viewing.surface import surface_of
@@ -68,14 +67,12 @@ class TrainedScene:
         source: data set.
         subdivision: rays per pixel; the default is the subdivision of the run's evaluation.
         name: name of the experiment.
-        content: corners of the box outside of which the field is empty, world units; None if the box is unknown.
     """
 
     renderer: Renderer
     source: DataSource
     subdivision: Subdivision = field(default_factory=Subdivision)
     name: str = ""
-    content: Float[Tensor, "2 3"] | None = None
 
     def __repr__(self) -> str:
         return f"TrainedScene({self.name}, {self.renderer.scene})"
@@ -145,8 +142,7 @@ class TrainedScene:
     @property
     def surface(self) -> list[TriangleMesh]:
         """Surfaces on which rays bend, of each body in ascending order of priority; world units."""
-        sampler = self.renderer.path_sampler
-        return surface_of(self.renderer.scene.medium, isinstance(sampler, Snell) and sampler.interface == "mesh")
+        return surface_of(self.renderer.scene.medium, self.renderer.path_sampler.traces_triangles)
 
     @property
     def field(self) -> Field:
@@ -165,12 +161,13 @@ class TrainedScene:
         box = self.renderer.scene.medium.content_box.float().cpu()
         if (box[1] > box[0]).all():
             return box
-        if self.content is None:
+        content = self.renderer.scene.space.content
+        if content is None:
             raise NerfroError(
                 "the position of the object is unknown, because the run has neither glass nor content.box_min; "
                 "train with content.box_min and content.box_max"
             )
-        return self.content
+        return content.cpu()
 
     def with_(
         self,

@@ -12,8 +12,8 @@ from torch import Tensor
 from nerfro.backgrounds.base import Background
 from nerfro.core.types import Exits, FieldValues, Samples
 from nerfro.fields.base import Field
-from nerfro.fields.selection import inside_box
 from nerfro.geometry.interpolation import smooth, trilinear
+from nerfro.geometry.space import inside_box
 
 # Directions are looked up on the unit sphere in a grid over this cube.
 _SKY_SIDE = 1.1
@@ -92,6 +92,6 @@ def _mean_radiance(field: Field, positions: Float[Tensor, "points 3"]) -> Float[
     s = positions.new_zeros(len(positions), 1)
     for axis in axes:
         directions = axis.expand(len(positions), 1, 3)
-        found = field(Samples(positions[:, None], directions, s, torch.cat([s, s], 1), s[:, 0]))
-        total += torch.cat([found.radiance[:, 0], found.density], -1).float() / len(axes)
+        values = field(Samples(positions[:, None], directions, s, torch.cat([s, s], 1), s[:, 0]))
+        total += torch.cat([values.radiance[:, 0], values.density], -1).float() / len(axes)
     return total

@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import resolve_path
-from nerfro.fields.selection import inside_box
 from nerfro.geometry.mesh import load_mesh, local_origin
+from nerfro.geometry.space import inside_box
 from nerfro.media.base import Medium
 from nerfro.registry.allowed import Depth, Natural, Positive, Width
 from nerfro.registry.registration import register
@@ -101,9 +101,9 @@ class IndexField(Medium):
         """Evaluate the refractive index and the gradient; the network is evaluated only inside the box."""
         flat = positions.reshape(-1, 3)
         index = inside_box(flat, *self.box).nonzero().squeeze(1)
-        chosen = flat[index]
-        network, slope = self._network(chosen)
-        window = self._window(chosen)
+        inside = flat[index]
+        network, slope = self._network(inside)
+        window = self._window(inside)
         excess = network - self._network(self.frame)[0].mean()
         n = torch.ones_like(flat[:, 0]).index_copy(0, index, (1 + window * excess).to(flat))
         gradients = torch.zeros_like(flat).index_copy(0, index, (window[:, None] * slope).to(flat))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from enum import IntEnum
 from typing import Annotated
 
@@ -15,7 +15,7 @@ from nerfro.core.draws import Draws
 from nerfro.core.errors import NerfroError
 from nerfro.core.types import FieldValues, Path, Rays, Rendering, Samples
 from nerfro.fields.base import Field
-from nerfro.fields.selection import inside_box
+from nerfro.geometry.space import inside_box
 from nerfro.registry.allowed import Count, Positive, Share
 from nerfro.registry.registration import register
 from nerfro.rendering import Components, Renderer, composite
@@ -48,7 +48,6 @@ class EikonalFields(Renderer):
     Args:
         components: components of the model; the medium has parameters.
         scene_fraction, index_fraction: fractions of the budget for the first two stages; the third has the rest.
-        box_min, box_max: corners of the box in which radiance is sampled, world units.
         resolution: vertices along each side of the grids of the second stage.
         blur: standard deviation of the blur at the first level, voxels; each level halves the value.
         num_levels: number of levels of blur, for equal fractions of the second stage.
@@ -61,18 +60,16 @@ class EikonalFields(Renderer):
         NerfroError: the fractions leave a negative rest.
     """
 
+    needs_box = True
     trains_in_parallel = False  # a stage leaves out parameters, whose gradients other processes would wait for
 
     stage: Tensor
-    box: Float[Tensor, "2 3"]
 
     def __init__(
         self,
         components: Components,
         scene_fraction: Share = 0.4,
         index_fraction: Share = 0.4,
-        box_min: Sequence[float] = (-1.0, -1.0, -1.0),
-        box_max: Sequence[float] = (1.0, 1.0, 1.0),
         resolution: Annotated[int, Ge(2)] = 128,
         blur: Positive = 2.0,
         num_levels: Count = 5,
@@ -86,7 +83,6 @@ class EikonalFields(Renderer):
         self.interior = components.make_field()
         self.scene_fraction, self.index_fraction = scene_fraction, index_fraction
         self.resolution, self.blur, self.num_levels = resolution, blur, num_levels
-        self.register_buffer("box", torch.tensor([list(box_min), list(box_max)]), persistent=False)
         self.register_buffer("stage", torch.tensor(int(TrainingStage.SCENE)))
         self._sharp: BackgroundGrids | None = None
         self._blurred: BackgroundGrids | None = None
@@ -119,7 +115,7 @@ class EikonalFields(Renderer):
             self._sharp = BackgroundGrids.fit(
                 field,  # type: ignore[arg-type]
                 scene.background,
-                self.box,
+                scene.space.box,
                 scene.medium.box,
                 self.resolution,
             )
@@ -159,17 +155,17 @@ class EikonalFields(Renderer):
 def radiance_where(field: Field | Ask, samples: Samples, selected: Bool[Tensor, "P N"]) -> FieldValues:
     """Evaluate a field only at the selected samples; density and radiance are zero elsewhere."""
     ray, i = selected.nonzero(as_tuple=True)
-    chosen = Samples(
+    queried = Samples(
         samples.positions[ray, i][:, None],
         samples.directions[ray, i][:, None],
         samples.s[ray, i][:, None],
         torch.stack([samples.edges[ray, i], samples.edges[ray, i + 1]], -1),
         samples.radii[ray],
     )
-    found = field(chosen)
+    values = field(queried)
     density: Float[Tensor, "P N"] = torch.zeros_like(samples.s)
     radiance: Float[Tensor, "P N 3"] = torch.zeros_like(samples.positions)
     return FieldValues(
-        density.index_put((ray, i), found.density[:, 0].to(density)),
-        radiance.index_put((ray, i), found.radiance[:, 0].to(radiance)),
+        density.index_put((ray, i), values.density[:, 0].to(density)),
+        radiance.index_put((ray, i), values.radiance[:, 0].to(radiance)),
     )

@@ -21,24 +21,24 @@ from nerfro.core.draws import Draws
 from nerfro.core.errors import NerfroError
 from nerfro.core.types import Exits
 from nerfro.geometry.mesh import load_mesh
-from nerfro.media.sdf_grid import SdfGrid
+from nerfro.media.bodies import Bodies
 from nerfro.samplers.paths.snell import Snell
 from nerfro.silhouettes.silhouettes import mesh_silhouettes
 from nerfro.silhouettes.visual_hull import Silhouettes
 from tests.ball_photographs import BOX, RADIUS, cameras, mesh, photographs_of, save, sky, solid
-from tests.closed_forms import grid_points
+from tests.closed_forms import grid_points, sampled
 from tests.conftest import Runner
 
 DEPTH, WIDTH, AXIS = 0.05, 0.12, torch.tensor([0.6, 0.0, 0.8])
 
 
-def dented() -> SdfGrid:
+def dented() -> Bodies:
     """The ball, flattened on one side."""
     ball = solid([1.5])
     directions = grid_points(0.9, len(ball.grids[0].distances))
     directions = torch.nn.functional.normalize(directions, dim=-1)
     dent = DEPTH * torch.exp((directions @ AXIS - 1) / WIDTH)
-    return SdfGrid.from_distances([ball.grids[0].distances + dent], BOX, [1.5], 0.01)
+    return sampled([ball.grids[0].distances + dent], BOX, [1.5], 0.01)
 
 
 SHORT = RefinementSettings((DescentStage(150, 5e-4, (3.0, 1.0)), DescentStage(50, 1e-4, (0.0, 0.0))), 2000, (8, 16))
@@ -53,11 +53,11 @@ def shown() -> tuple[Silhouettes, Pixels, Surroundings]:
     return silhouettes, through, learn_surroundings(beside, mesh(), False)
 
 
-def refined(start: SdfGrid, settings: RefinementSettings = SHORT, learn_index: bool = False) -> Refined:
+def refined(start: Bodies, settings: RefinementSettings = SHORT, learn_index: bool = False) -> Refined:
     return refine_surface(RefinementProblem(mesh(), start, *shown()), learn_index, settings=settings)
 
 
-def degrees_off(medium: SdfGrid, num_views: int = 6) -> float:
+def degrees_off(medium: Bodies, num_views: int = 6) -> float:
     """Median angle between exit directions and the right ones, of rays that the dent turns by a degree or more."""
     errors, right = [], dented()
     for view in range(num_views):
@@ -150,7 +150,7 @@ def test_panorama_matches_the_room_along_every_ray() -> None:
 def preprocess(tmp_path: Path, run_here: Runner) -> Callable:
     """Refine the ball's mesh by photographs of another medium; returns the folder, and what was printed."""
 
-    def run(*overrides: str, medium: SdfGrid | None = None, ior: float | None = 1.5) -> tuple[Path, str]:
+    def run(*overrides: str, medium: Bodies | None = None, ior: float | None = 1.5) -> tuple[Path, str]:
         save(photographs_of(dented() if medium is None else medium), tmp_path)
         out = tmp_path / "out"
         options = [f"data.root={tmp_path}", f"mesh={tmp_path / 'mesh.ply'}", f"out={out}", "data.near=0.5"]
@@ -185,7 +185,7 @@ def test_failed_refinement_keeps_the_surface(preprocess: Callable, monkeypatch: 
 
 
 def test_refinement_starts_with_the_estimated_index(preprocess: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
-    begun: list[SdfGrid] = []
+    begun: list[Bodies] = []
 
     def kept(problem: RefinementProblem, *_: object) -> Refined:
         begun.append(problem.medium)

@@ -15,12 +15,14 @@ from nerfro.capture.vessel_fit import fit_vessel
 from nerfro.core.types import Exits
 from nerfro.data.base import Views
 from nerfro.geometry.mesh import load_mesh
-from nerfro.media.sdf_grid import SdfGrid
-from nerfro.media.solid import Solid
+from nerfro.media.bodies import Bodies, GridSettings
+from nerfro.media.body_settings import make_bodies
+from nerfro.media.material import Material
+from nerfro.media.surface import MeshSurface
+from nerfro.media.vessel import VesselLengths, make_vessel, vessel
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.subdivision import pixel_rays
 from tests.ball_photographs import NUM_VIEWS, SIZE, cameras, sky
-from tests.media.vessels import SdfVessel
 
 RADIUS, HEIGHT, NUM_PIXELS = 0.45, 1.0, 1000
 # A larger fillet and a thicker foot have similar effects.
@@ -41,11 +43,11 @@ def cylinder(tmp_path: Path) -> Path:
     return tmp_path / "glass.ply"
 
 
-def observed(cylinder: Path, glass: Solid) -> Observations:
+def observed(cylinder: Path, glass: Bodies) -> Observations:
     """Observe a body through pixels of its silhouette, with all reflections."""
     taken, random = cameras(), torch.Generator().manual_seed(0)
     index = torch.randint(NUM_VIEWS * SIZE * SIZE, (8 * NUM_PIXELS,), generator=random)
-    silhouette = Snell()(pixel_rays(taken, index), SdfGrid(str(cylinder), **BOX)).refracted
+    silhouette = Snell()(pixel_rays(taken, index), make_bodies(str(cylinder), **BOX)).refracted
     index = index[silhouette][:NUM_PIXELS].sort().values
     path = Snell(branches="all", least_weight=0.02)(pixel_rays(taken, index), glass)
     seen = Pixels(taken, index, path.sum_polylines(sky(path.exits().directions)).float())
@@ -62,11 +64,14 @@ def observed(cylinder: Path, glass: Solid) -> Observations:
     ids=["empty", "partly filled"],
 )
 def test_vessel_fit_recovers_lengths_from_default_values(cylinder: Path, lengths: dict[str, float]) -> None:
-    def build(**options: Any) -> SdfVessel:
-        return SdfVessel(str(cylinder), ior=1.52, **BOX, **options)
+    outer, grid = MeshSurface(str(cylinder)), GridSettings(**BOX)
 
-    glass = build(**lengths, liquid_ior=1.333 if "level" in lengths else 1.0)
-    found = fit_vessel(build, 2 * RADIUS, observed(cylinder, glass))
+    def build(lengths: VesselLengths) -> Bodies:
+        liquid = None if lengths.level is None else Material(1.333)
+        return vessel(outer, lengths, Material(1.52), liquid, grid=grid)
+
+    glass = build(VesselLengths(**lengths))
+    found = fit_vessel(build, 2 * RADIUS, HEIGHT, observed(cylinder, glass))
     assert found.lengths.keys() == lengths.keys()
     assert not found.unknown
     for name, length in lengths.items():
@@ -78,10 +83,11 @@ def test_vessel_fit_recovers_lengths_from_default_values(cylinder: Path, lengths
 def test_pixels_support_the_body_that_refracts_their_rays(
     cylinder: Path, ior: float | None, supported: list[str]
 ) -> None:
-    solid, vessel = SdfGrid(str(cylinder), ior=ior or 1.5, **BOX), SdfVessel(str(cylinder), wall=0.05, level=0.6, **BOX)
-    observations = observed(cylinder, solid if ior else vessel)
+    solid = make_bodies(str(cylinder), ior=ior or 1.5, **BOX)
+    filled = make_vessel(str(cylinder), wall=0.05, level=0.6, **BOX)
+    observations = observed(cylinder, solid if ior else filled)
     found = {"solid body, water", "solid body, glass", "vessel"}.difference(
-        unsupported_bodies(observations, solid, True, vessel)
+        unsupported_bodies(observations, solid, True, filled)
     )
     assert found == set(supported)
     assert unsupported_bodies(observations, solid, False, None) == ([] if ior == 1.333 else ["solid body"])

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from omegaconf import OmegaConf
 
 from nerfro.core.errors import NerfroError
 from nerfro.data.base import Views
 from nerfro.data.formats import colmap_model
 from nerfro.data.formats.colmap_model import CAMERA_MODELS
+from nerfro.training.load import load as load_run
 from tests.conftest import SMALL, refused
 
 from .formats import BROWN, FORMATS, OPENCV, TRAIN, write_colmap
@@ -50,10 +50,9 @@ def test_distorted_reconstruction_of_a_room_trains(write, train_here, tmp_path):
     )  # fmt: skip
     rows = json.loads((run / "metrics.json").read_text())["views"]
     assert len(rows) == 2
-    config = OmegaConf.load(run / "config.yaml")
-    middle = [0.5 * (low + high) for low, high in zip(config.field.box_min, config.field.box_max, strict=True)]
-    assert middle == pytest.approx([0, 0, 0], abs=1e-4)  # of the mesh
-    assert config.field.radius == config.sampler.points.radius > 0.5
+    space = load_run(run).renderer.scene.space
+    assert space.centre.tolist() == pytest.approx([0, 0, 0], abs=1e-4)  # of the mesh
+    assert space.radius > 0.5
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,9 @@ import torch
 from nerfro.core.types import Samples
 from nerfro.fields import hash_encoding
 from nerfro.fields.hash_grid import HashGridField
-from nerfro.fields.selection import evaluate_selected, inside_box
+from nerfro.fields.selection import evaluate_selected
 from nerfro.fields.spherical_harmonics import spherical_harmonics
-from nerfro.geometry.contraction import contract, expand
+from nerfro.geometry.space import Box, Contracted, Space, inside_box
 from tests.exact_silhouettes import cameras_around
 
 
@@ -22,10 +22,13 @@ def make_samples(num_rays: int = 6, num_samples: int = 9, scale: float = 2.0) ->
     return Samples(positions, directions, edges[:, :-1], edges, torch.ones(num_rays))
 
 
-def make_field(precision: str = "float32", **changes: object) -> HashGridField:
+CUBE = Box([[-1.0] * 3, [1.0] * 3])
+
+
+def make_field(space: Space = CUBE, precision: str = "float32", **changes: object) -> HashGridField:
     torch.manual_seed(0)
     settings = {"num_levels": 4, "finest_resolution": 32, "log2_table_size": 10, "precision": precision} | changes
-    field = HashGridField(**settings)
+    field = HashGridField(space, **settings)
     torch.nn.init.normal_(field.table, std=0.5)
     return field
 
@@ -60,17 +63,16 @@ def test_empty_selection_has_gradients() -> None:
 
 
 def test_only_samples_inside_the_box_are_evaluated() -> None:
-    field, samples = make_field(box_min=[-1, -0.5, 0], box_max=[1, 0.5, 1.5]), make_samples()
-    inside = ((samples.positions >= field.box_min) & (samples.positions <= field.box_max)).all(-1)
+    field, samples = make_field(Box([[-1, -0.5, 0], [1, 0.5, 1.5]])), make_samples()
+    inside = inside_box(samples.positions, *field.bounds)
     assert 0 < inside.sum() < inside.numel()
     values = field(samples)
     assert torch.equal(values.density > 0, inside)
-    assert torch.equal(inside_box(torch.full((2, 3), float("nan")), field.box_min, field.box_max), torch.zeros(2) > 0)
 
 
-@pytest.mark.parametrize("radius", [None, 3.0])
-def test_only_occupied_samples_are_evaluated_in_images(radius: float | None) -> None:
-    field, samples = make_field(box_min=[-2, -2, -2], box_max=[2, 2, 2], radius=radius).eval(), make_samples()
+@pytest.mark.parametrize("space", [Box([[-2] * 3, [2] * 3]), Contracted([[-2] * 3, [2] * 3], 3.0)])
+def test_only_occupied_samples_are_evaluated_in_images(space: Space) -> None:
+    field, samples = make_field(space).eval(), make_samples()
     occupied = torch.rand(6, 9, generator=torch.Generator().manual_seed(5)) < 0.4
     whole, part = field(samples), field(replace(samples, occupied=occupied))
     assert (whole.density > 0).all()
@@ -82,7 +84,7 @@ def decoded_in_double(
     field: HashGridField, positions: torch.Tensor, directions: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Density and colour by plain PyTorch in double precision."""
-    unit = (positions - field.box_min) / field.side
+    unit = (positions - field.space.box[0]) / field.space.side
     geometry = field.density_mlp.double()(hash_encoding.hash_encode(unit, field.table.double(), field.levels))
     inputs = torch.cat([geometry, spherical_harmonics(directions, field.direction_bands)], -1)
     raw = field.colour_mlp.double()(inputs) + geometry[:, 1:4]
@@ -101,7 +103,7 @@ def test_gradients_of_positions_and_directions_match_autograd() -> None:
     in_double = [values.detach().double().requires_grad_() for values in inputs]
     density, colour = decoded_in_double(field, *in_double)
     expected = torch.autograd.grad(density.sum() + (colour * upstream).sum(), in_double)
-    inside = inside_box(inputs[0], field.box_min, field.box_max)
+    inside = inside_box(inputs[0], *field.bounds)
     assert 10 < inside.sum() < 70
     for found, reference in zip(ours, expected, strict=True):
         assert not found[~inside].any()
@@ -136,21 +138,21 @@ def test_field_runs_under_autocast_with_encodings_in_single_precision() -> None:
 def test_untrained_field_is_almost_transparent_in_any_box() -> None:
     for side in (0.1, 20.0):
         torch.manual_seed(0)
-        field = HashGridField([0.0] * 3, [side] * 3, initial_depth=0.2)
+        field = HashGridField(Box([[0.0] * 3, [side] * 3]), initial_depth=0.2)
         with torch.no_grad():
             density, _ = field.decode(side * torch.rand(100, 3), torch.tensor([[0.0, 0, 1]]).expand(100, 3))
         torch.testing.assert_close(density * side, torch.full((100,), 0.2), rtol=0.02, atol=0)
 
 
 def test_field_of_all_space_is_evaluated_at_contracted_positions() -> None:
-    box = {"box_min": [-0.5, 0.0, 0.5], "box_max": [0.5, 1.0, 1.5]}
-    everywhere, samples = make_field(**box, radius=0.8), make_samples(scale=5.0)
+    space = Contracted([[-0.5, 0.0, 0.5], [0.5, 1.0, 1.5]], 0.8)
+    everywhere, samples = make_field(space), make_samples(scale=5.0)
     centre, positions = torch.tensor([0.0, 0.5, 1.0]), samples.positions.flatten(0, 1)
     offset = positions - centre
     within = offset.norm(dim=-1) < 0.8
     assert 0 < within.sum() < len(within)
     values = everywhere(samples)
-    density, colour = everywhere.decode(contract(positions, centre, 0.8), samples.directions.flatten(0, 1))
+    density, colour = everywhere.decode(space.contract(positions), samples.directions.flatten(0, 1))
     torch.testing.assert_close(values.radiance.flatten(0, 1), colour)
     found = values.density.flatten()
     torch.testing.assert_close(found[within], density[within])
@@ -161,10 +163,11 @@ def test_field_of_all_space_is_evaluated_at_contracted_positions() -> None:
 @pytest.mark.parametrize(("num_cameras", "needed"), [(12, 3), (1, 1)])
 def test_space_close_to_a_camera_is_empty_unless_three_cameras_see_it(num_cameras: int, needed: int) -> None:
     cameras = cameras_around(num_cameras, 16)
-    field, whole = make_field(radius=2.0), make_field(radius=2.0)
+    space = Contracted([[-1.0] * 3, [1.0] * 3], 2.0)
+    field, whole = make_field(space), make_field(space)
     field.begin(cameras)
     cells = torch.randint(64, (20_000, 3), generator=torch.Generator().manual_seed(0))
-    points = expand(-4 + (cells + 0.5) / 8, torch.zeros(3), 2.0)
+    points = space.expand(-4 + (cells + 0.5) / 8)
     offset = points - cameras.camera_to_world[:, None, :, 3]
     right, up, back = (offset @ cameras.camera_to_world[:, :, :3]).unbind(-1)
     seen = torch.maximum(right.abs(), up.abs()) * 2 * 1.4 < -back  # a focal length of 1.4 image sides

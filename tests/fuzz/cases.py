@@ -54,7 +54,7 @@ _LEFT_ALONE = ("trainer.devices", "trainer.num_nodes", "trainer.strategy", "trai
                "trainer.profiler", "compile", "logger", "name")  # fmt: skip
 GROUPS = ["field=nerf", "field=mip_nerf", "background=constant", "background=skybox", "background=near_field",
           "sampler/points=stratified", "sampler/points=hierarchical", "sampler/path=straight", "sampler/path=eikonal",
-          "medium=voxel_grid", "medium=ball", "medium=vacuum", "camera=given", "data=opencv", "data=llff",
+          "medium=voxel_grid", "medium=vacuum", "camera=given", "data=opencv", "data=llff",
           "data=colmap", "data=nerfstudio", "data=idr", "data=refref", "model=mip_nerf",
           "+experiment=mipnerf", "+experiment=nerf", "+experiment=ablation_noH", "+scene=glass",
           "+loss/distortion=distortion"]  # fmt: skip
@@ -117,7 +117,7 @@ def options_of_other_commands(world: World, draw: random.Random) -> str | None:
     np.savez(world.root / "rays.npz", **rays_through_ball())
     commands = {
         "trace": ["medium.mesh", "medium.ior", "medium.resolution", "medium.box_max", "medium.shell_voxels",
-                  "medium.inner_iors", "sampler.path.max_events",
+                  "medium.bodies", "sampler.path.max_events",
                   "sampler.path.interface", "near", "far", "rays", "plot", "out", "overwrite"],
         "evaluate": ["split", "root", "chunk_size", "subdivision.side", "subdivision.divergence", "masks", "alpha",
                      "device", "predictions", "references", "overwrite"],

@@ -13,7 +13,7 @@ BOX = np.array([[-1.5] * 3, [1.5] * 3])
 
 
 def _winding_number(points: np.ndarray, mesh: TriangleMesh) -> np.ndarray:
-    """Solid angle of the mesh over 4 pi: Van Oosterom and Strackee (1983), Eqn. 8."""
+    """Bodies angle of the mesh over 4 pi: Van Oosterom and Strackee (1983), Eqn. 8."""
     a, b, c = (mesh.triangles[None, :, i] - points[:, None] for i in range(3))
     la, lb, lc = (np.linalg.norm(v, axis=-1) for v in (a, b, c))
     volume = np.einsum("pfi,pfi->pf", a, np.cross(b, c))

@@ -10,7 +10,7 @@ import trimesh
 from nerfro.geometry.mesh import load_mesh
 from nerfro.geometry.normals import corner_normals
 from nerfro.geometry.orientation import area_vectors
-from nerfro.media.sdf_grid import SdfGrid
+from nerfro.media.body_settings import make_bodies
 from nerfro.samplers.paths.bend import bend
 from tests.geometry.test_bodies import ball, box, mesh_of
 
@@ -114,7 +114,7 @@ def test_normals_that_contradict_the_faces_are_ignored(tmp_path: Path) -> None:
 
 
 def test_large_flat_faces_of_the_embedded_cube_are_flat_in_the_distance() -> None:
-    medium = SdfGrid(TORUS_CUBE, resolution=64, cache=False)
+    medium = make_bodies(TORUS_CUBE, resolution=64, cache=False)
     across = torch.linspace(-0.55, 0.55, 12)
     x, y = torch.meshgrid(across, across, indexing="ij")
     phi, gradient = medium.signed_distances(torch.stack([x, y, torch.full_like(x, 0.75)], -1).reshape(-1, 3))

@@ -23,14 +23,13 @@ except ValueError:
 
 TWO_THREADS = """
 import threading, numba, torch
-from nerfro.media.sdf_grid import SdfGrid
 from nerfro.samplers.paths.snell import Snell
 from nerfro.core.types import Rays
 
 torch.set_num_threads(2)
 axis = torch.linspace(-1.5, 1.5, 16)
 distances = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).norm(dim=-1) - 0.8
-ball = SdfGrid.from_distances(distances[None], torch.tensor([[-1.5] * 3, [1.5] * 3]), [1.5], 0.01)
+ball = sampled(distances[None], torch.tensor([[-1.5] * 3, [1.5] * 3]), [1.5], 0.01)
 directions = torch.nn.functional.normalize(torch.rand(500, 3) - 0.5, dim=-1)
 one = torch.ones(500)
 rays = Rays(-4 * directions.roll(1, 1) * 0.1 - 4 * directions, directions, 0 * one, 2 * one, 6 * one)

@@ -11,12 +11,12 @@ from nerfro.losses.backdrop import Backdrop
 from nerfro.losses.base import Loss
 from nerfro.losses.near_camera import NearCamera
 from nerfro.losses.opaque import Opaque
-from nerfro.media.shapes import Ball
 from nerfro.rendering import Scene, composite
 from nerfro.samplers.paths.straight import Straight
-from nerfro.testing import example_batch, example_path
+from nerfro.testing import example_batch, example_path, example_space
+from tests.closed_forms import Ball
 
-SCENE = Mock(spec=Scene)
+SCENE = Mock(spec=Scene, space=example_space())
 
 WHITE = [1.0, 1.0, 1.0]
 
@@ -69,7 +69,7 @@ def white_fog(path: Path, density: torch.Tensor) -> Rendering:
     return composite(samples, FieldValues(density.expand(8, 8), torch.ones(8, 8, 3)), torch.ones(8, 3), path)
 
 
-CONTENT = NearCamera((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+CONTENT = NearCamera()
 
 
 def straight_paths(near: float = 0.0) -> Path:

@@ -8,14 +8,13 @@ import torch
 from torch import Tensor
 
 from nerfro.core.types import FieldValues, Path, Rays
-from nerfro.media.shapes import Ball
 from nerfro.models.refractive import RefractiveModel
 from nerfro.paper.eikonal import Eikonal
 from nerfro.rendering import composite
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.points.stratified import point_samples
 from nerfro.testing import example_components, example_rays
-from tests.closed_forms import beam, random_rays
+from tests.closed_forms import Ball, beam, random_rays
 from tests.conftest import refused
 from tests.samplers.nested import NestedBalls, nested_grid, nested_mesh
 
@@ -86,7 +85,7 @@ def _chord(rays: Rays, centre: list[float], radius: float) -> Tensor:
 
 
 def test_absorption_has_gradients_without_new_paths() -> None:
-    model = RefractiveModel(replace(example_components(), medium=Ball(learn_absorption=True), path_sampler=Snell()))
+    model = RefractiveModel(replace(example_components(), medium=Ball(learn=["absorption"]), path_sampler=Snell()))
     assert not model.paths_learn, "paths may be traced ahead"
     absorption = "bodies.object.material.absorption"
     parameter = model.parameters_by_name()[absorption]
@@ -101,7 +100,7 @@ def test_absorption_has_gradients_without_new_paths() -> None:
 
 @pytest.mark.parametrize("radius", [0.8 / 1024, 0.8 * 1024])
 def test_learned_absorption_is_independent_of_the_world_unit(radius: float) -> None:
-    one, other = (Ball(size, learn_absorption=True).materials[0] for size in (0.8, radius))
+    one, other = (Ball(size, learn=["absorption"]).materials[0] for size in (0.8, radius))
     for material in (one, other):
         (gradient,) = torch.autograd.grad(material.absorption.sum(), material.learned()["absorption"])
         with torch.no_grad():
@@ -111,12 +110,12 @@ def test_learned_absorption_is_independent_of_the_world_unit(radius: float) -> N
 
 def test_learned_absorption_starts_from_a_given_one_of_any_size() -> None:
     for coefficient in (0.1, 30.0, 3000.0):
-        started = Ball(0.8, absorption=[coefficient], learn_absorption=True).absorption
+        started = Ball(0.8, absorption=[coefficient], learn=["absorption"]).absorption
         torch.testing.assert_close(started, torch.full((1, 3), coefficient))
 
 
 def test_checkpoints_with_absorption_per_world_unit_are_read() -> None:
-    learning = Ball(0.8, learn_absorption=True)
+    learning = Ball(0.8, learn=["absorption"])
     name = "materials.0._absorption"
     assert name in learning.state_dict()
     learning.load_state_dict({name: torch.tensor([-1.0, 0.0, 1.0])})
@@ -127,6 +126,6 @@ def test_checkpoints_with_absorption_per_world_unit_are_read() -> None:
 def test_absorption_is_given_for_all_bodies_or_for_each() -> None:
     torch.testing.assert_close(Ball(absorption=[0.4]).absorption, torch.full((1, 3), 0.4))
     assert Ball().absorption is None
-    start = Ball(absorption=SIGMA, learn_absorption=True).absorption
+    start = Ball(absorption=SIGMA, learn=["absorption"]).absorption
     torch.testing.assert_close(start, torch.tensor([SIGMA]))
     refused("path=snell", lambda: Eikonal()(example_rays(), Ball(absorption=[0.1])))

@@ -13,8 +13,9 @@ from torch import Tensor
 
 from nerfro.core.types import Path as RayPath
 from nerfro.core.types import Rays
+from nerfro.media.bodies import Bodies
+from nerfro.media.body_settings import BodySettings, expanded, make_bodies
 from nerfro.media.material import MATERIALS
-from nerfro.media.sdf_grid import SdfGrid
 from nerfro.paper.eikonal import Eikonal
 from nerfro.samplers.paths.snell import Snell, trace_interfaces
 from tests.closed_forms import angle, ball_exits, make_rays
@@ -31,8 +32,8 @@ def _ball(folder: Path, centre: tuple[float, ...], subdivisions: int = 4) -> str
     return str(file)
 
 
-def _medium(resolution: int = 48, **bodies: dict[str, Any]) -> SdfGrid:
-    return SdfGrid(bodies=bodies, resolution=resolution, cache=False)
+def _medium(resolution: int = 48, **bodies: dict[str, Any]) -> Bodies:
+    return make_bodies(bodies=bodies, resolution=resolution, cache=False)
 
 
 def _rays_at(centre: tuple[float, ...], num: int = 300) -> Rays:
@@ -48,14 +49,14 @@ def test_two_balls_far_apart_are_as_exact_as_each_alone(tracer: str, tmp_path: P
     files = [_ball(tmp_path, centre) for centre in CENTRES]
     both = _medium(a={"mesh": files[0], "ior": 1.5}, b={"mesh": files[1], "ior": 1.33})
 
-    def exits(rays: Rays, medium: SdfGrid) -> Tensor:
+    def exits(rays: Rays, medium: Bodies) -> Tensor:
         if tracer == "reference":
             return trace_interfaces(rays, medium, 16).path.exit_directions
         sampler = {"kernel": Snell(), "triangles": Snell("mesh"), "eikonal": Eikonal()}[tracer]
         return sampler(rays, medium).exit_directions
 
     for file, centre, ior in zip(files, CENTRES, (1.5, 1.33), strict=True):
-        rays, alone = _rays_at(centre), SdfGrid(file, ior, resolution=48, cache=False)
+        rays, alone = _rays_at(centre), make_bodies(file, ior, resolution=48, cache=False)
         expected = ball_exits(rays, 1.0, ior, centre)
         errors = [angle(exits(rays, medium), expected) for medium in (both, alone)]
         assert errors[0].median() < (0.1 if tracer == "eikonal" else 0.03)
@@ -162,7 +163,7 @@ def test_index_and_absorption_of_two_bodies_are_learned_together(tmp_path: Path)
 def test_empty_list_of_learned_quantities_keeps_a_body_constant(tmp_path: Path) -> None:
     files = [_ball(tmp_path, centre) for centre in CENTRES]
     bodies = {"glass": {"mesh": files[0], "ior": 1.45}, "water": {"mesh": files[1], "ior": 1.33, "learn": []}}
-    medium = SdfGrid(bodies=bodies, learn_ior=True, resolution=16, cache=False)
+    medium = make_bodies(bodies=bodies, learn_ior=True, resolution=16, cache=False)
     assert list(medium.parameters_by_name()) == ["bodies.glass.material.ior"]
 
 
@@ -191,10 +192,11 @@ def test_wrong_bodies_are_refused_by_name(settings: Any, message: str, tmp_path:
     refused(message, _medium, 16, glass=settings)
 
 
-def test_short_and_long_form_exclude_each_other(tmp_path: Path) -> None:
-    bodies = {"glass": {"mesh": _ball(tmp_path, (0.0, 0.0, 0.0), 2), "ior": 1.5}}
-    refused(r"medium\.abbe has no meaning beside bodies", SdfGrid, bodies=bodies, abbe=[50])
-    refused("needs mesh", SdfGrid)
+def test_mesh_and_index_are_short_for_one_body(tmp_path: Path) -> None:
+    mesh = _ball(tmp_path, (0.0, 0.0, 0.0), 2)
+    assert expanded({"mesh": mesh, "ior": 1.4}) == {"object": BodySettings(mesh=mesh, ior=1.4)}
+    assert expanded({"mesh": mesh, "bodies": {"object": {"ior": 1.4}}}) == expanded({"mesh": mesh, "ior": 1.4})
+    refused("needs mesh", make_bodies)
 
 
 # Index of the d line and Abbe number, as data sheets and handbooks print them.

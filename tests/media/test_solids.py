@@ -10,26 +10,26 @@ import trimesh
 from nerfro.core.errors import NerfroError
 from nerfro.media.analytic import Vacuum
 from nerfro.media.base import Medium
+from nerfro.media.bodies import Bodies
+from nerfro.media.body_settings import make_bodies
 from nerfro.media.distance_grid import SURFACE_BLOCK
-from nerfro.media.sdf_grid import SdfGrid
-from nerfro.media.shapes import Ball
-from tests.closed_forms import Luneburg, RoundedBox, Slab, grid_points
+from tests.closed_forms import Ball, Luneburg, RoundedBox, Slab, grid_points, sampled
 from tests.conftest import refused
 
 BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
 
 
-def _nested_balls(size: int = 48) -> SdfGrid:
+def _nested_balls(size: int = 48) -> Bodies:
     radius = grid_points(1.5, size).norm(dim=-1)
-    return SdfGrid.from_distances(torch.stack([radius - 0.9, radius - 0.5]), BOX, [1.5, 1.33], 0.1)
+    return sampled(torch.stack([radius - 0.9, radius - 0.5]), BOX, [1.5, 1.33], 0.1)
 
 
-def _half_full_ball() -> SdfGrid:
+def _half_full_ball() -> Bodies:
     """Bodies that are where all before them are: a wall of glass, air in it, water in its lower half."""
     balls = _nested_balls()
     outer, inner = (grid.distances for grid in balls.grids)
     distances = [outer, inner, torch.linspace(-1.5, 1.5, len(outer)).expand(outer.shape)]
-    medium = SdfGrid.from_distances(distances, BOX, [1.5, 1.0, 1.33], 0.1)
+    medium = sampled(distances, BOX, [1.5, 1.0, 1.33], 0.1)
     medium.nested = True
     return medium
 
@@ -80,7 +80,7 @@ def test_nested_body_lies_within_the_bodies_before_it() -> None:
 
 
 @pytest.mark.parametrize("make", [_nested_balls, _half_full_ball])
-def test_clearance_reaches_no_shell(make: Callable[[], SdfGrid]) -> None:
+def test_clearance_reaches_no_shell(make: Callable[[], Bodies]) -> None:
     medium = make()
     positions = torch.rand(500, 3) * 2.8 - 1.4
     clearance = medium.clearance(positions)
@@ -139,7 +139,7 @@ def test_empty_blocks_contain_no_surface() -> None:
 
 def test_mesh_becomes_a_distance_that_is_smooth_where_the_mesh_is(tmp_path: Path) -> None:
     trimesh.creation.icosphere(3, 0.8).export(tmp_path / "ball.ply")
-    medium = SdfGrid(str(tmp_path / "ball.ply"), resolution=64, cache=False)
+    medium = make_bodies(str(tmp_path / "ball.ply"), resolution=64, cache=False)
     directions = torch.nn.functional.normalize(torch.randn(500, 3), dim=-1)
     phi, normals = medium.signed_distances(0.8 * directions)
     assert phi.abs().max() < 5e-4
@@ -151,17 +151,16 @@ def test_mesh_becomes_a_distance_that_is_smooth_where_the_mesh_is(tmp_path: Path
 def test_bad_solids_are_named(tmp_path: Path) -> None:
     trimesh.creation.icosphere(2, 0.8).export(tmp_path / "ball.ply")
     mesh = str(tmp_path / "ball.ply")
-    refused("one index for each inner mesh", SdfGrid, mesh, inner_meshes=[mesh], resolution=16, cache=False)
-    refused(r"box_min=.*box_max=", SdfGrid, mesh, box_min=[-1.5] * 3, box_max=[0.7] * 3, resolution=16, cache=False)
+    refused(r"box_min=.*box_max=", make_bodies, mesh, box_min=[-1.5] * 3, box_max=[0.7] * 3, resolution=16, cache=False)
     with pytest.raises(NerfroError, match=r"medium\.box_min and medium\.box_max belong together"):
-        SdfGrid(mesh, box_max=[1.5] * 3, resolution=16, cache=False)
+        make_bodies(mesh, box_max=[1.5] * 3, resolution=16, cache=False)
 
 
 @pytest.mark.parametrize("sides", [(2.0, 2.0, 2.0), (3.0, 1.0, 0.6)])
 @pytest.mark.parametrize("resolution", [12, 33])
 def test_default_box_encloses_the_object_tightly(sides: tuple[float, ...], resolution: int, tmp_path: Path) -> None:
     trimesh.creation.box(sides, trimesh.transformations.translation_matrix([5, -7, 9])).export(tmp_path / "box.ply")
-    medium = SdfGrid(str(tmp_path / "box.ply"), resolution=resolution, cache=False)
+    medium = make_bodies(str(tmp_path / "box.ply"), resolution=resolution, cache=False)
     spacing = (medium.box[1] - medium.box[0]) / (resolution - 1)
     assert spacing.max() < 2.01 * spacing.min()
     air = torch.stack([medium.content_box[0] - medium.box[0], medium.box[1] - medium.content_box[1]])

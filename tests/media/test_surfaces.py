@@ -13,8 +13,8 @@ import torch
 import trimesh
 from torch import Tensor
 
-from nerfro.media.bodies import origin_of
-from nerfro.media.sdf_grid import SdfGrid
+from nerfro.media.bodies import Bodies
+from nerfro.media.body_settings import make_bodies, origin_of
 from nerfro.registry.registration import discover
 from nerfro.samplers.paths.snell import Snell
 from tests.closed_forms import angle, make_rays
@@ -45,8 +45,10 @@ def _torus(x: Tensor) -> Tensor:
     return torch.hypot(torch.hypot(x[..., 0], x[..., 1]) - 0.7, x[..., 2]) - 0.3
 
 
-def _medium(surface: Any, resolution: int = 48, **settings: Any) -> SdfGrid:
-    return SdfGrid(bodies={"body": {"surface": surface, "ior": 1.5, **settings}}, resolution=resolution, cache=False)
+def _medium(surface: Any, resolution: int = 48, **settings: Any) -> Bodies:
+    return make_bodies(
+        bodies={"body": {"surface": surface, "ior": 1.5, **settings}}, resolution=resolution, cache=False
+    )
 
 
 @pytest.fixture
@@ -113,7 +115,7 @@ def test_water_inside_a_wall_of_constant_thickness_is_an_offset_surface() -> Non
         "glass": {"surface": ball, "ior": 1.5},
         "water": {"surface": {"name": "offset", "surface": ball, "distance": -0.1}, "ior": 1.33},
     }
-    medium = SdfGrid(bodies=bodies, resolution=48, cache=False)
+    medium = make_bodies(bodies=bodies, resolution=48, cache=False)
     height = torch.linspace(0.05, 0.8, 9).double()
     origins = torch.stack([height, 0 * height, 0 * height + 3], -1)
     path = Snell()(make_rays(origins, [[0.0, 0.0, -1.0]] * 9, 0.5, 8.0), medium)

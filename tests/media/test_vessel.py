@@ -8,12 +8,14 @@ import torch
 import trimesh
 
 from nerfro.geometry.mesh import load_mesh
+from nerfro.media.bodies import Bodies
 from nerfro.media.lids import find_lid
+from nerfro.media.vessel import make_vessel
 from nerfro.samplers.paths.snell import Snell, trace_interfaces
 from nerfro.viewing.surface import surface_of
 from tests.closed_forms import angle, make_rays
 from tests.conftest import refused
-from tests.media.vessels import RADIUS, WALL, SdfVessel, exit_directions, spherical_vessel
+from tests.media.vessels import RADIUS, WALL, exit_directions, spherical_vessel
 
 # A glass: its height, its radii below and above, its wall.
 HEIGHT, BELOW, ABOVE, THIN = 1.6, 0.4, 0.55, 0.05
@@ -29,7 +31,7 @@ def _rays_at_the_ball(count: int) -> tuple[np.ndarray, np.ndarray]:
     return origins, directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
-def _errors(vessel: SdfVessel, wall: float, surface: float | None) -> torch.Tensor:
+def _errors(vessel: Bodies, wall: float, surface: float | None) -> torch.Tensor:
     """Angles to the exit directions of the formulas, degrees, of rays that leave."""
     origins, directions = _rays_at_the_ball(400)
     expected, left = exit_directions(origins, directions, wall, surface)
@@ -51,13 +53,13 @@ def test_rays_through_a_spherical_vessel_match_closed_forms(tmp_path: Path, wall
     assert errors.median() < (0.01 if full else 0.02)
 
 
-def _glass(folder: Path, **options: object) -> SdfVessel:
+def _glass(folder: Path, **options: object) -> Bodies:
     """A conical glass of radius 0.4 at the foot and 0.55 at the brim, from z = -0.8 to 0.8."""
     outline = [[0, -0.5 * HEIGHT], [BELOW, -0.5 * HEIGHT], [ABOVE, 0.5 * HEIGHT], [0, 0.5 * HEIGHT]]
     trimesh.creation.revolve(np.array(outline), sections=160).export(folder / "glass.ply")
     known = {"wall": THIN, "foot": 0.2, "level": 1.0, "resolution": 96, "cache": False, "box_min": [-1] * 3,
              "box_max": [1] * 3}  # fmt: skip
-    return SdfVessel(str(folder / "glass.ply"), **known | options)
+    return make_vessel(str(folder / "glass.ply"), **known | options)
 
 
 @pytest.mark.parametrize("closed", [False, True], ids=["open", "closed"])
@@ -78,7 +80,7 @@ def test_inner_wall_is_an_offset_of_the_outer_wall_with_an_opening(tmp_path: Pat
 def test_fillet_is_a_circle_tangent_to_wall_and_foot(tmp_path: Path) -> None:
     trimesh.creation.cylinder(0.5, HEIGHT, sections=256).export(tmp_path / "cylinder.ply")
     wall, foot, fillet, box = 0.05, 0.2, 0.15, {"box_min": [-1.0] * 3, "box_max": [1.0] * 3}
-    vessel = SdfVessel(str(tmp_path / "cylinder.ply"), wall, foot, resolution=96, cache=False, fillet=fillet, **box)
+    vessel = make_vessel(str(tmp_path / "cylinder.ply"), wall, foot, resolution=96, cache=False, fillet=fillet, **box)
     turn, bend = (torch.from_numpy(x) for x in np.meshgrid(np.linspace(0, 6, 20), np.linspace(0.1, 1.5, 15)))
     radius, z = 0.5 - wall - fillet * (1 - bend.cos()), -0.5 * HEIGHT + foot + fillet * (1 - bend.sin())
     cavity, normals = vessel.signed_distances(torch.stack([radius * turn.cos(), radius * turn.sin(), z], -1).float())
@@ -157,7 +159,11 @@ def test_lid_consists_of_upward_faces_around_the_highest_point(tmp_path: Path) -
 
 
 def test_tint_and_dispersion_are_those_of_wall_and_liquid(tmp_path: Path) -> None:
-    vessel = spherical_vessel(tmp_path, level=0.9, resolution=40, absorption=[1, 2, 3, 4, 5, 6], abbe=[60, 55])
+    materials = {
+        "glass": {"ior": 1.5, "absorption": [1, 2, 3], "abbe": 60},
+        "liquid": {"ior": 1.333, "absorption": [4, 5, 6], "abbe": 55},
+    }
+    vessel = spherical_vessel(tmp_path, level=0.9, resolution=40, **materials)
     assert vessel.absorption.tolist() == [[1, 2, 3], [0, 0, 0], [4, 5, 6]]
     assert vessel.at_wavelength(486.13).iors[1] == 1
     dyed = vessel.with_indices(torch.ones(3))
@@ -181,7 +187,7 @@ def test_tint_and_dispersion_are_those_of_wall_and_liquid(tmp_path: Path) -> Non
         ({"up": [0.0, 0.0, 0.0]}, "is no direction; give three numbers"),
         ({"up": [0.0, 1.0]}, "is no direction; give three numbers"),
         ({"wall": -1.0}, "more than 0"),
-        ({"absorption": [1.0, 2.0]}, r"give red, green and blue of each body \(6 numbers\), or one for all"),
+        ({"glass": {"ior": 1.5, "mesh": "glass.ply"}}, "describe materials; remove"),
     ],
 )
 def test_impossible_vessels_are_refused_in_one_line(tmp_path: Path, options: dict[str, object], message: str) -> None:
@@ -193,6 +199,8 @@ def test_grown_vessel_keeps_its_wall_thickness(tmp_path: Path) -> None:
     larger = vessel.grown(torch.full_like(vessel.grids[0].distances, 0.02))
     torch.testing.assert_close(larger.grids[0].distances, vessel.grids[0].distances - 0.02)
     # Where the wall and not the foot bounds the cavity, before and after.
-    by_wall = (vessel.grids[1].distances == vessel._side + WALL) & (larger.grids[1].distances == larger._side + WALL)
+    by_wall = (vessel.grids[1].distances == vessel.grids[1].side + WALL) & (
+        larger.grids[1].distances == larger.grids[1].side + WALL
+    )
     assert by_wall.float().mean() > 0.5
     torch.testing.assert_close(larger.grids[1].distances[by_wall], vessel.grids[1].distances[by_wall] - 0.02)

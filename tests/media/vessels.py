@@ -6,19 +6,20 @@ import numpy as np
 import trimesh
 from jaxtyping import Bool, Float
 
-from nerfro.media.vessel import SdfVessel
+from nerfro.media.bodies import Bodies
+from nerfro.media.vessel import make_vessel
 
 RADIUS, WALL = 0.8, 0.1
 GLASS, WATER = 1.5, 1.333
 
 
-def spherical_vessel(folder: Path, subdivisions: int = 5, **options: object) -> SdfVessel:
+def spherical_vessel(folder: Path, subdivisions: int = 5, **options: object) -> Bodies:
     """A closed one, its lowest point at z = -RADIUS."""
     file = folder / "ball.ply"
     trimesh.creation.icosphere(subdivisions, RADIUS).export(file)
     known = {"wall": WALL, "closed": True, "ior": GLASS, "liquid_ior": WATER, "resolution": 96, "cache": False,
              "box_min": [-0.9] * 3, "box_max": [0.9] * 3}  # fmt: skip
-    return SdfVessel(str(file), **known | options)
+    return make_vessel(str(file), **known | options)
 
 
 def exit_direction(

@@ -9,15 +9,16 @@ from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.core.draws import Draws
 from nerfro.core.types import Path
 from nerfro.fields.hash_grid import HashGridField
-from nerfro.media.shapes import Ball
+from nerfro.geometry.space import Box, Contracted, Space
 from nerfro.rendering import composite
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.points.density_grid import DensityGridSampler
 from tests.cameras_at import cameras_at
+from tests.closed_forms import Ball
 
 WALL = 3.0  # half side of the room
 TOY, SIZE = torch.tensor([0.3, 1.2, 0.2]), 0.3
-SPACE = {"box_min": [-1.0] * 3, "box_max": [1.0] * 3, "radius": 2.0}
+SPACE = Contracted([[-1.0] * 3, [1.0] * 3], 2.0, near=0.3)
 
 
 def seen(path: Path) -> tuple[torch.Tensor, torch.Tensor]:
@@ -61,14 +62,14 @@ def rendered(
     return composite(samples, field(samples), background(path.exits()), path).radiance
 
 
-def scores(space: dict, background: Background, num_steps: int = 150) -> list[float]:
+def scores(space: Space, background: Background, num_steps: int = 150) -> list[float]:
     """PSNR of unseen views: of all pixels, of those behind glass, of those that see the toy."""
     path, target, _ = photographs(24, 1)
     field = HashGridField(
-        **space, num_levels=6, finest_resolution=64, log2_table_size=14, width=32, initial_depth=3.0,
+        space, num_levels=6, finest_resolution=64, log2_table_size=14, width=32, initial_depth=3.0,
         direction_bands=1,
     )  # fmt: skip
-    sampler = DensityGridSampler(24, 48, **space, near=0.3, resolution=32, update_every=4, decay=0.6)
+    sampler = DensityGridSampler(space, 24, 48, resolution=32, update_every=4, decay=0.6)
     parameters = [*field.parameters(), *background.parameters()]
     optimizer = torch.optim.Adam(parameters, eps=1e-15)
     for step in range(num_steps):
@@ -88,7 +89,7 @@ def scores(space: dict, background: Background, num_steps: int = 150) -> list[fl
 
 def test_volume_of_all_space_learns_a_room_better_than_box_and_environment_map() -> None:
     volume = scores(SPACE, ConstantBackground([0.0, 0.0, 0.0]))
-    sky = scores({"box_min": [-0.85] * 3, "box_max": [0.85] * 3}, EnvironmentMap([4, 8, 16, 32]))
+    sky = scores(Box([[-0.85] * 3, [0.85] * 3]), EnvironmentMap([4, 8, 16, 32]))
     assert volume[0] > sky[0] + 6
     assert volume[1] > sky[1] + 5, "behind the glass"
     assert volume[2] > sky[2] + 5, "a box holds what is in it, and the toy stands before it"

@@ -11,21 +11,19 @@ import torch
 from torch import Tensor
 
 from nerfro.core.types import Path, Rays
-from nerfro.media.sdf_grid import SdfGrid
-from nerfro.media.shapes import Ball
-from nerfro.media.solid import Solid
+from nerfro.media.bodies import Bodies
 from nerfro.samplers.paths import compiled
 from nerfro.samplers.paths.replay import smallest_cosine
 from nerfro.samplers.paths.snell import Snell, trace_interfaces
 from nerfro.samplers.paths.snell_law import reflectance
-from tests.closed_forms import RoundedBox, Slab, beam, make_rays, random_rays
+from tests.closed_forms import Ball, RoundedBox, Slab, beam, make_rays, random_rays
 from tests.samplers.nested import NestedBalls, nested_grid, nested_mesh
 
 BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
 _rays = functools.partial(random_rays, width=1.6, seed=2, far=6)
 
 
-def _nested_grid(size: int = 40, iors: Sequence[float] = (1.5, 1.2), **glass: Any) -> SdfGrid:
+def _nested_grid(size: int = 40, iors: Sequence[float] = (1.5, 1.2), **glass: Any) -> Bodies:
     return nested_grid(1.5, size, iors, **glass).float()
 
 
@@ -128,7 +126,7 @@ def test_compiled_branches_match_the_reference(iors: list[float], monkeypatch: p
 
 
 @pytest.mark.parametrize("medium", [_nested_grid(), NestedBalls()], ids=["compiled", "torch"])
-def test_absorbing_body_of_index_one_adds_no_event(medium: Solid) -> None:
+def test_absorbing_body_of_index_one_adds_no_event(medium: Bodies) -> None:
     rays, sampler = _rays(100), Snell(branches="first")
     iors = torch.tensor([1.0, 1.5]).double().requires_grad_()
     results = []
@@ -181,7 +179,7 @@ def test_weights_of_omitted_branches_are_added_to_the_others() -> None:
 def test_derivatives_of_replayed_weights_match_traced_weights(what: str) -> None:
     rays, sampler = _rays(60), Snell(branches="all", least_weight=1e-3)
 
-    def traced(step: Tensor) -> tuple[Path, Rays, Solid]:
+    def traced(step: Tensor) -> tuple[Path, Rays, Bodies]:
         medium = NestedBalls()
         medium = medium.with_indices(medium.iors + (step if what == "index" else 0))
         moved = Rays(rays.origins + (step if what == "origin" else 0), *list(vars(rays).values())[1:])
@@ -205,7 +203,7 @@ def test_derivatives_of_replayed_weights_match_traced_weights(what: str) -> None
     assert float(expected[steady].abs().max()) > 0.05
 
 
-class CementedHalves(Solid):
+class CementedHalves(Bodies):
     """A ball of two glasses: the second one fills the half x > 0 and reaches a rounding error beyond the first one."""
 
     box = BOX.double()

@@ -7,7 +7,7 @@ import torch
 
 from nerfro.core.types import FieldValues, Path, Samples
 from nerfro.fields.base import Field
-from nerfro.geometry.contraction import contracted_length, contraction_scale
+from nerfro.geometry.space import Box, Contracted, Space, contracted_length
 from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.testing import example_draws, example_path
 
@@ -22,25 +22,26 @@ class DenseBall(Field):
         return FieldValues(50.0 * inside, torch.zeros_like(samples.positions))
 
 
-ALL_OF_SPACE = {"radius": 0.7, "near": 0.3, "max_bin_alpha": 0.4}
+CUBE = Box([[-1.0] * 3, [1.0] * 3])
+ALL_OF_SPACE = Contracted([[-1.0] * 3, [1.0] * 3], 0.7, near=0.3)
 
 
-def trained_sampler(**space: float) -> DensityGridSampler:
-    sampler = DensityGridSampler(num_samples=16, num_bins=64, resolution=32, update_every=1, **space)
+def trained_sampler(space: Space = CUBE) -> DensityGridSampler:
+    sampler = DensityGridSampler(space, num_samples=16, num_bins=64, resolution=32, update_every=1)
     for step in range(200):
         sampler.update([DenseBall()], example_draws(step=step))
     return sampler
 
 
-@pytest.mark.parametrize("space", [{}, ALL_OF_SPACE])
-def test_compiled_sampler_matches_the_reference(space: dict) -> None:
-    sampler, path = trained_sampler(**space), example_path(64)
+@pytest.mark.parametrize("space", [CUBE, ALL_OF_SPACE])
+def test_compiled_sampler_matches_the_reference(space: Space) -> None:
+    sampler, path = trained_sampler(space), example_path(64)
     for draws in (None, example_draws(64)):
         plain, compiled = sampler.draw(path, draws), sampler.draw_compiled(path, draws)
         # Nearly infinite places may differ by some of their distance.
-        torch.testing.assert_close(compiled.edges, plain.edges, rtol=5e-3 * bool(space), atol=2e-4)
-        torch.testing.assert_close(compiled.s, plain.s, rtol=5e-3 * bool(space), atol=2e-4)
-        places = sampler.contracted(compiled.positions), sampler.contracted(plain.positions)
+        torch.testing.assert_close(compiled.edges, plain.edges, rtol=5e-3 * space.infinite, atol=2e-4)
+        torch.testing.assert_close(compiled.s, plain.s, rtol=5e-3 * space.infinite, atol=2e-4)
+        places = space.contract(compiled.positions), space.contract(plain.positions)
         torch.testing.assert_close(*places, rtol=0, atol=1e-3)
         torch.testing.assert_close(compiled.deltas, plain.deltas, rtol=1e-2, atol=2e-4)
         close = (compiled.directions - plain.directions).norm(dim=-1) < 1e-5
@@ -58,7 +59,7 @@ def test_samples_concentrate_at_the_density() -> None:
 
 @pytest.mark.parametrize(("max_bin_alpha", "behind"), [(1.0, 0.0), (0.4, 0.26)])
 def test_content_behind_a_partly_empty_cell_gets_samples(max_bin_alpha: float, behind: float) -> None:
-    sampler = DensityGridSampler(num_samples=64, num_bins=64, resolution=32, uniform=0.01, max_bin_alpha=max_bin_alpha)
+    sampler = DensityGridSampler(CUBE, 64, 64, resolution=32, uniform=0.01, max_bin_alpha=max_bin_alpha)
     sampler.density[15:17] = 1e3  # four bins look opaque: two of a cell that something fills in part, and two behind
     path = straight(torch.tensor([0.0, 8.0]), 0.1)
     drawn = sampler(path, None)
@@ -76,10 +77,10 @@ def straight(s: torch.Tensor, impact_parameter: float) -> Path:
 
 @pytest.mark.parametrize("impact_parameter", [0.0, 0.5, 2.0])
 def test_samples_of_all_space_cover_the_contracted_length(impact_parameter: float) -> None:
-    sampler = trained_sampler(**ALL_OF_SPACE)
+    sampler = trained_sampler(ALL_OF_SPACE)
     path = straight(torch.tensor([2.0, 3.0, 3.5, 6.0]), impact_parameter)
     samples = sampler(path, None)
-    shorter = contraction_scale(samples.positions, torch.zeros(3), 0.7)
+    shorter = ALL_OF_SPACE.scale(samples.positions)
     ends = contracted_length(torch.tensor([0.3 - 4, 1e6]), torch.tensor(impact_parameter), 0.7)
     torch.testing.assert_close((samples.deltas * shorter).sum(), ends[1] - ends[0], rtol=1e-3, atol=0)
     assert samples.edges[0, 0] == pytest.approx(0.3, abs=1e-3)  # though the path begins at 2
@@ -87,14 +88,15 @@ def test_samples_of_all_space_cover_the_contracted_length(impact_parameter: floa
 
 
 def test_samples_of_all_space_do_not_depend_on_where_a_line_has_vertices() -> None:
-    sampler = trained_sampler(**ALL_OF_SPACE)
+    sampler = trained_sampler(ALL_OF_SPACE)
     few, many = (sampler(straight(s, 0.2), None) for s in (torch.tensor([1.0, 9.0]), torch.linspace(0.5, 7, 12)))
-    torch.testing.assert_close(sampler.contracted(few.positions), sampler.contracted(many.positions), rtol=0, atol=1e-5)
+    places = ALL_OF_SPACE.contract(few.positions), ALL_OF_SPACE.contract(many.positions)
+    torch.testing.assert_close(*places, rtol=0, atol=1e-5)
     torch.testing.assert_close(few.deltas[:, :-1], many.deltas[:, :-1], rtol=1e-3, atol=1e-5)
 
 
 def test_evaluation_has_its_own_number_of_samples() -> None:
-    sampler = DensityGridSampler(num_samples=16, num_samples_evaluation=40)
+    sampler = DensityGridSampler(CUBE, num_samples=16, num_samples_evaluation=40)
     assert sampler(example_path(4), None, example_draws(4)).s.shape == (4, 16)
     assert sampler(example_path(4), None).s.shape == (4, 40)
 
@@ -116,7 +118,7 @@ class Fog(Field):
 
 @pytest.mark.parametrize(("resolution", "fraction"), [(2, 1 / 16), (4, 1e-4)])
 def test_small_updates_reach_all_cells(resolution: int, fraction: float) -> None:
-    sampler = DensityGridSampler(resolution=resolution, update_fraction=fraction, update_every=1)
+    sampler = DensityGridSampler(CUBE, resolution=resolution, update_fraction=fraction, update_every=1)
     for step in range(12 * resolution**3):
         sampler.update([Fog()], example_draws(step=step))
     assert (sampler.density > 0).all()
@@ -155,12 +157,11 @@ def test_main_polylines_are_sampled_like_unsplit_rays() -> None:
 
 @pytest.mark.parametrize("resolution", [8, 9])
 def test_every_position_is_in_an_updated_cell(resolution: int) -> None:
-    sampler = DensityGridSampler(box_min=[-1] * 3, box_max=[1] * 3, radius=1.0, resolution=resolution)
+    numbered = Contracted([[-1.0] * 3, [1.0] * 3], 1.0).cells(resolution)
     middle = (torch.arange(301) - 150) / 150.5  # of the cube around the ball; some lie in all cells that touch it
     places = torch.cartesian_prod(middle, middle, middle[::7])
     places = places[places.norm(dim=-1) < 1]
     cells = ((places + 1) / 2 * resolution).long()
     numbers = (cells[:, 0] * resolution + cells[:, 1]) * resolution + cells[:, 2]
-    assert sampler.inside is not None
-    assert torch.isin(numbers.unique(), sampler.inside).all()
-    assert len(sampler.inside) < resolution**3
+    assert torch.isin(numbers.unique(), numbered).all()
+    assert len(numbered) < resolution**3

@@ -8,12 +8,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfro.media.sdf_grid import SdfGrid
-from nerfro.media.shapes import Ball
-from nerfro.media.solid import Solid
+from nerfro.media.bodies import Bodies
+from nerfro.media.body_settings import make_bodies
 from nerfro.paper.eikonal import Eikonal
 from nerfro.samplers.paths.snell import Snell
-from tests.closed_forms import RoundedBox, angle, beam, make_rays, random_rays
+from tests.closed_forms import Ball, RoundedBox, angle, beam, make_rays, random_rays
 from tests.conftest import refused
 from tests.samplers.test_snell import _prism
 
@@ -28,7 +27,7 @@ def cauchy(n: float, abbe: float, wavelength: float) -> float:
 
 
 def test_index_follows_cauchys_equation() -> None:
-    medium = Ball(0.8, 1.52, abbe=[60.0]).double()
+    medium = Ball(0.8, 1.52, abbe=60.0).double()
     lines = {name: float(medium.at_wavelength(w).iors[0]) for name, w in (("d", 587.56), ("F", 486.13), ("C", 656.27))}
     assert lines["d"] == pytest.approx(1.52, abs=1e-12)
     assert 0.52 / (lines["F"] - lines["C"]) == pytest.approx(60, rel=1e-9)
@@ -40,7 +39,7 @@ def test_index_follows_cauchys_equation() -> None:
 def test_angles_of_the_primary_rainbow_match_closed_form(wavelength: float, degrees: float) -> None:
     n = cauchy(*WATER, wavelength)
     i = math.acos(math.sqrt((n * n - 1) / 3)) + 1e-3 * torch.linspace(-1, 1, 201, dtype=torch.float64)
-    medium = Ball(0.8, WATER[0], abbe=[WATER[1]]).double()
+    medium = Ball(0.8, WATER[0], abbe=WATER[1]).double()
     sampler = Snell(branches="all", least_weight=1e-3, wavelengths=[wavelength, 500, 500])
     trace = sampler.trace(beam(0.8 * i.sin()), medium)
     bow = trace.path.exit_directions[(trace.num_events == 3) & (trace.path.band == 0)]
@@ -55,7 +54,8 @@ def test_angles_of_the_primary_rainbow_match_closed_form(wavelength: float, degr
 def test_dispersion_of_a_prism_matches_closed_form(tmp_path: FilePath) -> None:
     apex, n, abbe = math.radians(50), 1.5, 40.0
     _prism(apex, 0.9).export(tmp_path / "prism.ply")
-    medium = SdfGrid(str(tmp_path / "prism.ply"), n, resolution=48, abbe=[abbe], cache=False)
+    prism = {"mesh": str(tmp_path / "prism.ply"), "ior": n, "abbe": abbe}
+    medium = make_bodies(bodies={"prism": prism}, resolution=48, cache=False)
     i = math.radians(45)
     direction = np.array([[math.cos(i - apex / 2), math.sin(i - apex / 2), 0.0]])
     target = np.array([-0.225 * math.tan(apex / 2) * 2, 0.0, 0.1])
@@ -76,7 +76,7 @@ def test_dispersion_of_a_prism_matches_closed_form(tmp_path: FilePath) -> None:
 @pytest.mark.parametrize("branches", ["none", "all"])
 def test_every_band_is_traced_as_a_ray_of_its_colour(branches: str) -> None:
     rays, sampler = random_rays(60, 2.0, seed=3, far=6), Snell(branches=branches)  # type: ignore[arg-type]
-    medium = RoundedBox(abbe=[30.0]).double()
+    medium = RoundedBox(abbe=30.0).double()
     path = sampler(rays, medium)
     total = path.sum_polylines(torch.ones(len(path.s), 3).double())
     torch.testing.assert_close(total, torch.ones_like(total))
@@ -95,7 +95,7 @@ def test_every_band_is_traced_as_a_ray_of_its_colour(branches: str) -> None:
 
 def test_gradients_of_all_bands_reach_the_index() -> None:
     def exits(step: Tensor, refine: bool) -> Tensor:
-        medium: Solid = Ball(abbe=[30.0]).double()
+        medium: Bodies = Ball(abbe=30.0).double()
         medium = medium.with_indices(medium.iors + step)
         with torch.no_grad():
             path = sampler(rays, medium)
@@ -112,10 +112,10 @@ def test_gradients_of_all_bands_reach_the_index() -> None:
 
 def test_learned_index_keeps_its_abbe_number() -> None:
     index = torch.tensor([1.5], dtype=torch.float64, requires_grad=True)
-    medium = Ball(abbe=[30.0]).with_indices(index)
+    medium = Ball(abbe=30.0).with_indices(index)
     (gradient,) = torch.autograd.grad(medium.at_wavelength(450).iors.sum(), index)
     assert float(gradient) == pytest.approx((cauchy(1.6, 30, 450) - cauchy(1.5, 30, 450)) / 0.1)
 
 
 def test_unsupported_dispersion_is_refused() -> None:
-    refused("path=snell", lambda: Eikonal()(random_rays(2, 2.0, seed=3, far=6), Ball(abbe=[30.0])))
+    refused("path=snell", lambda: Eikonal()(random_rays(2, 2.0, seed=3, far=6), Ball(abbe=30.0)))

@@ -6,12 +6,23 @@ import pytest
 import torch
 
 from nerfro.media.base import Medium
-from nerfro.media.sdf_grid import SdfGrid
-from nerfro.media.shapes import Ball
+from nerfro.media.bodies import Bodies
 from nerfro.paper.eikonal import Eikonal, march_adaptive, march_uniform
 from nerfro.paper.integrators import euler
 from nerfro.paper.voxel_grid import VoxelGrid
-from tests.closed_forms import Luneburg, RoundedBox, Slab, angle, ball_exits, beam, grid_points, make_rays, random_rays
+from tests.closed_forms import (
+    Ball,
+    Luneburg,
+    RoundedBox,
+    Slab,
+    angle,
+    ball_exits,
+    beam,
+    grid_points,
+    make_rays,
+    random_rays,
+    sampled,
+)
 
 BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
 
@@ -92,11 +103,11 @@ def test_rays_continue_straight_after_the_limit_of_steps() -> None:
 # --- compiled kernels against plain torch ---
 
 
-def _grids() -> tuple[VoxelGrid, SdfGrid]:
+def _grids() -> tuple[VoxelGrid, Bodies]:
     points = grid_points(1.5, 40)
     radius = points.norm(dim=-1)
     voxels = VoxelGrid.from_occupancy((radius < 0.8).float(), BOX, 1.5, 5, 1.0)
-    return voxels, SdfGrid.from_distances(torch.stack([radius - 0.9, radius - 0.4]), BOX, [1.5, 1.2], 0.02)
+    return voxels, sampled(torch.stack([radius - 0.9, radius - 0.4]), BOX, [1.5, 1.2], 0.02)
 
 
 def test_compiled_uniform_steps_match_the_reference() -> None:

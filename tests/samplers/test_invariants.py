@@ -7,8 +7,6 @@ from torch import Tensor
 from nerfro.core.types import FieldValues, Path, Rendering
 from nerfro.media.analytic import Vacuum
 from nerfro.media.base import Medium
-from nerfro.media.sdf_grid import SdfGrid
-from nerfro.media.shapes import Ball
 from nerfro.paper.eikonal import Eikonal
 from nerfro.paper.hierarchical import Hierarchical
 from nerfro.paper.integrators import RayState, kick_drift_kick, leapfrog
@@ -20,6 +18,7 @@ from nerfro.samplers.paths.straight import Straight
 from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import example_rays
 from tests.closed_forms import (
+    Ball,
     FunctionMedium,
     Squared,
     blurred_ball,
@@ -27,6 +26,7 @@ from tests.closed_forms import (
     fisheye,
     grid_points,
     luneburg,
+    sampled,
 )
 
 SMOOTH = [luneburg, fisheye, fibre]
@@ -105,7 +105,7 @@ def test_speed_equals_the_index_and_radial_media_conserve_the_moment(squared: Sq
 def _of_index_one() -> dict[str, tuple[PathSampler, Medium]]:
     box = torch.tensor([[-1.5] * 3, [1.5] * 3])
     radius = grid_points(1.5, 40).norm(dim=-1)
-    distances = SdfGrid.from_distances(radius[None] - 0.8, box, [1.0], 0.02)
+    distances = sampled(radius[None] - 0.8, box, [1.0], 0.02)
     voxels = VoxelGrid.from_occupancy((radius < 0.8).float(), box, 1.0, 5, 1.0)
     return {
         "snell-vacuum": (Snell(), Vacuum()),

@@ -11,7 +11,7 @@ from torch import Tensor
 from nerfro.core.types import Path
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.media.base import Medium
-from nerfro.media.sdf_grid import SdfGrid
+from nerfro.media.body_settings import make_bodies
 from nerfro.paper.eikonal import Eikonal
 from nerfro.samplers.base import PathSampler
 from nerfro.samplers.paths.snell import Snell
@@ -26,7 +26,7 @@ def _medium(folder: FilePath, kind: str) -> Medium:
     if kind == "analytic":
         return RoundedBox(0.7, 0.1, 1.5)
     trimesh.creation.box(extents=[1.4, 1.4, 1.4]).export(folder / "cube.ply")
-    return SdfGrid(str(folder / "cube.ply"), 1.5, resolution=48, cache=False)
+    return make_bodies(str(folder / "cube.ply"), 1.5, resolution=48, cache=False)
 
 
 CASES = [

@@ -14,15 +14,15 @@ from torch import Tensor
 from nerfro.core.types import Path, Rays, Samples
 from nerfro.media.analytic import Vacuum
 from nerfro.media.base import Medium
-from nerfro.media.sdf_grid import SdfGrid
-from nerfro.media.shapes import Ball
+from nerfro.media.bodies import Bodies
+from nerfro.media.body_settings import make_bodies
 from nerfro.paper.eikonal import Eikonal, march_adaptive
 from nerfro.paper.voxel_grid import VoxelGrid
 from nerfro.samplers.base import PathSampler
 from nerfro.samplers.paths.replay import smallest_cosine
 from nerfro.samplers.paths.snell import Snell, trace_interfaces
 from nerfro.samplers.paths.straight import Straight
-from tests.closed_forms import RoundedBox, beam, grid_points, make_rays, random_rays
+from tests.closed_forms import Ball, RoundedBox, beam, grid_points, make_rays, random_rays
 from tests.samplers.nested import NestedBalls, nested_grid, nested_mesh
 
 BOX = torch.tensor([[-1.2] * 3, [1.2] * 3], dtype=torch.float64)
@@ -46,14 +46,14 @@ class PlainEikonal(Eikonal):
         return march_adaptive(rays, medium, 1e-3, self.max_steps)[0]
 
 
-def _nested_grid(inner_ior: float = 1.0, **glass: Any) -> SdfGrid:
+def _nested_grid(inner_ior: float = 1.0, **glass: Any) -> Bodies:
     """A ball of glass with a ball beside its middle, by default a bubble: rays are totally reflected at either."""
     return nested_grid(1.2, 33, [1.5, inner_ior], **glass)
 
 
-def _cube_mesh(folder: FilePath) -> SdfGrid:
+def _cube_mesh(folder: FilePath) -> Bodies:
     trimesh.creation.box(extents=[1.1, 1.2, 1.3]).export(folder / "cube.ply")
-    return SdfGrid(str(folder / "cube.ply"), 1.52, resolution=24, cache=False).double()
+    return make_bodies(str(folder / "cube.ply"), 1.52, resolution=24, cache=False).double()
 
 
 SCENES: dict[str, tuple[PathSampler, Callable[[FilePath], Medium]]] = {
@@ -158,7 +158,7 @@ REFINED: list[tuple[PathSampler, Callable[[FilePath], Medium]]] = [
     (Eikonal("euler", 64), lambda folder: _voxels()),
     (Snell(), lambda folder: Vacuum()),
     (Straight(), lambda folder: Vacuum()),
-    (Snell(), lambda folder: Ball(0.8, 1.5, abbe=[30.0])),
+    (Snell(), lambda folder: Ball(0.8, 1.5, abbe=30.0)),
 ]
 
 

@@ -12,11 +12,23 @@ from torch import Tensor
 from benchmarks.rounded_cube import trace_rounded_cube
 from nerfro.core.errors import NerfroError
 from nerfro.core.types import Rays
-from nerfro.media.sdf_grid import SdfGrid
-from nerfro.media.shapes import Ball
+from nerfro.media.bodies import Bodies
+from nerfro.media.body_settings import make_bodies
 from nerfro.samplers.paths.snell import Snell, trace_interfaces
 from nerfro.samplers.paths.snell_law import refract
-from tests.closed_forms import Luneburg, RoundedBox, Slab, angle, ball_exits, beam, grid_points, make_rays, random_rays
+from tests.closed_forms import (
+    Ball,
+    Luneburg,
+    RoundedBox,
+    Slab,
+    angle,
+    ball_exits,
+    beam,
+    grid_points,
+    make_rays,
+    random_rays,
+    sampled,
+)
 from tests.conftest import refused
 
 BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
@@ -26,13 +38,13 @@ def _rays(origins: list | Tensor, directions: list | Tensor, near: float = 0.5, 
     return make_rays(origins, directions, near, far)
 
 
-def _grid(values: Tensor, iors: list[float]) -> SdfGrid:
-    return SdfGrid.from_distances(values, BOX, iors, 0.02)
+def _grid(values: Tensor, iors: list[float]) -> Bodies:
+    return sampled(values, BOX, iors, 0.02)
 
 
-def _mesh_medium(shape: trimesh.Trimesh, folder: FilePath, ior: float = 1.5, resolution: int = 48) -> SdfGrid:
+def _mesh_medium(shape: trimesh.Trimesh, folder: FilePath, ior: float = 1.5, resolution: int = 48) -> Bodies:
     shape.export(folder / "shape.ply")
-    return SdfGrid(str(folder / "shape.ply"), ior, resolution=resolution, cache=False)
+    return make_bodies(str(folder / "shape.ply"), ior, resolution=resolution, cache=False)
 
 
 # --- the law ---
@@ -216,7 +228,8 @@ def test_water_that_exactly_fills_its_glass_matches_closed_form(tmp_path: FilePa
     trimesh.util.concatenate([trimesh.creation.icosphere(4, 0.9), water]).export(tmp_path / "glass.ply")
     water.export(tmp_path / "water.ply")
     glass, inner = str(tmp_path / "glass.ply"), str(tmp_path / "water.ply")
-    medium = SdfGrid(glass, 1.5, inner_meshes=[inner], inner_iors=[1.33], resolution=48, cache=False)
+    bodies = {"glass": {"mesh": glass, "ior": 1.5}, "water": {"mesh": inner, "ior": 1.33}}
+    medium = make_bodies(bodies=bodies, resolution=48, cache=False)
     path = Snell("mesh")(beam(heights), medium)
     assert angle(path.exit_directions, _nested_exit(heights, 0.9, 1.5, 0.7, 1.33)[0]).median() < 0.05
 
@@ -255,7 +268,7 @@ def test_winding_of_an_open_mesh_does_not_decide_where_rays_begin(tmp_path: File
     if inverted:
         dome.invert()
     dome.export(tmp_path / "dome.ply")
-    medium = SdfGrid(str(tmp_path / "dome.ply"), 1.5, resolution=48, accept_open_mesh=True, cache=False)
+    medium = make_bodies(str(tmp_path / "dome.ply"), 1.5, resolution=48, accept_open_mesh=True, cache=False)
     rays = _rays([[0.0, 0.0, 1.0], [0.1, 0.0, 0.3]], [[0.0, 0.6, -0.8], [0.6, 0.0, 0.8]], near=0.0)
     assert Snell("mesh")(rays, medium).body[:, 0].tolist() == [0, 1]
 

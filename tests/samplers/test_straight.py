@@ -3,8 +3,8 @@
 import torch
 
 from nerfro.core.types import Rays
-from nerfro.media.shapes import Ball
 from nerfro.samplers.paths.straight import Straight
+from tests.closed_forms import Ball
 
 
 def test_path_is_the_line_from_near_to_far_in_any_medium() -> None:

@@ -10,8 +10,8 @@ from torch import Tensor
 from nerfro.core.light import to_srgb
 from nerfro.core.types import Path, Rays
 from nerfro.evaluation.image_metrics import psnr
-from nerfro.media.sdf_grid import SdfGrid
-from nerfro.media.shapes import Ball
+from nerfro.media.bodies import Bodies
+from nerfro.media.body_settings import make_bodies
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.subdivision import part_rays
 from nerfro.synthetic import path_tracer
@@ -19,7 +19,7 @@ from nerfro.synthetic.path_tracer import PathTracer, Pinhole
 from nerfro.synthetic.surface import SurfaceMesh, rounded_box, sphere
 from nerfro.synthetic.viewpoints import look_at_origin
 from tests.cameras_at import cameras_at
-from tests.closed_forms import RoundedBox, grid_points
+from tests.closed_forms import Ball, RoundedBox, grid_points, sampled
 from tests.synthetic.empty_glass import empty_glass
 
 # Sums over a pixel of a cube converge slowly: an edge sees lamps in many directions.
@@ -65,11 +65,11 @@ def path_traced(
     return torch.from_numpy(tracer.render(POSE, SPP, seed=1))
 
 
-def on_grid(what: str, **glass: list[float] | bool) -> SdfGrid:
+def on_grid(what: str, **glass: list[float] | bool) -> Bodies:
     """The ball or the cube on a grid, for the compiled kernel."""
     shape = Ball(0.7) if what == "ball" else RoundedBox(0.55, 0.2)
     points = grid_points(0.9, 96)
-    return SdfGrid.from_distances(shape.signed_distances(points)[0].movedim(-1, 0), BOX, [1.5], 0.02, **glass)
+    return sampled(shape.signed_distances(points)[0].movedim(-1, 0), BOX, [1.5], 0.02, **glass)
 
 
 def rays_of_picture(parts: int = PARTS) -> Rays:
@@ -98,8 +98,10 @@ def test_images_of_empty_glass_match_the_dielectric_of_mitsuba(what: str, tmp_pa
         inner = water, 1.33
         glass.save(tmp_path / "glass.ply")
         water.save(tmp_path / "water.ply")
-        files = str(tmp_path / "glass.ply"), 1.5, [str(tmp_path / "water.ply")], [1.33]
-        medium = SdfGrid(*files, 48, BOX[0].tolist(), BOX[1].tolist(), cache=False)
+        meshes = {"glass.ply": 1.5, "water.ply": 1.33}
+        bodies = {name[:5]: {"mesh": str(tmp_path / name), "ior": ior} for name, ior in meshes.items()}
+        box = {"box_min": BOX[0].tolist(), "box_max": BOX[1].tolist()}
+        medium = make_bodies(bodies=bodies, resolution=48, cache=False, **box)
     else:
         medium = on_grid(what)
     expected, rays = path_traced(glass, 1.5, inner=inner), rays_of_picture()
@@ -120,9 +122,9 @@ def test_images_of_empty_glass_match_the_dielectric_of_mitsuba(what: str, tmp_pa
 @pytest.mark.parametrize("what", ["ball", "cube"])
 def test_absorption_matches_the_path_tracer_and_is_learned_from_an_image(what: str) -> None:
     expected = path_traced(BALL if what == "ball" else CUBE, 1.5, COLOURED).float()
-    given, learner = on_grid(what, absorption=list(COLOURED)), on_grid(what, learn_absorption=True)
+    given, learner = on_grid(what, absorption=list(COLOURED)), on_grid(what, learn=["absorption"])
 
-    def picture(medium: SdfGrid, path: Path) -> Tensor:
+    def picture(medium: Bodies, path: Path) -> Tensor:
         return seen(path, medium.with_absorption(path).transmitted(path.far[:, None])[:, 0])
 
     assert agreement(picture(given, BRANCHES(rays_of_picture(), given)), expected) > 35
@@ -141,7 +143,7 @@ def test_absorption_matches_the_path_tracer_and_is_learned_from_an_image(what: s
 
 @pytest.mark.usefixtures("mitsuba")
 def test_dispersive_cube_matches_the_path_tracer_at_three_wavelengths() -> None:
-    medium, rays = on_grid("cube", abbe=[5.0]), rays_of_picture()
+    medium, rays = on_grid("cube", abbe=5.0), rays_of_picture()
     iors = [float(medium.at_wavelength(wavelength).iors) for wavelength in BRANCHES.wavelengths]
     assert iors[2] - iors[0] > 0.1
     expected = torch.stack([path_traced(CUBE, ior)[..., colour] for colour, ior in enumerate(iors)], -1)

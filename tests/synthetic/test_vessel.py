@@ -10,10 +10,10 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from nerfro.core.rays import Rays
-from nerfro.media.solid import Solid
+from nerfro.media.bodies import Bodies
+from nerfro.media.vessel import make_vessel
 from nerfro.samplers.paths.snell import Snell
 from tests.closed_forms import angle, make_rays
-from tests.media.vessels import SdfVessel
 
 RADIUS, HEIGHT, WALL, FOOT, LEVEL = 0.5, 1.6, 0.06, 0.16, 0.8
 GLASS, WATER, AIR = 1.5, 1.33, 1.0
@@ -120,7 +120,7 @@ def _with_bsdf(mi: ModuleType, material: object) -> object:
     return properties
 
 
-def _errors(medium: Solid, rays: Rays, by_mitsuba: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+def _errors(medium: Bodies, rays: Rays, by_mitsuba: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor]:
     """Angles to Mitsuba's directions, degrees: of rays through the water, and of those far from edges."""
     directions, through_water, steady = by_mitsuba
     errors = angle(Snell()(rays, medium).exit_directions.double(), directions)
@@ -133,7 +133,7 @@ def test_rays_through_a_half_full_glass_match_mitsuba(
     _, through_water, steady = by_mitsuba
     assert through_water.float().mean() > 0.5
     assert steady.float().mean() > 0.2
-    glass = SdfVessel(mesh, WALL, FOOT, LEVEL, ior=GLASS, liquid_ior=WATER, **GRID)
+    glass = make_vessel(mesh, WALL, FOOT, LEVEL, ior=GLASS, liquid_ior=WATER, **GRID)
     errors, errors_far_from_edges = _errors(glass, rays, by_mitsuba)
     assert errors.median() < 0.03
     assert errors_far_from_edges.median() < 0.01

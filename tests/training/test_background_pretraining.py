@@ -96,7 +96,8 @@ def test_fits_of_few_pixels_use_the_pixels_of_larger_fits(
 def test_rays_that_split_into_colours_do_not_show_the_background(
     tiny_scene: Path, tiny_default_run: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    module, data = build(overrides=[*tiny_default_run, "medium.abbe=[30]", "trainer.max_steps=1"])
+    flint = "medium.bodies={object: {ior: 1.5, abbe: 30}}"
+    module, data = build(overrides=[*tiny_default_run, flint, "trainer.max_steps=1"])
     views = BlenderData(str(tiny_scene), near=2.0, far=6.0).load("train")
     run = TrainingRun(module.renderer, data.batches, views, torch.optim.Adam(module.parameters()), 0.0)
     phase = BackgroundSteps(steps=2, start=8)

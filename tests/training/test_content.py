@@ -1,17 +1,22 @@
 """The space that a run covers, and the resolution of its background."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from omegaconf import DictConfig, OmegaConf
 
+from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.core.cameras import Cameras
+from nerfro.fields.hash_grid import HashGridField
+from nerfro.geometry.space import Contracted, Unbounded
 from nerfro.media.analytic import Vacuum
 from nerfro.registry.allowed import untyped
-from nerfro.registry.registration import discover, find
-from nerfro.training.angular_resolution import derive_angular_resolution
+from nerfro.testing import example_views
 from nerfro.training.config import TrainConfig
-from nerfro.training.content import common_target, derive_content, describe
+from nerfro.training.content import common_target, content_settings, describe, space_of
+from nerfro.training.settings import with_values
 from tests.exact_silhouettes import cameras_around
 
 MIDDLE = np.array([0.4, -2.0, 1.0])
@@ -25,12 +30,14 @@ def around(num: int) -> Cameras:
 
 
 def of_all_space(**content: object) -> DictConfig:
-    config = OmegaConf.structured(untyped(TrainConfig()))
-    config.medium = {}
-    config.content.space = "all"
-    config.content.update(content)
-    derive_content(config, Vacuum(), around(7))
-    return config.content
+    config = OmegaConf.structured(untyped(TrainConfig(medium={})))
+    config = with_values(config, {"content.space": "all", **{f"content.{name}": content[name] for name in content}})
+    return with_values(config, content_settings(config, Vacuum(), around(7))).content
+
+
+def finest_cells(radius: float) -> int:
+    views, space = replace(example_views(), cameras=around(7)), Contracted(np.stack([MIDDLE - 1, MIDDLE + 1]), radius)
+    return HashGridField.derive(OmegaConf.create(), views, space)["finest_resolution"]
 
 
 def test_content_ball_lies_at_the_target_of_the_cameras() -> None:
@@ -38,17 +45,20 @@ def test_content_ball_lies_at_the_target_of_the_cameras() -> None:
     np.testing.assert_allclose(np.mean([content.box_min, content.box_max], axis=0), MIDDLE, atol=1e-4)
     assert content.radius == 1.5
     assert content.near == pytest.approx(0.9)
+    assert "contracted beyond 1.5 around (0.4, -2, 1)" in describe(OmegaConf.create({"content": content, "field": {}}))
+
+
+def test_finest_cells_are_half_a_pixel_wide() -> None:
     # A pixel is 3 / 40 wide there, and contracted space 6; two cells a pixel.
-    assert content.cells == pytest.approx(160, abs=1)
-    assert of_all_space(radius=6.0).cells == pytest.approx(640, abs=1)
-    assert of_all_space(radius=0.75).cells == 128  # 80 would be too few
-    assert "contracted beyond 1.5 around (0.4, -2, 1)" in describe(content)
+    assert finest_cells(1.5) == pytest.approx(160, abs=1)
+    assert finest_cells(6.0) == pytest.approx(640, abs=1)
+    assert finest_cells(0.75) == 128  # 80 would be too few
 
 
 def test_explicit_settings_are_kept() -> None:
-    given = {"box_min": [0.0, 0.0, 0.0], "box_max": [2.0, 2.0, 2.0], "radius": 5.0, "near": 0.0, "cells": 77}
-    content = of_all_space(**given)
-    assert {name: content[name] for name in given} == given
+    explicit = {"box_min": [0.0, 0.0, 0.0], "box_max": [2.0, 2.0, 2.0], "radius": 5.0, "near": 0.0}
+    content = of_all_space(**explicit)
+    assert {name: content[name] for name in explicit} == explicit
 
 
 def test_parallel_cameras_have_a_default_depth() -> None:
@@ -57,12 +67,13 @@ def test_parallel_cameras_have_a_default_depth() -> None:
     np.testing.assert_allclose(common_target(centres, forward, 4.0), [0.5, 0.5, -4.0], atol=1e-9)
 
 
-def test_content_in_a_box_needs_no_cameras() -> None:
-    config = OmegaConf.structured(untyped(TrainConfig()))
-    config.content.box_min, config.content.box_max = [0.0] * 3, [1.0] * 3
-    derive_content(config, Vacuum())
-    assert config.content.radius is None
-    assert describe(config.content) == ""
+@pytest.mark.parametrize("space", ["box", "unbounded"])
+def test_content_without_contraction_needs_no_cameras(space: str) -> None:
+    box = {"content.box_min": [0.0] * 3, "content.box_max": [1.0] * 3}
+    config = with_values(OmegaConf.structured(untyped(TrainConfig(field={}))), {"content.space": space, **box})
+    assert content_settings(config, Vacuum(), around(0)) == box
+    assert space_of(config.content).has_box == (space == "box")
+    assert describe(config) == ""
 
 
 @pytest.mark.parametrize(
@@ -80,19 +91,15 @@ def test_content_in_a_box_needs_no_cameras() -> None:
 def test_finest_texel_follows_the_pixel(
     side: int, fits: bool, given: list[int] | None, descent: int, finest: int
 ) -> None:
-    discover()
-    cameras = cameras_around(3, side, focal=1.4)
-    background = {"_target_": find("background", "envmap").target, "resolutions": given, "fitted_resolutions": None}
+    views = replace(example_views(), cameras=cameras_around(3, side, focal=1.4))
     config = OmegaConf.create({
-        "background": background,
-        "content": {"space": "box"},
-        "loss": {"total_variation": {"weight": 1.0, "angle": None}},
+        "background": {"resolutions": given, "fitted_resolutions": None},
         "phase": {"background": {"steps": 10 if fits else 0}},
     })  # fmt: skip
-    derive_angular_resolution(config, cameras)
-    assert max(config.background.resolutions) == descent
-    assert max([*config.background.resolutions, *(config.background.fitted_resolutions or ())]) == finest
+    settings = {**config.background} | EnvironmentMap.derive(config, views, Unbounded())
+    resolutions, fitted = settings["resolutions"], settings["fitted_resolutions"]
+    assert max(resolutions) == descent
+    assert max([*resolutions, *(fitted or ())]) == finest
     if given is None and side < 4000 and fits:
         pixel = 57.3 / (1.4 * side)
         assert 2**-0.5 < (90 / finest) / pixel < 2**0.5
-    assert config.loss.total_variation.angle == pytest.approx(2 * 90 / descent)

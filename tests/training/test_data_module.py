@@ -15,7 +15,7 @@ from lightning.pytorch import Trainer
 from nerfro.core.types import Batch
 from nerfro.data.blender import BlenderData
 from nerfro.data.pixel_store import PixelStore
-from nerfro.media.sdf_grid import SdfGrid
+from nerfro.media.bodies import Bodies
 from nerfro.paper.eikonal import Eikonal
 from nerfro.rendering import Renderer, Scene
 from nerfro.samplers.paths.snell import Snell
@@ -23,16 +23,16 @@ from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.training.data_module import Prefetcher, RayDataModule, can_prefetch, multiplies_large_matrices
 from nerfro.training.module import TrainingModule
 from nerfro.training.ray_batches import RayBatches
-from tests.closed_forms import grid_points, random_rays
+from tests.closed_forms import grid_points, random_rays, sampled
 from tests.conftest import Runner, weights_of
 from tests.pretended_gpu import GPU, PretendedGpu
 
 
 @pytest.fixture(scope="module")
-def ball() -> SdfGrid:
+def ball() -> Bodies:
     points = grid_points(1.5, 40)
     box = torch.tensor([[-1.5] * 3, [1.5] * 3])
-    return SdfGrid.from_distances(points.norm(dim=-1)[None] - 0.8, box, [1.5], 0.01)
+    return sampled(points.norm(dim=-1)[None] - 0.8, box, [1.5], 0.01)
 
 
 def running() -> list[str]:
@@ -54,7 +54,7 @@ def ahead():
     assert not running()
 
 
-def test_prefetched_paths_equal_those_of_the_step_in_any_order(ahead, ball: SdfGrid) -> None:
+def test_prefetched_paths_equal_those_of_the_step_in_any_order(ahead, ball: Bodies) -> None:
     sampler = Snell()
     make: Any = lambda step: sampler(random_rays(300, 1.6, step, 6.0), ball)  # noqa: E731
     one = ahead(make)
@@ -105,7 +105,7 @@ def test_prefetcher_limits_the_threads_of_torch_unless_matrices_are_large(
         torch.set_num_threads(threads)
 
 
-def test_paths_are_not_prefetched_if_they_learn_or_need_python(ball: SdfGrid, monkeypatch) -> None:
+def test_paths_are_not_prefetched_if_they_learn_or_need_python(ball: Bodies, monkeypatch) -> None:
     monkeypatch.setattr("os.sched_getaffinity", lambda pid: {0, 1}, raising=False)
 
     def model(path_sampler, learns: bool = False) -> Any:
@@ -143,7 +143,7 @@ def test_weights_depend_neither_on_the_thread_nor_on_an_interruption(
 
 @pytest.mark.parametrize("learns", [True, False])
 def test_batch_is_made_when_its_step_begins_if_paths_learn(
-    learns: bool, ball: SdfGrid, monkeypatch: pytest.MonkeyPatch
+    learns: bool, ball: Bodies, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Lightning fetches one step early, so what it fetches must not be the batch."""
     monkeypatch.setattr("os.sched_getaffinity", lambda pid: {0, 1}, raising=False)

@@ -28,8 +28,8 @@ def dent(mesh: Path) -> None:
 def test_files_of_the_medium_and_cameras_are_compared_with_a_checkpoint(tmp_path: Path) -> None:
     for name in ("mesh.ply", "inner.ply"):
         trimesh.creation.icosphere(2).export(tmp_path / name)
-    inner = [f"medium.inner_meshes=[{tmp_path / 'inner.ply'}]", "medium.inner_iors=[1.3]"]
-    config = composed(f"medium.mesh={tmp_path / 'mesh.ply'}", *inner)
+    bodies = f"{{glass: {{ior: 1.5}}, water: {{mesh: {tmp_path / 'inner.ply'}, ior: 1.3}}}}"
+    config = composed(f"medium.mesh={tmp_path / 'mesh.ply'}", f"medium.bodies={bodies}")
     cameras = Cameras(torch.rand(3, 3, 4), *torch.rand(4, 3), 8, 8, 1.0, 2.0)
     checkpoint = {INPUTS: inputs_of(config, cameras)}
     path = tmp_path / "last.ckpt"
@@ -37,8 +37,8 @@ def test_files_of_the_medium_and_cameras_are_compared_with_a_checkpoint(tmp_path
     fewer = cameras.select([0, 1])
     refused("was trained on other photographs or cameras", require_same_inputs, checkpoint, path, config, fewer)
     dent(tmp_path / "inner.ply")
-    assert changed_file(checkpoint, config) == "medium.inner_meshes[0]"
-    refused(r"content of the file medium\.inner_meshes\[0\]", require_same_inputs, checkpoint, path, config, cameras)
+    assert changed_file(checkpoint, config) == "medium.bodies.water.mesh"
+    refused(r"content of the file medium\.bodies\.water\.mesh", require_same_inputs, checkpoint, path, config, cameras)
 
 
 def test_changed_surface_is_reported_in_loading_and_refused_in_resuming(

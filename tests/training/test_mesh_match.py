@@ -10,7 +10,7 @@ import trimesh
 
 from nerfro.core.errors import NerfroError
 from nerfro.data.base import Views
-from nerfro.media.sdf_grid import SdfGrid
+from nerfro.media.body_settings import make_bodies
 from nerfro.training.mesh_match import require_match
 from tests.exact_silhouettes import cameras_around, photographed
 
@@ -44,7 +44,7 @@ def test_unit_axes_and_position_of_a_mesh_are_compared_with_the_masks(
 ) -> None:  # fmt: skip
     changed = trimesh.Trimesh(OBJECT.vertices @ matrix.T + shift, OBJECT.faces, process=False)
     changed.export(tmp_path / "mesh.ply")
-    medium = SdfGrid(str(tmp_path / "mesh.ply"), resolution=24, cache=False)
+    medium = make_bodies(str(tmp_path / "mesh.ply"), resolution=24, cache=False)
     try:
         require_match(medium, views)
         said = capsys.readouterr().out

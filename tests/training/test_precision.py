@@ -12,6 +12,7 @@ from torch import Tensor
 from nerfro.evaluation.request import find_device
 from nerfro.fields import relu_mlp
 from nerfro.fields.hash_grid import HashGridField
+from nerfro.testing import example_space
 from nerfro.training.trainer import lightning_precision, training_accelerator
 
 
@@ -51,7 +52,7 @@ def test_field_uses_bfloat16_if_the_machine_supports_it(has_units: bool, monkeyp
     monkeypatch.setattr(relu_mlp, "relu_mlp", spy)
     positions = torch.zeros(4, 3)
     for precision in (None, "bfloat16", "float32"):
-        HashGridField(num_levels=2, log2_table_size=6, precision=precision).density(positions)
+        HashGridField(example_space(), num_levels=2, log2_table_size=6, precision=precision).density(positions)
     assert used == [torch.bfloat16 if has_units else torch.float32, torch.bfloat16, torch.float32]
 
 

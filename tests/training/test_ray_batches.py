@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from nerfro.data.base import Views
-from nerfro.media.shapes import Ball
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.training.ray_batches import RayBatches
 from tests.cameras_at import cameras_at, random_poses
+from tests.closed_forms import Ball
 from tests.conftest import refused
 
 NUM_VIEWS, HEIGHT, WIDTH = 5, 12, 16

@@ -125,7 +125,7 @@ def test_short_runs_score_one_view(train: Runner, tmp_path: Path) -> None:
 def test_switches_shorten_runs(option: str, steps: int) -> None:
     config = OmegaConf.structured(untyped(TrainConfig()))
     OmegaConf.update(config, option, True)
-    resolve_trainer_options(config)
+    config = resolve_trainer_options(config)
     assert config.trainer.max_steps == config.evaluation.every == steps
 
 
@@ -166,7 +166,7 @@ def test_unusual_precision_and_size_train(options: list[str], train: Runner, tmp
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["content.space=all"], "add field=volume sampler/points=volume"),
+        (["content.space=all", "field=nerf", "sampler/points=stratified"], "add field=volume sampler/points=volume"),
         (["background.image=sky.exr", "model.colour=srgb"], "take model.colour=linear"),
         (
             [f"loss.{name}.weight=0" for name in ("photometric", "background", "smoothness", "total_variation")],

@@ -17,13 +17,13 @@ from nerfro.core.light import to_srgb
 from nerfro.core.types import Rays, mean_per_pixel
 from nerfro.data.base import Views
 from nerfro.data.blender import BlenderData
-from nerfro.media.shapes import Ball
 from nerfro.rendering import ColourSpace, Renderer, Scene
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.training.data_module import NO_IMAGE, RayDataModule, RotatingView, validation_interval
 from nerfro.training.ray_batches import RayBatches
 from nerfro.training.validation import OverfittingWarning, ValidationPixels
+from tests.closed_forms import Ball
 from tests.conftest import Runner, repaint
 
 LINE = "the model overfits"

@@ -13,7 +13,6 @@ from nerfro.core.types import FieldValues, Samples
 from nerfro.data.base import DataSource, Views
 from nerfro.fields.base import Field
 from nerfro.files import lat_long
-from nerfro.media.shapes import Ball
 from nerfro.models.refractive import RefractiveModel
 from nerfro.registry.registration import discover
 from nerfro.rendering import Components
@@ -22,6 +21,7 @@ from nerfro.samplers.points.stratified import Stratified
 from nerfro.viewing.server import PageServer
 from nerfro.viewing.trained_scene import TrainedScene
 from tests.cameras_at import cameras_at
+from tests.closed_forms import Ball
 
 RADIUS, INSIDE_RADIUS, INSIDE_CENTRE, IOR = 0.8, 0.3, (0.1, 0.0, 0.05), 1.3
 

@@ -19,7 +19,8 @@ from PIL import Image
 
 from nerfro.core.errors import NerfroError
 from nerfro.core.light import to_linear, to_srgb
-from nerfro.media.sdf_grid import SdfGrid
+from nerfro.geometry.space import Box
+from nerfro.media.body_settings import make_bodies
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.viewing.changes import with_changed_scene
 from nerfro.viewing.exports import ExportConfig, export_of, find_export
@@ -71,7 +72,7 @@ def two_bodies(scene: TrainedScene, tmp_path: Path) -> TrainedScene:
         shape.apply_translation([x, 0, 0])
         shape.export(tmp_path / f"{name}.ply")
         bodies[name]["mesh"] = str(tmp_path / f"{name}.ply")
-    medium = SdfGrid(bodies=bodies, resolution=32, cache=False)
+    medium = make_bodies(bodies=bodies, resolution=32, cache=False)
     return replace(scene, renderer=with_changed_scene(scene.renderer, medium=medium))
 
 
@@ -112,9 +113,13 @@ def test_mitsuba_accepts_strong_absorption(scene: TrainedScene, tmp_path: Path) 
     np.testing.assert_allclose(numbers["sigma_t"] * numbers["scale"], [0.5, 1.0, 2.0], rtol=1e-6)
 
 
+def with_box(scene: TrainedScene, half_side: float = 1.0) -> TrainedScene:
+    """The scene with a cube as its space."""
+    return replace(scene, renderer=with_changed_scene(scene.renderer, space=Box([[-half_side] * 3, [half_side] * 3])))
+
+
 def test_mitsuba_scenes_need_no_glass(scene: TrainedScene, tmp_path: Path) -> None:
-    box = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
-    write(replace(scene.with_(glass=False), content=box), "mitsuba", tmp_path / "straight.xml")
+    write(with_box(scene.with_(glass=False)), "mitsuba", tmp_path / "straight.xml")
     root = ElementTree.parse(tmp_path / "straight.xml").getroot()
     assert [shape.get("id") for shape in root.findall("shape")] == ["inside"]
 
@@ -123,10 +128,10 @@ def test_mitsuba_scenes_need_no_glass(scene: TrainedScene, tmp_path: Path) -> No
 def test_mitsuba_sensors_see_the_object_in_any_world_unit(
     scene: TrainedScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, factor: float
 ) -> None:
-    cameras, box = scene.cameras("test"), factor * torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+    cameras = scene.cameras("test")
     poses = torch.cat([cameras.camera_to_world[..., :3], factor * cameras.camera_to_world[..., 3:]], -1)
     monkeypatch.setattr(TrainedScene, "cameras", lambda self, split: replace(cameras, camera_to_world=poses))
-    write(replace(scene.with_(glass=False, inside=False), content=box), "mitsuba", tmp_path / "far.xml")
+    write(with_box(scene.with_(glass=False, inside=False), factor), "mitsuba", tmp_path / "far.xml")
     for sensor in ElementTree.parse(tmp_path / "far.xml").getroot().findall("sensor"):
         clip = {child.get("name"): float(str(child.get("value"))) for child in sensor.findall("float")}
         assert clip["near_clip"] < factor * 2

@@ -24,7 +24,9 @@ from nerfro.evaluation.image_metrics import psnr
 from nerfro.fields.base import Field
 from nerfro.files import lat_long
 from nerfro.files.deep_images import write_radiance
-from nerfro.media.sdf_grid import SdfGrid
+from nerfro.geometry.space import Contracted
+from nerfro.media.bodies import Bodies
+from nerfro.media.body_settings import make_bodies
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.samplers.subdivision import Subdivision
@@ -32,7 +34,7 @@ from nerfro.testing import example_draws
 from nerfro.viewing.changes import with_changed_scene
 from nerfro.viewing.page import make_page
 from nerfro.viewing.trained_scene import TrainedScene
-from tests.closed_forms import Luneburg
+from tests.closed_forms import Luneburg, sampled
 from tests.conftest import refused
 from tests.media.vessels import spherical_vessel
 from tests.viewing.browser import Browser, needs_chromium
@@ -72,7 +74,7 @@ def one_ray(scene: TrainedScene, cameras: Cameras | None = None) -> Float[torch.
     return scene.render(cameras or scene.cameras("test"), Subdivision()).rgb
 
 
-def in_embedded_scene(scene: TrainedScene, medium: SdfGrid) -> TrainedScene:
+def in_embedded_scene(scene: TrainedScene, medium: Bodies) -> TrainedScene:
     """The ball inside another medium, under the embedded scene's sky and seen by its cameras."""
     sky = EnvironmentMap([128], image=str(resolve_path("embedded:torus/sky.png")))
     renderer = with_changed_scene(scene.renderer, medium=medium, background=sky)
@@ -84,10 +86,10 @@ def glass_cube(scene: TrainedScene) -> TrainedScene:
     """The embedded scene's glass, sky and cameras around the ball inside, and a bubble in the glass; both disperse."""
     mesh = "embedded:torus/mesh.ply"
     box = torch.tensor([[-1.5] * 3, [1.5] * 3])
-    outer = SdfGrid(mesh, resolution=64, box_min=[-1.5] * 3, box_max=[1.5] * 3, cache=False)
+    outer = make_bodies(mesh, resolution=64, box_min=[-1.5] * 3, box_max=[1.5] * 3, cache=False)
     axes = torch.stack(torch.meshgrid(*[torch.linspace(-1.5, 1.5, 64)] * 3, indexing="ij"), -1)
     bubble = torch.linalg.vector_norm(axes - torch.tensor([-0.3, -0.3, 0.2]), dim=-1) - 0.15
-    medium = SdfGrid.from_distances([outer.grids[0].distances, bubble], box, [1.5, 1.05], outer.shell, abbe=[8.0])
+    medium = sampled([outer.grids[0].distances, bubble], box, [1.5, 1.05], outer.shell, abbe=8.0)
     return in_embedded_scene(scene, medium)
 
 
@@ -141,13 +143,12 @@ class Surroundings(Field):
 
 @needs_chromium
 def test_contracted_surroundings_are_shown(scene: TrainedScene, tmp_path: Path) -> None:
-    sampler = DensityGridSampler(
-        512, 256, [-2.0] * 3, [2.0] * 3, radius=2.0, near=1.0, resolution=48, update_fraction=0.9
-    )
+    space = Contracted([[-2.0] * 3, [2.0] * 3], 2.0, near=1.0)
+    sampler = DensityGridSampler(space, 512, 256, resolution=48, update_fraction=0.9)
     field = Surroundings()
     for step in range(3):
         sampler.update([field], example_draws(step=step * sampler.update_every))
-    renderer = with_changed_scene(scene.renderer, fields=torch.nn.ModuleList([field]))
+    renderer = with_changed_scene(scene.renderer, fields=torch.nn.ModuleList([field]), space=space)
     everywhere = replace(scene, renderer=variant(renderer, point_sampler=sampler))
     found = ask(
         make_page(everywhere, 96), f"(() => {{ {SHOT} return [0, 1, 2].map((v) => shot(v, 32)); }})()", tmp_path

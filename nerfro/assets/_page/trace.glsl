@@ -111,7 +111,7 @@ float clearanceAt(vec3 x) {
   return free;
 }
 
-// Returns the number of the body that decides at a point, from 1; 0 in air (media/solid.py).
+// Returns the number of the body that decides at a point, from 1; 0 in air (media/bodies.py).
 int decidingBody(int inside) {
   int number = 0;
   for (int body = 0; body < numBodies; ++body) {
@@ -191,7 +191,7 @@ float fresnelReflectance(float cosine, float cosineAfter, float n) {
   return 0.5 * (s * s + p * p);
 }
 
-// Returns the scale of lengths under contraction (geometry/contraction.py).
+// Returns the scale of lengths under contraction (geometry/space.py).
 float contractionScale(vec3 x) {
   vec3 offset = x - 0.5 * (volumeLow + volumeHigh);
   return contractionRadius > 0.0 ? min(contractionRadius * contractionRadius / dot(offset, offset), 1.0) : 1.0;

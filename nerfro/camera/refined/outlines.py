@@ -22,7 +22,6 @@ from nerfro.core.provenance import AlgorithmSettings
 from nerfro.data.base import Views
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.media.base import Medium
-from nerfro.media.sdf_grid import SdfGrid
 from nerfro.silhouettes.rims import RimFinder
 from nerfro.silhouettes.silhouettes import PixelBlocks
 from nerfro.silhouettes.visual_hull import Silhouettes
@@ -72,13 +71,14 @@ def align_to_masks(
     Returns:
         Prior of the cameras from the outlines; None without masks or without a surface.
     """
-    if not isinstance(medium, SdfGrid) or not medium.meshes or views.masks is None:
+    outline = medium.outline
+    if outline is None or views.masks is None:
         return None
     blocks = PixelBlocks(views.cameras, settings.max_pixels)
     masks = torch.stack([blocks.mean(mask) for mask in views.masks])
     silhouettes = Silhouettes.of(blocks.cameras(views.cameras), masks)
     priors = [] if panorama is None else [panorama]
-    return align_to_outlines(camera, views.cameras, blocks.cameras, silhouettes, medium.outline, priors, settings)
+    return align_to_outlines(camera, views.cameras, blocks.cameras, silhouettes, outline, priors, settings)
 
 
 @torch.no_grad()

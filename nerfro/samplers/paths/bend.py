@@ -16,8 +16,7 @@ from nerfro.core.errors import NerfroError
 from nerfro.core.paths import resolve_path
 from nerfro.geometry.mesh import load_mesh
 from nerfro.media.base import Medium
-from nerfro.media.sdf_grid import SdfGrid
-from nerfro.media.solid import Solid
+from nerfro.media.body_settings import make_bodies
 from nerfro.registry.registration import discover, find
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.paths.thin_walls import warn_of_thin_walls
@@ -73,7 +72,7 @@ def bend(
     low, high = load_mesh(resolve_path(mesh)).bounds
     margin = (high - low).max() * _MARGIN / (resolution - 1 - 2 * _MARGIN)
     low, high = (low - margin).tolist(), (high + margin).tolist()
-    medium = SdfGrid(str(mesh), ior, resolution=resolution, box_min=low, box_max=high)
+    medium = make_bodies(str(mesh), ior, resolution, low, high)
     sampler = Snell(interface)
     warn_of_thin_walls(sampler, medium)
     path = sampler(make_rays(starts, towards, medium, 0.0, None), medium)
@@ -100,7 +99,7 @@ def polylines(
         NerfroError: the rays are not [R, 3] finite numbers.
     """
     rays = make_rays(*_checked_rays(origins, directions), medium, 0.0, length)
-    if isinstance(medium, Solid):
+    if medium.bodies is not None:
         path = Snell()(rays, medium)
     else:
         discover()  # the sampler is a plugin

@@ -15,7 +15,7 @@ from nerfro.samplers.paths.branching import Branching
 from nerfro.samplers.paths.polylines import SnellTrace
 
 if TYPE_CHECKING:
-    from nerfro.media.sdf_grid import SdfGrid
+    from nerfro.media.bodies import Bodies
     from nerfro.samplers.paths.snell_cpu import TracedRows
 
 # Capacity of the first attempt: vertices of a polyline, and polylines of a ray. Rays that need more are traced again;
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 _MAX_VERTICES, _MAX_POLYLINES = 18, 8
 
 
-def snell_on_grid(rays: Rays, medium: SdfGrid, max_events: int, branching: Branching) -> SnellTrace:
+def snell_on_grid(rays: Rays, medium: Bodies, max_events: int, branching: Branching) -> SnellTrace:
     """Evaluate `samplers.paths.snell.trace_interfaces` by the compiled kernel, on the CPU for rays on any device.
 
     A GPU would need a million small operators of PyTorch for the rays of one training step.

@@ -20,7 +20,7 @@ from torch.nn import functional
 from nerfro.core.types import Path, Rays
 from nerfro.geometry.intersection import Triangles
 from nerfro.media.base import Medium
-from nerfro.media.solid import Solid
+from nerfro.media.bodies import Bodies
 from nerfro.samplers.paths.branching import ONE_PATH, Branching
 from nerfro.samplers.paths.polylines import distance_to_end
 from nerfro.samplers.paths.snell_law import reflectance, refract, turning_normals
@@ -68,8 +68,7 @@ def smallest_cosine(path: Path, medium: Medium) -> Float[Tensor, "P"]:
 
 def indices_of(medium: Medium, like: Tensor) -> Float[Tensor, " media"]:
     """Return the refractive index of air and of each body, with gradients."""
-    bodies = [medium.iors] if isinstance(medium, Solid) else []
-    return torch.cat([like.new_ones(1), *(iors.to(like) for iors in bodies)])
+    return torch.cat([like.new_ones(1), medium.iors.to(like)])
 
 
 def start_of(path: Path, rays: Rays) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"], Float[Tensor, "P"]]:
@@ -150,7 +149,7 @@ def is_interior(path: Path) -> Bool[Tensor, "P S"]:
     return (path.s < path.s[:, -1:]) & (torch.arange(path.s.shape[1], device=path.s.device) > 0)
 
 
-def intersect_solid(medium: Solid, surface: Int[Tensor, "P S"]) -> Intersect:
+def intersect_solid(medium: Bodies, surface: Int[Tensor, "P S"]) -> Intersect:
     """Intersect rays with zero levels of signed distances: t <- t - phi(x + t d) / (grad phi . d), divisor detached.
 
     Args:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Annotated, Any, Literal
 
 import torch
@@ -17,17 +17,15 @@ from nerfro.core.errors import NerfroError
 from nerfro.core.types import Path, Rays
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.kernels.tolerances import MIN_SEARCH_STEP
-from nerfro.media.analytic import Vacuum
 from nerfro.media.base import Medium
-from nerfro.media.sdf_grid import SdfGrid
-from nerfro.media.solid import Solid
+from nerfro.media.bodies import Bodies
 from nerfro.registry.allowed import OnlyWith, Positive, Share
 from nerfro.registry.registration import register
 from nerfro.samplers.base import PathSampler
 from nerfro.samplers.paths.branching import ONE_PATH, Branching
 from nerfro.samplers.paths.compiled import snell_on_grid
 from nerfro.samplers.paths.polylines import SnellTrace
-from nerfro.samplers.paths.replay import intersect_solid, intersect_triangles, replay, smallest_cosine
+from nerfro.samplers.paths.replay import Intersect, intersect_solid, intersect_triangles, replay, smallest_cosine
 from nerfro.samplers.paths.straight import replay_straight, straight_path
 from nerfro.samplers.paths.wavefront import Wavefront
 
@@ -37,6 +35,85 @@ _ROOT_ITERATIONS = 60
 _SEARCH_OFFSET = 1e-6
 # Training uses no derivatives of paths whose `smallest_cosine` is below this value.
 _STEADY = 0.15
+
+
+class Tracer(ABC):
+    """Trace rays from surface to surface of bodies at one wavelength.
+
+    Attributes:
+        medium: the bodies, with one index for all wavelengths in a call of `trace` or `replay`.
+        releases_gil: whether tracing on the CPU releases the global interpreter lock.
+    """
+
+    releases_gil = False
+
+    def __init__(self, medium: Bodies) -> None:
+        self.medium = medium
+
+    @abstractmethod
+    def trace(self, rays: Rays, max_events: int, branching: Branching) -> SnellTrace:
+        """Trace rays without gradients, and count events."""
+
+    def replay(self, path: Path, rays: Rays, branching: Branching) -> Path:
+        """Return a traced path with gradients; see `samplers.paths.replay`."""
+        return replay(path, rays, self.medium, self.intersect(path), branching)
+
+    def intersect(self, path: Path) -> Intersect:
+        """Return the intersection of rays with the recorded surfaces of a path."""
+        return intersect_solid(self.medium, path.surface_body)
+
+    def at_wavelengths(self, wavelengths: Sequence[float]) -> Sequence[Tracer]:
+        """Return one tracer for each wavelength; the tracer itself if the medium has no dispersion."""
+        if not self.medium.disperses:
+            return [self]
+        return [type(self)(self.medium.at_wavelength(wavelength)) for wavelength in wavelengths]
+
+
+class GridTracer(Tracer):
+    """Trace zero levels of distance grids by the compiled kernel."""
+
+    releases_gil = True
+
+    def trace(self, rays: Rays, max_events: int, branching: Branching) -> SnellTrace:
+        return snell_on_grid(rays, self.medium, max_events, branching)
+
+
+class TriangleTracer(Tracer):
+    """Trace triangles of meshes."""
+
+    def __init__(self, medium: Bodies) -> None:
+        super().__init__(medium)
+        medium.intersector  # noqa: B018 (created once, before the variants of all wavelengths share it)
+
+    def trace(self, rays: Rays, max_events: int, branching: Branching) -> SnellTrace:
+        return _trace_triangles(rays, self.medium, max_events, branching)
+
+    def intersect(self, path: Path) -> Intersect:
+        return intersect_triangles(self.medium.triangles, path.triangle)
+
+
+class ReferenceTracer(Tracer):
+    """Trace zero levels of any signed distances by operators of PyTorch."""
+
+    def trace(self, rays: Rays, max_events: int, branching: Branching) -> SnellTrace:
+        return trace_interfaces(rays, self.medium, max_events, branching)
+
+
+class StraightTracer(Tracer):
+    """Leave rays straight in a vacuum."""
+
+    def __init__(self) -> None:
+        pass
+
+    def trace(self, rays: Rays, max_events: int, branching: Branching) -> SnellTrace:
+        none = torch.zeros(len(rays), dtype=torch.long, device=rays.near.device)
+        return SnellTrace(straight_path(rays), none, none.bool())
+
+    def replay(self, path: Path, rays: Rays, branching: Branching) -> Path:
+        return replay_straight(path, rays)
+
+    def at_wavelengths(self, wavelengths: Sequence[float]) -> Sequence[Tracer]:
+        return [self]
 
 
 @register("sampler/path", "snell")
@@ -68,8 +145,30 @@ class Snell(PathSampler):
                 f"sampler.path.wavelengths={list(wavelengths)} is not allowed; give as many for red, green, blue"
             )
         self.wavelengths = list(wavelengths)
-        self.interface, self.max_events = interface, max_events
+        self.interface, self.max_events, self.traces_triangles = interface, max_events, interface == "mesh"
         self.branching = Branching({"none": 0, "first": 1, "all": max_events}[branches], least_weight)
+
+    def tracer(self, medium: Medium) -> Tracer:
+        """Return the tracer for the surfaces of a medium.
+
+        Raises:
+            NerfroError: the medium has no surfaces, or no triangles for `interface=mesh`.
+        """
+        if medium.is_vacuum:
+            return StraightTracer()
+        bodies = medium.bodies
+        if bodies is None:
+            raise NerfroError(
+                "sampler/path=snell needs a medium with a surface; take medium=sdf_grid, or sampler/path=eikonal"
+            )
+        if self.interface == "sdf":
+            return GridTracer(bodies) if len(bodies.grids) else ReferenceTracer(bodies)
+        if not bodies.meshes:
+            raise NerfroError(
+                "sampler.path.interface=mesh needs a medium made of meshes; give each body of medium=sdf_grid a "
+                "mesh, or set sampler.path.interface=sdf"
+            )
+        return TriangleTracer(bodies)
 
     @torch.no_grad()
     def forward(self, rays: Rays, medium: Medium) -> Path:
@@ -78,84 +177,49 @@ class Snell(PathSampler):
 
     @torch.no_grad()
     def trace_main(self, rays: Rays, medium: Medium) -> Path:
-        if isinstance(medium, Solid) and medium.disperses:
-            medium = self._at_wavelengths(medium)[0]
-        return self.trace(rays, medium, replace(self.branching, main_only=True)).path
+        tracer = self.tracer(medium).at_wavelengths(self.wavelengths)[0]
+        return tracer.trace(rays, self.max_events, replace(self.branching, main_only=True)).path
 
     def replay(self, path: Path, rays: Rays, medium: Medium) -> Path:
         """Return the path with gradients with respect to rays, indices and distance grids; see `samplers.paths.replay`.
 
         Gradients are unbounded at grazing and critical angles; omit paths whose `smallest_cosine` is below 0.15.
         """
-        if isinstance(medium, Solid) and medium.disperses:
-            return _replay_in_bands(path, rays, self._at_wavelengths(medium), self._replay)
-        return self._replay(path, rays, medium)
-
-    def _replay(self, path: Path, rays: Rays, medium: Medium) -> Path:
-        if self.interface == "mesh" and isinstance(medium, SdfGrid):
-            intersect = intersect_triangles(medium.triangles, path.triangle)
-        elif isinstance(medium, Solid):
-            intersect = intersect_solid(medium, path.surface_body)
-        else:
-            return replay_straight(path, rays)
-        return replay(path, rays, medium, intersect, self.branching)
-
-    def _at_wavelengths(self, medium: Solid) -> list[Solid]:
-        """Return the medium at each wavelength."""
-        if self.interface == "mesh" and isinstance(medium, SdfGrid) and medium.meshes:
-            medium.intersector  # noqa: B018 (created once, before the variants share it)
-        return [medium.at_wavelength(wavelength) for wavelength in self.wavelengths]
+        tracers = self.tracer(medium).at_wavelengths(self.wavelengths)
+        if len(tracers) == 1:
+            return tracers[0].replay(path, rays, self.branching)
+        return _replay_in_bands(path, rays, tracers, self.branching)
 
     def steady(self, path: Path, medium: Medium) -> Bool[Tensor, "P"]:
         return smallest_cosine(path, medium) > _STEADY
 
     def releases_gil(self, medium: Medium) -> bool:
-        return self.interface == "sdf" and isinstance(medium, SdfGrid)
+        return self.tracer(medium).releases_gil
 
     @torch.no_grad()
     def trace(self, rays: Rays, medium: Medium, branching: Branching | None = None) -> SnellTrace:
         """Trace rays and count events; `branching` replaces the rule of the sampler."""
-        if isinstance(medium, Vacuum):
-            none = torch.zeros(len(rays), dtype=torch.long, device=rays.near.device)
-            return SnellTrace(straight_path(rays), none, none.bool())
-        if not isinstance(medium, Solid):
-            raise NerfroError(
-                "sampler/path=snell needs a medium with a surface; take medium=sdf_grid, or sampler/path=eikonal"
-            )
-        if medium.disperses:
-            return _traced_in_bands(rays, self._at_wavelengths(medium), partial(self._trace, branching=branching))
-        return self._trace(rays, medium, branching)
-
-    def _trace(self, rays: Rays, medium: Solid, branching: Branching | None = None) -> SnellTrace:
-        branching = branching or self.branching
-        if self.interface == "mesh":
-            if not isinstance(medium, SdfGrid) or not medium.meshes:
-                raise NerfroError(
-                    "sampler.path.interface=mesh needs a medium made of meshes; give each body of medium=sdf_grid a "
-                    "mesh, or set sampler.path.interface=sdf"
-                )
-            return _trace_triangles(rays, medium, self.max_events, branching)
-        if isinstance(medium, SdfGrid):
-            return snell_on_grid(rays, medium, self.max_events, branching)
-        return trace_interfaces(rays, medium, self.max_events, branching)
+        tracers = self.tracer(medium).at_wavelengths(self.wavelengths)
+        settings = self.max_events, branching or self.branching
+        return tracers[0].trace(rays, *settings) if len(tracers) == 1 else _traced_in_bands(rays, tracers, *settings)
 
 
-def _traced_in_bands(rays: Rays, media: Sequence[Solid], trace: Callable[[Rays, Solid], SnellTrace]) -> SnellTrace:
+def _traced_in_bands(rays: Rays, tracers: Sequence[Tracer], max_events: int, branching: Branching) -> SnellTrace:
     """Trace rays at each wavelength; rays that miss the object have one polyline with light of all colours.
 
     Args:
         rays: camera rays.
-        media: bodies with the indices at each wavelength: the bands of red, then of green, then of blue.
-        trace: function that traces rays at one wavelength.
+        tracers: tracer at each wavelength: the bands of red, then of green, then of blue.
+        max_events, branching: see `Tracer.trace`.
     """
-    first = trace(rays, media[0])
+    first = tracers[0].trace(rays, max_events, branching)
     bent = first.path.refracted
     rows = first.path.ray[bent].unique_consecutive()
-    traces = [first, *(trace(rays[rows], medium) for medium in media[1:])]
+    traces = [first, *(tracer.trace(rays[rows], max_events, branching) for tracer in tracers[1:])]
     path = Path.joined([trace.path for trace in traces])
     of_rays = [first.path.ray, *(rows[trace.path.ray] for trace in traces[1:])]
     band = torch.cat([torch.full_like(ray, number) for number, ray in enumerate(of_rays)])
-    num_bands = len(media) // 3
+    num_bands = len(tracers) // 3
     # Straight polylines have all colours.
     colours = one_hot(torch.div(band, num_bands, rounding_mode="floor"), 3).to(path.s) / num_bands
     colours = torch.where(path.refracted[:, None], colours, 1.0)
@@ -169,18 +233,18 @@ def _traced_in_bands(rays: Rays, media: Sequence[Solid], trace: Callable[[Rays, 
     return SnellTrace(path, num_events, exceeded)
 
 
-def _replay_in_bands(
-    path: Path, rays: Rays, media: Sequence[Solid], replay: Callable[[Path, Rays, Solid], Path]
-) -> Path:
-    """Replay the polylines of each band in the medium at its wavelength; see `_traced_in_bands` for the arguments."""
-    rows = [(path.band == band).nonzero()[:, 0] for band in range(len(media))]
-    replayed = [replay(path[some], rays[path.ray[some]], medium) for some, medium in zip(rows, media, strict=True)]
+def _replay_in_bands(path: Path, rays: Rays, tracers: Sequence[Tracer], branching: Branching) -> Path:
+    """Replay the polylines of each band at its wavelength; see `_traced_in_bands` for the arguments."""
+    rows = [(path.band == band).nonzero()[:, 0] for band in range(len(tracers))]
+    replayed = [
+        tracer.replay(path[some], rays[path.ray[some]], branching) for some, tracer in zip(rows, tracers, strict=True)
+    ]
     order, names = torch.cat(rows).argsort(), ("positions", "directions", "s", "throughput")
     columns: dict[str, Any] = {name: torch.cat([getattr(part, name) for part in replayed])[order] for name in names}
     return replace(path, **columns)
 
 
-def _trace_triangles(rays: Rays, medium: SdfGrid, max_events: int, branching: Branching) -> SnellTrace:
+def _trace_triangles(rays: Rays, medium: Bodies, max_events: int, branching: Branching) -> SnellTrace:
     """Trace rays from triangle to triangle of meshes, on the CPU and in double precision.
 
     The number of crossings of its surface determines whether a ray is inside a body.
@@ -216,7 +280,7 @@ def _trace_triangles(rays: Rays, medium: SdfGrid, max_events: int, branching: Br
 
 
 def _inside_at_start(
-    medium: SdfGrid, x: Float[Tensor, "P 3"], d: Float[Tensor, "P 3"], offset: float
+    medium: Bodies, x: Float[Tensor, "P 3"], d: Float[Tensor, "P 3"], offset: float
 ) -> Bool[Tensor, "P K"]:
     """Return which bodies contain the starts of rays, given by triangles.
 
@@ -248,7 +312,7 @@ def _inside_at_start(
     return inside
 
 
-def trace_interfaces(rays: Rays, medium: Solid, max_events: int, branching: Branching = ONE_PATH) -> SnellTrace:
+def trace_interfaces(rays: Rays, medium: Bodies, max_events: int, branching: Branching = ONE_PATH) -> SnellTrace:
     """Trace rays from surface to surface of any solid; the reference implementation of the compiled kernel.
 
     Sphere tracing finds the surfaces, because a step of the signed distance cannot miss one. A change of sign ends the
@@ -273,7 +337,7 @@ def trace_interfaces(rays: Rays, medium: Solid, max_events: int, branching: Bran
 
 
 def _search(
-    medium: Solid, x: Tensor, d: Tensor, inside: Tensor, limit: Tensor, min_step: float
+    medium: Bodies, x: Tensor, d: Tensor, inside: Tensor, limit: Tensor, min_step: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Trace spheres up to `limit`; returns start and end of the last step, and whether it crosses a surface."""
     before, after = torch.zeros_like(limit), torch.zeros_like(limit)
@@ -291,7 +355,7 @@ def _search(
 
 
 def _first_crossing(
-    medium: Solid, x: Tensor, d: Tensor, inside: Tensor, before: Tensor, after: Tensor
+    medium: Bodies, x: Tensor, d: Tensor, inside: Tensor, before: Tensor, after: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Bisect each bracket around the first change of sign; returns the bracket and the body whose sign changes."""
     for _ in range(_ROOT_ITERATIONS):
@@ -306,7 +370,7 @@ def _first_crossing(
 
 
 def _closed_gaps(
-    medium: Solid, x: Tensor, d: Tensor, inside: Tensor, after: Tensor, body: Tensor, min_step: float
+    medium: Bodies, x: Tensor, d: Tensor, inside: Tensor, after: Tensor, body: Tensor, min_step: float
 ) -> tuple[Tensor, Tensor]:
     """Close gaps of air between two bodies that are thinner than the shortest step of the search.
 

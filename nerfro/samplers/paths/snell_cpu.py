@@ -88,7 +88,7 @@ class Scratch(NamedTuple):
 
 @compiled
 def _deciding_body(inside, solids):
-    """Return the number of the body that decides at a point, from 1; 0 in air (`media.solid.Solid.deciding_body`)."""
+    """Return the number of the body that decides at a point, from 1; 0 in air (`media.bodies.Bodies.deciding_body`)."""
     number = 0
     for body in range(len(inside)):
         if inside[body]:

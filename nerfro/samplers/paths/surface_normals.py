@@ -9,7 +9,6 @@ from torch.nn import functional
 
 from nerfro.core.types import Path
 from nerfro.media.base import Medium
-from nerfro.media.solid import Solid
 from nerfro.samplers.paths.replay import indices_of
 from nerfro.samplers.paths.snell_law import turning_normals
 
@@ -33,7 +32,7 @@ def _bent_normals(path: Path, medium: Medium) -> Float[Tensor, "P 3"]:
     events = (before != after).any(-1) | (n[:, :-1] != n[:, 1:])
     first = events.byte().argmax(-1)
     arriving = before[rows, first]
-    if isinstance(medium, Solid):
+    if medium.bodies is not None:
         normals = turning_normals(arriving, after[rows, first], n[rows, first], n[rows, first + 1])
     else:
         _, normals = medium(path.positions[rows, first + 1])

@@ -13,9 +13,7 @@ from nerfro.geometry.intersection import MeshIntersector
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.geometry.orientation import area_vectors
 from nerfro.media.base import Medium
-from nerfro.media.sdf_grid import SdfGrid
 from nerfro.samplers.base import PathSampler
-from nerfro.samplers.paths.snell import Snell
 
 # Thickness, in voxels, below which the spline of one side of a wall contains the fold of the distances in its middle.
 # Median error of exit directions behind a hollow ball of index 1.5: 0.01 degrees at 4.8 voxels, 0.6 at 3, and 2 at 1.8.
@@ -28,10 +26,10 @@ _MAX_VERTICES = 512  # largest resolution that the warning recommends
 
 def warn_of_thin_walls(sampler: PathSampler, medium: Medium) -> None:
     """Print a warning for each body with walls that are too thin for its grid, unless the sampler traces triangles."""
-    traces_triangles = isinstance(sampler, Snell) and sampler.interface == "mesh"
-    if traces_triangles or not sampler.needs_medium or not isinstance(medium, SdfGrid):
+    bodies = medium.bodies
+    if sampler.traces_triangles or not sampler.needs_medium or bodies is None:
         return
-    for name, mesh, grid in zip(medium.names, medium.meshes, medium.grids, strict=False):
+    for name, mesh, grid in zip(bodies.names, bodies.meshes, bodies.grids, strict=False):
         if not mesh.is_closed:
             continue
         try:

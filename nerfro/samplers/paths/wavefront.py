@@ -12,7 +12,7 @@ from torch.nn import functional
 
 from nerfro.core.types import Rays
 from nerfro.geometry.interpolation import intersect_box
-from nerfro.media.solid import Solid
+from nerfro.media.bodies import Bodies
 from nerfro.samplers.paths.branching import Branching
 from nerfro.samplers.paths.polylines import Crossed, PolylineBuilder, SnellTrace
 from nerfro.samplers.paths.replay import indices_of
@@ -71,7 +71,7 @@ class Wavefront:
     def __init__(
         self,
         rays: Rays,
-        medium: Solid,
+        medium: Bodies,
         box: Float[Tensor, "2 3"],
         max_events: int,
         branching: Branching,

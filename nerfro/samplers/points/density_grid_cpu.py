@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numba import prange
 
-from nerfro.geometry.contraction import FAR, NEAREST
+from nerfro.geometry.space import FAR, NEAREST
 from nerfro.kernels.compilation import compiled, compiled_parallel
 from nerfro.kernels.lookup import box_span
 from nerfro.kernels.philox import fill_uniform
@@ -89,7 +89,7 @@ def _segment(s, vertex, at):
 
 @compiled
 def _contracted_length(t, impact, radius):
-    """Compute `geometry.contraction.contracted_length` of one number."""
+    """Compute `geometry.space.contracted_length` of one number."""
     within = np.sqrt(max(radius * radius - impact * impact, 0.0))
     beyond = max(abs(t), within)
     angle = np.arctan2(impact * (beyond - within), impact * impact + beyond * within)
@@ -99,7 +99,7 @@ def _contracted_length(t, impact, radius):
 
 @compiled
 def _world_length(length, impact, radius):
-    """Compute `geometry.contraction.world_length` of one number."""
+    """Compute `geometry.space.world_length` of one number."""
     within = np.sqrt(max(radius * radius - impact * impact, 0.0))
     beyond = abs(length)
     if beyond > within:
@@ -110,7 +110,7 @@ def _world_length(length, impact, radius):
 
 @compiled
 def _contracted_segments(path, centre, radius, near, segments):
-    """Fill the segments of `samplers.points.density_grid.ContractedLength` for one polyline; return its total."""
+    """Fill the segments of `geometry.space.ContractedLength` for one polyline; return its total."""
     positions, directions, s = path
     cumulative, start_length, closest, impact = segments
     total, last = 0.0, len(s) - 1
@@ -150,7 +150,7 @@ def _arc_length(place, segment, segments, radius):
 
 @compiled
 def _contraction_scale(x, y, z, centre, radius):
-    """Compute `geometry.contraction.contraction_scale` of one position; 1 where nothing is contracted."""
+    """Compute `Space.scale` of one position."""
     if radius == 0.0:
         return 1.0
     square = (x - centre[0]) ** 2 + (y - centre[1]) ** 2 + (z - centre[2]) ** 2

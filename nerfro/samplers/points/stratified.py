@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import torch
@@ -13,6 +12,7 @@ from torch import Tensor
 from nerfro.core.draws import Draws
 from nerfro.core.errors import NerfroError
 from nerfro.core.types import Path, Rendering, Samples
+from nerfro.geometry.space import Space, Unbounded
 from nerfro.registry.registration import register
 from nerfro.samplers.base import PointSampler
 
@@ -29,14 +29,13 @@ class Stratified(PointSampler):
     Args:
         num_samples: number of bins, N_c.
         draw: `arc_length` draws any arc length; `vertices` selects one of every S / N_c vertices, as the paper does,
-            and needs paths with a multiple of N_c vertices.
+            from near to far, and needs paths with a multiple of N_c vertices.
         cast: `points`, or `cones`, whose samples fill the bins (mip-NeRF).
         offset: position in the bin in evaluation, 0 for the start, 0.5 for the centre, less than 1.
-        box_min, box_max: corners of the box to sample, world units; empty to sample the whole path.
+        space: space in which arc lengths are drawn; None for the whole path.
     """
 
     num_levels = 1
-    box: Float[Tensor, "2 3"] | None
 
     def __init__(
         self,
@@ -44,22 +43,18 @@ class Stratified(PointSampler):
         draw: Literal["arc_length", "vertices"] = "arc_length",
         cast: Literal["points", "cones"] = "points",
         offset: Annotated[float, Ge(0), Lt(1)] = 0.5,
-        box_min: Sequence[float] = (),
-        box_max: Sequence[float] = (),
+        space: Space | None = None,
     ) -> None:
         super().__init__()
         if cast == "cones" and draw == "vertices":
             raise NerfroError("sampler/points: cones have no vertices to draw; set draw=arc_length")
-        if len(box_min) != len(box_max) or len(box_min) not in (0, 3) or (box_min and draw == "vertices"):
-            raise NerfroError("sampler/points: give three numbers for box_min and box_max each, with draw=arc_length")
         self.num_samples, self.draw, self.cast, self.offset = num_samples, draw, cast, offset
-        box = torch.tensor([list(box_min), list(box_max)]) if box_min else None
-        self.register_buffer("box", box, persistent=False)
+        self.space = Unbounded() if space is None else space
 
     def forward(self, path: Path, previous: Rendering | None, draws: Draws | None = None) -> Samples:
         if self.draw == "vertices":
             return self._draw_vertices(path, draws)
-        near, far = (path.near, path.far) if self.box is None else path.span(self.box)
+        near, far = self.space.span(path)
         cones = self.cast == "cones"
         fractions = self._cone_fractions(path, draws) if cones else self._point_fractions(path, draws)
         s = near[:, None] + fractions * (far - near)[:, None]
