@@ -11,14 +11,13 @@ import inspect
 import re
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from hydra import compose, initialize_config_dir
-from hydra.core.config_store import ConfigStore
-from omegaconf import DictConfig
+from omegaconf import OmegaConf
 
 from nerfro.__main__ import commands
-from nerfro.cli.options import google_docstring, plugin_options, schema_options, yaml_comments
+from nerfro.cli.options import google_docstring, plugin_options, schema_options, store_schema
 from nerfro.core.paths import CONF_DIR
 from nerfro.registry.registration import KINDS, Plugin, discover, plugins
 from nerfro.training import lightning_callbacks  # noqa: F401 - registers callbacks
@@ -53,10 +52,8 @@ def commands_page() -> str:
         text.append(f"## {name}\n\n{purpose[:1].upper()}{purpose[1:]}\n")
         if name == "train":
             text.append("All settings are listed in [configuration](configuration.md).\n")
-        elif (found := command_schema(name)) is not None:
-            schema, folder = found
-            comments = yaml_comments(folder / f"{name}.yaml")
-            text.append(_table(schema_options(schema, compose_defaults(name, schema, folder), comments)))
+        elif (schema := command_schema(name)) is not None:
+            text.append(_table(schema_options(schema, compose_defaults(name, schema))))
     return "\n".join(text)
 
 
@@ -67,7 +64,7 @@ def configuration_page() -> str:
         "`field`, and their options are in [plugins](plugins.md). This page is generated from the configuration.\n",
         "## General\n",
     ]
-    rows = list(schema_options(TrainConfig, compose_defaults("train", TrainConfig, CONF_DIR), {}))
+    rows = list(schema_options(TrainConfig, compose_defaults("train", TrainConfig)))
     text.append(_table(row for row in rows if "." not in row[0]))
     sections = dict.fromkeys(row[0].split(".")[0] for row in rows if "." in row[0])
     for section in sections:
@@ -106,21 +103,22 @@ def _plugin(plugin: Plugin) -> str:
     return f"### {plugin.name}\n\n{body}\n\n{_table(rows)}"
 
 
-def command_schema(command: str) -> tuple[type, Path] | None:
-    """Return the dataclass of the options of a command, and the folder of its YAML file; None without options."""
+def command_schema(command: str) -> type | None:
+    """Return the dataclass of the options of a command; None without options."""
     module = importlib.import_module(f"nerfro.{command}")
     for node in ast.walk(ast.parse(inspect.getsource(module))):
-        if isinstance(node, ast.Call) and ast.unparse(node.func) == "entry_point":
-            folder = CONF_DIR / command
-            return getattr(module, ast.unparse(node.args[1])), folder if folder.is_dir() else CONF_DIR
+        if isinstance(node, ast.Call) and ast.unparse(node.func) in ("entry_point", "command"):
+            return getattr(module, ast.unparse(node.args[1]))
     return None
 
 
-def compose_defaults(command: str, schema: type, folder: Path) -> DictConfig:
-    """Compose the default configuration of a command."""
-    ConfigStore.instance().store(name=f"{command}_schema", node=schema, provider="nerfro")
-    with initialize_config_dir(str(folder), version_base="1.3"):
-        return compose(command)
+def compose_defaults(command: str, schema: type) -> dict[str, Any]:
+    """Compose the default configuration of a command; empty for a command without groups."""
+    if not (CONF_DIR / f"{command}.yaml").is_file():
+        return {}
+    store_schema(command, schema)
+    with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
+        return cast(dict, OmegaConf.to_container(compose(command)))
 
 
 def _table(rows: Any) -> str:

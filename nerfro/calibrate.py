@@ -7,23 +7,20 @@ Examples:
 
 from __future__ import annotations
 
-from omegaconf import DictConfig
-
 import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
-from nerfro.cli.calls import options_in
-from nerfro.cli.entry import entry_point
 from nerfro.cli.overrides import print_next
+from nerfro.cli.parsing import command
 from nerfro.poses.calibrate import calibrate
 from nerfro.poses.options import CalibrateConfig
 
 
-@entry_point("calibrate", CalibrateConfig)
-def main(config: DictConfig) -> None:
+@command("calibrate", CalibrateConfig)
+def main(options: CalibrateConfig) -> None:
     """Detect the board, estimate lens and poses, write the data set, and print the next command."""
-    capture = calibrate(options_in(config, CalibrateConfig))
-    if config.images is not None:
-        command, options = ("preprocess", []) if capture.masks else ("mask", ["view=true"])
-        print_next("next", command, [*capture.overrides, *options])
+    capture = calibrate(options)
+    if options.images is not None:
+        following, added = ("preprocess", []) if capture.masks else ("mask", ["view=true"])
+        print_next("next", following, [*capture.overrides, *added])
 
 
 if __name__ == "__main__":

@@ -7,19 +7,16 @@ Examples:
 
 from __future__ import annotations
 
-from omegaconf import DictConfig
-
 import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
-from nerfro.cli.calls import options_in
-from nerfro.cli.entry import entry_point
+from nerfro.cli.parsing import command
 from nerfro.evaluation.request import EvaluateConfig
 from nerfro.pipeline.evaluate import evaluate
 
 
-@entry_point("evaluate", EvaluateConfig)
-def main(config: DictConfig) -> None:
+@command("evaluate", EvaluateConfig)
+def main(options: EvaluateConfig) -> None:
     """Score the test views of a checkpoint, or a folder of images."""
-    evaluate(options=options_in(config, EvaluateConfig))
+    evaluate(options=options)
 
 
 if __name__ == "__main__":

@@ -7,19 +7,16 @@ Examples:
 
 from __future__ import annotations
 
-from omegaconf import DictConfig
-
 import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
-from nerfro.cli.calls import options_in
-from nerfro.cli.entry import entry_point
+from nerfro.cli.parsing import command
 from nerfro.pipeline.export import export
 from nerfro.viewing.exports import ExportConfig
 
 
-@entry_point("export", ExportConfig)
-def main(config: DictConfig) -> None:
+@command("export", ExportConfig)
+def main(options: ExportConfig) -> None:
     """Check the request, load the scene, and write the file."""
-    export(options=options_in(config, ExportConfig))
+    export(options=options)
 
 
 if __name__ == "__main__":

@@ -3,6 +3,8 @@
 A plugin begins with one import, such as `from nerfro.parts import Loss, register`; see docs/guides/plugins.md.
 """
 
+from annotated_types import Ge, Gt, Le, Lt
+
 from nerfro.backgrounds.base import Background
 from nerfro.camera.base import CameraModel
 from nerfro.core.cameras import Cameras
@@ -22,7 +24,7 @@ from nerfro.media.bodies import Bodies, Body, GridSettings
 from nerfro.media.material import Material
 from nerfro.media.surface import Grid, MeshSurface, Surface
 from nerfro.models.refractive import RefractiveModel
-from nerfro.registry.allowed import Count, Distance, Natural, NotNegative, Positive, Range
+from nerfro.registry.allowed import Count, Distance, Natural, NotNegative, Positive
 from nerfro.registry.registration import register
 from nerfro.rendering import Components, Renderer, Scene
 from nerfro.samplers.base import PathSampler, PointSampler
@@ -34,9 +36,9 @@ from nerfro.viewing.trained_scene import TrainedScene
 
 __all__ = [
     "EXPORTS", "Background", "Batch", "Bodies", "Body", "Box", "CameraModel", "Cameras", "Components", "Contracted",
-    "Count", "DataSource", "Distance", "Draws", "Exits", "Export", "ExportConfig", "Field", "FieldValues", "Grid",
-    "GridSettings", "ImageMetric", "Loss", "Material", "Medium", "MeshSurface", "Natural", "NerfroError",
-    "NotNegative", "OpticalRecord", "Path", "PathSampler", "Phase", "PointSampler", "Positive", "Range", "Rays",
+    "Count", "DataSource", "Distance", "Draws", "Exits", "Export", "ExportConfig", "Field", "FieldValues", "Ge",
+    "Grid", "GridSettings", "Gt", "ImageMetric", "Le", "Loss", "Lt", "Material", "Medium", "MeshSurface", "Natural",
+    "NerfroError", "NotNegative", "OpticalRecord", "Path", "PathSampler", "Phase", "PointSampler", "Positive", "Rays",
     "RefractiveModel", "Renderer", "Rendering", "Samples", "Scalars", "Scene", "Space", "Stratified", "Surface",
     "TrainedScene", "TrainingRun", "Unbounded", "Vectors", "Views", "invert_cdf", "load_arrays", "point_samples",
     "register", "resolve_path", "spread_uniform", "write_atomically",

@@ -7,20 +7,16 @@ Examples:
 
 from __future__ import annotations
 
-from omegaconf import DictConfig
-
 import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
-from nerfro.cli.calls import options_in
-from nerfro.cli.entry import entry_point
-from nerfro.core.paths import CONF_DIR
+from nerfro.cli.parsing import command
 from nerfro.pipeline.render import render
 from nerfro.viewing.render_request import RenderConfig
 
 
-@entry_point("render", RenderConfig, CONF_DIR / "render")
-def main(config: DictConfig) -> None:
+@command("render", RenderConfig)
+def main(options: RenderConfig) -> None:
     """Check the request, load the scene, render the missing frames, and encode films."""
-    render(options=options_in(config, RenderConfig))
+    render(options=options)
 
 
 if __name__ == "__main__":

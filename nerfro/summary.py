@@ -7,18 +7,15 @@ Examples:
 
 from __future__ import annotations
 
-from omegaconf import DictConfig
-
 import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
-from nerfro.cli.calls import options_in
-from nerfro.cli.entry import entry_point
+from nerfro.cli.parsing import command
 from nerfro.report.summary import SummaryConfig, summarize
 
 
-@entry_point("summary", SummaryConfig)
-def main(config: DictConfig) -> None:
+@command("summary", SummaryConfig)
+def main(options: SummaryConfig) -> None:
     """Read and compare runs, and print and write the result."""
-    summarize(options_in(config, SummaryConfig))
+    summarize(options)
 
 
 if __name__ == "__main__":

@@ -7,19 +7,16 @@ Examples:
 
 from __future__ import annotations
 
-from omegaconf import DictConfig
-
 import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
-from nerfro.cli.entry import entry_point
-from nerfro.core.paths import CONF_DIR
+from nerfro.cli.parsing import command
 from nerfro.synthetic.options import SynthesizeConfig
 from nerfro.synthetic.synthesis import synthesize
 
 
-@entry_point("synthesize", SynthesizeConfig, CONF_DIR / "synthesize")  # conf/scene would turn `scene=` into a group
-def main(config: DictConfig) -> None:
+@command("synthesize", SynthesizeConfig)
+def main(options: SynthesizeConfig) -> None:
     """Render the missing images, and print the next command."""
-    data = synthesize(config)
+    data = synthesize(options)
     print(f"done: {data.folder}")
     print(data.next_command())
 

@@ -5,19 +5,17 @@ Examples:
     nerfro view checkpoint=outputs/first port=0 open=false
 """
 
-# ruff: noqa: UP045 - OmegaConf on Python 3.10 wants Optional
-
 from __future__ import annotations
 
 import signal
 from dataclasses import dataclass
-from typing import Annotated, Optional
+from typing import Annotated
 
-from omegaconf import MISSING, DictConfig
+from annotated_types import Ge, Le
+from omegaconf import MISSING
 
 import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
-from nerfro.cli.entry import entry_point
-from nerfro.registry.allowed import Range
+from nerfro.cli.parsing import command
 from nerfro.training.load import load
 from nerfro.viewing.page import make_page
 from nerfro.viewing.server import PageServer, open_page
@@ -26,25 +24,35 @@ from nerfro.viewing.volume import RESOLUTION
 
 @dataclass
 class ViewConfig:
-    """Options of `python -m nerfro.view`."""
+    """Options of `python -m nerfro.view`.
 
-    checkpoint: str = MISSING  # run folder, or a checkpoint in it
-    host: str = "localhost"  # address of the server; 0.0.0.0 accepts connections from other machines
-    port: Annotated[int, Range(at_least=0, at_most=65535)] = 8008  # 0 for any free port
-    open: bool = True  # whether to open a browser
-    resolution: Annotated[int, Range(at_least=2)] = RESOLUTION  # grid vertices along the longest side of the volume
-    root: Optional[str] = None  # folder of the data, if it has moved since training
-    device: str = "auto"  # `cpu` or `cuda`; `auto` means the CPU
+    Attributes:
+        checkpoint: run folder, or a checkpoint in it.
+        host: address of the server; 0.0.0.0 accepts connections from other machines.
+        port: 0 for any free port.
+        open: whether to open a browser.
+        resolution: grid vertices along the longest side of the volume.
+        root: folder of the data, if it has moved since training.
+        device: `cpu` or `cuda`; `auto` means the CPU.
+    """
+
+    checkpoint: str = MISSING
+    host: str = "localhost"
+    port: Annotated[int, Ge(0), Le(65535)] = 8008
+    open: bool = True
+    resolution: Annotated[int, Ge(2)] = RESOLUTION
+    root: str | None = None
+    device: str = "auto"
 
 
-@entry_point("view", ViewConfig)
-def main(config: DictConfig) -> None:
+@command("view", ViewConfig)
+def main(options: ViewConfig) -> None:
     """Serve the page until Ctrl-C."""
-    scene = load(config.checkpoint, config.device, config.root)
-    server = PageServer(config.host, config.port)
-    server.open(make_page(scene, config.resolution))
+    scene = load(options.checkpoint, options.device, options.root)
+    server = PageServer(options.host, options.port)
+    server.open(make_page(scene, options.resolution))
     print(f"nerfro: {scene.name} on {server.url}; Ctrl-C ends it", flush=True)
-    if config.open:
+    if options.open:
         open_page(server.url)
     signal.pause()
 

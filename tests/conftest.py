@@ -20,7 +20,6 @@ import pytest
 import torch
 import trimesh
 from hydra import compose, initialize_config_dir
-from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig
 from PIL import Image
 from scipy.spatial.transform import Rotation
@@ -119,11 +118,12 @@ class Bomb:
 
 def composed(*overrides: str) -> DictConfig:
     """The configuration that `nerfro.train` composes of some overrides."""
+    from nerfro.cli.options import store_schema
     from nerfro.registry.registration import discover
     from nerfro.training.config import TrainConfig
 
     discover()
-    ConfigStore.instance().store(name="train_schema", node=TrainConfig, provider="nerfro")
+    store_schema("train", TrainConfig)
     with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
         return compose("train", list(overrides))
 

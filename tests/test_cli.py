@@ -9,11 +9,12 @@ from pathlib import Path
 import pytest
 import yaml
 from hydra import compose, initialize_config_dir
+from hydra._internal.utils import get_args_parser
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import OverrideParseException
 
 from nerfro.cli.composition import BoundedFiles
-from nerfro.cli.entry import _flags_first
+from nerfro.cli.entry import _flags
 from nerfro.cli.failures import errors_in_one_line, in_one_line
 from nerfro.cli.overrides import full_key
 from nerfro.core.errors import NerfroError, warn
@@ -69,11 +70,10 @@ def test_unparsable_overrides_explain_quoting(override: str, hint: str) -> None:
 
 
 def test_flags_may_stand_anywhere() -> None:
-    given = ["seed=1", "--config-dir", "mine", "seed=2", "-m"]
-    assert _flags_first(given) == ["--config-dir", "mine", "-m", "seed=1", "seed=2"]
-    assert _flags_first(["~seed", "+a=-1"]) == ["~seed", "+a=-1"]
-    for flags, message in ((["--sed"], "--sed is not an option; write key=value"), (["-p", "a"], "need --cfg")):
-        refused(message, _flags_first, flags)
+    flags = _flags(get_args_parser(), ["seed=1", "--config-dir", "mine", "seed=2", "-m", "~field"])
+    assert (flags.config_dir, flags.multirun, flags.overrides) == ("mine", True, ["seed=1", "seed=2", "~field"])
+    for arguments, message in ((["--sed"], "--sed is not an option; write key=value"), (["-p", "a"], "need --cfg")):
+        refused(message, _flags, get_args_parser(), arguments)
 
 
 def test_messages_are_one_line_for_any_file_name(capsys: pytest.CaptureFixture[str]) -> None:

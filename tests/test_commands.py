@@ -160,7 +160,9 @@ def test_pages_open_in_graphical_browsers_and_are_printed_over_ssh(
     assert "ssh -L 83:localhost:83 HOST" in capsys.readouterr().out
 
 
-COMMANDS = {file.stem for file in PACKAGE_DIR.glob("*.py") if "\n@entry_point" in file.read_text()} | {
+COMMANDS = {
+    file.stem for file in PACKAGE_DIR.glob("*.py") if re.search(r"\n@(entry_point|command)", file.read_text())
+} | {
     "demo",
     "plugins",
 }

@@ -19,6 +19,7 @@ from lightning.pytorch import LightningModule, Trainer
 from omegaconf import OmegaConf
 
 from nerfro.core.types import Batch
+from nerfro.registry.allowed import untyped
 from nerfro.rendering import RayTracer
 from nerfro.training.build import build
 from nerfro.training.callbacks import Checkpoints, SharedTimer, StopOnSignal, Throughput
@@ -52,6 +53,7 @@ import time
 import torch
 import torch.distributed as dist
 from nerfro.losses.base import Loss
+from nerfro.registry.allowed import untyped
 from nerfro.registry.registration import register
 
 @register("loss", "watching")
@@ -208,7 +210,7 @@ def test_every_parameter_has_a_gradient_if_no_ray_meets_the_object(tiny_default_
 @pytest.mark.parametrize("strategy", ["ddp", "auto"])
 def test_processes_do_not_exchange_buffers(strategy: str, tmp_path: Path) -> None:
     two = {"trainer": {"devices": 2, "accelerator": "cpu", "strategy": strategy}}
-    config = OmegaConf.merge(OmegaConf.structured(TrainConfig), two)
+    config = OmegaConf.merge(OmegaConf.structured(untyped(TrainConfig())), two)
     trainer = make_trainer(config, tmp_path, Throughput(), [])
     assert trainer.strategy._ddp_kwargs["broadcast_buffers"] is False
 

@@ -1,5 +1,6 @@
 """The commands and settings in README and documentation exist."""
 
+import contextlib
 import copy
 import functools
 import re
@@ -13,16 +14,16 @@ from typing import get_type_hints
 
 import pytest
 from hydra import compose, initialize_config_dir
-from hydra.core.config_store import ConfigStore
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
-from nerfro.cli.entry import _quoted, added
-from nerfro.cli.options import Described, describe_command, usage
+from nerfro.cli.composition import added, quoted
+from nerfro.cli.options import Described, describe, describe_command, store_schema, usage
 from nerfro.cli.overrides import full_key, is_scene_file
+from nerfro.cli.parsing import values_of
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import CONF_DIR, PACKAGE_DIR
-from nerfro.registry.allowed import check_names, check_settings
+from nerfro.registry.allowed import MissingSettingError, plain, untyped, validate
 from nerfro.registry.registration import KINDS, discover, plugins
 from nerfro.synthetic.scenes import SCENES
 from nerfro.training.effects import settings_without_effect
@@ -46,7 +47,7 @@ COMMAND = re.compile(
 JOB_FILE = re.compile(r"^```bash\n(.*?)^```", re.DOTALL | re.MULTILINE)
 FLAG = re.compile(r" (?:--cfg \w+|-p \S+|-m|\.\.\.)(?= |$)", re.MULTILINE)
 # The schema of a command, and its options that are texts.
-ENTRY_POINT = re.compile(r'^@entry_point\("(\w+)", (\w+).*?(?:verbatim=\((.*)\))?\)', re.MULTILINE)
+ENTRY_POINT = re.compile(r'^@(?:entry_point|command)\("(\w+)", (\w+).*?(?:verbatim=\((.*)\))?\)', re.MULTILINE)
 
 
 @functools.cache
@@ -71,18 +72,19 @@ def commands(page: str) -> Iterator[tuple[str, list[str]]]:
 @functools.cache
 def described(command: str, num_plugins: int) -> Described:
     """Describe the options of a command; with another number of plugins, again."""
-    return describe_command(command, entry_points()[command][0], folder_of(command))
+    describe_it = describe_command if has_groups(command) else describe
+    return describe_it(command, entry_points()[command][0])
 
 
-def folder_of(command: str) -> Path:
-    return CONF_DIR if (CONF_DIR / f"{command}.yaml").is_file() else CONF_DIR / command
+def has_groups(command: str) -> bool:
+    return (CONF_DIR / f"{command}.yaml").is_file()
 
 
 @functools.cache
 def composed(command: str, choices: tuple[str, ...]) -> DictConfig:
     """Compose the configuration of a command with options that choose members of groups."""
-    ConfigStore.instance().store(name=f"{command}_schema", node=entry_points()[command][0], provider="nerfro")
-    with initialize_config_dir(str(folder_of(command)), version_base="1.3"):
+    store_schema(command, entry_points()[command][0])
+    with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
         return compose(command, list(choices))
 
 
@@ -93,8 +95,14 @@ def require_valid(command: str, options: list[str]) -> None:
     options = [full_key(option) for option in options]
     # Of a sweep the first value; no patterns, and no options of Hydra, whose launchers may not be installed.
     options = [re.sub(r"^([^=]+=[^,[{]+),[^]}]*$", r"\1", option) for option in options if "(" not in option]
-    options = [_quoted(option, verbatim) for option in options if not option.lstrip("+").startswith("hydra")]
+    options = [quoted(option, verbatim) for option in options if not option.lstrip("+").startswith("hydra")]
     described(command, len(plugins())).require_known(options)
+    if not has_groups(command):
+        with contextlib.suppress(MissingSettingError):
+            parsed = validate(schema, values_of(options))
+            if command == "export":
+                find_export(parsed.what, Path(parsed.out))
+        return
     options = list(map(added, options)) if command == "train" else options
     choices, settings = [], []
     for override in OverridesParser.create().parse_overrides(options):
@@ -104,12 +112,10 @@ def require_valid(command: str, options: list[str]) -> None:
     config = copy.deepcopy(composed(command, tuple(str(choice.input_line) for choice in choices)))
     for setting in settings:
         OmegaConf.update(config, setting.key_or_group, setting.value(), force_add=setting.is_add())
-    check_names(config)
-    check_settings(config, schema)
+    with contextlib.suppress(MissingSettingError):
+        validate(schema, plain(config))
     if command == "train":
         assert settings_without_effect(config, options) == []
-    if command == "export" and not OmegaConf.is_missing(config, "what"):
-        find_export(config.what, Path(config.out))
 
 
 @pytest.fixture
@@ -173,7 +179,9 @@ def nested_names(config: DictConfig, prefix: str = "") -> Iterator[str]:
 
 @pytest.mark.usefixtures("documented_plugins")
 def test_settings_in_the_text_exist() -> None:
-    known = {name for schema, _ in entry_points().values() for name in nested_names(OmegaConf.structured(schema))}
+    known = {
+        name for schema, _ in entry_points().values() for name in nested_names(OmegaConf.structured(untyped(schema())))
+    }
     for plugin in plugins():
         group = plugin.kind.replace("/", ".")
         known |= {f"{node}.{name}" for name, *_ in plugin.fields() for node in (group, f"{group}.{plugin.name}")}

@@ -113,8 +113,9 @@ def test_only_training_imports_lightning() -> None:
 PLUGINS = {str(file.relative_to(PLUGINS_DIR)): file for file in PLUGINS_DIR.rglob("*.py")}
 # Requirement that provides an imported package with another name.
 PROVIDED_BY = {
-    "PIL": "pillow", "flip_evaluator": "flip-evaluator", "OpenImageIO": "openimageio", "hydra": "hydra-core",
-    "markupsafe": "jinja2", "omegaconf": "hydra-core", "skimage": "scikit-image", "yaml": "hydra-core",
+    "PIL": "pillow", "annotated_types": "annotated-types",
+    "flip_evaluator": "flip-evaluator", "OpenImageIO": "openimageio", "hydra": "hydra-core", "markupsafe": "jinja2",
+    "omegaconf": "hydra-core", "skimage": "scikit-image", "yaml": "hydra-core",
 }  # fmt: skip
 
 

@@ -61,7 +61,7 @@ def test_constructor_becomes_the_configuration() -> None:
     ]
     medium = nn.Identity()
     built = build({"_target_": plugin.target, "required": 3}, medium=medium, something_else=1)
-    assert built.arguments == (3, 0.5, ["a"], None, None, "fast")
+    assert built.arguments == (3, 0.5, ("a",), None, None, "fast")
     assert built.medium is medium
 
 
@@ -116,7 +116,7 @@ def test_unknown_field_of_a_lightning_object_is_refused() -> None:
     [
         (
             {"photometric": {"weigth": 1}},
-            "loss=photometric: Key 'weigth' not in 'PhotometricConfig'; its fields: coarse",
+            r"loss\.photometric\.weigth is not a setting; did you mean weight\?",
         ),
         (
             {"photometric": 3},

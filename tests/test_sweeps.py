@@ -15,7 +15,7 @@ from hydra.core.plugins import Plugins
 from omegaconf import OmegaConf
 
 from nerfro.core.paths import CONF_DIR, scene_name
-from nerfro.registry.allowed import check_settings
+from nerfro.registry.allowed import plain, validate
 from nerfro.training.config import TrainConfig
 from nerfro.training.sweeps import identity_of
 from tests.conftest import Runner, composed
@@ -102,7 +102,7 @@ def test_sweep_file_composes_its_cells(name: str) -> None:
     assert hydra.sweep.dir == f"outputs/sweeps/{name}"
     for key, values in hydra.sweeper.params.items():
         for value in values.split(","):
-            check_settings(composed(f"{key}={value}"), TrainConfig)
+            validate(TrainConfig, plain(composed(f"{key}={value}")))
 
 
 SWEEPER = """

@@ -5,16 +5,16 @@ import shlex
 from types import SimpleNamespace
 
 import pytest
-from omegaconf import OmegaConf
 from PIL import Image
 from torch.nn.functional import max_pool2d
 
 from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.core.light import to_srgb
-from nerfro.core.paths import ASSETS_DIR, CONF_DIR
+from nerfro.core.paths import ASSETS_DIR
 from nerfro.core.types import Exits
 from nerfro.data.blender import BlenderData
 from nerfro.geometry.mesh import load_mesh
+from nerfro.registry.allowed import validate
 from nerfro.synthetic.dataset import ViewSplits
 from nerfro.synthetic.options import SynthesizeConfig
 from nerfro.synthetic.scenes.photographs import Photographs
@@ -28,9 +28,7 @@ SPLITS = {"train": 100, "val": 10, "test": 20}
 
 def configured(**options):
     """The configuration of the command line, with other values."""
-    file = OmegaConf.load(CONF_DIR / "synthesize" / "synthesize.yaml")
-    plain = {key: file[key] for key in file if key not in ("defaults", "hydra")}
-    return OmegaConf.merge(OmegaConf.structured(SynthesizeConfig), plain, options)
+    return validate(SynthesizeConfig, options)
 
 
 def small(folder, **options):

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_dir
-from hydra.core.config_store import ConfigStore
 
+from nerfro.cli.options import store_schema
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import CONF_DIR
 from nerfro.core.trust import GuardedConfigLoader
@@ -64,7 +64,7 @@ def test_plugins_of_hydra_in_the_current_directory_are_not_imported(folder: Path
 )
 def test_configuration_files_name_no_foreign_code(hydra: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hydra._internal.hydra.ConfigLoaderImpl", GuardedConfigLoader)
-    ConfigStore.instance().store(name="train_schema", node=TrainConfig)
+    store_schema("train", TrainConfig)
     write_experiment(folder, hydra)
     options = ["+experiment=other", f"hydra.searchpath=[file://{folder}/conf]"]
     with (

@@ -6,9 +6,10 @@ import typing
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Ge, Le
 from jaxtyping import Float
 from omegaconf import MISSING, DictConfig, OmegaConf
 
@@ -20,10 +21,11 @@ from nerfro.core.paths import EMBEDDED_PREFIX, resolve_path, user_path
 from nerfro.data.base import DataSource
 from nerfro.data.frames import require_root
 from nerfro.files.atomic import refuse_existing
+from nerfro.geometry.box import corners_of_box
 from nerfro.geometry.mesh import TriangleMesh, load_mesh, local_origin, num_decimals
 from nerfro.media.base import Medium
 from nerfro.media.body_settings import expanded
-from nerfro.registry.allowed import Count, Natural, NotNegative, Range, corners_of_box, refuse_unused
+from nerfro.registry.allowed import Count, Natural, NotNegative, refuse_unused
 from nerfro.registry.registration import build
 from nerfro.rendering.scene_file import SCENE, SceneFile, take_bodies
 from nerfro.silhouettes.overlaps import REPORT, SHEET
@@ -62,16 +64,16 @@ class PreprocessConfig:
     data: Any = MISSING
     medium: Any = MISSING
     refine: bool = False
-    mesh: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
-    room: Optional[bool] = None  # noqa: UP045
-    out: Optional[str] = None  # noqa: UP045
-    resolution: Annotated[int, Range(at_least=16, at_most=1024)] = 96
-    box_min: Optional[list[float]] = None  # noqa: UP045
-    box_max: Optional[list[float]] = None  # noqa: UP045
-    wrong_masks: Optional[Natural] = 0  # noqa: UP045
-    keep: Optional[Count] = None  # noqa: UP045
+    mesh: str | None = None
+    room: bool | None = None
+    out: str | None = None
+    resolution: Annotated[int, Ge(16), Le(1024)] = 96
+    box_min: list[float] | None = None
+    box_max: list[float] | None = None
+    wrong_masks: Natural | None = 0
+    keep: Count | None = None
     smoothing: NotNegative = 1.0
-    symmetry: Annotated[Optional[str], Symmetry] = None  # noqa: UP045
+    symmetry: Annotated[str | None, Symmetry] = None
     vessel: bool = False
     overwrite: bool = False
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 import torch
@@ -245,7 +246,7 @@ class Observations:
         self.shift, self._mesh, self._room, self._settings = shift, mesh.relative_to(shift), room, settings
 
     @property
-    def distance(self) -> str | None:
+    def distance(self) -> Literal["near", "far"] | None:
         """Distance of the surroundings, `near` or `far`; None if neither given nor reconstructed."""
         surroundings = self.__dict__.get("surroundings")
         near = self._room if surroundings is None else isinstance(surroundings.background, Room)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import copy
 import dataclasses
-import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,27 +12,20 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-from hydra import compose, initialize_config_dir
-from hydra.core.config_store import ConfigStore
-from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
-from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from nerfro.cli.composition import composed_with
-from nerfro.cli.entry import added, check_configuration
+from nerfro.cli.composition import Composer, Expand
 from nerfro.cli.failures import in_one_line
 from nerfro.cli.options import describe_command
-from nerfro.cli.overrides import full_key
-from nerfro.core.errors import NerfroError, nearest_of
-from nerfro.core.paths import CONF_DIR
-from nerfro.registry.allowed import check_settings
-from nerfro.registry.registration import discover, plugin_of
+from nerfro.core.errors import NerfroError
+from nerfro.registry.allowed import validate
+from nerfro.registry.registration import plugin_of
 
 Options = TypeVar("Options")
-Expand = Callable[[Sequence[str], Sequence[str]], list[str]]
 
 
 def options_of(
@@ -50,27 +42,9 @@ def options_of(
     Raises:
         NerfroError: a name is unknown, or a value is missing or not allowed.
     """
-    names = [field.name for field in dataclasses.fields(cast(Any, schema))]
-    settings = {**settings, **{name: value for name, value in arguments.items() if value is not None}}
-    for name in settings:
-        if name not in names:
-            raise NerfroError(f"{name} is not a setting; {nearest_of(name, names)}")
-    values = {name: os.fspath(value) if isinstance(value, os.PathLike) else value for name, value in settings.items()}
-    try:
-        typed = cast(DictConfig, OmegaConf.merge(OmegaConf.structured(options or schema), values))
-        check_settings(typed, schema)
-        return cast(Options, OmegaConf.to_object(typed))
-    except MissingMandatoryValue as error:
-        raise NerfroError(f"{error.full_key}=... is missing") from error
-    except OmegaConfBaseException as error:
-        raise NerfroError(in_one_line(error)) from error
-
-
-def options_in(config: DictConfig, schema: type[Options]) -> Options:
-    """Return the checked configuration of a command as a dataclass."""
-    options = OmegaConf.to_object(config)
-    assert isinstance(options, schema)
-    return options
+    values = {} if options is None else vars(options)
+    changes = {name: value for name, value in arguments.items() if value is not None}
+    return validate(schema, {**values, **settings, **changes})
 
 
 def parsed(overrides: Sequence[str]) -> dict[str, Any]:
@@ -124,7 +98,7 @@ def composed(
     schema: type,
     overrides: Sequence[str],
     expand: Expand,
-    check: Callable[[DictConfig], None] = lambda config: None,
+    check: Callable[[DictConfig], None] | None = None,
 ) -> Iterator[Composition]:
     """Compose the configuration of a command for a call from Python.
 
@@ -135,31 +109,21 @@ def composed(
         command: name of the command.
         schema: dataclass of the root of the configuration.
         overrides: settings as on the command line.
-        expand: function that replaces overrides that stand for several settings, see `entry_point`.
+        expand: function that replaces overrides that stand for several settings, see `Composer`.
         check: further check of the configuration.
 
     Raises:
         NerfroError: a setting does not exist, or its value is not allowed.
     """
 
-    def check_all(config: DictConfig) -> None:
-        check_configuration(config, schema, CONF_DIR)
-        check(config)
-
-    discover()
-    ConfigStore.instance().store(name=f"{command}_schema", node=schema, provider="nerfro")
-    arguments = expand([*map(full_key, overrides)], [field.name for field in dataclasses.fields(schema)])
-    arguments = [*map(added, arguments)] if command == "train" else arguments
-    outer = GlobalHydra.instance().hydra
-    GlobalHydra.instance().hydra = None  # of a command that calls this function
+    composer = Composer(command, schema, check, expand)
+    arguments = composer.overrides(overrides)
     try:
-        with composed_with(check_all), initialize_config_dir(str(CONF_DIR), version_base="1.3"):
-            job = compose(command, arguments, return_hydra_config=True)
+        with composer.hydra() as hydra:
+            job = hydra.compose_config(command, arguments, RunMode.RUN, with_log_configuration=False, from_shell=False)
     except HydraException as error:
-        describe_command(command, schema, CONF_DIR).require_known(arguments)
+        describe_command(command, schema).require_known(arguments)
         raise NerfroError(in_one_line(error)) from error
-    finally:
-        GlobalHydra.instance().hydra = outer
     with open_dict(job):
         job.hydra.runtime.output_dir = job.hydra.run.dir
     config = copy.deepcopy(job)

@@ -4,39 +4,124 @@ from __future__ import annotations
 
 import contextlib
 import copy
-import functools
+import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, is_dataclass
 from pathlib import Path
 from typing import Any, cast
 
-import hydra
-import hydra._internal.hydra
+from hydra import version
 from hydra._internal.core_plugins.file_config_source import FileConfigSource
-from hydra.core.config_search_path import ConfigSearchPath
+from hydra._internal.hydra import Hydra
+from hydra._internal.sources_registry import SourcesRegistry
+from hydra._internal.utils import create_config_search_path
+from hydra.core.config_search_path import ConfigSearchPath, SearchPathQuery
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.plugins.config_source import ConfigResult
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, flag_override
+from omegaconf.errors import MissingMandatoryValue
 
+from nerfro.cli.options import ADDED_GROUPS, store_schema, usage
 from nerfro.cli.overrides import SHORT_NAMES, full_key
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import CONF_DIR, refuse_root, user_path
 from nerfro.core.trust import MAX_YAML_CHARACTERS, GuardedConfigLoader, require_bounded_yaml
-from nerfro.registry.allowed import check_names
+from nerfro.registry.allowed import MissingSettingError, hints_of, plain, require_names, validate
 from nerfro.registry.registration import discover
+
+Expand = Callable[[Sequence[str], Sequence[str]], list[str]]
+
+
+@dataclass(frozen=True)
+class Composer:
+    """Composition of the configuration of a command from groups.
+
+    Attributes:
+        command: name of the command, and of its YAML file in conf/.
+        schema: dataclass of the root.
+        check: further check of the configuration.
+        expand: function that replaces arguments that stand for several settings; it also receives the names of the
+            settings of the root.
+        verbatim: keys whose values are texts that may contain commas and equals signs, which Hydra would parse.
+    """
+
+    command: str
+    schema: type
+    check: Callable[[DictConfig], None] | None = None
+    expand: Expand | None = None
+    verbatim: tuple[str, ...] = ()
+
+    def overrides(self, arguments: Sequence[str]) -> list[str]:
+        """Write the arguments of a command line in the grammar of Hydra."""
+        overrides = [quoted(full_key(argument), self.verbatim) for argument in arguments]
+        if self.expand is not None:
+            overrides = self.expand(overrides, list(hints_of(self.schema)))
+        return [*map(added, overrides)] if self.command == "train" else overrides
+
+    def require_valid(self, config: DictConfig) -> None:
+        """Refuse an invalid configuration of a job.
+
+        Raises:
+            NerfroError: a setting is unknown or missing, or its value is not allowed.
+        """
+        groups = [path.name for path in CONF_DIR.iterdir() if path.is_dir()]
+        values = plain(config)
+        require_names("", [*hints_of(self.schema), *groups], values)
+        with missing_with_example(self.command):
+            validate(self.schema, values)
+            if self.check is not None:
+                self.check(config)
+
+    @contextlib.contextmanager
+    def hydra(self, folders: Sequence[str] = ()) -> Iterator[Hydra]:
+        """Prepare Hydra to compose configurations, which are checked.
+
+        Args:
+            folders: further folders of YAML files, which have precedence.
+        """
+        discover()
+        store_schema(self.command, self.schema)
+        SourcesRegistry.instance().types["file"] = BoundedFiles
+        search_path = create_config_search_path(str(CONF_DIR))
+        for folder in folders:
+            path = f"file://{os.path.abspath(folder)}"
+            search_path.prepend("command-line", path, SearchPathQuery(provider="schema"))
+        version.setbase("1.3")  # jobs stay in the current directory
+        current = GlobalHydra.instance()
+        outer = current.hydra
+        current.hydra = Hydra(self.command, _ConfigLoader(self.require_valid, search_path))
+        try:
+            yield current.hydra
+        finally:
+            current.hydra = outer
 
 
 @contextlib.contextmanager
-def composed_with(check: Callable[[DictConfig], None]) -> Iterator[None]:
-    """Let Hydra compose configurations with the checks of a command."""
-    before = hydra._internal.hydra.ConfigLoaderImpl
-    hydra._internal.hydra.ConfigLoaderImpl = functools.partial(_ConfigLoader, check)  # type: ignore[misc, assignment]
+def missing_with_example(command: str) -> Iterator[None]:
+    """Show an example of the command if a required option is missing."""
     try:
         yield
-    finally:
-        hydra._internal.hydra.ConfigLoaderImpl = before  # type: ignore[misc]
+    except (MissingMandatoryValue, MissingSettingError) as error:
+        name = error.full_key if isinstance(error, MissingMandatoryValue) else error.name
+        example = usage(command).partition("Examples:\n")[2].partition("\n")[0].strip()
+        raise NerfroError(f"{name}=... is missing; for example: {example}") from error
+
+
+def quoted(argument: str, keys: tuple[str, ...]) -> str:
+    """Quote the value of an override if its key is one of `keys`."""
+    key, _, value = argument.partition("=")
+    if key not in keys or not set(",=") & set(value) or value[0] in "\"'":
+        return argument
+    return f"{key}='{value}'"
+
+
+def added(argument: str) -> str:
+    """Add the plus sign with which Hydra selects an option of a group without a default, as in `experiment=glass`."""
+    return f"+{argument}" if argument.partition("=")[0] in ADDED_GROUPS else argument
 
 
 class _ConfigLoader(GuardedConfigLoader):
@@ -61,7 +146,7 @@ class _ConfigLoader(GuardedConfigLoader):
     def check(self, config: DictConfig) -> None:
         discover()  # the process may be a launcher's worker
         # Hydra adds the group `env`, and the options of plugins of other packages are theirs to check.
-        check_names(config.hydra, "hydra.", also=["env", "sweeper", "launcher"])
+        _require_declared(config.hydra, "hydra.", ["env", "sweeper", "launcher"])
         job, hydra_config = copy.deepcopy(config), HydraConfig.instance()
         before = hydra_config.cfg
         try:
@@ -88,6 +173,22 @@ class _ConfigLoader(GuardedConfigLoader):
         parts = [f"-{key.lstrip('+').rpartition('.')[2]}={value}" for key, _, value in swept if key not in excluded]
         config.hydra.job.override_dirname = re.sub(r"[^\w.=+-]+", "_", "".join(parts)).rstrip("_")
         return config
+
+
+def _require_declared(node: DictConfig, prefix: str, also: Sequence[str] = ()) -> None:
+    """Refuse settings of Hydra that its dataclasses do not declare; `+` would add them.
+
+    Args:
+        node: the configuration of Hydra, or a node in it.
+        prefix: full name of the node, with a dot at the end.
+        also: further allowed names; nodes with these names are not checked.
+    """
+    schema = OmegaConf.get_type(node)
+    if is_dataclass(schema):
+        require_names(prefix, [*hints_of(schema), *also], node)
+    for name, child in node.items_ex(resolve=False):
+        if isinstance(child, DictConfig) and name not in also and not child._is_none():
+            _require_declared(child, f"{prefix}{name!s}.")
 
 
 class BoundedFiles(FileConfigSource):

@@ -78,9 +78,6 @@ def _description(error: Exception) -> str:
     if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and _NO_MEMORY.search(str(error))):
         reason = " ".join(str(error).split("\n")[0].split())
         return f"not enough memory{reason and f' ({reason})'}; take smaller sizes, such as batches.size"
-    setting = re.search(r"full_key: (\S+)", str(error)) if isinstance(error, OverflowError) else None
-    if setting is not None:  # OmegaConf, about an integer of hundreds of digits
-        return f"{setting[1]} is too large; take a number that a float can hold"
     if isinstance(error, (HydraException, OmegaConfBaseException)):
         message = " ".join(_messages(error))
         extras = [extra for option, extra in _EXTRAS.items() if f"Could not find '{option}" in message]
@@ -151,7 +148,7 @@ def _unselected(key: str) -> str | None:
     """Explain how to add a missing loss or callback to the experiment; None for other settings."""
     kind, name, option = [*key.split("."), "", ""][:3]
     plugin = next((plugin for plugin in plugins() if (plugin.kind, plugin.name) == (kind, name)), None)
-    if plugin is None or kind not in SEVERAL or (option and option not in plugin.setting_names):
+    if plugin is None or kind not in SEVERAL or (option and option not in plugin.hints):
         return None
     if kind != "callbacks":
         setting = option or {"loss": "weight"}.get(kind, "SETTING")

@@ -1,4 +1,4 @@
-"""Options of commands and plugins, described by their annotations, docstrings and comments, and a cache of them.
+"""Options of commands and plugins, described by their annotations and docstrings, and a cache of them.
 
 The cache lets a command print its help, and refuse misspelt options, before it imports torch and Lightning.
 """
@@ -19,17 +19,18 @@ import sys
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, cast, get_args, get_type_hints
+from typing import Any, NamedTuple, cast, get_args
 
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
-from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
+from nerfro.cli.overrides import full_key, is_scene_file
 from nerfro.core.errors import NerfroError, nearest_of
 from nerfro.core.paths import CONF_DIR, PACKAGE_DIR, cache_dir
-from nerfro.registry.allowed import Refused
-from nerfro.registry.registration import ENTRY_POINTS, KINDS, SEVERAL, Plugin, plugin_folders, plugins, type_name
+from nerfro.registry.allowed import Refused, default_of, hints_of, is_missing, type_name, untyped
+from nerfro.registry.registration import ENTRY_POINTS, KINDS, SEVERAL, Plugin, plugin_folders, plugins
 
 # Groups without a default in conf/train.yaml.
 ADDED_GROUPS = ("callbacks", "evaluation", "experiment", "scene", "sweep")
@@ -39,7 +40,6 @@ _ADDED_PLUGINS = {
     "phase": "+phase.NAME={}",
     "surface": "+bodies.BODY.surface.name=NAME",
 }
-_TOOLS = re.compile(r"#\s*(noqa|type:).*?(?= - (?!OmegaConf)|#|$)")  # comments for linters
 _WIDTH = 100  # characters in a line of the help
 
 
@@ -81,6 +81,20 @@ class Described:
     names: Mapping[str, Sequence[str]]
     choices: Mapping[str, Sequence[str]]
 
+    def answer(self, arguments: Sequence[str]) -> None:
+        """Print the help and exit on request, or refuse misspelt names.
+
+        Raises:
+            NerfroError: a setting or an option does not exist.
+        """
+        if {"-h", "--help"} & {*arguments} and "hydra" not in arguments:
+            print(self.help)
+            sys.exit()
+        # Other folders of configurations may have other groups.
+        if not any(argument.startswith(("--config", "-c", "hydra.searchpath")) for argument in arguments):
+            has_scene = bool({"data", "medium"} & {*self.names.get("", ())})
+            self.require_known([full_key(text) for text in arguments if not (has_scene and is_scene_file(text))])
+
     def require_known(self, arguments: Sequence[str]) -> None:
         """Refuse the first override with a name that the command cannot know, whatever options are chosen.
 
@@ -113,16 +127,25 @@ class Described:
                     raise NerfroError(f"{place} is not a setting; {nearest_of(name, known)}")
 
 
-def describe_command(command: str, schema: type, folder: Path) -> Described:
-    """Describe a command; its plugins must have been discovered.
+def describe(command: str, schema: type) -> Described:
+    """Describe a command without configuration groups; its plugins must have been discovered.
+
+    Args:
+        command: name of the command.
+        schema: dataclass of the options.
+    """
+    return Described(_page(command, list(schema_options(schema, {})), {}), _names(schema), {})
+
+
+def describe_command(command: str, schema: type) -> Described:
+    """Describe a command with configuration groups; its plugins must have been discovered.
 
     Args:
         command: name of the command, and of its YAML file.
         schema: dataclass of the configuration.
-        folder: folder of the YAML file.
     """
-    ConfigStore.instance().store(name=f"{command}_schema", node=schema, provider="nerfro")
-    with initialize_config_dir(str(folder), version_base="1.3"):
+    store_schema(command, schema)
+    with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
         config = compose(command, return_hydra_config=True)
         groups = [kind for kind in KINDS if isinstance(OmegaConf.select(config, kind.replace("/", ".")), DictConfig)]
         groups = list(dict.fromkeys([*groups, "logger", *ADDED_GROUPS])) if command == "train" else groups
@@ -132,22 +155,29 @@ def describe_command(command: str, schema: type, folder: Path) -> Described:
     added = {option: [p.name for p in plugins(kind)] for kind, option in _ADDED_PLUGINS.items() if kind in kinds}
     names = _names(schema)
     names[""] += [group.partition("/")[0] for group in groups]
-    options = list(schema_options(schema, config, yaml_comments(folder / f"{command}.yaml")))
+    values = cast(dict[str, Any], OmegaConf.to_container(config))
+    options = list(schema_options(schema, values))
     for kind in [group for group in groups if group in KINDS]:
         path, of_kind = kind.replace("/", "."), plugins(kind)
         nodes = {path: OmegaConf.select(config, path)}
         if kind in SEVERAL:
             nodes = {f"{path}.{name}": node for name, node in nodes[path].items()}
             names[path] = [plugin.name for plugin in of_kind]
-            names |= {f"{path}.{plugin.name}": plugin.setting_names for plugin in of_kind}
+            names |= {f"{path}.{plugin.name}": list(plugin.hints) for plugin in of_kind}
         else:
-            names[path] = sorted({name for plugin in of_kind for name in plugin.setting_names})
-        for place, node in nodes.items():
+            names[path] = sorted({name for plugin in of_kind for name in (*plugin.hints, "_target_")})
+        for prefix, node in nodes.items():
             plugin = next((plugin for plugin in of_kind if plugin.target == node.get("_target_")), None)
-            options += [] if plugin is None else plugin_options(plugin, f"{place}.", node)
-    chosen = {group: f"{group}={config.hydra.runtime.choices.get(group, 'NAME')}" for group in choices}
-    listed = {chosen[group]: found for group, found in choices.items()} | added
+            node_values = cast(dict[str, Any], OmegaConf.to_container(node))
+            options += [] if plugin is None else plugin_options(plugin, f"{prefix}.", node_values)
+    selected = {group: f"{group}={config.hydra.runtime.choices.get(group, 'NAME')}" for group in choices}
+    listed = {selected[group]: names for group, names in choices.items()} | added
     return Described(_page(command, options, listed), names, choices)
+
+
+def store_schema(command: str, schema: type) -> None:
+    """Store the names and defaults of the settings of a command for Hydra."""
+    ConfigStore.instance().store(name=f"{command}_schema", node=untyped(schema()), provider="nerfro")
 
 
 def usage(command: str) -> str:
@@ -167,61 +197,58 @@ def _page(command: str, options: Sequence[Option], choices: Mapping[str, Sequenc
         sections.setdefault(option.name.rpartition(".")[0].partition(".")[0], []).append(option)
     for section, members in sections.items():
         lines += [f"Options of {section}:" if section else "Options:", *map(str, members), ""]
-    lines.append("`--help hydra` explains the flags of Hydra, such as -m for sweeps and --cfg job.")
+    if (CONF_DIR / f"{command}.yaml").is_file():
+        lines.append("`--help hydra` explains the flags of Hydra, such as -m for sweeps and --cfg job.")
+    else:
+        lines.append("`--cfg job` prints the options.")
     return "\n".join(lines).replace("`", "")
 
 
-def schema_options(schema: type, values: DictConfig, comments: Mapping[str, str], prefix: str = "") -> Iterator[Option]:
+def schema_options(schema: Any, values: Mapping[str, Any], prefix: str = "") -> Iterator[Option]:
     """Yield the options of a configuration dataclass and of nested dataclasses.
 
     Args:
         schema: the dataclass.
-        values: composed configuration, which holds the defaults.
-        comments: explanations by name, which override those of the dataclass.
+        values: values that replace the defaults.
         prefix: full name of the node, with a dot at the end.
     """
-    hints = get_type_hints(schema, include_extras=True)
-    explained = google_docstring(inspect.getdoc(schema) or "")[1] | _field_comments(schema)
+    hints, explained = hints_of(schema), google_docstring(inspect.getdoc(schema) or "")[1]
     for field in dataclasses.fields(schema):
-        hint, name = hints[field.name], prefix + field.name
+        hint, name, default = hints[field.name], prefix + field.name, default_of(field)
         if field.name.startswith("_") or any(isinstance(limit, Refused) for limit in get_args(hint)):
             continue
+        default = values.get(field.name, default)
         if dataclasses.is_dataclass(hint):
-            yield from schema_options(cast(type, hint), values[field.name], {}, f"{name}.")
+            nested = default if isinstance(default, Mapping) else vars(default)
+            yield from schema_options(hint, nested, f"{name}.")
             continue
-        default = _plain(values).get(field.name, field.default)
-        text = comments.get(field.name) or explained.get(field.name, "")
+        text = explained.get(field.name, "")
         if "_target_" in hints and not text:
-            text = f"As in `{values['_target_']}`"
-        if isinstance(default, dict) and default:
+            text = f"As in `{values.get('_target_')}`"
+        if isinstance(default, Mapping) and default:
             if hint is Any:  # a component, whose options are those of its class
                 continue
             default = ", ".join(default)
-        yield Option(name, type_name(hint), default, _sentence(text))
+        yield Option(name, type_name(hint), "required" if is_missing(default) else default, _sentence(text))
 
 
-def plugin_options(plugin: Plugin, prefix: str, values: DictConfig | None = None) -> list[Option]:
+def plugin_options(plugin: Plugin, prefix: str, values: Mapping[str, Any] | None = None) -> list[Option]:
     """Return the options of a plugin.
 
     Args:
         plugin: the plugin.
         prefix: full name of its node, with a dot at the end.
-        values: configuration that replaces the defaults.
+        values: values that replace the defaults.
     """
     explained: dict[str, str] = {}
     for base in getattr(plugin.cls, "__mro__", (plugin.cls,)):
         for documented in (vars(base).get("__init__"), base):
             explained = google_docstring(inspect.cleandoc(documented.__doc__ or ""))[1] | explained
-    given = {} if values is None else _plain(values)
+    changed = {name: "required" if is_missing(value) else value for name, value in (values or {}).items()}
     return [
-        Option(prefix + name, kind, given.get(name, default), _sentence(explained.get(name, "")))
+        Option(prefix + name, kind, changed.get(name, default), _sentence(explained.get(name, "")))
         for name, kind, default in plugin.fields()
     ]
-
-
-def _plain(values: DictConfig) -> dict[str, Any]:
-    given = cast(dict[str, Any], OmegaConf.to_container(values, resolve=False))
-    return {name: "required" if value == MISSING else value for name, value in given.items()}
 
 
 def _sentence(text: str) -> str:
@@ -240,38 +267,14 @@ def google_docstring(docstring: str) -> tuple[str, dict[str, str]]:
     return parts[0].strip(), explained
 
 
-def yaml_comments(file: Path) -> dict[str, str]:
-    """Return the comments on the lines of the settings in a YAML file, by name."""
-    return dict(re.findall(r"^(\w+):.*?\s# (.*)$", file.read_text(encoding="utf-8"), re.MULTILINE))
-
-
-def _names(schema: type, prefix: str = "") -> dict[str, list[str]]:
+def _names(schema: Any, prefix: str = "") -> dict[str, list[str]]:
     """Return the names of the settings of a dataclass and of nested dataclasses, by the full name of the node."""
-    hints = get_type_hints(schema)
-    found = {prefix: list(hints)}
+    hints = hints_of(schema)
+    names = {prefix: list(hints)}
     for name, hint in hints.items():
         if dataclasses.is_dataclass(hint):
-            found |= _names(hint, f"{prefix}.{name}".lstrip("."))  # type: ignore[arg-type]
-    return found
-
-
-def _field_comments(schema: type) -> dict[str, str]:
-    """Return the comments of the fields of a dataclass: on the line of the field, or on the lines above."""
-    lines = inspect.getsource(schema).split("\n")
-    found = {}
-    for node in ast.parse(textwrap.dedent("\n".join(lines))).body[0].body:  # type: ignore[attr-defined]
-        if not isinstance(node, ast.AnnAssign):
-            continue
-        above: list[str] = []
-        number = node.lineno - 2
-        while lines[number].lstrip().startswith("#"):
-            above.insert(0, lines[number].lstrip(" #"))
-            number -= 1
-        end = lines[(node.end_lineno or node.lineno) - 1].partition("  #")[2]
-        beside = _TOOLS.sub("", f"#{end}").lstrip("# ").removeprefix("- ") if end else ""
-        inside = [part for line in lines[node.lineno : node.end_lineno] if (part := line.partition("  # ")[2])]
-        found[ast.unparse(node.target)] = " ".join([*above, *inside, beside]).strip()
-    return {name: comment for name, comment in found.items() if comment}
+            names |= _names(hint, f"{prefix}.{name}".lstrip("."))
+    return names
 
 
 def recall(command: str) -> Described | None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import sys
 from types import TracebackType
 
-from nerfro.cli.entry import answer, print_version, program
+from nerfro.cli.entry import print_version, program
 from nerfro.cli.failures import errors_in_one_line
 from nerfro.cli.options import Described, recall, usage
 
@@ -30,7 +30,7 @@ def begin(command: str) -> None:
     with errors_in_one_line():
         described = Described(usage(command), {}, {}) if command in _WITHOUT_CONFIGURATION else recall(command)
         if described is not None:
-            answer(described, sys.argv[1:])
+            described.answer(sys.argv[1:])
 
 
 def _print_in_one_line(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:

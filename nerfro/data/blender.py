@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
+from annotated_types import Gt, Le
+
 from nerfro.data.frames import FrameSet, PosedImages
 from nerfro.data.transforms import find_splits, read_manifest
-from nerfro.registry.allowed import Distance, Range
+from nerfro.registry.allowed import Distance
 from nerfro.registry.registration import register
 
 
@@ -49,7 +51,7 @@ class OpenCVData(PosedImages):
         root: str,
         near: Distance | None = None,
         far: Distance | None = None,
-        eval_crop: Annotated[float, Range(more_than=0, at_most=1)] = 1.0,
+        eval_crop: Annotated[float, Gt(0), Le(1)] = 1.0,
         **options: Any,
     ) -> None:
         super().__init__(root, near, far, **options)

@@ -11,6 +11,7 @@ from typing import Annotated, Literal, TypeVar
 
 import numpy as np
 import torch
+from annotated_types import Ge
 from jaxtyping import Float
 
 from nerfro.core.cameras import Cameras, central_window
@@ -21,9 +22,9 @@ from nerfro.data.image_files import IMAGE_SUFFIXES, Alpha, read_rgb
 from nerfro.data.lazy_images import LazyImages
 from nerfro.data.lenses import Lens, check_lenses
 from nerfro.data.masks import find_mask, find_masks, find_usable, require_used, unused_masks
-from nerfro.registry.allowed import Coordinate, Distance, Factor, Range, check, checked
+from nerfro.registry.allowed import Coordinate, Distance, Factor, check, validated
 
-Every = Annotated[int, Range(at_least=2)]  # every n-th view is a test view
+Every = Annotated[int, Ge(2)]  # every n-th view is a test view
 SPLITS = ["train", "val", "test"]
 Item = TypeVar("Item")
 
@@ -52,7 +53,7 @@ class FrameSet:
     usable: Sequence[Path | None] = ()
 
 
-@checked("data")
+@validated("data")
 class PosedImages(DataSource):
     """Base class of the built-in data formats. A format implements `read` and, if it defines splits, `splits`.
 

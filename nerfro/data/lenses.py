@@ -10,13 +10,14 @@ from typing import Annotated, Any
 
 import numpy as np
 import torch
+from annotated_types import Ge, Gt, Le, Lt
 from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.core.errors import NerfroError, first_of, warn
 from nerfro.core.lens import coefficients, distort, opencv_coefficients, undistort
 from nerfro.files.reading import is_number, parse_matrix
-from nerfro.registry.allowed import Range, check
+from nerfro.registry.allowed import check
 
 # Perspective lenses in the files of nerfstudio, COLMAP and Blender. They differ in the coefficients that are zero.
 _PERSPECTIVE = ("OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE", "PERSP")
@@ -29,11 +30,11 @@ _OTHER = re.compile(
     rf"{_PROJECTIONS.pattern}|rolling|skew|^sk[xy]$|fov|focal|intrinsic|principal|cameramat|cammatrix|cameraangle|"
     r"(?<!un)distort|distcoef|pixelaspect|^shift[xy]$|^[cf]l?[xy]?$|^[dkp]\d*$"
 )
-_NUMBER = Annotated[float, Range()]
-_PIXELS = Annotated[float, Range(at_least=1, at_most=10**6)]
-_POSITIVE = Annotated[float, Range(more_than=0)]
-_RADIANS = Annotated[float, Range(more_than=0, less_than=math.pi)]
-_DEGREES = Annotated[float, Range(more_than=0, less_than=180)]
+_NUMBER = float  # finite
+_PIXELS = Annotated[float, Ge(1), Le(10**6)]
+_POSITIVE = Annotated[float, Gt(0)]
+_RADIANS = Annotated[float, Gt(0), Lt(math.pi)]
+_DEGREES = Annotated[float, Gt(0), Lt(180)]
 # Arguments of `coefficients`: numerator, tangential and denominator.
 _COEFFICIENTS = (("k1", "k2", "k3", "k4"), ("p1", "p2"), ("q1", "q2", "q3"))
 _NAMES = (*_COEFFICIENTS[0], "k5", "k6", *_COEFFICIENTS[1])
@@ -229,12 +230,9 @@ def check_lenses(lenses: Iterable[Lens], names: Iterable[str], size: tuple[int, 
     longer, outside = max(size), []
     limits = {
         # A field of view from 0.06 to 177.7 degrees.
-        "fx": Annotated[float, Range(at_least=0.01 * longer, at_most=1000 * longer)],
-        "fy / fx": Annotated[float, Range(at_least=1 / 4, at_most=4)],
-        **{
-            key: Annotated[float, Range(at_least=-5 * side, at_most=6 * side)]
-            for key, side in zip(("cx", "cy"), size, strict=True)
-        },
+        "fx": Annotated[float, Ge(0.01 * longer), Le(1000 * longer)],
+        "fy / fx": Annotated[float, Ge(1 / 4), Le(4)],
+        **{key: Annotated[float, Ge(-5 * side), Le(6 * side)] for key, side in zip(("cx", "cy"), size, strict=True)},
     }
     first: dict[Lens, str] = {}
     for lens, name in zip(lenses, names, strict=True):

@@ -1,7 +1,5 @@
 """Configuration and output folder of `python -m nerfro.evaluate`."""
 
-# ruff: noqa: UP045 - OmegaConf on Python 3.10 wants Optional
-
 from __future__ import annotations
 
 import dataclasses
@@ -9,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, Optional
+from typing import Literal
 
 import torch
 from omegaconf import OmegaConf
@@ -26,25 +24,40 @@ REQUEST_FILE = "evaluate.yaml"
 
 @dataclass
 class EvaluateConfig:
-    """Options of `python -m nerfro.evaluate`, which scores a trained model or images of any program."""
+    """Options of `python -m nerfro.evaluate`, which scores a trained model or images of any program.
 
-    checkpoint: Optional[str] = None  # run folder or checkpoint of nerfro.train to render and score
-    split: str = "test"  # split to render
-    root: Optional[str] = None  # folder of the data set of the run, if it has moved since training
-    chunk_size: Optional[NumRays] = None  # rays rendered at once, which limits memory; by default as in training
-    # Which pixels get several rays (see docs/concepts/background.md); by default as in training.
+    Attributes:
+        checkpoint: run folder or checkpoint of nerfro.train to render and score.
+        split: split to render.
+        root: folder of the data set of the run, if it has moved since training.
+        chunk_size: rays rendered at once, which limits memory; by default as in training.
+        subdivision: which pixels get several rays (see docs/concepts/background.md); by default as in training.
+        predictions: folder of images to score, instead of a checkpoint.
+        references: folder of reference images with the same names as `predictions`.
+        masks: folder of masks with the same names; by default the masks beside the references, or their
+            transparency.
+        mask_labels: labels of the object in the masks; by default all but the background.
+        alpha: treatment of transparency in both folders: `drop` ignores it, `white` and `black` composite over
+            this colour.
+        out: folder for images and tables; by default beside the folder of checkpoints, or `scores` in
+            `predictions`.
+        device: `cpu` or `cuda`; `auto` means the CPU.
+        overwrite: whether to replace an earlier evaluation in `out`.
+    """
+
+    checkpoint: str | None = None
+    split: str = "test"
+    root: str | None = None
+    chunk_size: NumRays | None = None
     subdivision: SubdivisionChanges = dataclasses.field(default_factory=SubdivisionChanges)
-    predictions: Optional[str] = None  # folder of images to score, instead of a checkpoint
-    references: Optional[str] = None  # folder of reference images with the same names as `predictions`
-    # Folder of masks with the same names; by default the masks beside the references, or their transparency.
-    masks: Optional[str] = None
-    mask_labels: Optional[list[Natural]] = None  # labels of the object in the masks; by default all but the background
-    # Treatment of transparency in both folders: `drop` ignores it, `white` and `black` composite over this colour.
-    alpha: Annotated[str, Literal["drop", "white", "black"]] = "drop"
-    # Folder for images and tables; by default beside the folder of checkpoints, or `scores` in `predictions`.
-    out: Optional[str] = None
-    device: str = "auto"  # `cpu` or `cuda`; `auto` means the CPU
-    overwrite: bool = False  # whether to replace an earlier evaluation in `out`
+    predictions: str | None = None
+    references: str | None = None
+    masks: str | None = None
+    mask_labels: list[Natural] | None = None
+    alpha: Literal["drop", "white", "black"] = "drop"
+    out: str | None = None
+    device: str = "auto"
+    overwrite: bool = False
 
 
 def require_one_task(options: EvaluateConfig) -> None:
@@ -77,7 +90,7 @@ def own_folder(options: EvaluateConfig, default: Path) -> Iterator[Path]:
 
 def record(folder: Path, options: EvaluateConfig) -> None:
     """Write the options, which marks the folder as that of an evaluation, before any other file."""
-    write_atomically(folder / REQUEST_FILE, OmegaConf.to_yaml(options))
+    write_atomically(folder / REQUEST_FILE, OmegaConf.to_yaml(OmegaConf.create(dataclasses.asdict(options))))
 
 
 def report_unused_gpu(option: str) -> None:

@@ -9,14 +9,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+from annotated_types import Ge, Lt
+
 from nerfro.core.errors import NerfroError
 from nerfro.evaluation.image_metrics import image_metrics
 from nerfro.files.atomic import write_atomically
 from nerfro.files.reading import is_number, read_json
-from nerfro.registry.allowed import Range, check
+from nerfro.registry.allowed import check
 
 TOO_LARGE = 1e15  # for scores, steps and times; sums of larger numbers may overflow
-_Amount = Annotated[float, Range(at_least=0, less_than=TOO_LARGE)]
+_Amount = Annotated[float, Ge(0), Lt(TOO_LARGE)]
 Score = float | None  # None if not available; the notes contain the reason
 
 

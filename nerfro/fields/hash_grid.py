@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 import torch
+from annotated_types import Ge, Le
 from jaxtyping import Bool, Float
 from omegaconf import DictConfig
 from torch import Tensor, nn
@@ -23,7 +24,7 @@ from nerfro.fields.selection import evaluate_selected
 from nerfro.fields.spherical_harmonics import MAX_BANDS
 from nerfro.fields.spherical_harmonics_cpu import spherical_harmonics
 from nerfro.geometry.space import Space
-from nerfro.registry.allowed import Depth, Positive, Range, Width
+from nerfro.registry.allowed import Depth, Positive, Width
 from nerfro.registry.registration import register
 
 # Number of features that the density network passes to the colour network.
@@ -72,10 +73,10 @@ class HashGridField(Field):
         self,
         space: Space,
         num_levels: Depth = 12,
-        finest_resolution: Annotated[int, Range(at_least=_COARSEST_RESOLUTION)] | None = 256,
-        log2_table_size: Annotated[int, Range(at_least=4, at_most=24)] = 15,
+        finest_resolution: Annotated[int, Ge(_COARSEST_RESOLUTION)] | None = 256,
+        log2_table_size: Annotated[int, Ge(4), Le(24)] = 15,
         width: Width = 64,
-        direction_bands: Annotated[int, Range(at_least=1, at_most=MAX_BANDS)] = 4,
+        direction_bands: Annotated[int, Ge(1), Le(MAX_BANDS)] = 4,
         initial_depth: Positive = 0.1,
         shortcut: bool = True,
         precision: Literal["bfloat16", "float32"] | None = None,

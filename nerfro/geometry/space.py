@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from nerfro.core.cameras import Cameras
 from nerfro.core.errors import NerfroError
 from nerfro.core.types import Path
-from nerfro.registry.allowed import corners_of_box
+from nerfro.geometry.box import corners_of_box
 
 # Stand-in for infinity, in units of the ball's radius, or of the line's distance if the line misses the ball.
 FAR = 1e4

@@ -6,12 +6,12 @@ import math
 from typing import Annotated
 
 import torch
+from annotated_types import Gt, Lt
 from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.core.types import Batch, Exits, Rendering
 from nerfro.losses.base import Loss
-from nerfro.registry.allowed import Range
 from nerfro.registry.registration import register
 from nerfro.rendering import Scene
 
@@ -35,7 +35,7 @@ class TotalVariation(Loss):
 
     weight = 1e-3
 
-    def __init__(self, angle: Annotated[float, Range(more_than=0, less_than=90)] | None = None) -> None:
+    def __init__(self, angle: Annotated[float, Gt(0), Lt(90)] | None = None) -> None:
         super().__init__()
         self.angle = angle
 

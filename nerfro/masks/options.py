@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Optional
+from typing import Annotated, Any
 
+from annotated_types import Ge, Le
 from omegaconf import MISSING
-
-from nerfro.registry.allowed import Range
 
 
 @dataclass
@@ -33,10 +32,10 @@ class MaskConfig:
 
     data: Any = MISSING
     outlines: Any = None
-    sam2: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
+    sam2: str | None = None
     hull_only: bool = False
     overwrite: bool = False
     view: bool = False
     host: str = "localhost"
-    port: Annotated[int, Range(at_least=0, at_most=65535)] = 8008
+    port: Annotated[int, Ge(0), Le(65535)] = 8008
     open: bool = True

@@ -6,20 +6,18 @@ import dataclasses
 import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Optional
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
-from nerfro.core.errors import NerfroError, nearest_of
+from nerfro.core.errors import NerfroError
 from nerfro.core.paths import resolve_path
 from nerfro.geometry.mesh import local_origin, origin_of_file
 from nerfro.media.bodies import Bodies, Body, GridSettings
 from nerfro.media.material import Abbe, Learns, Material, find_material, learned_quantities
 from nerfro.media.surface import make_surface
-from nerfro.registry.allowed import NotNegative, Positive, Resolution, check
+from nerfro.registry.allowed import NotNegative, Positive, Resolution, validate
 from nerfro.registry.registration import register
 
 _LEARNED = ("ior", "absorption")
@@ -41,14 +39,14 @@ class BodySettings:
             `medium.learn_ior` and `medium.learn_absorption`.
     """
 
-    mesh: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
+    mesh: str | None = None
     surface: Any = None
-    ior: Optional[Positive] = None  # noqa: UP045
-    material: Optional[str] = None  # noqa: UP045
-    abbe: Optional[Positive] = None  # noqa: UP045
-    absorption: list[float] = dataclasses.field(default_factory=list)
+    ior: Positive | None = None
+    material: str | None = None
+    abbe: Positive | None = None
+    absorption: list[NotNegative] = dataclasses.field(default_factory=list)
     priority: int = 0
-    learn: Optional[list[str]] = None  # noqa: UP045
+    learn: list[str] | None = None
 
 
 def expanded(medium: Mapping[str, Any]) -> dict[str, BodySettings]:
@@ -139,18 +137,7 @@ def _settings(name: str, values: Any) -> BodySettings:
     where = f"bodies.{name}"
     if not isinstance(values, Mapping):
         raise NerfroError(f"{where}={values} is not a set of settings; write {where}={{mesh: FILE, ior: 1.5}}")
-    names = [field.name for field in dataclasses.fields(BodySettings)]
-    for key in values:
-        if key not in names:
-            raise NerfroError(f"{where}.{key} is not a setting; {nearest_of(str(key), names)}")
-    try:
-        merged = OmegaConf.merge(OmegaConf.structured(BodySettings), dict(values))
-        settings = typing.cast(BodySettings, OmegaConf.to_object(merged))
-    except OmegaConfBaseException as error:
-        reason = str(error).strip().split("\n", 1)[0]
-        raise NerfroError(f"{where}: {reason}; see docs/guides/several_bodies.md") from error
-    hints = typing.get_type_hints(BodySettings, include_extras=True)
-    check(f"{where}.", hints | {"absorption": Sequence[NotNegative]}, vars(settings))
+    settings = validate(BodySettings, values, f"{where}.")
     if len(settings.absorption) not in (0, 1, 3):
         raise NerfroError(f"{where}.absorption={settings.absorption} is not allowed; give red, green and blue, or one")
     unknown = [quantity for quantity in settings.learn or [] if quantity not in _LEARNED]

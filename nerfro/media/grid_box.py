@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from nerfro.core.errors import NerfroError
+from nerfro.geometry.box import corners_of_box
 from nerfro.geometry.mesh import num_decimals
-from nerfro.registry.allowed import corners_of_box
 
 _AIR = 4  # voxels around the object if its box is not given
 BYTES_PER_VERTEX = 64  # peak memory while a grid is built

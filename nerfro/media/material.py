@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from nerfro.core.errors import NerfroError, nearest_of
-from nerfro.registry.allowed import NotNegative, OnlyWith, Positive, checked
+from nerfro.registry.allowed import NotNegative, OnlyWith, Positive, validated
 
 # Whether training learns a quantity of the medium, which only some path samplers trace.
 Learns = Annotated[bool, OnlyWith("sampler.path", attribute="needs_medium")]
@@ -162,7 +162,7 @@ def find_material(name: str) -> Formula:
     return MATERIALS[name]
 
 
-@checked("material")
+@validated("material")
 class Material(nn.Module):
     """Refractive index, dispersion and absorption of a body.
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 import torch
+from annotated_types import Ge, Le
 from jaxtyping import Bool
 from torch import Tensor
 
@@ -18,7 +19,7 @@ from nerfro.paper.compiled import eikonal_on_grid, uniform_on_grid
 from nerfro.paper.integrators import Integrator, RayState, euler, leapfrog
 from nerfro.paper.tolerances import MIN_TURN, REACHED
 from nerfro.paper.voxel_grid import VoxelGrid
-from nerfro.registry.allowed import Count, OnlyWith, Positive, Range
+from nerfro.registry.allowed import Count, OnlyWith, Positive
 from nerfro.registry.registration import register
 from nerfro.samplers.base import PathSampler
 from nerfro.samplers.paths.polylines import PolylineBuilder
@@ -43,7 +44,7 @@ class Eikonal(PathSampler):
     def __init__(
         self,
         integrator: Literal["adaptive", "euler"] = "adaptive",
-        num_steps: Annotated[int, Range(at_least=2, at_most=8192), OnlyWith("integrator", ("euler",))] = 768,
+        num_steps: Annotated[int, Ge(2), Le(8192), OnlyWith("integrator", ("euler",))] = 768,
         tolerance: Annotated[Positive, OnlyWith("integrator", ("adaptive",))] = 2e-4,
         max_steps: Annotated[Count, OnlyWith("integrator", ("adaptive",))] = 16384,
     ) -> None:

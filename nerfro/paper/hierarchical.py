@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 import torch
+from annotated_types import Ge, Le, Lt
 from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.core.draws import Draws
 from nerfro.core.types import Path, Rendering, Samples
 from nerfro.geometry.space import Space
-from nerfro.registry.allowed import Range
 from nerfro.registry.registration import register
 from nerfro.samplers.base import PointSampler
 from nerfro.samplers.points.stepfun import invert_cdf, midpoints, spread_uniform
@@ -39,11 +39,11 @@ class Hierarchical(PointSampler):
 
     def __init__(
         self,
-        num_coarse: Annotated[int, Range(at_least=4, at_most=8192)] = 64,
-        num_fine: Annotated[int, Range(at_least=1, at_most=8192)] = 128,
+        num_coarse: Annotated[int, Ge(4), Le(8192)] = 64,
+        num_fine: Annotated[int, Ge(1), Le(8192)] = 128,
         draw: Literal["arc_length", "vertices"] = "arc_length",
         cast: Literal["points", "cones"] = "points",
-        offset: Annotated[float, Range(at_least=0, less_than=1)] = 0.5,
+        offset: Annotated[float, Ge(0), Lt(1)] = 0.5,
         space: Space | None = None,
     ) -> None:
         super().__init__()

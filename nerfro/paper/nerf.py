@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
+from annotated_types import Ge, Le
 from jaxtyping import Float
 from omegaconf import DictConfig
 from torch import Tensor
@@ -15,7 +16,7 @@ from nerfro.fields.selection import evaluate_selected
 from nerfro.geometry.space import Space, Unbounded
 from nerfro.paper.encoding import DIRECTION_DEGREE, positional_encoding
 from nerfro.paper.mlp import RadianceMLP, in_blocks
-from nerfro.registry.allowed import Depth, Positive, Range, Width
+from nerfro.registry.allowed import Depth, Positive, Width
 from nerfro.registry.registration import register
 
 # Distance from near to far in the scenes of NeRF, for whose world unit its encoding of positions is made.
@@ -61,7 +62,7 @@ class NerfField(EncodedField):
         depth: Depth = 8,
         skip: int = 5,
         view_width: Width = 128,
-        position_degree: Annotated[int, Range(at_least=0, at_most=64)] = 10,
+        position_degree: Annotated[int, Ge(0), Le(64)] = 10,
         unit: Positive | None = 1.0,
         space: Space | None = None,
     ) -> None:

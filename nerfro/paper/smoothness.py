@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Annotated
 
+from annotated_types import Ge
 from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.core.types import Batch, Exits, Rendering
 from nerfro.losses.base import Loss
-from nerfro.registry.allowed import Range
 from nerfro.registry.registration import register
 from nerfro.rendering import Scene
 
@@ -24,7 +24,7 @@ class Smoothness(Loss):
 
     start = 2500
 
-    def __init__(self, tile_size: Annotated[int, Range(at_least=2)] = 128) -> None:
+    def __init__(self, tile_size: Annotated[int, Ge(2)] = 128) -> None:
         super().__init__()
         self.tile_size = tile_size
 

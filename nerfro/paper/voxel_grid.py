@@ -7,11 +7,13 @@ from typing import Annotated
 
 import numpy as np
 import torch
+from annotated_types import Ge, Le
 from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.core.errors import NerfroError
 from nerfro.files.cache import cached_arrays, content_hash
+from nerfro.geometry.box import corners_of_box
 from nerfro.geometry.interpolation import neighbours, smooth, trilinear
 from nerfro.geometry.mesh import local_origin, require_inside
 from nerfro.geometry.occupancy import occupancy_fraction
@@ -22,7 +24,7 @@ from nerfro.kernels.constants import constant
 from nerfro.media.base import Medium, Scalars, Vectors
 from nerfro.media.grid_box import BYTES_PER_VERTEX, check_margin
 from nerfro.media.surface import MeshSurface
-from nerfro.registry.allowed import Positive, Range, Resolution, corners_of_box
+from nerfro.registry.allowed import Positive, Resolution
 from nerfro.registry.registration import register
 
 # Part of the cache key. Increase it when the same mesh and settings give different fractions.
@@ -62,7 +64,7 @@ class VoxelGrid(Medium):
         resolution: Resolution = 128,
         box_min: Sequence[float] = (-1.5, -1.5, -1.5),
         box_max: Sequence[float] = (1.5, 1.5, 1.5),
-        smoothing_size: Annotated[int, Range(at_least=0, at_most=99)] = 9,
+        smoothing_size: Annotated[int, Ge(0), Le(99)] = 9,
         smoothing_sigma: Positive = 1.0,
         accept_open_mesh: bool = False,
         cache: bool = True,

@@ -5,13 +5,14 @@ from __future__ import annotations
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Optional
+from typing import Annotated, Any
 
+from annotated_types import Ge, Le
 from omegaconf import MISSING, DictConfig
 
 from nerfro.cli.overrides import is_given
 from nerfro.core.errors import NerfroError
-from nerfro.registry.allowed import Count, Natural, Range
+from nerfro.registry.allowed import Count, Natural
 
 
 @dataclass
@@ -42,12 +43,12 @@ class ReconstructConfig:
 
     data: Any = MISSING
     medium: Any = MISSING
-    images: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
-    video: Optional[str] = None  # noqa: UP045
-    frames: Annotated[int, Range(at_least=3, at_most=1000)] = 60
-    masks: Optional[str] = None  # noqa: UP045
+    images: str | None = None
+    video: str | None = None
+    frames: Annotated[int, Ge(3), Le(1000)] = 60
+    masks: str | None = None
     outlines: Any = None
-    out: Optional[str] = None  # noqa: UP045
+    out: str | None = None
     trial_steps: Natural = 600
     pixels: Count = 256
     calibrate: str = ""

@@ -1,16 +1,16 @@
 """Options of `nerfro.calibrate`."""
 
-# ruff: noqa: UP045 - OmegaConf on Python 3.10 wants Optional
-
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Literal, Optional
+from typing import Annotated, Literal
+
+from annotated_types import Ge, Le
 
 from nerfro.data.frames import Every
-from nerfro.registry.allowed import Count, Natural, Positive, Range
+from nerfro.registry.allowed import Count, Natural, Positive
 
-Squares = Annotated[int, Range(at_least=1, at_most=100)]  # along a side of a board
+Squares = Annotated[int, Ge(1), Le(100)]  # along a side of a board
 
 
 @dataclass
@@ -40,18 +40,18 @@ class CalibrateConfig:
         overwrite: allow replacing existing files.
     """
 
-    images: Optional[str] = None
-    out: Optional[str] = None
-    target: Annotated[str, Literal["apriltag", "colmap"]] = "apriltag"
-    board: Annotated[str, Literal["twelve_faces", "grid"]] = "twelve_faces"
-    columns: Optional[Squares] = None
-    rows: Optional[Squares] = None
+    images: str | None = None
+    out: str | None = None
+    target: Literal["apriltag", "colmap"] = "apriltag"
+    board: Literal["twelve_faces", "grid"] = "twelve_faces"
+    columns: Squares | None = None
+    rows: Squares | None = None
     size: Positive = 0.05
     write_board: bool = False
-    reconstruction: Optional[str] = None
-    pairs: Annotated[Optional[str], Literal["sequential", "all"]] = None
-    threads: Optional[Count] = None
-    lens: Annotated[str, Literal["pinhole", "radial", "opencv"]] = "pinhole"
-    mask_labels: Optional[list[Natural]] = None
+    reconstruction: str | None = None
+    pairs: Literal["sequential", "all"] | None = None
+    threads: Count | None = None
+    lens: Literal["pinhole", "radial", "opencv"] = "pinhole"
+    mask_labels: list[Natural] | None = None
     test_every: Every = 8
     overwrite: bool = False

@@ -1,7 +1,6 @@
-"""Allowed values of parameters and settings, declared by annotations such as `Annotated[int, Range(at_least=1)]`.
+"""Settings with annotated types, checked and converted by pydantic.
 
-Numbers must be finite. Choices of text in configuration dataclasses have the
-form `Annotated[str, Literal["a", "b"]]`, because OmegaConf does not support `Literal`.
+The limits of numbers are those of annotated-types, such as `Annotated[int, Ge(1), Le(8)]`. Numbers must be finite.
 """
 
 from __future__ import annotations
@@ -9,57 +8,20 @@ from __future__ import annotations
 import dataclasses
 import functools
 import inspect
-import math
+import os
 import types
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from numbers import Real
-from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
-import numpy as np
-from jaxtyping import Float
-from omegaconf import DictConfig, OmegaConf
+from annotated_types import Ge, Gt, Le, Lt
+from omegaconf import MISSING, DictConfig, OmegaConf
+from pydantic import AllowInfNan, BeforeValidator, TypeAdapter, ValidationError
 
 from nerfro.core.errors import NerfroError, nearest_of
 
 Class = TypeVar("Class")
-
-
-def _is_finite(number: object) -> bool:
-    try:
-        return isinstance(number, Real) and not isinstance(number, bool) and math.isfinite(number)
-    except OverflowError:  # an integer of hundreds of digits
-        return False
-
-
-@dataclass(frozen=True)
-class Range:
-    """A range of finite numbers.
-
-    Attributes:
-        at_least, at_most: inclusive bounds; None for no bound.
-        more_than, less_than: exclusive bounds; None for no bound.
-    """
-
-    at_least: float | None = None
-    more_than: float | None = None
-    at_most: float | None = None
-    less_than: float | None = None
-
-    def __contains__(self, number: Any) -> bool:
-        return (
-            _is_finite(number)
-            and (self.at_least is None or number >= self.at_least)
-            and (self.more_than is None or number > self.more_than)
-            and (self.at_most is None or number <= self.at_most)
-            and (self.less_than is None or number < self.less_than)
-        )
-
-    def __str__(self) -> str:
-        ends = dataclasses.asdict(self).items()
-        limits = " and ".join(f"{word.replace('_', ' ')} {end}" for word, end in ends if end is not None)
-        return limits or "a finite number"
+Settings = TypeVar("Settings")
 
 
 @dataclass(frozen=True)
@@ -75,6 +37,11 @@ class Names:
 
 class Refused(str):
     """Reason why a setting has no meaning, and what to use instead."""
+
+    def refuse(self, value: object) -> None:
+        """Refuse all values but None, which leaves the setting out."""
+        if value is not None:
+            raise ValueError(str(self))
 
 
 @dataclass(frozen=True)
@@ -93,37 +60,143 @@ class OnlyWith:
     attribute: str | None = None
 
 
-_FURTHEST = 10**7  # world units, as in georeferenced data
+FURTHEST = 10**7  # world units, as in georeferenced data
 
-Count = Annotated[int, Range(at_least=1)]
-NumRays = Annotated[int, Range(at_least=1, at_most=2**22)]  # computed in one chunk
-Side = Annotated[int, Range(at_least=1, at_most=32)]  # number of rays along each side of a pixel
-Depth = Annotated[int, Range(at_least=1, at_most=64)]  # number of layers, levels or octaves
-Width = Annotated[int, Range(at_least=1, at_most=2**13)]  # of layers
-Resolution = Annotated[int, Range(at_least=4, at_most=2048)]  # vertices along each side of a grid
-Natural = Annotated[int, Range(at_least=0)]
-Positive = Annotated[float, Range(more_than=0)]
-NotNegative = Annotated[float, Range(at_least=0)]
-Factor = Annotated[float, Range(at_least=1)]
-Share = Annotated[float, Range(more_than=0, less_than=1)]
-Coordinate = Annotated[float, Range(at_least=-_FURTHEST, at_most=_FURTHEST)]  # world units
-Distance = Annotated[float, Range(at_least=0, at_most=_FURTHEST)]  # world units
+Count = Annotated[int, Ge(1)]
+NumRays = Annotated[int, Ge(1), Le(2**22)]  # computed in one chunk
+Side = Annotated[int, Ge(1), Le(32)]  # number of rays along each side of a pixel
+Depth = Annotated[int, Ge(1), Le(64)]  # number of layers, levels or octaves
+Width = Annotated[int, Ge(1), Le(2**13)]  # of layers
+Resolution = Annotated[int, Ge(4), Le(2048)]  # vertices along each side of a grid
+Natural = Annotated[int, Ge(0)]
+Positive = Annotated[float, Gt(0)]
+NotNegative = Annotated[float, Ge(0)]
+Factor = Annotated[float, Ge(1)]
+Share = Annotated[float, Gt(0), Lt(1)]
+Coordinate = Annotated[float, Ge(-FURTHEST), Le(FURTHEST)]  # world units
+Distance = Annotated[float, Ge(0), Le(FURTHEST)]  # world units
+
+_TEXT = "float_parsing"  # type of pydantic's errors about text instead of a number
+_LONGEST = 100  # characters of a value in a message
+_BEYOND_LIMITS = ("greater_than_equal", "greater_than", "less_than_equal", "less_than")  # types of pydantic's errors
+_WORDS = {Ge: ("at least", "ge"), Gt: ("more than", "gt"), Le: ("at most", "le"), Lt: ("less than", "lt")}
 
 
-def checked(where: str) -> Callable[[Class], Class]:
-    """Decorate a class or a function so that its constructor or call checks all arguments against the annotations.
+def convert(where: str, hints: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Check settings against annotations, and convert them to the annotated types; digits are numbers, too.
+
+    Args:
+        where: start of the error message.
+        hints: annotations by name, including `Annotated`; values without a setting's annotation are returned as is.
+        values: values by name.
+
+    Raises:
+        NerfroError: a value is not allowed; the message names the value and the allowed ones.
+    """
+    converted = {}
+    for name, value in values.items():
+        adapter = _adapter(hints.get(name))
+        try:
+            converted[name] = value if adapter is None else adapter.validate_python(value)
+        except ValidationError as error:
+            raise _not_allowed(where, name, value, _advice(hints[name], error.errors()[0])) from None
+    return converted
+
+
+def check(where: str, hints: Mapping[str, Any], values: Mapping[str, Any]) -> None:
+    """Check values of a file against annotations, like `convert`; text is no number, and None is always allowed."""
+    present = {name: value for name, value in values.items() if value is not None}
+    for name, value in convert(where, hints, present).items():
+        if value != present[name]:
+            raise _not_allowed(
+                where,
+                name,
+                present[name],
+                _advice(hints[name], {"type": _TEXT if isinstance(present[name], str) else "", "loc": (0,)}),
+            )
+
+
+def _not_allowed(where: str, name: str, value: object, advice: str) -> NerfroError:
+    shown = repr(value) if len(repr(value)) < _LONGEST else f"{repr(value)[:_LONGEST]}..."
+    return NerfroError(f"{where}{name}={shown} is not allowed; {advice}")
+
+
+def validate(schema: type[Settings], values: object, prefix: str = "") -> Settings:
+    """Check the values of the settings in a dataclass and in nested dataclasses, and return the dataclass.
+
+    Args:
+        schema: the dataclass.
+        values: mapping with the values; the others have their defaults.
+        prefix: full name of the node, with a dot at the end.
+
+    Raises:
+        NerfroError: a setting is unknown or missing, or its value is not allowed.
+    """
+    if not isinstance(values, Mapping):
+        raise NerfroError(f"{prefix[:-1]}={values} is not a set of settings; write {prefix}NAME=VALUE")
+    hints, fields = hints_of(cast(Any, schema)), {field.name: field for field in dataclasses.fields(cast(Any, schema))}
+    require_names(prefix, fields, values)
+    own = {str(name): value for name, value in values.items() if not is_missing(value)}
+    for name, field in fields.items():
+        if name not in own and is_missing(default_of(field)):
+            raise MissingSettingError(f"{prefix}{name}")
+        nested = schema_of(hints[name])
+        if nested is not None and isinstance(own.get(name), Mapping):
+            if dataclasses.is_dataclass(hints[name]):
+                own[name] = validate(nested, own[name], f"{prefix}{name}.")
+            else:
+                own[name] = {key: validate(nested, node, f"{prefix}{name}.{key}.") for key, node in own[name].items()}
+    return schema(**convert(prefix, hints, own))
+
+
+class MissingSettingError(NerfroError):
+    """A required setting without a value."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(f"{name}=... is missing")
+        self.name = name
+
+
+def require_names(prefix: str, names: Iterable[str], values: Iterable[object]) -> None:
+    """Refuse the first unknown name of a setting, and suggest the most similar one.
+
+    Raises:
+        NerfroError: a name is unknown.
+    """
+    known = [*names]
+    for name in map(str, values):
+        if name not in known:
+            raise NerfroError(f"{prefix}{name} is not a setting; {nearest_of(name, known)}")
+
+
+@functools.cache
+def hints_of(schema: Any) -> dict[str, Any]:
+    """Return the annotations of a dataclass or function by name, including `Annotated`."""
+    return get_type_hints(schema, include_extras=True)
+
+
+def schema_of(hint: Any) -> Any:
+    """Return the dataclass of a nested node, or of each node of a mapping; None for other settings."""
+    inner = [arg for arg in get_args(hint) if arg is not type(None)]
+    hint = inner[1] if get_origin(hint) is dict else hint
+    return hint if dataclasses.is_dataclass(hint) else None
+
+
+def validated(where: str) -> Callable[[Class], Class]:
+    """Decorate a class or a function so that its constructor or call checks and converts all settings among arguments.
 
     Args:
         where: start of the error message, such as `medium=vacuum`.
     """
 
     def guarded(function: Any) -> Any:
-        signature, hints = inspect.signature(function), get_type_hints(function, include_extras=True)
+        signature = inspect.signature(function)
 
         @functools.wraps(function)
         def call(*arguments: Any, **named: Any) -> Any:
-            check(f"{where}: ", hints, signature.bind(*arguments, **named).arguments)
-            return function(*arguments, **named)
+            bound = signature.bind(*arguments, **named)
+            bound.arguments |= convert(f"{where}: ", hints_of(function), bound.arguments)
+            return function(*bound.args, **bound.kwargs)
 
         return call
 
@@ -136,130 +209,157 @@ def checked(where: str) -> Callable[[Class], Class]:
     return wrap
 
 
-def check_settings(config: DictConfig, schema: type, prefix: str = "") -> None:
-    """Check the settings of a configuration, and of nested nodes, against the annotations of a dataclass.
+def setting_type(hint: Any) -> Any:
+    """Convert an annotation to the type by which pydantic validates a setting; None if it is no setting.
+
+    Settings are int, float, bool, str, `Literal`, their optional, list and dict forms, and all of these `Annotated`.
+    """
+    origin, args = get_origin(hint), get_args(hint)
+    if hint in (int, float, str):
+        return setting_type(Annotated[hint, None])
+    if hint is bool or origin is Literal:
+        return hint
+    if origin is Annotated:
+        limits = [BeforeValidator(limit.refuse) if isinstance(limit, Refused) else limit for limit in args[1:]]
+        if args[0] is float:
+            limits.append(AllowInfNan(False))
+        if args[0] in _CONVERSIONS:
+            limits.append(BeforeValidator(_CONVERSIONS[args[0]]))
+        inner = args[0] if args[0] in (Any, *_CONVERSIONS) else setting_type(args[0])
+        arguments = (inner, *limits)
+        return None if inner is None else Annotated[arguments]
+    if origin in (Union, types.UnionType):
+        inner = setting_type(_without_none(args)) if type(None) in args and len(args) == 2 else None
+        return None if inner is None else Union[inner, None]  # noqa: UP007 - for a variable
+    if origin in (list, tuple, Sequence):
+        element = Any if args[0] is Any else setting_type(args[0])
+        return None if element is None else tuple[element, ...] if origin is tuple else origin[element]
+    return dict[str, Any] if dict in (hint, origin) else None
+
+
+@functools.cache
+def _adapter(hint: Any) -> TypeAdapter | None:
+    kind = setting_type(hint)
+    return None if kind is None else TypeAdapter(kind)
+
+
+def _integer(value: Any) -> Any:
+    if isinstance(value, bool | float):
+        raise ValueError("no integer")
+    return value
+
+
+def _number(value: Any) -> Any:
+    if isinstance(value, bool):
+        raise ValueError("no number")
+    return value
+
+
+def _text(value: Any) -> Any:
+    return str(value) if isinstance(value, os.PathLike | int | float) else value
+
+
+_CONVERSIONS = {int: _integer, float: _number, str: _text}  # before pydantic validates a value
+
+
+def _without_none(args: Sequence[Any]) -> Any:
+    return next(arg for arg in args if arg is not type(None))
+
+
+def _advice(hint: Any, error: Mapping[str, Any]) -> str:
+    """Say which values a setting may have.
 
     Args:
-        config: the configuration.
-        schema: dataclass with the annotations.
-        prefix: full name of the node, with a dot at the end.
-
-    Raises:
-        NerfroError: a value is not allowed.
+        hint: annotation of the setting.
+        error: an error of pydantic: its type, the position in a list, and the exception of a validator.
     """
-    hints = get_type_hints(schema, include_extras=True)
-    settings = {name: config[name] for name in hints if not OmegaConf.is_missing(config, name)}
-    check(prefix, hints, settings)
-    for name, value in settings.items():
-        if dataclasses.is_dataclass(hints[name]):
-            check_settings(value, hints[name], f"{prefix}{name}.")
+    inner, limits, choices = _parts(hint)
+    if error["type"] == "value_error" and any(isinstance(mark, Refused) for mark in get_args(hint)):
+        return str(error["ctx"]["error"])
+    if choices:
+        return f"choose {', '.join(map(repr, choices))}"
+    if get_origin(inner) in (list, tuple, Sequence):
+        return _advice(get_args(inner)[0], {**error, "loc": error["loc"][1:]}) if error["loc"] else "take a list"
+    if error["type"] in (_TEXT, "int_parsing"):
+        return "take a number, not text"
+    names = {int: "an integer", float: "a finite number", str: "text", bool: "true or false"}
+    is_in_type = error["type"] in _BEYOND_LIMITS or inner is float
+    return (
+        f"take {limits}"
+        if limits and is_in_type
+        else ", ".join(filter(None, [f"take {names.get(inner, 'a mapping')}", limits]))
+    )
 
 
-def check_names(config: DictConfig, prefix: str = "", groups: Sequence[str] = (), also: Sequence[str] = ()) -> None:
-    """Refuse settings without a field in the dataclass of the configuration or of a nested node.
-
-    Hydra adds undeclared settings for overrides that begin with `+`.
-
-    Args:
-        config: the configuration.
-        prefix: full name of the node, with a dot at the end.
-        groups: names of configuration groups for suggestions in the error message.
-        also: further allowed names at the root; nodes with these names are not checked.
-
-    Raises:
-        NerfroError: a name is unknown.
-    """
-    schema = OmegaConf.get_type(config)
-    fields = None if not dataclasses.is_dataclass(schema) else [field.name for field in dataclasses.fields(schema)]
-    for key, node in config.items_ex(resolve=False):
-        name = str(key)
-        if fields is not None and name not in (*fields, *also):
-            raise NerfroError(f"{prefix}{name} is not a setting; {nearest_of(name, [*fields, *groups])}")
-        if not isinstance(node, DictConfig) or name in also:
-            continue
-        if not (node._is_none() or node._is_missing() or node._is_interpolation()):
-            check_names(node, f"{prefix}{name}.")
+def _parts(hint: Any) -> tuple[Any, str, tuple[Any, ...]]:
+    """Return the type of a setting without `Optional` and `Annotated`, its limits in words, and the choices."""
+    limits, choices = [], ()
+    while get_origin(hint) in (Annotated, Union, types.UnionType):
+        if get_origin(hint) is Annotated:
+            known = ((_WORDS[type(limit)], limit) for limit in hint.__metadata__ if type(limit) in _WORDS)
+            limits += [f"{words} {getattr(limit, name)}" for (words, name), limit in known]
+            hint = hint.__origin__
+        else:
+            hint = _without_none(get_args(hint))
+    if get_origin(hint) is Literal:
+        choices = get_args(hint)
+    return hint, " and ".join(limits), choices
 
 
-def check(where: str, hints: Mapping[str, Any], values: Mapping[str, Any]) -> None:
-    """Check values against annotations, and refuse the first forbidden value.
+def type_name(hint: Any) -> str:
+    """Describe a type and its allowed values, in Markdown."""
+    inner, limits, choices = _parts(hint)
+    names = [name for mark in get_args(hint) if isinstance(mark, Names) for name in mark.of()] or choices
+    if names:
+        text = ", ".join(f"`{name}`" for name in names)
+    elif get_origin(inner) in (list, tuple, Sequence):
+        text = f"list of {type_name(get_args(inner)[0])}"
+    elif dict in (inner, get_origin(inner)):
+        text = "mapping"
+    else:
+        text = ", ".join(["any" if inner is Any else inner.__name__, *([limits] if limits else [])])
+    is_optional = any(type(None) in get_args(level) for level in (hint, *get_args(hint)[:1]))
+    return f"{text}; or null" if is_optional else text
 
-    Args:
-        where: start of the error message.
-        hints: annotations by name, including `Annotated`.
-        values: values by name.
 
-    Raises:
-        NerfroError: a value is not allowed; the message names the value and the allowed ones.
-    """
-    for name, value in values.items():
-        reason = _refusal(value, hints.get(name))
-        if reason is not None:
-            raise NerfroError(f"{where}{name}={value!r} is not allowed; {reason}")
-
-
-def refuse_unused(options: object, names: Iterable[str], reason: str) -> None:
+def refuse_unused(settings: Any, names: Iterable[str], reason: str) -> None:
     """Refuse settings that are neither off (null, 0, false or empty) nor at their defaults, but have no effect.
 
     Args:
-        options: a dataclass of options, or a configuration of its type.
+        settings: dataclass with the settings.
         names: names of the settings without effect.
         reason: end of the sentence "NAME=VALUE has no effect".
 
     Raises:
         NerfroError: a setting has such a value.
     """
-    settings = options if isinstance(options, DictConfig) else OmegaConf.structured(options)
-    defaults = OmegaConf.structured(OmegaConf.get_type(settings))
+    fields = {field.name: field for field in dataclasses.fields(settings)}
     for name in names:
-        if settings[name] and settings[name] != defaults[name]:
-            raise NerfroError(f"{name}={settings[name]} has no effect {reason}; remove it")
+        value = getattr(settings, name)
+        if value and value != default_of(fields[name]):
+            raise NerfroError(f"{name}={value} has no effect {reason}; remove it")
 
 
-def corners_of_box(box_min: Sequence[float], box_max: Sequence[float]) -> Float[np.ndarray, "2 3"]:
-    """Return the corners of a box as an array.
-
-    Args:
-        box_min, box_max: lower and upper corner, world units.
-
-    Raises:
-        NerfroError: a corner does not have three numbers or is farther than 10^7 units from the origin, or the lower
-            corner is not below the upper one.
-    """
-    box = np.array([box_min, box_max], np.float64) if len(box_min) == len(box_max) == 3 else np.zeros((2, 3))
-    if not (box[1] > box[0]).all() or not (np.abs(box) <= _FURTHEST).all():
-        raise NerfroError(
-            f"box_min={list(box_min)}, box_max={list(box_max)} is not a box; give three numbers each, min below max, "
-            f"and none beyond {_FURTHEST}"
-        )
-    return box
+def default_of(field: dataclasses.Field) -> Any:
+    """Return the default of a field of a dataclass; `MISSING` of OmegaConf for none."""
+    if field.default_factory is not dataclasses.MISSING:
+        return field.default_factory()
+    return MISSING if field.default is dataclasses.MISSING else field.default
 
 
-def _refusal(value: Any, hint: Any) -> str | None:
-    origin, hints = get_origin(hint), get_args(hint)
-    if value is None:
-        return None
-    if origin is Literal:
-        return None if value in hints else f"choose {', '.join(map(repr, hints))}"
-    if origin is Annotated and isinstance(hints[1], Refused):
-        return str(hints[1])
-    if origin is Annotated and isinstance(hints[1], OnlyWith):
-        return _refusal(value, hints[0])
-    has_range = origin is Annotated and isinstance(hints[1], Range)
-    if (has_range or hint in (float, int)) and isinstance(value, str):  # the value of an interpolation may be text
-        return "take a number, not text"
-    if has_range:
-        return f"take {hints[1]}" if value not in hints[1] else None
-    if origin is Annotated:
-        return _refusal(value, hints[1])
-    if hint is str:
-        return None if isinstance(value, (str, Path)) else "take text"
-    if hint is float:
-        return None if _is_finite(value) else "take a finite number"
-    if origin in (list, Sequence) and isinstance(value, str):
-        return "take a list"
-    if origin in (list, tuple, Sequence) and isinstance(value, Sequence):
-        return next((reason for each in value if (reason := _refusal(each, hints[0]))), None)
-    if origin in (Union, types.UnionType):
-        return next((reason for each in hints if (reason := _refusal(value, each))), None)
-    return None
+def is_missing(value: object) -> bool:
+    """Test whether a value stands for a required setting that is not set."""
+    return isinstance(value, str) and value == MISSING
+
+
+def plain(node: Any) -> dict[str, Any]:
+    """Convert a node of a configuration to a mapping without interpolations."""
+    return cast(dict, OmegaConf.to_container(node, resolve=True)) if isinstance(node, DictConfig) else dict(node)
+
+
+def untyped(settings: Any) -> Any:
+    """Copy a dataclass to one with the same names and values, whose types OmegaConf does not check."""
+    values = {field.name: getattr(settings, field.name) for field in dataclasses.fields(settings)}
+    values = {name: untyped(value) if dataclasses.is_dataclass(value) else value for name, value in values.items()}
+    kinds = {name: type(value) if dataclasses.is_dataclass(value) else Any for name, value in values.items()}
+    return dataclasses.make_dataclass(type(settings).__name__, kinds.items())(**values)

@@ -1,13 +1,12 @@
 """Registry of plugins; the constructor of a plugin class defines the configuration schema.
 
-`@register(kind, name)` converts the signature of the constructor to a typed dataclass and stores the dataclass in Hydra
-as option `name` of group `kind`. Only `build(node)` instantiates classes from a configuration, and only registered
+`@register(kind, name)` reads the settings from the signature of the constructor and stores their defaults in Hydra as
+option `name` of group `kind`. Only `build(node)` instantiates classes from a configuration, and only registered
 ones.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import importlib
 import importlib.metadata
 import inspect
@@ -15,11 +14,10 @@ import os
 import pkgutil
 import sys
 import types
-import typing
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, Optional, TypeVar, Union, get_args, get_origin
+from typing import Any, TypeVar
 
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
@@ -28,11 +26,20 @@ from hydra.errors import InstantiationException
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from hydra.utils import instantiate
 from omegaconf import MISSING, DictConfig, OmegaConf
-from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+from omegaconf.errors import OmegaConfBaseException
 
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import PLUGINS_DIR, PLUGINS_PACKAGE
-from nerfro.registry.allowed import Names, Range, check, checked
+from nerfro.registry.allowed import (
+    convert,
+    hints_of,
+    is_missing,
+    plain,
+    require_names,
+    setting_type,
+    type_name,
+    validated,
+)
 
 KINDS = (
     "model", "camera", "medium", "surface", "sampler/path", "sampler/points", "field", "background", "loss", "phase",
@@ -66,22 +73,22 @@ Part = TypeVar("Part")
 
 @dataclass(frozen=True)
 class Plugin:
-    """A registered class and its configuration.
+    """A registered class and its settings.
 
     Attributes:
         kind: plugin type and configuration group, such as `sampler/path`.
         name: name of the option in the group, such as `eikonal`.
         cls: the class, or a function that returns an instance.
-        config: dataclass of the configurable parameters, with `_target_`.
-        hints: annotations of the configurable parameters with allowed values, see `nerfro.registry.allowed`.
+        hints: annotations of the settings, see `nerfro.registry.allowed`.
+        defaults: defaults of the settings; `MISSING` for required ones.
         parts: other constructor parameters; the caller of `build` passes the values.
     """
 
     kind: str
     name: str
     cls: Any
-    config: type
     hints: Mapping[str, Any]
+    defaults: Mapping[str, Any]
     parts: frozenset[str]
 
     @property
@@ -94,17 +101,22 @@ class Plugin:
         return (inspect.getdoc(self.cls) or "").split("\n", 1)[0]
 
     @property
-    def setting_names(self) -> list[str]:
-        """Names of the settings of a configuration node, with `_target_`."""
-        return [field.name for field in dataclasses.fields(self.config)]
+    def node(self) -> dict[str, Any]:
+        """Node of a configuration with the defaults."""
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in self.defaults.items()} | {
+            "_target_": self.target
+        }
+
+    @property
+    def prefix(self) -> str:
+        """Full name of the node in a configuration, with a dot at the end."""
+        return f"{self.kind.replace('/', '.')}." + f"{self.name}." * (self.kind in SEVERAL)
 
     def fields(self) -> Iterator[tuple[str, str, object]]:
-        """Yield the name, type and default of each configurable parameter."""
-        for field in dataclasses.fields(self.config):
-            if field.name == "_target_":
-                continue
-            default = field.default_factory() if callable(field.default_factory) else field.default
-            yield field.name, type_name(self.hints[field.name]), "required" if default is MISSING else default
+        """Yield the name, type and default of each setting."""
+        for name, hint in self.hints.items():
+            default = self.node[name]
+            yield name, type_name(hint), "required" if is_missing(default) else default
 
 
 _plugins: dict[tuple[str, str], Plugin] = {}
@@ -131,7 +143,7 @@ def register(kind: str, name: str) -> Callable[[Part], Part]:
 
     def wrap(cls: Part) -> Part:
         add(kind, name, cls)
-        return checked(f"{kind}={name}")(cls)
+        return validated(f"{kind}={name}")(cls)
 
     return wrap
 
@@ -147,10 +159,9 @@ def add(kind: str, name: str, cls: Any) -> None:
         )
     if kind in CHECKS:
         CHECKS[kind](name, cls)
-    plugin = _make_plugin(kind, name, cls)
-    _plugins[kind, name] = plugin
+    _plugins[kind, name] = plugin = _make_plugin(kind, name, cls)
     package = f"{kind}.{name}" if kind == "callbacks" else None  # a run may have several
-    ConfigStore.instance().store(group=kind, name=name, node=plugin.config, package=package, provider="nerfro")
+    ConfigStore.instance().store(group=kind, name=name, node=plugin.node, package=package, provider="nerfro")
 
 
 def plugins(kind: str | None = None) -> list[Plugin]:
@@ -248,16 +259,21 @@ def plugin_of(node: DictConfig) -> Plugin:
 
 
 def create(plugin: Plugin, node: DictConfig | Mapping[str, object], **parts: object) -> Any:
-    """Instantiate a plugin from the configuration node and the other constructor arguments."""
-    values = configure(plugin, node)
-    attributes = {name: values.pop(name) for name in _settings(plugin.cls)}
+    """Instantiate a plugin from its configuration node and other constructor arguments; the constructor checks both.
+
+    Raises:
+        NerfroError: a setting is unknown or missing, or its value is not allowed.
+    """
+    values = settings_of(plugin, node)
+    attributes = {name: values.pop(name) for name in _attributes(plugin.cls) if name in values}
+    attributes = convert(f"{plugin.kind}={plugin.name}: ", plugin.hints, attributes)
     made = plugin.cls(**values, **parts)
     for name, value in attributes.items():
         setattr(made, name, value)
     return made
 
 
-def _settings(cls: Any) -> tuple[str, ...]:
+def _attributes(cls: Any) -> tuple[str, ...]:
     """Names of configurable class attributes, such as the weight of a loss."""
     return getattr(cls, "SETTINGS", ())
 
@@ -280,25 +296,26 @@ def _targets(node: object) -> Iterator[object]:
 
 
 def configure(plugin: Plugin, node: DictConfig | Mapping[str, object]) -> dict[str, Any]:
-    """Check the configuration node of a plugin and return the values of all configurable parameters.
+    """Check the configuration node of a plugin, and return the converted settings.
 
     Raises:
-        NerfroError: a parameter is unknown, missing, of the wrong type, or has a forbidden value.
+        NerfroError: a setting is unknown or missing, or its value is not allowed.
     """
-    where = f"{plugin.kind}={plugin.name}"
-    try:
-        # Resolved before merging, because interpolations of a merged copy would lose their parent nodes.
-        given = OmegaConf.to_container(node, resolve=True) if isinstance(node, DictConfig) else dict(node)
-        merged = OmegaConf.merge(OmegaConf.structured(plugin.config), given)
-        settled = OmegaConf.to_container(merged, resolve=True, throw_on_missing=True)
-    except MissingMandatoryValue as error:
-        place = f"{plugin.kind.replace('/', '.')}.{f'{plugin.name}.' * (plugin.kind in SEVERAL)}{error.full_key}"
-        raise NerfroError(f"{where} needs {error.full_key}; add {place}=...") from error
-    except (OmegaConfBaseException, OverflowError) as error:  # the latter of integers with hundreds of digits
-        known = ", ".join(name for name, _, _ in plugin.fields()) or "none"
-        raise NerfroError(f"{where}: {_first_line(error)}; its fields: {known}") from error
-    values = {str(key): value for key, value in typing.cast(dict, settled).items() if key != "_target_"}
-    check(f"{where}: ", plugin.hints, values)
+    return convert(f"{plugin.kind}={plugin.name}: ", plugin.hints, settings_of(plugin, node))
+
+
+def settings_of(plugin: Plugin, node: DictConfig | Mapping[str, object]) -> dict[str, Any]:
+    """Return the given settings of a plugin, with known names.
+
+    Raises:
+        NerfroError: a setting is unknown, or a required one is missing.
+    """
+    values = {name: value for name, value in plain(node).items() if name != "_target_" and not is_missing(value)}
+    require_names(plugin.prefix, plugin.hints, values)
+    required = (name for name, default in plugin.defaults.items() if is_missing(default))
+    missing = next((name for name in required if name not in values), None)
+    if missing is not None:
+        raise NerfroError(f"{plugin.kind}={plugin.name} needs {missing}; add {plugin.prefix}{missing}=...")
     return values
 
 
@@ -382,40 +399,29 @@ def _import_plugin(module: str, where: str) -> None:
 
 
 def _make_plugin(kind: str, name: str, cls: Any) -> Plugin:
-    fields: list[tuple[str, Any, Any]] = []
-    parts: set[str] = set()
-    allowing: dict[str, Any] = {}
-    for parameter, hint, annotation in _parameters(cls):
+    hints, defaults, parts = {}, {}, set()
+    for parameter, hint in _parameters(cls):
         if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
             raise NerfroError(f"{kind}={name}: its constructor takes *{parameter.name}; name every parameter instead")
-        allowing[parameter.name] = annotation
-        config_type = _config_type(hint)
-        if config_type is None:
+        if setting_type(hint) is None:
             parts.add(parameter.name)
         else:
-            fields.append((parameter.name, config_type, _default(parameter)))
-    if _settings(cls):
-        annotations = typing.get_type_hints(cls, include_extras=True)
-        for attribute in _settings(cls):
-            allowing[attribute] = annotations[attribute]
-            default = dataclasses.field(default=getattr(cls, attribute))
-            fields.append((attribute, get_args(annotations[attribute])[0], default))
-    target = f"{cls.__module__}.{cls.__qualname__}"
-    fields.append(("_target_", str, dataclasses.field(default=target)))
-    config = dataclasses.make_dataclass(f"{cls.__name__}Config", fields, kw_only=True)
-    return Plugin(kind, name, cls, config, allowing, frozenset(parts))
+            hints[parameter.name] = hint
+            defaults[parameter.name] = MISSING if parameter.default is parameter.empty else parameter.default
+    for attribute in _attributes(cls):
+        hints[attribute] = hints_of(cls)[attribute]
+        defaults[attribute] = getattr(cls, attribute)
+    return Plugin(kind, name, cls, hints, defaults, frozenset(parts))
 
 
-def _parameters(cls: Any) -> list[tuple[inspect.Parameter, Any, Any]]:
-    """Return the parameters of a constructor or function with the types, without and with `Annotated`.
+def _parameters(cls: Any) -> list[tuple[inspect.Parameter, Any]]:
+    """Return the parameters of a constructor or function with their annotations.
 
     A constructor with `**options` also has the parameters of the base class constructor.
     """
-    found: dict[str, tuple[inspect.Parameter, Any, Any]] = {}
+    parameters: dict[str, tuple[inspect.Parameter, Any]] = {}
     if not isinstance(cls, type):
-        hints, annotations = (typing.get_type_hints(cls, include_extras=extras) for extras in (False, True))
-        signature = inspect.signature(cls)
-        return [(own, hints.get(name), annotations.get(name)) for name, own in signature.parameters.items()]
+        return [(own, hints_of(cls).get(name)) for name, own in inspect.signature(cls).parameters.items()]
     for base in inspect.getmro(cls):
         # Classes without their own constructor have no configuration; the signature of nn.Module is generic. The class
         # is compared by name, because this module must not import torch.
@@ -424,64 +430,12 @@ def _parameters(cls: Any) -> list[tuple[inspect.Parameter, Any, Any]]:
         if "__init__" not in vars(base):
             continue
         constructor = inspect.unwrap(base.__init__)  # type: ignore[misc]
-        hints, annotations = (typing.get_type_hints(constructor, include_extras=extras) for extras in (False, True))
-        _, *parameters = inspect.signature(constructor).parameters.values()
-        inherits = any(parameter.kind == parameter.VAR_KEYWORD for parameter in parameters)
-        for parameter in parameters:
-            found.setdefault(parameter.name, (parameter, hints.get(parameter.name), annotations.get(parameter.name)))
-        if not inherits:
-            return [given for given in found.values() if given[0].kind != given[0].VAR_KEYWORD]
-    return list(found.values())
-
-
-def _config_type(hint: Any) -> Any:
-    """Convert an annotation to a type supported by OmegaConf; None if the parameter is not configurable."""
-    if hint in (int, float, bool, str):
-        return hint
-    origin, args = get_origin(hint), get_args(hint)
-    if origin is Literal:
-        return type(args[0])
-    if origin in (Union, types.UnionType) and type(None) in args and len(args) == 2:
-        inner = _config_type(next(a for a in args if a is not type(None)))
-        if get_origin(inner) is dict:  # OmegaConf cannot replace None by a mapping if it knows the type
-            return Any
-        return None if inner is None else Optional[inner]  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
-    if origin in (list, tuple, Sequence):
-        element = next((a for a in args if a is not Ellipsis), Any)
-        return list[element] if element is Any or _config_type(element) is not None else None
-    if origin is dict:
-        return dict[str, Any]
-    return None
-
-
-def _default(parameter: inspect.Parameter) -> Any:
-    if parameter.default is parameter.empty:
-        return dataclasses.field(default=MISSING)
-    if isinstance(parameter.default, (list, tuple)):
-        value = list(parameter.default)
-        return dataclasses.field(default_factory=lambda: list(value))
-    return dataclasses.field(default=parameter.default)
-
-
-def type_name(hint: Any) -> str:
-    """Describe a type and its allowed values, in Markdown."""
-    origin, args = get_origin(hint), get_args(hint)
-    if origin is Literal:
-        return ", ".join(f"`{value}`" for value in args)
-    if origin is Annotated:
-        limits = [str(limit) for limit in args[1:] if isinstance(limit, Range)]
-        choices = [limit for limit in args[1:] if get_origin(limit) is Literal]
-        names = [f"`{name}`" for limit in args[1:] if isinstance(limit, Names) for name in limit.of()]
-        if names:
-            return ", ".join(names)
-        return type_name(choices[0]) if choices else ", ".join([type_name(args[0]), *limits])
-    if type(None) in args:
-        return "; ".join(type_name(arg) for arg in args if arg is not type(None)) + "; or null"
-    if origin in (list, tuple, Sequence):
-        return f"list of {type_name(args[0])}"
-    if origin is dict:
-        return "mapping"
-    return "any" if hint is Any else getattr(hint, "__name__", str(hint))
+        _, *own = inspect.signature(constructor).parameters.values()
+        for parameter in own:
+            parameters.setdefault(parameter.name, (parameter, hints_of(constructor).get(parameter.name)))
+        if not any(parameter.kind == parameter.VAR_KEYWORD for parameter in own):
+            return [pair for pair in parameters.values() if pair[0].kind != inspect.Parameter.VAR_KEYWORD]
+    return list(parameters.values())
 
 
 def _first_line(error: BaseException) -> str:

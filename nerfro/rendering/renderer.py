@@ -22,7 +22,7 @@ from nerfro.fields.base import Field
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.geometry.space import Space, Unbounded
 from nerfro.media.base import Medium
-from nerfro.registry.allowed import checked
+from nerfro.registry.allowed import validated
 from nerfro.rendering.colour_space import ColourSpace
 from nerfro.rendering.scene import Scene
 from nerfro.samplers.base import PathSampler, PointSampler
@@ -73,7 +73,7 @@ class RenderedRays:
     normals: Float[Tensor, "R 3"]
 
 
-@checked("model")
+@validated("model")
 class Renderer(Component, nn.Module, ABC):
     """Render rays through a scene. Models derive from this class and implement `render_path`.
 

@@ -9,10 +9,7 @@ import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, Optional, cast
-
-from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from typing import Any, Literal
 
 from nerfro.cli.overrides import as_overrides, is_given, is_scene_file
 from nerfro.core.errors import NerfroError, warn
@@ -21,7 +18,7 @@ from nerfro.core.provenance import AlgorithmSettings, command_line, versions
 from nerfro.files.atomic import write_atomically
 from nerfro.files.reading import read_json
 from nerfro.media.body_settings import BodySettings, expanded
-from nerfro.registry.allowed import Count, check_settings
+from nerfro.registry.allowed import Count, validate
 
 SCENE = "scene.json"
 _ADVICE = "see docs/reference/file_formats.md, or run nerfro.preprocess again"
@@ -43,7 +40,7 @@ class Provenance:
     command: str = ""
     versions: dict[str, str] = field(default_factory=dict)
     algorithms: list[str] = field(default_factory=list)
-    standard_error: list[Optional[float]] = field(default_factory=list)  # noqa: UP045 - OmegaConf on Python 3.10
+    standard_error: list[float | None] = field(default_factory=list)
     doubts: list[str] = field(default_factory=list)
     unsupported: list[str] = field(default_factory=list)
 
@@ -66,7 +63,7 @@ class SceneFile:
     medium: dict[str, Any] = field(default_factory=dict)
     bodies: dict[str, BodySettings] = field(default_factory=dict)
     vessel: dict[str, Any] = field(default_factory=dict)
-    surroundings: Annotated[Optional[str], Literal["near", "far"]] = None  # noqa: UP045 - OmegaConf on Python 3.10
+    surroundings: Literal["near", "far"] | None = None
     photograph: list[Count] = field(default_factory=list)
     provenance: Provenance = field(default_factory=Provenance)
 
@@ -166,11 +163,9 @@ def read_scene_file(path: Path) -> SceneFile:
     if "${" in json.dumps(document):
         raise NerfroError(f"{path} contains an interpolation (${{...}}); write the value instead")
     try:
-        typed = cast(DictConfig, OmegaConf.merge(OmegaConf.structured(SceneFile), document))
-        check_settings(typed, SceneFile)
-        scene = cast(SceneFile, OmegaConf.to_object(typed))
-    except (OmegaConfBaseException, NerfroError) as error:
-        raise NerfroError(f"{path}: {str(error).strip().partition(chr(10))[0]}; {_ADVICE}") from error
+        scene = validate(SceneFile, document)
+    except NerfroError as error:
+        raise NerfroError(f"{path}: {error}; {_ADVICE}") from error
     for group in ("data", "medium", "vessel", "bodies"):
         for name in getattr(scene, group):
             if not re.fullmatch(r"[^\W\d_]\w*", name):

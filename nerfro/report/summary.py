@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal, Optional, cast
+from typing import Any, Literal, cast
 
 import rich
 
@@ -19,23 +19,63 @@ from nerfro.report.page import report_page
 from nerfro.report.runs import find_runs
 from nerfro.report.views import Selection
 
+_METHODS = {
+    "nerf": "NeRF",
+    "mipnerf": "mip-NeRF",
+    "mipnerf_sky": "mip-NeRF + sky",
+    "eikonal_fields": "Eikonal Fields",
+    "refractive": "refractive",
+    "ablation_noH": "refractive w/o H",
+    "ablation_noBD": "refractive w/o BD",
+    "glass": "glass",
+    "glass_noReflection": "glass w/o reflection",
+    "glass_noTint": "glass w/o tint",
+    "paper_nerf": "NeRF (paper)",
+    "paper_mipnerf": "mip-NeRF (paper)",
+    "paper_mipnerf_sky": "mip-NeRF + sky (paper)",
+    "paper_refractive": "refractive (paper)",
+    "paper_ablation_noH": "refractive w/o H (paper)",
+    "paper_ablation_noBD": "refractive w/o BD (paper)",
+}
+_SCENES = {
+    "torus": "Torus",
+    "ship": "Ship",
+    "deerglobe": "DeerGlobe",
+    "starlamp": "StarLamp",
+    "dolphin": "Dolphin",
+    "ball": "Ball",
+    "glass": "Glass",
+    "pen": "Pen",
+}
+
 
 @dataclass
 class SummaryConfig:
-    """Options of `python -m nerfro.summary`."""
+    """Options of `python -m nerfro.summary`.
 
-    # Run folders, folders that contain these at any depth, or glob patterns.
+    Attributes:
+        runs: run folders, folders that contain these at any depth, or glob patterns.
+        out: folder for the report and the tables (.csv, .md and .tex, one table per budget); without it, only
+            print.
+        report: whether to write `report.html`; the default of `out` is then `outputs/summary`.
+        metrics: columns of the tables; by default psnr, ssim, lpips, flip and the metrics of plugins, as far as
+            runs have them.
+        region: region of the scores: full, mask or crop.
+        methods: titles of experiments, in the order of the rows.
+        scenes: titles of scenes, by the last component of the data folder.
+        views: number of evenly spread views per scene in the report; 0 for all.
+        overwrite: whether to replace files in `out`.
+    """
+
     runs: Any = field(default_factory=lambda: ["outputs"])
-    # Folder for the report and the tables (.csv, .md and .tex, one table per budget); without it, only print.
-    out: Optional[str] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
-    report: bool = False  # whether to write `report.html`; the default of `out` is then `outputs/summary`
-    # Columns of the tables; by default psnr, ssim, lpips, flip and the metrics of plugins, as far as runs have them.
-    metrics: Optional[list[str]] = None  # noqa: UP045
-    region: Annotated[str, Literal["full", "mask", "crop"]] = FULL  # region of the scores: full, mask or crop
-    methods: dict[str, str] = field(default_factory=dict)  # titles of experiments, in the order of the rows
-    scenes: dict[str, str] = field(default_factory=dict)  # titles of scenes, by the last component of the data folder
-    views: Natural = 8  # number of evenly spread views per scene in the report; 0 for all
-    overwrite: bool = False  # whether to replace files in `out`
+    out: str | None = None
+    report: bool = False
+    metrics: list[str] | None = None
+    region: Literal["full", "mask", "crop"] = FULL
+    methods: dict[str, str] = field(default_factory=_METHODS.copy)
+    scenes: dict[str, str] = field(default_factory=_SCENES.copy)
+    views: Natural = 8
+    overwrite: bool = False
 
 
 def summarize(options: SummaryConfig) -> None:

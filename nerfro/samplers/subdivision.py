@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Optional
 
 import torch
 from jaxtyping import Float, Int
@@ -17,7 +16,7 @@ from torch import Tensor
 from nerfro.core.cameras import Cameras
 from nerfro.core.rays import Rays
 from nerfro.core.types import Path
-from nerfro.registry.allowed import Natural, NotNegative, Positive, Side, checked
+from nerfro.registry.allowed import Natural, NotNegative, Positive, Side, validated
 
 # Position of the neighbouring ray in a pixel along both axes: one pixel along the diagonal from the centre, so that
 # edges along rows and columns are detected equally.
@@ -27,7 +26,7 @@ NEIGHBOUR = 0.5 + math.sqrt(0.5)
 DIVERGENT = 8.0
 
 
-@checked("subdivision")
+@validated("subdivision")
 @dataclass
 class Subdivision:
     """Selection of pixels with several rays, and the number of rays.
@@ -46,17 +45,23 @@ class Subdivision:
 
     side: Side = 1
     divergence: NotNegative = 0.0
-    contrast: Optional[Positive] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
+    contrast: Positive | None = None
     contrast_start: Natural = 0
 
 
 @dataclass
 class SubdivisionChanges:
-    """Attributes of a `Subdivision` that are replaced; None keeps the value of the run."""
+    """Attributes of a `Subdivision` that are replaced; None keeps the value of the run.
 
-    side: Optional[Side] = None  # noqa: UP045 - rays along each side of a divided pixel
-    divergence: Optional[NotNegative] = None  # noqa: UP045 - minimum angle, in pixel angles, for which pixels are divided
-    contrast: Optional[Positive] = None  # noqa: UP045 - minimum difference of a channel for which pixels are divided
+    Attributes:
+        side: rays along each side of a divided pixel.
+        divergence: minimum angle, in pixel angles, for which pixels are divided.
+        contrast: minimum difference of a channel for which pixels are divided.
+    """
+
+    side: Side | None = None
+    divergence: NotNegative | None = None
+    contrast: Positive | None = None
 
 
 def pixel_rays(

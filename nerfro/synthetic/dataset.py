@@ -7,14 +7,13 @@ import importlib.metadata
 import json
 import platform
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from omegaconf import DictConfig, OmegaConf
 from PIL import Image
 
 from nerfro.cli.overrides import as_overrides, command_line
@@ -54,9 +53,9 @@ class PlannedImage:
 
 @dataclass(frozen=True)
 class DataSet(ABC):
-    """Images of a scene in a folder; `config` is a resolved `SynthesizeConfig`."""
+    """Images of a scene in a folder; `options` is a `SynthesizeConfig`."""
 
-    config: DictConfig
+    options: Any
     scene: SyntheticScene
     folder: Path
 
@@ -98,8 +97,8 @@ class DataSet(ABC):
         Raises:
             NerfroError: the folder contains other files, or another data set while `overwrite` is false.
         """
-        options: Any = OmegaConf.to_container(self.config)
-        settings = {"scene": self.config.scene, "fingerprint": fingerprint(self.scene)}
+        options = asdict(self.options)
+        settings = {"scene": self.options.scene, "fingerprint": fingerprint(self.scene)}
         settings |= {name: options[name] for name in self.OPTIONS}
         try:
             stored = read_json(self.folder / self.META, "").get("settings")
@@ -108,7 +107,7 @@ class DataSet(ABC):
         if stored == settings:
             return
         if stored is not None:
-            if not self.config.overwrite:
+            if not self.options.overwrite:
                 raise NerfroError(
                     f"'{self.folder}' holds a data set with other settings; choose another folder with out=DIR, "
                     "or replace the data set with overwrite=true"
@@ -120,7 +119,7 @@ class DataSet(ABC):
             require_only(self.folder, (), "it is no data set of nerfro; choose another folder with out=DIR")
         versions = {name: importlib.metadata.version(name) for name in ("mitsuba", "drjit", "numpy")}
         versions |= {"python": platform.python_version(), "variant": mitsuba.variant()}
-        meta = {"scene": self.config.scene, "ior": self.scene.ior, "tint": list(self.scene.tint)}
+        meta = {"scene": self.options.scene, "ior": self.scene.ior, "tint": list(self.scene.tint)}
         meta |= {"absorption": list(self.scene.absorption), **self.FACTS}
         write_json(self.folder / self.META, {**meta, "settings": settings, "versions": versions})
 
@@ -149,16 +148,16 @@ class ViewSplits(DataSet):
 
     @property
     def camera(self) -> Pinhole:
-        return Pinhole.square(CAMERA_ANGLE_X, self.config.resolution)
+        return Pinhole.square(CAMERA_ANGLE_X, self.options.resolution)
 
     def planned(self) -> list[PlannedImage]:
         planned = []
         for number, split in enumerate(SPLITS):
-            spp = self.config.test_spp if split == "test" else self.config.spp
-            directions = directions_on_sphere(self.config.views[split], self.config.seed, number)
+            spp = self.options.test_spp if split == "test" else self.options.spp
+            directions = directions_on_sphere(getattr(self.options.views, split), self.options.seed, number)
             for index, direction in enumerate(directions):
                 pose = look_at_origin(CAMERA_DISTANCE * direction)
-                seed, name = (self.config.seed * 3 + number) * 100_000 + index, f"{split}/r_{index:03d}.png"
+                seed, name = (self.options.seed * 3 + number) * 100_000 + index, f"{split}/r_{index:03d}.png"
                 planned.append(PlannedImage(name, f"masks/{name}", pose, spp, seed))
         return planned
 
@@ -168,10 +167,10 @@ class ViewSplits(DataSet):
 
     def finish(self, planned: list[PlannedImage]) -> None:
         assert self.scene.sky is not None
-        sky = lat_long_texture(self.scene.sky, self.config.sky_height)
+        sky = lat_long_texture(self.scene.sky, self.options.sky_height)
         self.scene.glass.save(self.folder / "mesh.ply")
         write_image(self.folder / "sky.png", to_srgb(sky))
-        if self.config.extras:
+        if self.options.extras:
             self.scene.interior.save(self.folder / "interior.ply")
             lat_long.save_lat_long(self.folder / "sky.exr", torch.from_numpy(sky))
         for split in SPLITS:

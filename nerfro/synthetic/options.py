@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated, Optional
+from typing import Annotated
 
-from omegaconf import MISSING
+from annotated_types import Ge, Le
 
-from nerfro.registry.allowed import Count, Names, Natural, NotNegative, Positive, Range
+from nerfro.registry.allowed import Count, Names, Natural, NotNegative, Positive
 from nerfro.synthetic.scenes import SCENES
 
 SceneName = Annotated[str, Names(lambda: SCENES)]
@@ -15,30 +15,52 @@ SceneName = Annotated[str, Names(lambda: SCENES)]
 
 @dataclass
 class ViewCounts:
-    """Number of views per split."""
+    """Number of views per split.
 
-    train: Count = MISSING  # number of training views
-    val: Count = MISSING  # number of validation views
-    test: Count = MISSING  # number of test views
+    Attributes:
+        train, val, test: number of training, validation and test views.
+    """
+
+    train: Count = 100
+    val: Count = 100
+    test: Count = 200
 
 
 @dataclass
 class SynthesizeConfig:
-    """Options of `nerfro.synthesize`; conf/synthesize/synthesize.yaml gives and explains the defaults."""
+    """Options of `nerfro.synthesize`.
 
-    scene: SceneName = MISSING
-    out: str = MISSING
-    resolution: Annotated[int, Range(at_least=8, at_most=16384)] = MISSING
-    spp: Count = MISSING
-    test_spp: Count = MISSING
+    Attributes:
+        scene: scene to render; dolphin_capture makes photographs without poses.
+        out: folder of the data set; by default outputs/scenes/SCENE.
+        resolution: side of the square images, pixels; width of photographs, which are 4:3.
+        spp: samples per pixel of training and validation views.
+        test_spp: samples per pixel of test views; noise of the reference limits every score.
+        photographs: number of photographs of dolphin_capture, instead of views.
+        noise: standard deviation of the sensor noise of dolphin_capture, for values in [0, 1].
+        fresnel: whether the glass reflects a part of the light.
+        absorption: absorption of the glass for red, green and blue, per world unit.
+        ior: refractive index of the glass; by default that of the scene.
+        seed: seed of viewpoints and sampler.
+        sky_height: rows of sky.png.
+        extras: whether to write interior.ply and sky.exr, which training does not need.
+        variant: variant of Mitsuba: auto, llvm_ad_rgb, cuda_ad_rgb or scalar_rgb.
+        overwrite: whether a data set with other settings in `out` may be replaced.
+    """
+
+    scene: SceneName = "torus"
+    out: str | None = None
+    resolution: Annotated[int, Ge(8), Le(16384)] = 800
+    spp: Count = 256
+    test_spp: Count = 1024
     views: ViewCounts = field(default_factory=ViewCounts)
-    photographs: Count = MISSING
-    noise: NotNegative = MISSING
-    fresnel: bool = MISSING
-    absorption: list[NotNegative] = MISSING
-    ior: Optional[Positive] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
-    seed: Natural = MISSING
-    sky_height: Annotated[int, Range(at_least=16, at_most=16384)] = MISSING
-    extras: bool = MISSING
-    variant: str = MISSING
-    overwrite: bool = MISSING
+    photographs: Count = 72
+    noise: NotNegative = 0.01
+    fresnel: bool = False
+    absorption: list[NotNegative] = field(default_factory=lambda: [0.0] * 3)
+    ior: Positive | None = None
+    seed: Natural = 0
+    sky_height: Annotated[int, Ge(16), Le(16384)] = 1024
+    extras: bool = True
+    variant: str = "auto"
+    overwrite: bool = False

@@ -6,13 +6,12 @@ from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
-from omegaconf import DictConfig
-
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import user_path
 from nerfro.core.progress import progress_bar
 from nerfro.files.folder_lock import lock_folder
 from nerfro.synthetic.dataset import DataSet, ViewSplits
+from nerfro.synthetic.options import SynthesizeConfig
 from nerfro.synthetic.path_tracer import PathTracer, load_mitsuba
 from nerfro.synthetic.scene import SyntheticScene
 from nerfro.synthetic.scenes import SCENES
@@ -40,33 +39,34 @@ def build_scene(name: str, resolution: int) -> SyntheticScene:
     return module.build(spacing=max(0.5 * data_set_type(module).WIDTH / resolution, 0.0025))
 
 
-def synthesize(config: DictConfig) -> DataSet:
+def synthesize(options: SynthesizeConfig) -> DataSet:
     """Render the missing images of a data set.
 
     Args:
-        config: resolved `SynthesizeConfig`.
+        options: options of the command.
 
     Raises:
         NerfroError: Mitsuba is missing, or `out` contains another data set or other files.
     """
-    if len(config.absorption) != 3:
-        raise NerfroError(f"absorption={list(config.absorption)} is not allowed; give red, green and blue")
-    with lock_folder(user_path(config.out), "out"):
-        return _synthesize(config, user_path(config.out))
+    if len(options.absorption) != 3:
+        raise NerfroError(f"absorption={list(options.absorption)} is not allowed; give red, green and blue")
+    folder = user_path(options.out or f"outputs/scenes/{options.scene}")
+    with lock_folder(folder, "out"):
+        return _synthesize(options, folder)
 
 
-def _synthesize(config: DictConfig, folder: Path) -> DataSet:
-    scene = build_scene(config.scene, config.resolution)
-    ior = scene.ior if config.ior is None else config.ior
-    scene = replace(scene, absorption=tuple(config.absorption), ior=ior)
-    mitsuba = load_mitsuba(config.variant)  # a missing Mitsuba is reported before files are removed
-    data = data_set_type(find_scene(config.scene))(config, scene, folder)
+def _synthesize(options: SynthesizeConfig, folder: Path) -> DataSet:
+    scene = build_scene(options.scene, options.resolution)
+    ior = scene.ior if options.ior is None else options.ior
+    scene = replace(scene, absorption=tuple(options.absorption), ior=ior)
+    mitsuba = load_mitsuba(options.variant)  # a missing Mitsuba is reported before files are removed
+    data = data_set_type(find_scene(options.scene))(options, scene, folder)
     data.prepare(mitsuba)
     planned = data.planned()
     waiting = data.missing(planned)
-    print(f"{config.scene}: {len(planned)} {data.NOUN}, {len(planned) - len(waiting)} of them already in {folder}")
+    print(f"{options.scene}: {len(planned)} {data.NOUN}, {len(planned) - len(waiting)} of them already in {folder}")
     if waiting:
-        tracer = PathTracer(data.lit(), config.fresnel, data.camera, config.variant)
+        tracer = PathTracer(data.lit(), options.fresnel, data.camera, options.variant)
         # The remaining time is estimated from samples, because test views have more samples.
         with progress_bar("render", sum(image.spp for image in waiting)) as bar:
             for image in waiting:

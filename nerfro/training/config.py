@@ -8,9 +8,10 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, Optional, cast, get_args
+from typing import Annotated, Any, Literal, cast, get_args
 
 import torch
+from annotated_types import Ge, Gt, Le
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -19,6 +20,7 @@ from nerfro.core.paths import CONF_DIR, resolve_path, scene_name
 from nerfro.data.base import DataSource
 from nerfro.data.validation_views import WithValidationViews
 from nerfro.evaluation.results import Region
+from nerfro.geometry.box import corners_of_box
 from nerfro.media.analytic import Vacuum
 from nerfro.media.base import Medium
 from nerfro.media.body_settings import origin_of
@@ -30,11 +32,11 @@ from nerfro.registry.allowed import (
     NumRays,
     OnlyWith,
     Positive,
-    Range,
     Refused,
     Resolution,
-    check_settings,
-    corners_of_box,
+    plain,
+    untyped,
+    validate,
 )
 from nerfro.registry.registration import (
     build,
@@ -57,49 +59,71 @@ MetricName = Annotated[str, Names(lambda: [plugin.name for plugin in plugins("me
 
 @dataclass
 class SamplerConfig:
-    """Path sampler and point sampler."""
+    """Path sampler and point sampler.
 
-    path: Any = MISSING  # plugin of type `sampler/path`
-    points: Any = MISSING  # plugin of type `sampler/points`
+    Attributes:
+        path: plugin of type `sampler/path`.
+        points: plugin of type `sampler/points`.
+    """
+
+    path: Any = MISSING
+    points: Any = MISSING
 
 
 @dataclass
 class BatchesConfig:
-    """Selection of the training pixels; defaults as in the paper, which conf/train.yaml changes."""
+    """Selection of the training pixels; defaults as in the paper, which conf/train.yaml changes.
 
-    size: NumRays = 1024  # number of pixels in a step
-    # Whether the pixels of a step come from one image or from all images.
-    batching: Annotated[str, Literal["single_image", "all_images"]] = "single_image"
-    # Fraction of the pixels of a step that is drawn only from the object, according to the masks.
-    object_fraction: Annotated[float, Range(at_least=0, at_most=1)] = 0.0
-    # Number of training views, spread over the positions of the cameras, that are used for validation instead.
+    Attributes:
+        size: number of pixels in a step.
+        batching: whether the pixels of a step come from one image or from all images.
+        object_fraction: fraction of the pixels of a step that is drawn only from the object, according to the
+            masks.
+        num_validation_views: number of training views, spread over the positions of the cameras, that are used
+            for validation instead.
+        precrop_steps: number of first steps that see only the central window of the images.
+        precrop_fraction: relative side of the window.
+        subdivision: which pixels get several rays, in training and in validation.
+    """
+
+    size: NumRays = 1024
+    batching: Literal["single_image", "all_images"] = "single_image"
+    object_fraction: Annotated[float, Ge(0), Le(1)] = 0.0
     num_validation_views: Natural = 0
-    precrop_steps: Natural = 0  # number of first steps that see only the central window of the images
-    # Relative side of the window.
-    precrop_fraction: Annotated[float, Range(more_than=0, at_most=1), OnlyWith("precrop_steps")] = 0.5
-    # Which pixels get several rays, in training and in validation.
+    precrop_steps: Natural = 0
+    precrop_fraction: Annotated[float, Gt(0), Le(1), OnlyWith("precrop_steps")] = 0.5
     subdivision: Subdivision = dataclasses.field(default_factory=lambda: Subdivision(divergence=8.0))
 
 
 @dataclass
 class EvaluationConfig:
-    """Evaluation of the trained model."""
+    """Evaluation of the trained model.
 
-    # Split of the data set; None, and `evaluation=none`, end the run without scores.
-    split: Optional[str] = "test"  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
-    chunk_size: NumRays = 8192  # rays rendered in one chunk; bounds the memory
-    # Steps between two images of validation views during training; the PSNR of a subset of their pixels is computed
-    # five times as often. 0 switches validation off.
+    Attributes:
+        split: split of the data set; None, and `evaluation=none`, end the run without scores.
+        chunk_size: rays rendered in one chunk; bounds the memory.
+        every: steps between two images of validation views during training; the PSNR of a subset of their
+            pixels is computed five times as often. 0 switches validation off.
+        subdivision: which pixels get several rays.
+    """
+
+    split: str | None = "test"
+    chunk_size: NumRays = 8192
     every: Natural = 500
-    subdivision: Subdivision = dataclasses.field(default_factory=Subdivision)  # which pixels get several rays
+    subdivision: Subdivision = dataclasses.field(default_factory=Subdivision)
 
 
 @dataclass
 class CheckpointConfig:
-    """Interval between checkpoints: in seconds or in steps. Only the latest checkpoint is kept."""
+    """Interval between checkpoints: in seconds or in steps. Only the latest checkpoint is kept.
 
-    every_seconds: Optional[Annotated[float, Range(more_than=0, at_most=10**9)]] = 60.0  # noqa: UP045 - between two checkpoints
-    every_steps: Optional[Count] = None  # noqa: UP045 - training steps between two checkpoints
+    Attributes:
+        every_seconds: seconds between two checkpoints.
+        every_steps: training steps between two checkpoints.
+    """
+
+    every_seconds: Annotated[float, Gt(0), Le(10**9)] | None = 60.0
+    every_steps: Count | None = None
 
 
 _EPOCHS = "a run has no epochs; set trainer.max_steps, trainer.max_time or evaluation.every"
@@ -107,34 +131,43 @@ _EPOCHS = "a run has no epochs; set trainer.max_steps, trainer.max_time or evalu
 
 @dataclass
 class TrainerConfig:
-    """Arguments of Lightning's Trainer; those that nerfro sets itself are refused. None is Lightning's default."""
+    """Arguments of Lightning's Trainer; those that nerfro sets itself are refused. None is Lightning's default.
+
+    Attributes:
+        accelerator: the CPU; gpu or cuda selects a GPU.
+        max_steps: -1 trains until max_time.
+        max_time: such as 90s, 5m, 1.5h, 2d, or DD:HH:MM:SS.
+        precision: `fastest` selects bf16-mixed if the machine has bfloat16 units, else 32-true.
+        profiler: time of each part of a step, on the console and in profile/ of the run folder.
+        enable_checkpointing: without checkpoints during training, an interrupted run still writes one at its
+            end.
+        overfit_batches: train on this number of batches, repeated; 0 draws new pixels in every step.
+        limit_test_batches: number of scored views; None scores all.
+        fast_dev_run: train for this number of steps, or for one step if true, and score one view.
+    """
 
     _target_: str = "lightning.pytorch.Trainer"
-    accelerator: str = "auto"  # the CPU; gpu or cuda selects a GPU
+    accelerator: str = "auto"
     devices: Any = 1
-    num_nodes: Optional[Count] = None  # noqa: UP045
+    num_nodes: Count | None = None
     strategy: Any = "auto"
-    max_steps: Annotated[int, Range(at_least=-1, at_most=10**9)] = -1  # -1 trains until max_time
-    max_time: Any = None  # such as 90s, 5m, 1.5h, 2d, or DD:HH:MM:SS
-    # `fastest` selects bf16-mixed if the machine has bfloat16 units, else 32-true.
-    precision: Annotated[str, Literal["32-true", "fastest", "16-mixed", "bf16-mixed", "64-true"]] = "32-true"
-    gradient_clip_val: Optional[Positive] = None  # noqa: UP045
-    gradient_clip_algorithm: Annotated[Optional[str], Literal["norm", "value"], OnlyWith("gradient_clip_val")] = None  # noqa: UP045
+    max_steps: Annotated[int, Ge(-1), Le(10**9)] = -1
+    max_time: Any = None
+    precision: Literal["32-true", "fastest", "16-mixed", "bf16-mixed", "64-true"] = "32-true"
+    gradient_clip_val: Positive | None = None
+    gradient_clip_algorithm: Annotated[Literal["norm", "value"] | None, OnlyWith("gradient_clip_val")] = None
     log_every_n_steps: Count = 50
     deterministic: Any = None
-    benchmark: Optional[bool] = None  # noqa: UP045
-    detect_anomaly: Optional[bool] = None  # noqa: UP045
-    # Time of each part of a step, on the console and in profile/ of the run folder.
-    profiler: Annotated[Optional[str], Literal["simple", "advanced", "pytorch"]] = None  # noqa: UP045
+    benchmark: bool | None = None
+    detect_anomaly: bool | None = None
+    profiler: Literal["simple", "advanced", "pytorch"] | None = None
     enable_model_summary: bool = False
     enable_progress_bar: bool = True
-    # Without checkpoints during training, an interrupted run still writes one at its end.
     enable_checkpointing: bool = True
-    min_steps: Optional[Count] = None  # noqa: UP045
-    overfit_batches: Natural = 0  # train on this number of batches, repeated; 0 draws new pixels in every step
-    limit_test_batches: Optional[Count] = None  # noqa: UP045 - number of scored views; None scores all
-    inference_mode: Optional[bool] = None  # noqa: UP045
-    # Train for this number of steps, or for one step if true, and score one view.
+    min_steps: Count | None = None
+    overfit_batches: Natural = 0
+    limit_test_batches: Count | None = None
+    inference_mode: bool | None = None
     fast_dev_run: Any = False
     accumulate_grad_batches: Annotated[Any, Refused("batches depend on the step; set batches.size")] = None
     barebones: Annotated[Any, Refused("set logger=none trainer.enable_checkpointing=false")] = None
@@ -159,39 +192,62 @@ class TrainerConfig:
 
 @dataclass
 class AuthorsConfig:
-    """Settings of the authors of the paper for a scene, used by `paper_*` and `ablation_euler`."""
+    """Settings of the authors of the paper for a scene, used by `paper_*` and `ablation_euler`.
 
-    # Lower corner of the index grid, world units.
+    Attributes:
+        box_min: lower corner of the index grid, world units.
+        box_max: upper corner of the index grid, world units.
+        resolution: vertices of the index grid along each side.
+        smoothing_size: taps of the smoothing kernel.
+        smoothing_sigma: standard deviation of the smoothing kernel, voxels.
+        num_steps: number of Eikonal steps, N_c x N_e.
+        background_weight: weight of the background regularizer.
+        max_steps: number of training steps.
+    """
+
     box_min: list[float] = dataclasses.field(default_factory=lambda: [-1.5] * 3)
-    # Upper corner of the index grid, world units.
     box_max: list[float] = dataclasses.field(default_factory=lambda: [1.5] * 3)
-    resolution: Resolution = 512  # vertices of the index grid along each side
-    smoothing_size: Natural = 9  # taps of the smoothing kernel
-    smoothing_sigma: Positive = 1.0  # standard deviation of the smoothing kernel, voxels
-    num_steps: Count = 768  # number of Eikonal steps, N_c x N_e
-    background_weight: NotNegative = 0.025  # weight of the background regularizer
-    max_steps: Count = 200_000  # number of training steps
+    resolution: Resolution = 512
+    smoothing_size: Natural = 9
+    smoothing_sigma: Positive = 1.0
+    num_steps: Count = 768
+    background_weight: NotNegative = 0.025
+    max_steps: Count = 200_000
 
 
 @dataclass
 class TrainConfig:
-    """Root of the configuration of `python -m nerfro.train`, composed from conf/train.yaml."""
+    """Root of the configuration of `python -m nerfro.train`, composed from conf/train.yaml.
 
-    name: str = "refractive"  # name of the experiment and of the run folder
-    seed: Annotated[int, Range(at_least=0, at_most=2**32 - 1)] = (
-        0  # seed of the initialization and of all random numbers
-    )
-    # One plugin of each type.
+    Attributes:
+        name: name of the experiment and of the run folder.
+        seed: seed of the initialization and of all random numbers.
+        data, camera, medium, field, background, model: a plugin of each type.
+        sampler: path sampler and point sampler.
+        loss: settings of each training loss, by the registered name of the loss.
+        phase: settings of each phase, by the registered name of the phase.
+        logger: Lightning loggers, by any name.
+        callbacks: settings of each callback, by the registered name of the callback.
+        optimized_metric: score that training returns to sweepers of Hydra: a metric, or `<region>.<metric>`,
+            such as mask.psnr.
+        debug: a run of ten steps that scores one view.
+        ckpt_path: checkpoint to resume from, or `last` for the newest checkpoint of this experiment.
+        viewer: serve an interactive page of the model during training, to browsers on this machine.
+        viewer_port: port of the page; 0 selects a free port.
+        compile: backend of torch.compile for the networks, such as inductor or cudagraphs on a GPU; None does
+            not compile them. Compilation takes a minute or more at the start.
+    """
+
+    name: str = "refractive"
+    seed: Annotated[int, Ge(0), Le(2**32 - 1)] = 0
     data: Any = MISSING
     camera: Any = MISSING
     medium: Any = MISSING
-    sampler: SamplerConfig = dataclasses.field(default_factory=SamplerConfig)  # path sampler and point sampler
+    sampler: SamplerConfig = dataclasses.field(default_factory=SamplerConfig)
     field: Any = MISSING
     background: Any = MISSING
     model: Any = MISSING
-    # Settings of each training loss, by the registered name of the loss.
     loss: dict[str, Any] = dataclasses.field(default_factory=dict)
-    # Settings of each phase, by the registered name of the phase.
     phase: dict[str, Any] = dataclasses.field(default_factory=dict)
     content: ContentConfig = dataclasses.field(default_factory=ContentConfig)
     authors: AuthorsConfig = dataclasses.field(default_factory=AuthorsConfig)
@@ -200,19 +256,14 @@ class TrainConfig:
     evaluation: EvaluationConfig = dataclasses.field(default_factory=EvaluationConfig)
     checkpoint: CheckpointConfig = dataclasses.field(default_factory=CheckpointConfig)
     trainer: TrainerConfig = dataclasses.field(default_factory=TrainerConfig)
-    logger: Any = None  # Lightning loggers, by any name
-    # Settings of each callback, by the registered name of the callback.
+    logger: Any = None
     callbacks: dict[str, Any] = dataclasses.field(default_factory=dict)
-    # Score that training returns to sweepers of Hydra: a metric, or `<region>.<metric>`, such as mask.psnr.
     optimized_metric: MetricName = "psnr"
-    debug: bool = False  # a run of ten steps that scores one view
-    # Checkpoint to resume from, or `last` for the newest checkpoint of this experiment.
-    ckpt_path: Optional[str] = None  # noqa: UP045
-    viewer: bool = False  # serve an interactive page of the model during training, to browsers on this machine
-    viewer_port: Annotated[int, Range(at_least=0, at_most=65535)] = 8008  # port of the page; 0 selects a free port
-    # Backend of torch.compile for the networks, such as inductor or cudagraphs on a GPU; None does not compile them.
-    # Compilation takes a minute or more at the start.
-    compile: Optional[str] = None  # noqa: UP045
+    debug: bool = False
+    ckpt_path: str | None = None
+    viewer: bool = False
+    viewer_port: Annotated[int, Ge(0), Le(65535)] = 8008
+    compile: str | None = None
 
 
 def check_trained(config: DictConfig, origin: Path) -> DictConfig:
@@ -226,8 +277,8 @@ def check_trained(config: DictConfig, origin: Path) -> DictConfig:
         NerfroError: a name or a value does not fit `TrainConfig`.
     """
     try:
-        typed = cast(DictConfig, OmegaConf.merge(OmegaConf.structured(TrainConfig), config))
-        check_settings(typed, TrainConfig)
+        typed = cast(DictConfig, OmegaConf.merge(OmegaConf.structured(untyped(TrainConfig())), config))
+        validate(TrainConfig, plain(typed))
         content = typed.content
         if content.box_min is not None or content.box_max is not None:
             corners_of_box(content.box_min or [], content.box_max or [])
@@ -259,7 +310,6 @@ def check_run(config: DictConfig) -> None:
         configure(find("callbacks", str(name)), node or {})
     for plugin_type in ("loss", "phase"):
         build_each(plugin_type, config[plugin_type])
-    OmegaConf.to_object(config.optimizer)  # checks groups of parameters
     for node in (config.data, config.camera, config.sampler.points, config.field, config.background, config.model):
         check_node(node)
     if check_node(config.sampler.path).needs_medium:  # type: ignore[attr-defined]
@@ -268,8 +318,7 @@ def check_run(config: DictConfig) -> None:
     if config.background.get("image") and config.model.get("colour") == "srgb":
         raise NerfroError(
             "background.image holds linear radiance, but fields and background have sRGB values with "
-            "model.colour=srgb; "
-            "take model.colour=linear"
+            "model.colour=srgb; take model.colour=linear"
         )
     if limit is None and config.trainer.max_steps < 0 and not (config.debug or config.trainer.fast_dev_run):
         raise NerfroError("the run would never end; set trainer.max_time, such as 5m, trainer.max_steps, or both")

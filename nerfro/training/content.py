@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, Optional
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -35,19 +35,24 @@ _WITH_BALL = OnlyWith("space", ("all",))
 
 @dataclass
 class ContentConfig:
-    """Space of the field and of the samples on paths."""
+    """Space of the field and of the samples on paths.
 
-    # `box`: a box, with the background outside of it. `all`: all of space, contracted outside of a ball, with the
-    # background at infinity. `unbounded`: from the near to the far bounds of the rays, without contraction.
-    space: Annotated[str, Literal["box", "all", "unbounded"]] = "box"
-    # Lower corner of the box, world units, relative to the origin of the medium; the ball is centred in the box. None
-    # takes the bounds of the object, or for the ball the point that the cameras face.
-    box_min: Optional[list[float]] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
-    box_max: Optional[list[float]] = None  # noqa: UP045 - upper corner of the box
-    # Radius of the ball, world units. None derives this and the next setting from the cameras.
-    radius: Annotated[Optional[Positive], _WITH_BALL] = None  # noqa: UP045
-    # Arc length of the first samples, world units.
-    near: Annotated[Optional[NotNegative], _WITH_BALL] = None  # noqa: UP045
+    Attributes:
+        space: `box`: a box, with the background outside of it. `all`: all of space, contracted outside of a
+            ball, with the background at infinity. `unbounded`: from the near to the far bounds of the rays,
+            without contraction.
+        box_min: lower corner of the box, world units, relative to the origin of the medium; the ball is centred
+            in the box. None takes the bounds of the object, or for the ball the point that the cameras face.
+        box_max: upper corner of the box.
+        radius: radius of the ball, world units. None derives this and the next setting from the cameras.
+        near: arc length of the first samples, world units.
+    """
+
+    space: Literal["box", "all", "unbounded"] = "box"
+    box_min: list[float] | None = None
+    box_max: list[float] | None = None
+    radius: Annotated[Positive | None, _WITH_BALL] = None
+    near: Annotated[NotNegative | None, _WITH_BALL] = None
 
 
 def space_of(content: DictConfig | ContentConfig) -> Space:

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from typing import Any, get_args, get_type_hints
+from typing import Any, get_args
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
-from nerfro.registry.allowed import OnlyWith
+from nerfro.registry.allowed import OnlyWith, hints_of, schema_of, untyped
 from nerfro.registry.registration import SEVERAL, Plugin, find, plugin_of
+from nerfro.training.config import TrainConfig
 from nerfro.training.settings import flat
 
 
@@ -80,13 +80,13 @@ def _fits(condition: OnlyWith, plugin: Plugin) -> bool:
 
 def _described(node: DictConfig, place: list[str]) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
     """Return the annotations and the defaults of the settings in a node; both are empty for other mappings."""
-    schema = OmegaConf.get_type(node)
     if len(place) == 2 and place[0] in SEVERAL:
         plugin = find(*place)
     elif "_target_" in node and place[0] not in ("logger", "trainer"):  # whose classes are those of Lightning
         plugin = plugin_of(node)
-    elif dataclasses.is_dataclass(schema):
-        return get_type_hints(schema, include_extras=True), OmegaConf.structured(schema)
     else:
-        return {}, {}
-    return plugin.hints, {name: default for name, _, default in plugin.fields()}
+        schema: Any = TrainConfig
+        for key in place:
+            schema = None if schema is None else schema_of(hints_of(schema).get(key))
+        return ({}, {}) if schema is None else (hints_of(schema), vars(untyped(schema())))
+    return plugin.hints, plugin.node

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
@@ -18,6 +18,7 @@ from nerfro.core.errors import NerfroError
 from nerfro.core.paths import user_path
 from nerfro.core.types import Batch
 from nerfro.losses.base import Loss
+from nerfro.registry.allowed import plain, validate
 from nerfro.registry.registration import discover
 from nerfro.rendering import Renderer, Scene
 from nerfro.training.config import build_each
@@ -65,7 +66,7 @@ class TrainingModule(LightningModule):
     ) -> TrainingModule:
         """Create the module from a configuration, and the cameras of the training views if they are known."""
         configuration = OmegaConf.to_yaml(config, resolve=True)
-        optimizer = cast(OptimizerConfig, OmegaConf.to_object(config.optimizer))
+        optimizer = validate(OptimizerConfig, plain(config.optimizer), "optimizer.")
         inputs = inputs_of(config, cameras)
         return cls(renderer, build_each("loss", config.loss), optimizer, callbacks, configuration, inputs)
 

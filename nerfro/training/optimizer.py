@@ -7,12 +7,12 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import Annotated, Optional
+from typing import Annotated
 
 from torch import nn
 
 from nerfro.core.errors import NerfroError
-from nerfro.registry.allowed import Natural, NotNegative, OnlyWith, Positive, checked
+from nerfro.registry.allowed import Natural, NotNegative, OnlyWith, Positive, validated
 
 # Patterns that have no effect in a scene without these parameters.
 OPTIONAL_PATTERNS = (
@@ -22,33 +22,45 @@ OPTIONAL_PATTERNS = (
 COMMON = "common"
 
 
-@checked("optimizer.groups")
+@validated("optimizer.groups")
 @dataclass
 class GroupConfig:
-    """Settings of all parameters whose names match a pattern."""
+    """Settings of all parameters whose names match a pattern.
 
-    learning_rate: Optional[Positive] = None  # noqa: UP045 - initial learning rate; None for the common rate
-    start: Natural = 0  # step at which the parameters begin to learn
+    Attributes:
+        learning_rate: initial learning rate; None for the common rate.
+        start: step at which the parameters begin to learn.
+    """
+
+    learning_rate: Positive | None = None
+    start: Natural = 0
 
 
-@checked("optimizer")
+@validated("optimizer")
 @dataclass
 class OptimizerConfig:
     """Adam with a log-linear learning rate and a sine warm-up (authors' code; mip-NeRF, section 4).
 
     The defaults are those of the paper; conf/train.yaml changes them.
+
+    Attributes:
+        learning_rate: initial learning rate.
+        final_learning_rate: learning rate at the end of the run.
+        groups: learning rate and start of parameters by the pattern of their names
+            (`Scene.parameters_by_name`), in which an asterisk stands for any text: {bodies.*.material.ior:
+            {learning_rate: 1e-3, start: 100}}. The rates have the same decay. Of several matching patterns the
+            last one decides.
+        warmup_steps: length of the warm-up; 0 for none.
+        warmup_factor: factor of the learning rate at its first step.
+        adam_epsilon: epsilon of Adam.
     """
 
-    learning_rate: Positive = 5e-4  # initial learning rate
-    final_learning_rate: Positive = 5e-6  # learning rate at the end of the run
-    # Learning rate and start of parameters by the pattern of their names (`Scene.parameters_by_name`), in which an
-    # asterisk stands for any text: {bodies.*.material.ior: {learning_rate: 1e-3, start: 100}}. The rates have the same
-    # decay. Of several matching patterns the last one decides.
+    learning_rate: Positive = 5e-4
+    final_learning_rate: Positive = 5e-6
     groups: dict[str, GroupConfig] = dataclasses.field(default_factory=dict)
-    warmup_steps: Natural = 2500  # length of the warm-up; 0 for none
-    # Factor of the learning rate at its first step.
+    warmup_steps: Natural = 2500
     warmup_factor: Annotated[NotNegative, OnlyWith("warmup_steps")] = 0.01
-    adam_epsilon: Positive = 1e-8  # epsilon of Adam
+    adam_epsilon: Positive = 1e-8
 
     def group(self, name: str) -> GroupConfig:
         """Return the settings of a group of `grouped`."""

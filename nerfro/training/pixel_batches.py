@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 import torch
+from annotated_types import Ge, Le
 from jaxtyping import Bool, Float, Int, UInt8
 from omegaconf import DictConfig
 from torch import Tensor
@@ -19,12 +20,12 @@ from nerfro.core.errors import NerfroError, warn
 from nerfro.core.types import Pixels
 from nerfro.data.base import Views
 from nerfro.data.pixel_store import PixelStore
-from nerfro.registry.allowed import Count, Natural, Range, checked
+from nerfro.registry.allowed import Count, Natural, validated
 
 Batching = Literal["single_image", "all_images"]
 
 
-@checked("batches")
+@validated("batches")
 class PixelBatches:
     """Random training pixels of each step, which depend only on the seed and the step.
 
@@ -40,7 +41,7 @@ class PixelBatches:
         seed: Natural = 0,
         precrop_steps: Natural = 0,
         precrop_fraction: float = 0.5,
-        object_fraction: Annotated[float, Range(at_least=0, at_most=1)] = 0.0,
+        object_fraction: Annotated[float, Ge(0), Le(1)] = 0.0,
     ) -> None:
         if len(views) == 0:
             raise NerfroError("there are no training images; give at least one")

@@ -1,13 +1,11 @@
 """Export of a trained scene: options of the command, and a writer for each kind of file."""
 
-# ruff: noqa: UP045 - OmegaConf on Python 3.10 wants Optional
-
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 from omegaconf import MISSING
 
@@ -21,21 +19,31 @@ ExportName = Annotated[str, Names(lambda: EXPORTS)]
 
 @dataclass
 class ExportConfig:
-    """Options of `python -m nerfro.export`."""
+    """Options of `python -m nerfro.export`.
 
-    checkpoint: str = MISSING  # run folder, or a checkpoint in it
-    what: ExportName = MISSING  # content and kind of the file
-    out: str = MISSING  # output file; its ending selects the format
-    # Grid vertices along the longest side of the volume (default 128), or rows of the sky (by default as
-    # many as the background has, at least 512).
-    resolution: Optional[Count] = None
-    # Length, world units, within which dense content absorbs half the light; the surface is extracted at this density.
-    # By default a hundredth of the object's longest side.
-    half_depth: Optional[Positive] = None
-    sky: Optional[str] = None  # lat-long image that replaces the sky (.hdr, .exr, .png, .jpg)
-    root: Optional[str] = None  # folder of the data, if it has moved since training
-    device: str = "auto"  # `cpu` or `cuda`; `auto` means the CPU
-    overwrite: bool = False  # whether existing output files may be replaced
+    Attributes:
+        checkpoint: run folder, or a checkpoint in it.
+        what: content and kind of the file.
+        out: output file; its ending selects the format.
+        resolution: grid vertices along the longest side of the volume (default 128), or rows of the sky (by
+            default as many as the background has, at least 512).
+        half_depth: length, world units, within which dense content absorbs half the light; the surface is
+            extracted at this density. By default a hundredth of the object's longest side.
+        sky: lat-long image that replaces the sky (.hdr, .exr, .png, .jpg).
+        root: folder of the data, if it has moved since training.
+        device: `cpu` or `cuda`; `auto` means the CPU.
+        overwrite: whether existing output files may be replaced.
+    """
+
+    checkpoint: str = MISSING
+    what: ExportName = MISSING
+    out: str = MISSING
+    resolution: Count | None = None
+    half_depth: Positive | None = None
+    sky: str | None = None
+    root: str | None = None
+    device: str = "auto"
+    overwrite: bool = False
 
 
 @dataclass(frozen=True)

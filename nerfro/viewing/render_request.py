@@ -1,16 +1,15 @@
 """Options of `python -m nerfro.render`, and the cameras and scenes that they select."""
 
-# ruff: noqa: UP045 - OmegaConf on Python 3.10 wants Optional
-
 from __future__ import annotations
 
 import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, Literal, Optional
+from typing import Annotated, Any, Literal
 
 import torch
+from annotated_types import Ge, Gt, Le, Lt
 from jaxtyping import Float
 from omegaconf import MISSING
 from torch import Tensor
@@ -22,48 +21,71 @@ from nerfro.core.lens import distort, fold_radius
 from nerfro.core.paths import user_path
 from nerfro.core.variants import variant
 from nerfro.data.lenses import Lens, check_lenses
-from nerfro.registry.allowed import Count, Positive, Range, refuse_unused
+from nerfro.registry.allowed import Count, Positive, refuse_unused
 from nerfro.samplers.subdivision import SubdivisionChanges
 from nerfro.viewing.camera_files import read_cameras
 from nerfro.viewing.camera_paths import PATHS, CaptureGeometry, OrbitPosition, path_cameras
 from nerfro.viewing.trained_scene import TrainedScene
 
-Angle = Annotated[float, Range(more_than=0, less_than=180)]
+Angle = Annotated[float, Gt(0), Lt(180)]
 _OF_PATHS = ("frames", "azimuth", "elevation", "distance")  # options of paths around the object
-FilmFormat = Annotated[str, Literal["mp4", "gif"]]
+FilmFormat = Literal["mp4", "gif"]
 
 
 @dataclass
 class RenderConfig:
-    """Options of `python -m nerfro.render`; `path`, `views` or `position` selects the cameras."""
+    """Options of `python -m nerfro.render`; `path`, `views` or `position` selects the cameras.
 
-    checkpoint: str = MISSING  # run folder or a checkpoint in it
-    path: Optional[str] = None  # path around the object: orbit, spiral, arc or dolly; or FILE.json of cameras
-    frames: Count = 120  # number of frames of the film
-    seconds: Positive = 5.0  # duration of the film
-    azimuth: float = 0.0  # start of the path, degrees around the object
-    elevation: Annotated[float, Range(at_least=-90, at_most=90)] = 10.0  # start of the path, degrees above the object
-    # Distance from the centre of the object at the start, world units; by default that of the photographs.
-    distance: Optional[Positive] = None
-    views: Optional[str] = None  # cameras of a split of the data, such as `test`, or one of them, such as `test:3`
-    position: Optional[list[float]] = None  # position of the camera of a still image, world units
-    # Point in the centre of the still image, world units; by default the centre of the object.
-    target: Optional[list[float]] = None
-    fov: Optional[Angle] = None  # horizontal field of view, degrees; by default that of the photographs
-    resolution: Any = None  # width in pixels, or [width, height]; by default that of the photographs
-    # rgb, depth, normals, opacity, exits, glass (nothing inside), inside (no glass), or sky (neither)
-    what: Annotated[str, Literal["rgb", "depth", "normals", "opacity", "exits", "glass", "inside", "sky"]] = "rgb"
-    sky: Optional[str] = None  # lat-long image that replaces the sky (.hdr, .exr, .png, .jpg)
-    # Pixels with several rays (see docs/concepts/background.md); by default as in the evaluation of the run.
+    Attributes:
+        checkpoint: run folder or a checkpoint in it.
+        path: path around the object: orbit, spiral, arc or dolly; or FILE.json of cameras.
+        frames: number of frames of the film.
+        seconds: duration of the film.
+        azimuth: start of the path, degrees around the object.
+        elevation: start of the path, degrees above the object.
+        distance: distance from the centre of the object at the start, world units; by default that of the
+            photographs.
+        views: cameras of a split of the data, such as `test`, or one of them, such as `test:3`.
+        position: position of the camera of a still image, world units.
+        target: point in the centre of the still image, world units; by default the centre of the object.
+        fov: horizontal field of view, degrees; by default that of the photographs.
+        resolution: width in pixels, or [width, height]; by default that of the photographs.
+        what: rgb, depth, normals, opacity, exits, glass (nothing inside), inside (no glass), or sky (neither).
+        sky: lat-long image that replaces the sky (.hdr, .exr, .png, .jpg).
+        subdivision: pixels with several rays (see docs/concepts/background.md); by default as in the evaluation
+            of the run.
+        chunk_size: rays rendered at once, which limits the memory; by default as in training.
+        out: folder of frames and films; an interrupted rendering resumes there.
+        format: format of the frames; exr stores values in their units: linear radiance, world units, unit
+            vectors.
+        film: mp4, gif, both or none.
+        root: folder of the data, if it has moved since training.
+        device: `cpu` or `cuda`; `auto` means the CPU.
+        overwrite: whether other frames in `out` may be replaced.
+    """
+
+    checkpoint: str = MISSING
+    path: str | None = None
+    frames: Count = 120
+    seconds: Positive = 5.0
+    azimuth: float = 0.0
+    elevation: Annotated[float, Ge(-90), Le(90)] = 10.0
+    distance: Positive | None = None
+    views: str | None = None
+    position: list[float] | None = None
+    target: list[float] | None = None
+    fov: Angle | None = None
+    resolution: Any = None
+    what: Literal["rgb", "depth", "normals", "opacity", "exits", "glass", "inside", "sky"] = "rgb"
+    sky: str | None = None
     subdivision: SubdivisionChanges = dataclasses.field(default_factory=SubdivisionChanges)
-    chunk_size: Optional[Count] = None  # rays rendered at once, which limits the memory; by default as in training
-    out: str = MISSING  # folder of frames and films; an interrupted rendering resumes there
-    # Format of the frames; exr stores values in their units: linear radiance, world units, unit vectors.
-    format: Annotated[str, Literal["png", "exr"]] = "png"
-    film: list[FilmFormat] = dataclasses.field(default_factory=lambda: ["mp4"])  # mp4, gif, both or none
-    root: Optional[str] = None  # folder of the data, if it has moved since training
-    device: str = "auto"  # `cpu` or `cuda`; `auto` means the CPU
-    overwrite: bool = False  # whether other frames in `out` may be replaced
+    chunk_size: Count | None = None
+    out: str = MISSING
+    format: Literal["png", "exr"] = "png"
+    film: list[FilmFormat] = dataclasses.field(default_factory=lambda: ["mp4"])
+    root: str | None = None
+    device: str = "auto"
+    overwrite: bool = False
 
 
 @dataclass(frozen=True)

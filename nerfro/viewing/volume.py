@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import torch
+from annotated_types import Ge
 from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.core.progress import track
 from nerfro.geometry.space import Box, Space
-from nerfro.registry.allowed import Range, check
+from nerfro.registry.allowed import check
 from nerfro.viewing.trained_scene import TrainedScene
 
 RESOLUTION = 128
@@ -53,7 +54,7 @@ def sample_field(
     Raises:
         NerfroError: the resolution is below 2.
     """
-    check("", {"resolution": Annotated[int, Range(at_least=2)]}, {"resolution": resolution})
+    check("", {"resolution": Annotated[int, Ge(2)]}, {"resolution": resolution})
     content = scene.renderer.scene.space.content
     space = Box(scene.bounds if content is None else content) if space is None else copy.deepcopy(space)
     box = space.cpu().box

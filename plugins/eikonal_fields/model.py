@@ -7,6 +7,7 @@ from enum import IntEnum
 from typing import Annotated
 
 import torch
+from annotated_types import Ge
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -14,7 +15,7 @@ from nerfro.core.errors import NerfroError
 from nerfro.core.types import Batch, FieldValues, Path, Rays, Rendering, Samples
 from nerfro.fields.base import Field
 from nerfro.geometry.space import inside_box
-from nerfro.registry.allowed import Count, Positive, Range, Share
+from nerfro.registry.allowed import Count, Positive, Share
 from nerfro.registry.registration import register
 from nerfro.rendering import Components, Renderer, composite
 from nerfro.samplers.paths.straight import straight_path
@@ -68,7 +69,7 @@ class EikonalFields(Renderer):
         components: Components,
         scene_fraction: Share = 0.4,
         index_fraction: Share = 0.4,
-        resolution: Annotated[int, Range(at_least=2)] = 128,
+        resolution: Annotated[int, Ge(2)] = 128,
         blur: Positive = 2.0,
         num_levels: Count = 5,
     ) -> None:

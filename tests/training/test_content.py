@@ -12,6 +12,7 @@ from nerfro.core.cameras import Cameras
 from nerfro.fields.hash_grid import HashGridField
 from nerfro.geometry.space import Contracted, Unbounded
 from nerfro.media.analytic import Vacuum
+from nerfro.registry.allowed import untyped
 from nerfro.testing import example_views
 from nerfro.training.config import TrainConfig
 from nerfro.training.content import common_target, content_settings, describe, space_of
@@ -29,7 +30,7 @@ def around(num: int) -> Cameras:
 
 
 def of_all_space(**content: object) -> DictConfig:
-    config = OmegaConf.structured(TrainConfig(medium={}))
+    config = OmegaConf.structured(untyped(TrainConfig(medium={})))
     config = with_values(config, {"content.space": "all", **{f"content.{name}": content[name] for name in content}})
     return with_values(config, content_settings(config, Vacuum(), around(7))).content
 
@@ -69,7 +70,7 @@ def test_parallel_cameras_have_a_default_depth() -> None:
 @pytest.mark.parametrize("space", ["box", "unbounded"])
 def test_content_without_contraction_needs_no_cameras(space: str) -> None:
     box = {"content.box_min": [0.0] * 3, "content.box_max": [1.0] * 3}
-    config = with_values(OmegaConf.structured(TrainConfig(field={})), {"content.space": space, **box})
+    config = with_values(OmegaConf.structured(untyped(TrainConfig(field={}))), {"content.space": space, **box})
     assert content_settings(config, Vacuum(), around(0)) == box
     assert space_of(config.content).has_box == (space == "box")
     assert describe(config) == ""

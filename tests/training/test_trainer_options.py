@@ -15,7 +15,7 @@ from lightning.pytorch.callbacks import Timer
 from omegaconf import OmegaConf
 
 import nerfro.training.trainer
-from nerfro.registry.allowed import Refused, check_settings
+from nerfro.registry.allowed import Refused, plain, untyped, validate
 from nerfro.registry.registration import build, find, register
 from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.testing import check
@@ -84,9 +84,9 @@ def test_settings_may_refer_to_hydra(key: str, train: Runner) -> None:
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_unsupported_arguments_are_refused_with_a_reason(name: str) -> None:
-    config = OmegaConf.structured(TrainConfig)
+    config = OmegaConf.structured(untyped(TrainConfig()))
     config.trainer[name] = 3
-    message = refused("is not allowed", check_settings, config, TrainConfig)
+    message = refused("is not allowed", validate, TrainConfig, plain(config))
     assert message == f"trainer.{name}=3 is not allowed; {REFUSED[name]}"
 
 
@@ -123,7 +123,7 @@ def test_short_runs_score_one_view(train: Runner, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("option", "steps"), [("debug", 10), ("trainer.fast_dev_run", 1)])
 def test_switches_shorten_runs(option: str, steps: int) -> None:
-    config = OmegaConf.structured(TrainConfig)
+    config = OmegaConf.structured(untyped(TrainConfig()))
     OmegaConf.update(config, option, True)
     config = resolve_trainer_options(config)
     assert config.trainer.max_steps == config.evaluation.every == steps

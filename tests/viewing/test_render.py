@@ -177,7 +177,7 @@ def test_another_sky_replaces_the_sky_of_the_scene(render: Runner) -> None:
         (["views=test", "resolution=[1,2,3]"], "resolution=[1, 2, 3] is not allowed"),
         (["views=test", "resolution=0"], "resolution=0 is not allowed"),
         (["views=test", "sky=gone.hdr"], "the sky gone.hdr does not exist"),
-        (["path=orbit", "fov=190"], "fov=190.0 is not allowed; take more than 0 and less than 180"),
+        (["path=orbit", "fov=190"], "fov=190 is not allowed; take more than 0 and less than 180"),
     ],
 )
 def test_impossible_renderings_are_refused_in_one_line(arguments: list[str], message: str, render: Runner) -> None:

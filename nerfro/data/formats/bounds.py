@@ -13,7 +13,7 @@ from nerfro.data.lenses import Lens
 from nerfro.geometry.lines import nearest_point
 from nerfro.registry.allowed import Coordinate
 
-_MAX_COORDINATE = get_args(Coordinate)[1].at_most  # world units
+_MAX_COORDINATE = get_args(Coordinate)[2].le  # world units
 
 
 def find_bounds(

@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 import torch
+from annotated_types import Ge, Le
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import one_hot
@@ -18,7 +19,7 @@ from nerfro.geometry.interpolation import intersect_box
 from nerfro.kernels.tolerances import MIN_SEARCH_STEP
 from nerfro.media.base import Medium
 from nerfro.media.bodies import Bodies
-from nerfro.registry.allowed import OnlyWith, Positive, Range, Share
+from nerfro.registry.allowed import OnlyWith, Positive, Share
 from nerfro.registry.registration import register
 from nerfro.samplers.base import PathSampler
 from nerfro.samplers.paths.branching import ONE_PATH, Branching
@@ -135,7 +136,7 @@ class Snell(PathSampler):
     def __init__(
         self,
         interface: Literal["sdf", "mesh"] = "sdf",
-        max_events: Annotated[int, Range(at_least=1, at_most=1000)] = 16,
+        max_events: Annotated[int, Ge(1), Le(1000)] = 16,
         branches: Literal["none", "first", "all"] = "none",
         least_weight: Annotated[Share, OnlyWith("branches", ("first", "all"))] = 0.02,
         wavelengths: Sequence[Positive] = (610.0, 550.0, 465.0),

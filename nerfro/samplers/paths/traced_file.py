@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path as FilePath
-from typing import Any, Optional
+from typing import Any
 
 import numpy as np
 import torch
@@ -33,20 +33,29 @@ class TraceSamplerConfig:
 
 @dataclass
 class TraceConfig:
-    """Options of `python -m nerfro.trace`, which traces rays of a file through a medium."""
+    """Options of `python -m nerfro.trace`, which traces rays of a file through a medium.
 
-    medium: Any = MISSING  # plugin of the group `medium`
+    Attributes:
+        medium: plugin of the group `medium`.
+        rays: .npz file with `origins` and `directions` [R, 3], world units and unit directions.
+        out: .npz file to write, with `exit_positions` and `exit_directions` [R, 3], `path_lengths` and `hit`
+            [R]. If rays split, there is one row for each polyline, and the arrays `ray` (row in `rays`) and
+            `throughput` [P, 3].
+        near: arc length at which paths begin.
+        far: arc length at which paths end. Bent paths end outside the box of the medium, beyond `far` if
+            necessary. By default, all paths end at the exit from the box.
+        plot: whether to plot some of the paths and the medium as .png beside `out`.
+        overwrite: whether to replace `out` and the plot.
+    """
+
+    medium: Any = MISSING
     sampler: TraceSamplerConfig = dataclasses.field(default_factory=TraceSamplerConfig)
-    rays: str = MISSING  # .npz file with `origins` and `directions` [R, 3], world units and unit directions
-    # .npz file to write, with `exit_positions` and `exit_directions` [R, 3], `path_lengths` and `hit` [R]. If rays
-    # split, there is one row for each polyline, and the arrays `ray` (row in `rays`) and `throughput` [P, 3].
+    rays: str = MISSING
     out: str = MISSING
-    near: Distance = 0.0  # arc length at which paths begin
-    # Arc length at which paths end. Bent paths end outside the box of the medium, beyond `far` if necessary. By
-    # default, all paths end at the exit from the box.
-    far: Optional[Distance] = None  # noqa: UP045 - OmegaConf on Python 3.10 wants Optional
-    plot: bool = False  # whether to plot some of the paths and the medium as .png beside `out`
-    overwrite: bool = False  # whether to replace `out` and the plot
+    near: Distance = 0.0
+    far: Distance | None = None
+    plot: bool = False
+    overwrite: bool = False
 
 
 def make_rays(

@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Annotated
 
 import torch
+from annotated_types import Ge, Gt, Le
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
@@ -16,7 +17,7 @@ from nerfro.core.types import Path, Rendering, Samples
 from nerfro.fields.base import Field
 from nerfro.geometry.space import Space
 from nerfro.kernels.arrays import arrays
-from nerfro.registry.allowed import Count, Range, Share
+from nerfro.registry.allowed import Count, Share
 from nerfro.registry.registration import register
 from nerfro.samplers.base import PointSampler
 from nerfro.samplers.points.stepfun import invert_cdf, midpoints, spread_uniform, volume_weights
@@ -61,15 +62,15 @@ class DensityGridSampler(PointSampler):
     def __init__(
         self,
         space: Space,
-        num_samples: Annotated[int, Range(at_least=1, at_most=8192)] = 32,
-        num_bins: Annotated[int, Range(at_least=2, at_most=8192)] = 96,
-        resolution: Annotated[int, Range(at_least=2, at_most=1024)] = 64,
+        num_samples: Annotated[int, Ge(1), Le(8192)] = 32,
+        num_bins: Annotated[int, Ge(2), Le(8192)] = 96,
+        resolution: Annotated[int, Ge(2), Le(1024)] = 64,
         uniform: Share = 0.2,
         update_every: Count = 16,
         update_fraction: Share = 1 / 16,
         decay: Share = 0.9,
-        max_bin_alpha: Annotated[float, Range(more_than=0, at_most=1)] = 0.4,
-        num_samples_evaluation: Annotated[int, Range(at_least=1, at_most=8192)] | None = None,
+        max_bin_alpha: Annotated[float, Gt(0), Le(1)] = 0.4,
+        num_samples_evaluation: Annotated[int, Ge(1), Le(8192)] | None = None,
     ) -> None:
         super().__init__()
         self.num_samples, self.num_bins, self.resolution = num_samples, num_bins, resolution

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 import torch
+from annotated_types import Ge, Le, Lt
 from jaxtyping import Float
 from torch import Tensor
 
@@ -12,7 +13,6 @@ from nerfro.core.draws import Draws
 from nerfro.core.errors import NerfroError
 from nerfro.core.types import Path, Rendering, Samples
 from nerfro.geometry.space import Space, Unbounded
-from nerfro.registry.allowed import Range
 from nerfro.registry.registration import register
 from nerfro.samplers.base import PointSampler
 
@@ -39,10 +39,10 @@ class Stratified(PointSampler):
 
     def __init__(
         self,
-        num_samples: Annotated[int, Range(at_least=2, at_most=8192)] = 64,
+        num_samples: Annotated[int, Ge(2), Le(8192)] = 64,
         draw: Literal["arc_length", "vertices"] = "arc_length",
         cast: Literal["points", "cones"] = "points",
-        offset: Annotated[float, Range(at_least=0, less_than=1)] = 0.5,
+        offset: Annotated[float, Ge(0), Lt(1)] = 0.5,
         space: Space | None = None,
     ) -> None:
         super().__init__()

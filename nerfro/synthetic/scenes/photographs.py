@@ -32,18 +32,18 @@ class Photographs(DataSet):
 
     @property
     def camera(self) -> Pinhole:
-        width, height = self.config.resolution, self.config.resolution * 3 // 4
+        width, height = self.options.resolution, self.options.resolution * 3 // 4
         cx, cy = 0.5 * width + OFF_CENTRE[0] * width, 0.5 * height + OFF_CENTRE[1] * width
         return Pinhole(width, height, FOCAL * width, cx, cy)
 
     def lit(self) -> SyntheticScene:
-        return bake(self.scene, BAKING_SPP, self.config.variant)
+        return bake(self.scene, BAKING_SPP, self.options.variant)
 
     def planned(self) -> list[PlannedImage]:
-        config = self.config
-        poses = hand_held(config.photographs, config.seed, self.scene.aim, DISTANCE, ELEVATIONS, LAPS)
+        options = self.options
+        poses = hand_held(options.photographs, options.seed, self.scene.aim, DISTANCE, ELEVATIONS, LAPS)
         return [
-            PlannedImage(f"images/{name}", f"masks/{name}", pose, config.spp, config.seed * 100_000 + index)
+            PlannedImage(f"images/{name}", f"masks/{name}", pose, options.spp, options.seed * 100_000 + index)
             for index, pose in enumerate(poses)
             for name in [f"photo_{index:03d}.png"]
         ]
@@ -53,7 +53,7 @@ class Photographs(DataSet):
 
         Noise of constant strength in sRGB approximates the noise of counted photons after encoding.
         """
-        grain = np.random.default_rng(image.seed).normal(scale=self.config.noise, size=radiance.shape)
+        grain = np.random.default_rng(image.seed).normal(scale=self.options.noise, size=radiance.shape)
         write_image(self.folder / image.mask_path, coverage >= 0.5)
         write_image(self.folder / image.image_path, to_srgb(np.clip(radiance, 0.0, 1.0)) + grain)
 
