@@ -164,7 +164,7 @@ class Path:
         record, records = None, [path.record for path in paths if path.record is not None]
         if records:
             absorption = max([record.absorption for record in records], key=len)
-            record = OpticalRecord(*[joined.pop(name) for name in _OF_ROWS], absorption)
+            record = OpticalRecord(absorption=absorption, **{name: joined.pop(name) for name in _OF_ROWS})
         return cls(**joined, splits=any([path.splits for path in paths]), record=record)
 
     def __repr__(self) -> str:

@@ -128,7 +128,9 @@ def _gradient_of_table(
 
 
 @lru_cache(maxsize=16)
-def _layout(resolutions: tuple[int, ...], sizes: tuple[int, ...]) -> tuple[np.ndarray, ...]:
+def _layout(
+    resolutions: tuple[int, ...], sizes: tuple[int, ...]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     levels = GridLevels(resolutions, sizes)
     return np.array(resolutions), np.array(sizes), np.array(levels.offsets), np.array(levels.dense)
 

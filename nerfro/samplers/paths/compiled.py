@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -80,17 +80,19 @@ def _trace(
         nested, shell: numbers of `kernels.lookup.Solids`.
         max_events, max_split_events, least_weight, main_only: see `snell_cpu.Settings`.
     """
-    rays, bodies = (origins, directions, near, far), [values.numpy() for values in solids]
-    packed = Solids(*bodies[:-2], nested, shell, *bodies[-2:])
+    names = [name for name in Solids._fields if name not in ("nested", "shell")]
+    arrays: dict[str, Any] = {name: values.numpy() for name, values in zip(names, solids, strict=True)}
+    packed = Solids(**arrays, nested=nested, shell=shell)
     settings = Settings(max_events, max_split_events, least_weight, main_only)
     max_polylines = _MAX_POLYLINES if max_split_events and not main_only else 1
-    rows, counts = trace_snell(*rays, packed, settings, _MAX_VERTICES, max_polylines)
+    rows, counts = trace_snell(origins, directions, near, far, packed, settings, _MAX_VERTICES, max_polylines)
     kept, needed = (counts <= (max_polylines, _MAX_VERTICES)).all(1), counts.max(0, initial=1)
     width = max(int(needed[1]), 2)
     columns = _polylines(rows, np.where(kept, counts[:, 0], 0), width)
     if not kept.all():
         rest = (~kept).nonzero()[0]
-        rows, counts = trace_snell(*(values[rest] for values in rays), packed, settings, width, int(needed[0]))
+        few = [values[rest] for values in (origins, directions, near, far)]
+        rows, counts = trace_snell(few[0], few[1], few[2], few[3], packed, settings, width, int(needed[0]))
         again = _polylines(rows, counts[:, 0], width)
         pairs = zip(columns, [rest[again[0]], *again[1:]], strict=True)
         joined = [np.concatenate(pair) for pair in pairs]
