@@ -195,7 +195,7 @@ def validated(where: str) -> Callable[[Class], Class]:
         @functools.wraps(function)
         def call(*arguments: Any, **named: Any) -> Any:
             bound = signature.bind(*arguments, **named)
-            bound.arguments |= convert(f"{where}: ", hints_of(function), bound.arguments)
+            bound.arguments.update(convert(f"{where}: ", hints_of(function), bound.arguments))
             return function(*bound.args, **bound.kwargs)
 
         return call
