@@ -16,11 +16,11 @@ from nerfro.core.paths import PACKAGE_DIR
 def main() -> None:
     """List the commands, or run the command in the first argument."""
     with errors_in_one_line():
-        known = commands()
+        names = commands()
         name, *arguments = sys.argv[1:] or ["--help"]
         if name in ("-h", "--help"):
             print("nerfro COMMAND [key=value ...], or python -m nerfro.COMMAND [key=value ...]\n")
-            for command, purpose in known.items():
+            for command, purpose in names.items():
                 print(f"  {command:12}{purpose}")
             print("\nnerfro COMMAND --help lists the options of a command.")
         elif name == "--version":
@@ -28,10 +28,10 @@ def main() -> None:
         elif name == "--completion":
             print(shell_code(" ".join(arguments)))
         elif name == "--complete":
-            print("\n".join(completions(known, arguments)))
-        elif name not in known:
-            raise NerfroError(f"there is no command '{name}'; {nearest_of(name, list(known))}")
-    if name not in known:
+            print("\n".join(completions(names, arguments)))
+        elif name not in names:
+            raise NerfroError(f"there is no command '{name}'; {nearest_of(name, list(names))}")
+    if name not in names:
         return
     del sys.argv[1]
     # Like python -m, because Hydra, launchers and the record of a run read the command from `__main__`.
@@ -40,12 +40,12 @@ def main() -> None:
 
 def commands() -> dict[str, str]:
     """Find the commands and their descriptions, from modules whose docstring begins "`python -m nerfro.NAME ...`: "."""
-    found = {}
+    summaries = {}
     for file in sorted(PACKAGE_DIR.glob("*.py")):
         first = (ast.get_docstring(ast.parse(file.read_text(encoding="utf-8"))) or "").partition("\n")[0]
         if first.startswith(f"`python -m nerfro.{file.stem}"):
-            found[file.stem] = first.partition("`: ")[2]
-    return found
+            summaries[file.stem] = first.partition("`: ")[2]
+    return summaries
 
 
 if __name__ == "__main__":

@@ -61,12 +61,12 @@ def _print_settings() -> None:
 def _chosen(arguments: list[str]) -> list[Plugin]:
     if not arguments:
         return plugins()
-    chosen = []
+    selected = []
     for argument in arguments:
         kind, _, name = argument.partition("=")
         of_kind = plugins(kind)
-        chosen += [find(kind, name)] if name else of_kind
-    return chosen
+        selected += [find(kind, name)] if name else of_kind
+    return selected
 
 
 if __name__ == "__main__":

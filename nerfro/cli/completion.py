@@ -52,11 +52,13 @@ def completions(commands: Iterable[str], arguments: Sequence[str]) -> list[str]:
     line = os.environ.get("COMP_LINE", "").encode()[: int(os.environ.get("COMP_POINT", "-1")) % 2**31].decode()
     _, *words, last = f"{line} ".removesuffix(" ").split(" ")
     described = recall(words[0]) if words else None
-    known = (f"{command} " for command in commands) if not words else () if described is None else _options(described)
+    words_known = (
+        (f"{command} " for command in commands) if not words else () if described is None else _options(described)
+    )
     kept = len(last) - len(arguments[1]) if len(arguments) > 1 else 0
     plus = last[: len(last) - len(last.lstrip("+"))]  # Hydra's sign of an added option
-    found = (plus + text for text in known)
-    return sorted(text[kept:] for text in found if text.startswith(last) and "." not in text[len(last) : -1])
+    completions = (plus + text for text in words_known)
+    return sorted(text[kept:] for text in completions if text.startswith(last) and "." not in text[len(last) : -1])
 
 
 def _options(described: Described) -> Iterator[str]:
@@ -64,6 +66,6 @@ def _options(described: Described) -> Iterator[str]:
         yield from (f"{group}={name} " for name in names)
     for node, names in described.names.items():
         for name in names:
-            place = f"{node}.{name}".removeprefix(".")
-            if place not in described.choices and name != "_target_":
-                yield place + ("." if place in described.names else "=")
+            full_name = f"{node}.{name}".removeprefix(".")
+            if full_name not in described.choices and name != "_target_":
+                yield full_name + ("." if full_name in described.names else "=")

@@ -166,9 +166,9 @@ class _ConfigLoader(GuardedConfigLoader):
         config = super().load_sweep_config(master_config, overrides)
         excluded = config.hydra.job.config.override_dirname.exclude_keys
         task = cast(list[str], OmegaConf.to_container(master_config.hydra.overrides.task, resolve=False))
-        given = OverridesParser.create().parse_overrides(task)
+        asked = OverridesParser.create().parse_overrides(task)
         # As sweepers write them: `debug=true` becomes `debug=True`.
-        common = {f"{o.get_key_element()}={o.get_value_element_as_str()}" for o in given if not o.is_sweep_override()}
+        common = {f"{o.get_key_element()}={o.get_value_element_as_str()}" for o in asked if not o.is_sweep_override()}
         swept = (override.partition("=") for override in overrides if override not in common)
         parts = [f"-{key.lstrip('+').rpartition('.')[2]}={value}" for key, _, value in swept if key not in excluded]
         config.hydra.job.override_dirname = re.sub(r"[^\w.=+-]+", "_", "".join(parts)).rstrip("_")

@@ -105,9 +105,9 @@ def _unforeseen(error: Exception) -> str:
     """Write the traceback of a bug to a file and return a message with the name of the file."""
     what = f"{type(error).__name__}: {error}".splitlines()[0]
     foreign = {plugin.cls.__module__ for plugin in plugins()}
-    place = next((place for place in reversed(_places(error)) if place[0] in foreign), None)
-    if place is not None and not place[0].startswith("nerfro."):
-        return f"{what}; raised in the plugin {place[1]}, line {place[2]} (NERFRO_DEBUG=1 shows the traceback)"
+    frame = next((frame for frame in reversed(_places(error)) if frame[0] in foreign), None)
+    if frame is not None and not frame[0].startswith("nerfro."):
+        return f"{what}; raised in the plugin {frame[1]}, line {frame[2]} (NERFRO_DEBUG=1 shows the traceback)"
     try:
         with tempfile.NamedTemporaryFile("w", prefix="nerfro_", suffix=".txt", delete=False) as file:
             print(shlex.join(sys.argv), file=file)

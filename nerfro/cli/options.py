@@ -119,12 +119,12 @@ class Described:
                 continue
             parts = key.split(".")
             for depth, name in enumerate(parts):
-                known = self.names.get(".".join(parts[:depth]))
-                if known is None:
+                names = self.names.get(".".join(parts[:depth]))
+                if names is None:
                     break
-                if name not in known:
-                    place = ".".join(parts[: depth + 1])
-                    raise NerfroError(f"{place} is not a setting; {nearest_of(name, known)}")
+                if name not in names:
+                    full_name = ".".join(parts[: depth + 1])
+                    raise NerfroError(f"{full_name} is not a setting; {nearest_of(name, names)}")
 
 
 def describe(command: str, schema: type) -> Described:
@@ -311,8 +311,8 @@ def _state_of_files() -> str:
         files += folder.glob("*.py")
         files += [file for package in folder.glob("*/__init__.py") for file in package.parent.rglob("*.py")]
     for entry_point in importlib.metadata.entry_points(group=ENTRY_POINTS):
-        found = importlib.util.find_spec(entry_point.module.partition(".")[0])
-        places = [] if found is None else [Path(found.origin or ""), *map(Path, found.submodule_search_locations or ())]
+        spec = importlib.util.find_spec(entry_point.module.partition(".")[0])
+        places = [] if spec is None else [Path(spec.origin or ""), *map(Path, spec.submodule_search_locations or ())]
         files += [file for place in places for file in ([place] if place.is_file() else place.rglob("*.py"))]
     facts = sorted((str(file), status.st_mtime_ns, status.st_size) for file in files for status in [file.stat()])
     return hashlib.sha256(repr((facts, sys.version)).encode()).hexdigest()

@@ -32,8 +32,8 @@ def is_given(option: str, overrides: Iterable[str]) -> bool:
 
 def not_given(options: Iterable[str], overrides: Iterable[str]) -> list[str]:
     """Select the options that overrides do not set."""
-    given = {_name(text) for text in overrides}
-    return [option for option in options if _name(option) not in given]
+    names = {_name(text) for text in overrides}
+    return [option for option in options if _name(option) not in names]
 
 
 def is_scene_file(argument: str) -> bool:

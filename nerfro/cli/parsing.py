@@ -59,9 +59,9 @@ def parse(name: str, schema: type[Options], arguments: Sequence[str]) -> Options
         described = describe(name, schema)
         remember(name, described)
         described.answer(arguments)
-    given = [text for text in arguments if text not in (*_SHOW, "--resolve")]
+    overrides = [text for text in arguments if text not in (*_SHOW, "--resolve")]
     with missing_with_example(name):
-        options = validate(schema, values_of(given))
+        options = validate(schema, values_of(overrides))
     if "--cfg" in arguments:
         print(to_yaml(options), end="")
         sys.exit()

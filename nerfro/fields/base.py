@@ -37,8 +37,8 @@ class Field(Component, nn.Module, ABC):
     ) -> tuple[Float[Tensor, " points"], Float[Tensor, "points 3"]]:
         """Evaluate density and colour at points, seen in unit directions, in single precision."""
         zeros = torch.zeros(len(positions), 2, device=positions.device)
-        found = self(Samples(positions[:, None], directions[:, None], zeros[:, :1], zeros, zeros[:, 0]))
-        return found.density[:, 0].float(), found.radiance[:, 0].float()
+        values = self(Samples(positions[:, None], directions[:, None], zeros[:, :1], zeros, zeros[:, 0]))
+        return values.density[:, 0].float(), values.radiance[:, 0].float()
 
     @abstractmethod
     def forward(self, samples: Samples) -> FieldValues:

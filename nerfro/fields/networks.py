@@ -20,9 +20,9 @@ class Network(nn.Module):
 
 def compile_networks(model: nn.Module, backend: str) -> None:
     """Compile a model's networks in place with torch.compile, for any number of points."""
-    known = torch.compiler.list_backends(exclude_tags=())
-    if backend not in known:
-        raise NerfroError(f"compile={backend} is not a backend of torch.compile; set one of {', '.join(known)}")
+    backends = torch.compiler.list_backends(exclude_tags=())
+    if backend not in backends:
+        raise NerfroError(f"compile={backend} is not a backend of torch.compile; set one of {', '.join(backends)}")
     for module in model.modules():
         if isinstance(module, (Network, nn.Sequential)):
             module.compile(backend=backend, dynamic=True)

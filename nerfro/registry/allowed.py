@@ -163,10 +163,10 @@ def require_names(prefix: str, names: Iterable[str], values: Iterable[object]) -
     Raises:
         NerfroError: a name is unknown.
     """
-    known = [*names]
+    allowed_names = [*names]
     for name in map(str, values):
-        if name not in known:
-            raise NerfroError(f"{prefix}{name} is not a setting; {nearest_of(name, known)}")
+        if name not in allowed_names:
+            raise NerfroError(f"{prefix}{name} is not a setting; {nearest_of(name, allowed_names)}")
 
 
 @functools.cache

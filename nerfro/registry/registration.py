@@ -167,8 +167,8 @@ def add(kind: str, name: str, cls: Any) -> None:
 def plugins(kind: str | None = None) -> list[Plugin]:
     """Return the registered plugins, of one type or of all, sorted by type and name."""
     _require_kind(kind or KINDS[0])
-    chosen = (p for p in _plugins.values() if kind in (None, p.kind))
-    return sorted(chosen, key=lambda p: (KINDS.index(p.kind), p.name))
+    of_kind = (p for p in _plugins.values() if kind in (None, p.kind))
+    return sorted(of_kind, key=lambda p: (KINDS.index(p.kind), p.name))
 
 
 def find(kind: str, name: str) -> Plugin:
@@ -178,8 +178,8 @@ def find(kind: str, name: str) -> Plugin:
         NerfroError: no such plugin is registered.
     """
     if (kind, name) not in _plugins:
-        known = ", ".join(p.name for p in plugins(kind))
-        raise NerfroError(f"no {kind} is called '{name}'; known: {known}")
+        names = ", ".join(p.name for p in plugins(kind))
+        raise NerfroError(f"no {kind} is called '{name}'; known: {names}")
     return _plugins[kind, name]
 
 

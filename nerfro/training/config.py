@@ -335,10 +335,10 @@ def clock_time(duration: object) -> object:
     """
     if duration is None or isinstance(duration, Mapping) or re.fullmatch(r"\d+:\d\d:\d\d:\d\d", str(duration)):
         return duration
-    given = re.fullmatch(r"(\d{1,6}(?:\.\d+)?)([smhd])", str(duration))
-    if given is None:
+    match = re.fullmatch(r"(\d{1,6}(?:\.\d+)?)([smhd])", str(duration))
+    if match is None:
         raise NerfroError(f"trainer.max_time={duration} is not a duration; write 90s, 5m, 1h, 2d or DD:HH:MM:SS")
-    seconds = math.ceil(float(given[1]) * {"s": 1, "m": 60, "h": 3600, "d": 86400}[given[2]])
+    seconds = math.ceil(float(match[1]) * {"s": 1, "m": 60, "h": 3600, "d": 86400}[match[2]])
     return f"{seconds // 86400:02d}:{seconds // 3600 % 24:02d}:{seconds // 60 % 60:02d}:{seconds % 60:02d}"
 
 

@@ -29,15 +29,15 @@ def settings_without_effect(config: DictConfig, overrides: Iterable[str]) -> lis
     Returns:
         A line about each setting without effect.
     """
-    found = []
+    lines = []
     parser = OverridesParser.create()
     for text in overrides:
         with suppress(HydraException):  # a path that was inserted for a scene, and that Hydra cannot parse
             override = parser.parse_override(text)
             if not override.is_delete():
                 for full_name in flat(override.value(), override.get_key_element().lstrip("+")):
-                    found += _reasons(config, full_name)
-    return found
+                    lines += _reasons(config, full_name)
+    return lines
 
 
 def _reasons(config: DictConfig, full_name: str) -> list[str]:

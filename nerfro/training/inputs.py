@@ -42,14 +42,14 @@ def file_hashes(config: DictConfig) -> dict[str, str]:
     """
     if not plugin_of(config.sampler.path).cls.needs_medium:  # type: ignore[attr-defined]
         return {}
-    found = {}
+    hashes = {}
     for name, value in flat(config.medium, "medium").items():
         places = value if isinstance(value, list) else [value]
         for number, place in enumerate(places):
             with suppress(OSError, NerfroError):  # other texts than paths
                 if isinstance(place, str) and resolve_path(place).is_file():
-                    found[f"{name}[{number}]" if isinstance(value, list) else name] = file_hash(resolve_path(place))
-    return found
+                    hashes[f"{name}[{number}]" if isinstance(value, list) else name] = file_hash(resolve_path(place))
+    return hashes
 
 
 def changed_file(checkpoint: Mapping[str, Any], config: DictConfig) -> str | None:

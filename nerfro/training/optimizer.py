@@ -94,11 +94,11 @@ def require_matches(where: str, patterns: Iterable[str], names: Iterable[str]) -
     Raises:
         NerfroError: a pattern matches no parameter.
     """
-    known = list(names)
+    learned = list(names)
     for pattern in patterns:
-        if pattern not in OPTIONAL_PATTERNS and not any(fnmatchcase(name, pattern) for name in known):
+        if pattern not in OPTIONAL_PATTERNS and not any(fnmatchcase(name, pattern) for name in learned):
             raise NerfroError(
-                f"{where}: {pattern} matches no learned parameter; choose from {', '.join(known) or 'none'}, with * "
+                f"{where}: {pattern} matches no learned parameter; choose from {', '.join(learned) or 'none'}, with * "
                 "for any text"
             )
 

@@ -223,12 +223,12 @@ def _of_object(views: Views, batching: Batching, window: Window) -> _Usable:
     filled = (view > 0.5 for view in views.masks)
     if views.usable is not None:
         filled = (mask & (view == 1) for mask, view in zip(filled, views.usable, strict=True))
-    found = _Usable(filled, len(views), window)
-    if found.starts[-1] == 0:
+    pixels = _Usable(filled, len(views), window)
+    if pixels.starts[-1] == 0:
         raise NerfroError(
             "batches.object_fraction draws pixels of the object, but the masks have none; correct them, or take 0"
         )
-    return found
+    return pixels
 
 
 class _Usable:
@@ -261,5 +261,5 @@ class _Usable:
         block = np.searchsorted(self._before, numbers, side="right") - 1
         view, within = np.divmod(block, self._bits.shape[1])
         counted = np.unpackbits(self._bits[view, within], axis=-1).cumsum(-1, dtype=np.uint8)  # at most _BLOCK
-        place = (counted <= (numbers - self._before[block])[:, None]).sum(-1)
-        return view, within * self._BLOCK + place
+        bit = (counted <= (numbers - self._before[block])[:, None]).sum(-1)
+        return view, within * self._BLOCK + bit

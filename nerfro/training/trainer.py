@@ -59,7 +59,7 @@ def make_trainer(
         enable_version_counter=False,
         save_on_train_epoch_end=False,
     )
-    chosen = [create(find("callbacks", str(name)), node or {}) for name, node in config.callbacks.items()]
+    callbacks = [create(find("callbacks", str(name)), node or {}) for name, node in config.callbacks.items()]
     ours: dict[str, Any] = {
         "default_root_dir": str(folder),
         "profiler": _profiler(config.trainer.profiler, folder),
@@ -67,7 +67,7 @@ def make_trainer(
             *([checkpoints] if config.trainer.enable_checkpointing else []),
             throughput,
             *([TrainingProgress(throughput)] if config.trainer.enable_progress_bar else []),
-            *chosen,
+            *callbacks,
             TrainingLog(config),
             OverfittingWarning(),
             *extra,
@@ -88,8 +88,8 @@ def make_trainer(
         # Buffers, such as the index grid, are equal in all processes and need no broadcast in every step.
         ours["strategy"] = DDPStrategy(broadcast_buffers=False, find_unused_parameters=False)
     accelerator = training_accelerator(config.trainer.accelerator)
-    given = {name: value for name, value in config.trainer.items() if value is not None and name not in _OWN}
-    trainer = build(given | {"accelerator": accelerator}, **ours)
+    options = {name: value for name, value in config.trainer.items() if value is not None and name not in _OWN}
+    trainer = build(options | {"accelerator": accelerator}, **ours)
     for logger in trainer.loggers:
         if isinstance(logger, CSVLogger) and trainer.is_global_zero:
             keep_rows(logger, num_steps)
@@ -168,10 +168,10 @@ def fit(
 
 def finish_logs(trainer: pl.Trainer, scores: Mapping[str, float | None]) -> None:
     """Log the final scores, and close the logs, because otherwise the next job of a sweep appends to them."""
-    known = {name: score for name, score in scores.items() if score is not None}
+    finite = {name: score for name, score in scores.items() if score is not None}
     for logger in trainer.loggers:
-        if known:
-            logger.log_metrics(known, trainer.global_step)
+        if finite:
+            logger.log_metrics(finite, trainer.global_step)
         logger.finalize("success")
         if isinstance(logger, WandbLogger):
             logger.experiment.finish()

@@ -50,14 +50,14 @@ class ValidationPixels:
     def of(cls, views: Views, seed: int = 0) -> ValidationPixels:
         """Draw random usable pixels, the same number from each view."""
         generator = np.random.default_rng([seed, 0])
-        chosen = views.spread(_MAX_VIEWS)
+        spread = views.spread(_MAX_VIEWS)
         size, indices, colours, contrasts = views.cameras.height * views.cameras.width, [], [], []
-        for view in chosen:
+        for view in spread:
             allowed = np.arange(size)
             if views.usable is not None:
                 usable = torch.as_tensor(views.usable[view]).flatten().numpy() == 1
                 allowed = np.flatnonzero(usable) if usable.any() else allowed
-            drawn = torch.from_numpy(generator.choice(allowed, min(_NUM_PIXELS // len(chosen), len(allowed)), False))
+            drawn = torch.from_numpy(generator.choice(allowed, min(_NUM_PIXELS // len(spread), len(allowed)), False))
             indices.append(view * size + drawn)
             image = views.images[view].reshape(-1, 3)
             colours.append(image[drawn])
@@ -78,8 +78,8 @@ class ValidationPixels:
             subdivision: which pixels get several rays; None for no pixel.
         """
         device = renderer.scene.device
-        found, rgb = self.rays(renderer, subdivision), self.rgb.to(device)
-        radiance = mean_per_pixel(renderer.radiance(found.rays), found.ray_pixel, len(rgb))
+        traced, rgb = self.rays(renderer, subdivision), self.rgb.to(device)
+        radiance = mean_per_pixel(renderer.radiance(traced.rays), traced.ray_pixel, len(rgb))
         if renderer.scene.camera.exposure is None:
             return _psnr(renderer.scene.colour_space.to_display(radiance), rgb)
         views = self.cameras.view_of(self.index.to(device))

@@ -186,16 +186,16 @@ class Wavefront:
         copies = torch.ones_like(self.ray)
         copies[rows] += followed
         source = torch.arange(len(copies), device=rows.device).repeat_interleave(copies)
-        place = torch.arange(len(rows), device=rows.device).repeat_interleave(1 + followed.long())
-        second = torch.zeros_like(place, dtype=torch.bool)
-        second[1:] = place[1:] == place[:-1]
+        parent = torch.arange(len(rows), device=rows.device).repeat_interleave(1 + followed.long())
+        second = torch.zeros_like(parent, dtype=torch.bool)
+        second[1:] = parent[1:] == parent[:-1]
         for name in _COLUMNS:
             setattr(self, name, getattr(self, name)[source])
         self.lines.take(source)
-        rows = (copies.cumsum(0) - copies)[rows[place]] + second
-        share = share[place]
-        self.weight[rows] *= torch.where(splits[place], torch.where(second, share, 1 - share), 1.0)
-        return rows, place, (reflected | whole)[place] | second
+        rows = (copies.cumsum(0) - copies)[rows[parent]] + second
+        share = share[parent]
+        self.weight[rows] *= torch.where(splits[parent], torch.where(second, share, 1 - share), 1.0)
+        return rows, parent, (reflected | whole)[parent] | second
 
     def finish(self, rays: Rays) -> SnellTrace:
         """Append the last vertices, and return the trace in the precision and on the device of the rays."""
