@@ -85,9 +85,11 @@ def decoded_in_double(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Density and colour by plain PyTorch in double precision."""
     unit = (positions - field.space.box[0]) / field.space.side
-    geometry = field.density_mlp.double()(hash_encoding.hash_encode(unit, field.table.double(), field.levels))
+    plain = torch.nn.Sequential.forward  # the layers of ReluMLP, without its kernel in single precision
+    encoded = hash_encoding.hash_encode(unit, field.table.double(), field.levels)
+    geometry = plain(field.density_mlp.double(), encoded)
     inputs = torch.cat([geometry, spherical_harmonics(directions, field.direction_bands)], -1)
-    raw = field.colour_mlp.double()(inputs) + geometry[:, 1:4]
+    raw = plain(field.colour_mlp.double(), inputs) + geometry[:, 1:4]
     return field.initial_density * geometry[:, 0].exp(), torch.sigmoid(raw).square()
 
 
