@@ -30,7 +30,7 @@ from nerfro.cli.overrides import SHORT_NAMES, full_key
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import CONF_DIR, refuse_root, user_path
 from nerfro.core.trust import MAX_YAML_CHARACTERS, GuardedConfigLoader, require_bounded_yaml
-from nerfro.registry.allowed import MissingSettingError, hints_of, plain, require_names, validate
+from nerfro.registry.allowed import MissingSettingError, hints_of, plain, require_names, set_types, validate
 from nerfro.registry.registration import discover
 
 Expand = Callable[[Sequence[str], Sequence[str]], list[str]]
@@ -62,8 +62,8 @@ class Composer:
             overrides = self.expand(overrides, list(hints_of(self.schema)))
         return [*map(added, overrides)] if self.command == "train" else overrides
 
-    def require_valid(self, config: DictConfig) -> None:
-        """Refuse an invalid configuration of a job.
+    def checked(self, config: DictConfig) -> Any:
+        """Check the configuration of a job, which gets the annotated types, and return its settings as a dataclass.
 
         Raises:
             NerfroError: a setting is unknown or missing, or its value is not allowed.
@@ -72,9 +72,11 @@ class Composer:
         values = plain(config)
         require_names("", [*hints_of(self.schema), *groups], values)
         with missing_with_example(self.command):
-            validate(self.schema, values)
+            settings: Any = validate(self.schema, values)
+            set_types(config, settings)
             if self.check is not None:
                 self.check(config)
+        return settings
 
     @contextlib.contextmanager
     def hydra(self, folders: Sequence[str] = ()) -> Iterator[Hydra]:
@@ -93,7 +95,7 @@ class Composer:
         version.setbase("1.3")  # jobs stay in the current directory
         current = GlobalHydra.instance()
         outer = current.hydra
-        current.hydra = Hydra(self.command, _ConfigLoader(self.require_valid, search_path))
+        current.hydra = Hydra(self.command, _ConfigLoader(self.checked, search_path))
         try:
             yield current.hydra
         finally:
@@ -130,7 +132,7 @@ class _ConfigLoader(GuardedConfigLoader):
     Launchers hand the object to their workers.
     """
 
-    def __init__(self, check_job: Callable[[DictConfig], None], config_search_path: ConfigSearchPath) -> None:
+    def __init__(self, check_job: Callable[[DictConfig], Any], config_search_path: ConfigSearchPath) -> None:
         super().__init__(config_search_path)
         self._check_job = check_job
 
@@ -156,7 +158,7 @@ class _ConfigLoader(GuardedConfigLoader):
                 job.hydra.runtime.output_dir = job.hydra.run.dir
             with flag_override(job, ["struct", "readonly"], False):
                 del job["hydra"]
-            self._check_job(job)
+            set_types(config, self._check_job(job))
         finally:
             hydra_config.cfg = before
 

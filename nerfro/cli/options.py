@@ -105,7 +105,7 @@ class Described:
             key, equals, value = argument.lstrip("+~").partition("=")
             if not equals or not re.fullmatch(r"[\w./]+", key) or key.startswith("hydra"):
                 continue
-            if key == "metric" and key not in self.names[""]:
+            if key == "metric" and self.names and key not in self.names.get("", ()):
                 raise NerfroError(f"{argument}: all registered metrics are scored, so there is nothing to choose")
             if key in self.choices:
                 if re.fullmatch(r"\w+", value) and value not in (*self.choices[key], "null"):
@@ -308,7 +308,7 @@ def _state_of_files() -> str:
     """Hash the names, times and sizes of all files that define options."""
     files = [*PACKAGE_DIR.rglob("*.py"), *CONF_DIR.rglob("*.yaml")]
     for folder in plugin_folders():
-        files += folder.glob("*.py")
+        files += [*folder.glob("*.py"), *folder.glob("*/conf/**/*.yaml")]
         files += [file for package in folder.glob("*/__init__.py") for file in package.parent.rglob("*.py")]
     for entry_point in importlib.metadata.entry_points(group=ENTRY_POINTS):
         spec = importlib.util.find_spec(entry_point.module.partition(".")[0])

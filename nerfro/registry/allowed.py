@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 from annotated_types import Ge, Gt, Le, Lt
-from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf import MISSING, DictConfig, OmegaConf, flag_override
 from pydantic import AllowInfNan, BeforeValidator, TypeAdapter, ValidationError
 
 from nerfro.core.errors import NerfroError, nearest_of
@@ -132,6 +132,8 @@ def validate(schema: type[Settings], values: object, prefix: str = "") -> Settin
     Raises:
         NerfroError: a setting is unknown or missing, or its value is not allowed.
     """
+    if dataclasses.is_dataclass(values):
+        return cast(Any, values)
     if not isinstance(values, Mapping):
         raise NerfroError(f"{prefix[:-1]}={values} is not a set of settings; write {prefix}NAME=VALUE")
     hints, fields = hints_of(cast(Any, schema)), {field.name: field for field in dataclasses.fields(cast(Any, schema))}
@@ -141,11 +143,12 @@ def validate(schema: type[Settings], values: object, prefix: str = "") -> Settin
         if name not in own and is_missing(default_of(field)):
             raise MissingSettingError(f"{prefix}{name}")
         nested = schema_of(hints[name])
-        if nested is not None and isinstance(own.get(name), Mapping):
-            if dataclasses.is_dataclass(hints[name]):
-                own[name] = validate(nested, own[name], f"{prefix}{name}.")
-            else:
-                own[name] = {key: validate(nested, node, f"{prefix}{name}.{key}.") for key, node in own[name].items()}
+        if nested is None or name not in own or isinstance(own[name], nested):
+            continue
+        if dataclasses.is_dataclass(hints[name]):
+            own[name] = validate(nested, own[name], f"{prefix}{name}.")
+        elif isinstance(own[name], Mapping):
+            own[name] = {key: validate(nested, node, f"{prefix}{name}.{key}.") for key, node in own[name].items()}
     return schema(**convert(prefix, hints, own))
 
 
@@ -233,8 +236,11 @@ def setting_type(hint: Any) -> Any:
         return None if inner is None else Union[inner, None]  # noqa: UP007 - for a variable
     if origin in (list, tuple, Sequence):
         element = Any if args[0] is Any else setting_type(args[0])
-        return None if element is None else tuple[element, ...] if origin is tuple else origin[element]
-    return dict[str, Any] if dict in (hint, origin) else None
+        if element is None:
+            return None
+        return Annotated[tuple[element, ...] if origin is tuple else origin[element], BeforeValidator(_listed)]
+    value_type: Any = (setting_type(args[1]) if origin is dict else None) or Any
+    return dict[str, value_type] if dict in (hint, origin) else None
 
 
 @functools.cache
@@ -244,9 +250,13 @@ def _adapter(hint: Any) -> TypeAdapter | None:
 
 
 def _integer(value: Any) -> Any:
-    if isinstance(value, bool | float):
+    if isinstance(value, bool) or type(value).__name__.startswith("float"):  # those of NumPy, too
         raise ValueError("no integer")
     return value
+
+
+def _listed(value: Any) -> Any:
+    return value.tolist() if hasattr(value, "tolist") else value
 
 
 def _number(value: Any) -> Any:
@@ -256,7 +266,9 @@ def _number(value: Any) -> Any:
 
 
 def _text(value: Any) -> Any:
-    return str(value) if isinstance(value, os.PathLike | int | float) else value
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    return str(value) if isinstance(value, int | float) else value
 
 
 _CONVERSIONS = {int: _integer, float: _number, str: _text}  # before pydantic validates a value
@@ -355,6 +367,26 @@ def is_missing(value: object) -> bool:
 def plain(node: Any) -> dict[str, Any]:
     """Convert a node of a configuration to a mapping without interpolations."""
     return cast(dict, OmegaConf.to_container(node, resolve=True)) if isinstance(node, DictConfig) else dict(node)
+
+
+def set_types(config: DictConfig, settings: Any) -> None:
+    """Give settings of a configuration the types of a checked dataclass, such as False in place of the text `off`."""
+    with flag_override(config, ["struct", "readonly"], False):
+        _set_types(config, vars(settings))
+
+
+def _set_types(node: DictConfig, values: Mapping[str, Any]) -> None:
+    for name, value in values.items():
+        if name not in node or node[name] is None:
+            continue
+        if dataclasses.is_dataclass(value):
+            _set_types(node[name], vars(value))
+        elif isinstance(value, dict) and any(map(dataclasses.is_dataclass, value.values())):
+            _set_types(node[name], value)
+        elif isinstance(value, bool | int | float | str) and type(node[name]) is not type(value):
+            node[name] = value
+        elif isinstance(value, list | tuple) and [*map(type, node[name])] != [*map(type, value)]:
+            node[name] = list(value)
 
 
 def untyped(settings: Any) -> Any:

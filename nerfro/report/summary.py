@@ -83,7 +83,7 @@ def summarize(options: SummaryConfig) -> None:
     metrics, region = find_metrics(options.metrics), cast(Region, options.region)
     patterns = options.runs if isinstance(options.runs, list) else [options.runs]
     runs, unfinished = find_runs([str(pattern) for pattern in patterns])
-    comparisons = compare(runs, options.methods, options.scenes)
+    comparisons = compare(runs, _METHODS | options.methods, _SCENES | options.scenes)
     tables = {c.budget.file_name: to_table(c, metrics, region) for c in comparisons}
 
     folder = "outputs/summary" if options.out is None and options.report else options.out

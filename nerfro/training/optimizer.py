@@ -62,6 +62,12 @@ class OptimizerConfig:
     warmup_factor: Annotated[NotNegative, OnlyWith("warmup_steps")] = 0.01
     adam_epsilon: Positive = 1e-8
 
+    def __post_init__(self) -> None:
+        self.groups = {
+            pattern: group if isinstance(group, GroupConfig) else GroupConfig(**group)
+            for pattern, group in self.groups.items()
+        }
+
     def group(self, name: str) -> GroupConfig:
         """Return the settings of a group of `grouped`."""
         return self.groups.get(name, GroupConfig())
