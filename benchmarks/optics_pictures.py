@@ -21,10 +21,11 @@ from nerfro.evaluation.path_plot import plot_paths
 from nerfro.files import lat_long
 from nerfro.media.base import Medium
 from nerfro.media.bodies import Bodies
+from nerfro.paper.eikonal import Eikonal
+from nerfro.paper.voxel_grid import VoxelGrid
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.subdivision import part_rays
 from tests.closed_forms import Ball, RoundedBox, angle, ball_exits, make_rays, sampled
-from tests.paper import Eikonal, VoxelGrid
 
 TILT = np.radians(33)
 SLANTED = np.array([[np.cos(TILT), np.sin(TILT), 0.0]])

@@ -26,9 +26,10 @@ from nerfro.core.cameras import Cameras
 from nerfro.core.types import Rays
 from nerfro.media.bodies import Bodies
 from nerfro.media.body_settings import make_bodies
+from nerfro.paper.eikonal import Eikonal
+from nerfro.paper.voxel_grid import VoxelGrid
 from nerfro.samplers.paths.snell import Snell
 from tests.closed_forms import Ball, RoundedBox, angle, ball_exits, make_rays, sampled
-from tests.paper import Eikonal, VoxelGrid
 
 RADIUS, N_BALL = 0.8, 1.5
 HALF_SIDE, EDGE, N_CUBE = 0.75, 0.08, 1.52

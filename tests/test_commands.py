@@ -89,7 +89,7 @@ def test_missing_option_is_reported_with_an_example(run_here: Runner, unchecked:
 
 def test_ctrl_c_during_the_imports_ends_in_one_line() -> None:
     program = (
-        "import sys, nerfro.cli.startup\nsys.argv = ['x']\nnerfro.startup.begin('plugins')\nraise KeyboardInterrupt"
+        "import sys, nerfro.cli.startup\nsys.argv = ['x']\nnerfro.cli.startup.begin('plugins')\nraise KeyboardInterrupt"
     )
     done = python("-c", program)
     assert done.stderr == "nerfro: interrupted\n"

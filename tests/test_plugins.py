@@ -465,7 +465,7 @@ sys.argv = ["nerfro.plugins", "background=installed_grey"]
 nerfro.plugins.main()
 check(find("background", "installed_grey"))
 print("kept its contract")
-sys.argv = "nerfro.train boundary=installed_grey boundary.grey=0.25 --cfg job -p boundary".split()
+sys.argv = "nerfro.train background=installed_grey background.grey=0.25 --cfg job -p background".split()
 main()
 """
 

@@ -1,5 +1,6 @@
 """Closed surfaces of one mesh: crossing surfaces are refused, others are accepted."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,8 @@ import trimesh
 
 from nerfro.geometry.bodies import bodies_of, require_separate
 from nerfro.geometry.mesh import TriangleMesh, load_mesh, merge_vertices
-from nerfro.media.bodies import Bodies
+from nerfro.media.base import Medium
+from nerfro.media.body_settings import make_bodies
 from nerfro.paper.voxel_grid import VoxelGrid
 from tests.conftest import refused
 
@@ -72,8 +74,8 @@ def test_intersecting_surfaces_are_refused(parts: list[trimesh.Trimesh]) -> None
     refused("closed surfaces of the mesh cross", require_separate, mesh)
 
 
-@pytest.mark.parametrize("medium", [Bodies, VoxelGrid])
-def test_duplicate_surface_counts_once(medium: type, tmp_path: Path) -> None:
+@pytest.mark.parametrize("medium", [make_bodies, VoxelGrid])
+def test_duplicate_surface_counts_once(medium: Callable[..., Medium], tmp_path: Path) -> None:
     ball(0.6).export(tmp_path / "once.ply")
     trimesh.util.concatenate([ball(0.6), ball(0.6)]).export(tmp_path / "twice.ply")
     once, twice = (medium(str(tmp_path / f"{name}.ply"), **BOX) for name in ("once", "twice"))
@@ -83,9 +85,9 @@ def test_duplicate_surface_counts_once(medium: type, tmp_path: Path) -> None:
         assert values.equal(dict(twice.named_buffers())[name]), name
 
 
-@pytest.mark.parametrize("medium", [Bodies, VoxelGrid])
+@pytest.mark.parametrize("medium", [make_bodies, VoxelGrid])
 @pytest.mark.parametrize("shape", ["flat", "both ways", "thin"])
-def test_mesh_without_an_interior_is_refused(medium: type, shape: str, tmp_path: Path) -> None:
+def test_mesh_without_an_interior_is_refused(medium: Callable[..., Medium], shape: str, tmp_path: Path) -> None:
     mesh = ball(0.6)
     if shape == "flat":
         normal = np.array([1.0, 2.0, 3.0]) / 14**0.5
@@ -107,8 +109,8 @@ def test_thin_plate_is_loaded_in_any_world_unit(tmp_path: Path) -> None:
     refused("1e-05 world units thin and 1.5 long, so it has no inside", load_mesh, tmp_path / "plate.ply")
 
 
-@pytest.mark.parametrize("medium", [Bodies, VoxelGrid])
-def test_open_mesh_is_accepted_on_request(medium: type, tmp_path: Path) -> None:
+@pytest.mark.parametrize("medium", [make_bodies, VoxelGrid])
+def test_open_mesh_is_accepted_on_request(medium: Callable[..., Medium], tmp_path: Path) -> None:
     mesh = ball(0.6)
     mesh.update_faces(np.arange(len(mesh.faces)) > 0)
     mesh.export(tmp_path / "mesh.ply")

@@ -44,7 +44,7 @@ uniform float marchStep;  // length of a step through the volume
 uniform float contractionRadius;  // radius around the centre of the volume beyond which space is contracted; 0 for none
 
 // Background radiance: the cube map of the model, or a picture that the user has chosen.
-uniform samplerCube sky;  // texels of equal angles, see boundaries/cube_map.py
+uniform samplerCube sky;  // texels of equal angles, see backgrounds/cube_map.py
 uniform sampler2D picture;  // lat-long, z up, +x in the middle
 uniform bool skyIsPicture;
 
