@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from hydra import compose, initialize_config_dir
@@ -13,10 +14,11 @@ from hydra._internal.utils import get_args_parser
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import OverrideParseException
 
+from nerfro.cli.calls import parsed
 from nerfro.cli.composition import BoundedFiles
 from nerfro.cli.entry import _flags
 from nerfro.cli.failures import errors_in_one_line, in_one_line
-from nerfro.cli.overrides import full_key
+from nerfro.cli.overrides import as_overrides, full_key
 from nerfro.core.errors import NerfroError, warn
 from nerfro.core.paths import CONF_DIR, resolve_path, user_path
 from nerfro.core.trust import GuardedConfigLoader
@@ -132,6 +134,11 @@ def test_bodies_are_settings_of_the_medium(tmp_path: Path, capsys: pytest.Captur
     config = BoundedFiles("main", str(tmp_path)).load_config("experiment/mine").config
     assert config == {"medium": {"bodies": {"a": {"ior": 1.5}}}}
     assert not capsys.readouterr().out
+
+
+def test_keyword_arguments_become_lists_and_numbers() -> None:
+    values = {"a": (1, 2.5), "b": np.array([[0.0, 1.0]]), "c": {"d": (np.float32(0.5), np.True_)}, "e": "x y"}
+    assert parsed(as_overrides(values)) == {"a": [1, 2.5], "b": [[0.0, 1.0]], "c": {"d": [0.5, True]}, "e": "x y"}
 
 
 def test_groups_of_parameters_are_added_to_those_of_the_experiment() -> None:

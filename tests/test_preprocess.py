@@ -216,6 +216,7 @@ def test_views_from_one_side_are_bounded_by_the_box(preprocess: Callable[..., st
 
 def test_options_out_of_range_are_refused(preprocess: Callable[..., str]) -> None:
     assert "resolution=8 is not allowed" in preprocess("resolution=8")
+    assert "symmetry='plane' is not allowed; choose 'axis', 'auto'" in preprocess("symmetry=plane")
     assert "give both box_min and box_max" in preprocess("box_min=[0,0,0]")
     assert "add out=FOLDER" in preprocess("data.root=embedded:torus")
     assert "set medium=object or medium=vessel" in preprocess("refine=true", "medium=object_voxels")

@@ -16,6 +16,7 @@ from nerfro.capture.vessel_fit import find_vessel
 from nerfro.cli.calls import composed
 from nerfro.cli.overrides import as_overrides
 from nerfro.core.errors import warn
+from nerfro.core.provenance import AlgorithmSettings
 from nerfro.data.base import Views
 from nerfro.data.capture import Capture
 from nerfro.data.masks import EVIDENCE, REVOLUTION, masked_views, method_of, with_other_splits
@@ -50,6 +51,7 @@ def preprocess(capture: Capture, overrides: Sequence[str] = (), **settings: obje
 @torch.no_grad()
 def preprocess_composed(request: Request) -> SceneFile:
     """Reconstruct surface and index for composed options, see `preprocess`."""
+    AlgorithmSettings.used.clear()
     request.check()
     with lock_folder(request.folder, "data.root" if request.config.out is None else "out"):
         return _preprocess(request)

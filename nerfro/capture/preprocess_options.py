@@ -25,7 +25,7 @@ from nerfro.geometry.box import corners_of_box
 from nerfro.geometry.mesh import TriangleMesh, load_mesh, local_origin, num_decimals
 from nerfro.media.base import Medium
 from nerfro.media.body_settings import expanded
-from nerfro.registry.allowed import Count, Natural, NotNegative, refuse_unused
+from nerfro.registry.allowed import Count, Natural, NotNegative, plain, refuse_unused, validate
 from nerfro.registry.registration import build
 from nerfro.rendering.scene_file import SCENE, SceneFile, take_bodies
 from nerfro.silhouettes.overlaps import REPORT, SHEET
@@ -73,7 +73,7 @@ class PreprocessConfig:
     wrong_masks: Natural | None = 0
     keep: Count | None = None
     smoothing: NotNegative = 1.0
-    symmetry: Annotated[str | None, Symmetry] = None
+    symmetry: Symmetry | None = None
     vessel: bool = False
     overwrite: bool = False
 
@@ -147,7 +147,8 @@ class Request:
         if config.box_min is not None:
             corners_of_box(config.box_min, config.box_max)
         if config.mesh is not None:
-            refuse_unused(config, _OF_HULL, "with mesh=..., which replaces the hull")
+            options = validate(PreprocessConfig, plain(config))
+            refuse_unused(options, _OF_HULL, "with mesh=..., which replaces the hull")
         if config.refine and "shell_voxels" not in config.medium:
             raise NerfroError("refine=true needs a distance grid; set medium=object or medium=vessel")
         if config.vessel and ("shell_voxels" not in config.medium or "wall" in config.medium):

@@ -58,9 +58,11 @@ def _name(override: str) -> str:
 
 
 def _quoted(value: object) -> str:
+    if hasattr(value, "tolist"):  # of NumPy or torch
+        value = value.tolist()
     if isinstance(value, Mapping):
         return "{" + ",".join(f"{name}:{_quoted(each)}" for name, each in value.items()) + "}"
-    if isinstance(value, list):
+    if isinstance(value, list | tuple):
         return f"[{','.join(map(_quoted, value))}]"
     text = "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
     if re.fullmatch(r"[\w./+@%-]+", text, re.ASCII):

@@ -15,11 +15,12 @@ class AlgorithmSettings:
     """Base class of the settings of an algorithm: a frozen dataclass of tuned numbers with a default for each.
 
     The function of the algorithm takes an instance as its argument `settings` and calls `use`. `nerfro plugins
-    settings` lists all subclasses; run.json and scene.json record the settings that a process has used.
+    settings` lists all subclasses; run.json and scene.json record the settings that their run has used.
 
     Attributes:
         classes: all subclasses by name.
-        used: the settings of algorithms that have run in this process, by class, as Python expressions.
+        used: the settings of algorithms that have run since the start of the last preprocessing or training in this
+            process, by class, as Python expressions.
     """
 
     classes: ClassVar[dict[str, type[AlgorithmSettings]]] = {}
@@ -29,7 +30,7 @@ class AlgorithmSettings:
         AlgorithmSettings.classes[cls.__name__] = cls
 
     def use(self) -> None:
-        """Remember these settings for the records of this process."""
+        """Remember these settings for the records of the run."""
         AlgorithmSettings.used[type(self).__name__] = repr(self)
 
 

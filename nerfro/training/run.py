@@ -11,6 +11,7 @@ from omegaconf import DictConfig
 
 from nerfro.cli.calls import Composition
 from nerfro.core.distributed import leave
+from nerfro.core.provenance import AlgorithmSettings
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.results import RunMetrics
 from nerfro.evaluation.tables import write_scores
@@ -71,6 +72,7 @@ def train(
 
 def run_training(composition: Composition) -> Run:
     """Train and evaluate a composed experiment in the folder of the run, or resume its training there."""
+    AlgorithmSettings.used.clear()
     with lock_run(composition.folder, composition.config) as checkpoint:
         return Run(composition.folder, _train(composition.config, composition.folder, checkpoint))
 

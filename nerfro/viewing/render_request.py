@@ -216,7 +216,7 @@ def _resized(cameras: Cameras, width: int, height: int) -> Cameras:
 def _size(options: RenderConfig, width: int, height: int) -> tuple[int, int]:
     """Return width and height in pixels."""
     resolution = options.resolution
-    sides = list(resolution) if isinstance(resolution, list) else [resolution]
+    sides = list(resolution) if isinstance(resolution, list | tuple) else [resolution]
     if resolution is None:
         return width, height
     if not all(isinstance(side, int) and side > 0 for side in sides) or len(sides) > 2:

@@ -127,6 +127,7 @@ def test_field_of_view_is_that_of_the_rays_through_a_distorting_lens(
         return find_shots(RenderConfig(checkpoint="a.ckpt", views="test", **options), scene).cameras
 
     wide = shots(fov=60.0, resolution=24)
+    assert shots(resolution=(24, 16)).height == 16
     both, sides = torch.zeros(2, dtype=torch.long), torch.tensor([0, 24])
     left, right = wide.rays(both, torch.tensor([12, 12]), sides, torch.zeros(2)).directions
     assert math.degrees(math.acos(float(left @ right))) == pytest.approx(60, abs=1e-3)
