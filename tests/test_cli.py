@@ -9,19 +9,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from hydra import compose, initialize_config_dir
 from hydra._internal.utils import get_args_parser
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import OverrideParseException
+from hydra.types import RunMode
 
 from nerfro.cli.calls import parsed
-from nerfro.cli.composition import BoundedFiles
+from nerfro.cli.composition import BoundedFiles, Composer
 from nerfro.cli.entry import _flags
 from nerfro.cli.failures import errors_in_one_line, in_one_line
 from nerfro.cli.overrides import as_overrides, full_key
 from nerfro.core.errors import NerfroError, warn
-from nerfro.core.paths import CONF_DIR, resolve_path, user_path
-from nerfro.core.trust import GuardedConfigLoader
+from nerfro.core.paths import resolve_path, user_path
+from nerfro.training.config import TrainConfig
 from tests.conftest import composed, refused
 
 
@@ -91,13 +91,12 @@ def test_killed_worker_of_a_launcher_is_not_reported_as_a_bug() -> None:
     assert line == "A worker was terminated (TerminatedWorkerError); repeat the command to continue the sweep"
 
 
-def test_missing_configuration_folder_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hydra._internal.hydra.ConfigLoaderImpl", GuardedConfigLoader)
+def test_missing_configuration_folder_is_refused() -> None:
     with (
-        initialize_config_dir(str(CONF_DIR), version_base="1.3"),
+        Composer("train", TrainConfig).hydra() as hydra,
         pytest.raises(NerfroError, match=r"hydra\.searchpath in command-line: the configuration folder /no/where does"),
     ):
-        compose("train", ["hydra.searchpath=[file:///no/where]"])
+        hydra.compose_config("train", ["hydra.searchpath=[file:///no/where]"], RunMode.RUN)
 
 
 def test_invalid_yaml_file_is_named_with_the_line(tmp_path: Path) -> None:

@@ -5,12 +5,10 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
+from hydra.types import RunMode
 
-from nerfro.cli.options import store_schema
+from nerfro.cli.composition import Composer
 from nerfro.core.errors import NerfroError
-from nerfro.core.paths import CONF_DIR
-from nerfro.core.trust import GuardedConfigLoader
 from nerfro.registry.registration import discover
 from nerfro.training.config import TrainConfig
 from tests.conftest import Bomb
@@ -62,16 +60,13 @@ def test_plugins_of_hydra_in_the_current_directory_are_not_imported(folder: Path
         "callbacks: {a: '${loss.a}'}",
     ],
 )
-def test_configuration_files_name_no_foreign_code(hydra: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hydra._internal.hydra.ConfigLoaderImpl", GuardedConfigLoader)
-    store_schema("train", TrainConfig)
+def test_configuration_files_name_no_foreign_code(hydra: str, folder: Path) -> None:
     write_experiment(folder, hydra)
-    options = ["+experiment=other", f"hydra.searchpath=[file://{folder}/conf]"]
     with (
-        initialize_config_dir(str(CONF_DIR), version_base="1.3"),
+        Composer("train", TrainConfig).hydra([str(folder / "conf")]) as composition,
         pytest.raises(NerfroError, match=r"^hydra\..*evil.run is not allowed"),
     ):
-        compose("train", options, return_hydra_config=True)
+        composition.compose_config("train", ["+experiment=other"], RunMode.RUN)
 
 
 @pytest.mark.parametrize("flags", [(), ("-m", "seed=1,2")], ids=["run", "sweep"])
