@@ -63,7 +63,7 @@ class Eikonal(PathSampler):
         tolerance = self.tolerance * float(torch.linalg.vector_norm(medium.box[1] - medium.box[0]))
         if isinstance(medium, VoxelGrid):
             return eikonal_on_grid(rays, medium, 0.5 * float(medium.spacing.min()), tolerance, self.max_steps)[0]
-        if medium.bodies is not None:
+        if _has_grids(medium):
             step = 2 * medium.bodies.shell / STEPS_PER_SHELL
             return eikonal_on_grid(rays, medium.bodies, step, tolerance, self.max_steps)[0]
         return march_adaptive(rays, medium, tolerance, self.max_steps)[0]
@@ -82,7 +82,12 @@ class Eikonal(PathSampler):
         return replace(path, **columns)
 
     def releases_gil(self, medium: Medium) -> bool:
-        return isinstance(medium, VoxelGrid) or (self.integrator == "adaptive" and medium.bodies is not None)
+        return isinstance(medium, VoxelGrid) or (self.integrator == "adaptive" and _has_grids(medium))
+
+
+def _has_grids(medium: Medium) -> bool:
+    """Return whether the medium consists of bodies on grids, which the kernel reads."""
+    return medium.bodies is not None and len(medium.bodies.grids) > 0
 
 
 def march_uniform(rays: Rays, medium: Medium, integrator: Integrator, num_steps: int) -> Path:

@@ -25,6 +25,7 @@ TWO_THREADS = """
 import threading, numba, torch
 from nerfro.samplers.paths.snell import Snell
 from nerfro.core.types import Rays
+from tests.closed_forms import sampled
 
 torch.set_num_threads(2)
 axis = torch.linspace(-1.5, 1.5, 16)

@@ -16,7 +16,7 @@ from nerfro.samplers.paths import compiled
 from nerfro.samplers.paths.replay import smallest_cosine
 from nerfro.samplers.paths.snell import Snell, trace_interfaces
 from nerfro.samplers.paths.snell_law import reflectance
-from tests.closed_forms import Ball, RoundedBox, Slab, beam, make_rays, random_rays
+from tests.closed_forms import Ball, FreeBodies, RoundedBox, Slab, beam, make_rays, random_rays
 from tests.samplers.nested import NestedBalls, nested_grid, nested_mesh
 
 BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
@@ -204,13 +204,11 @@ def test_derivatives_of_replayed_weights_match_traced_weights(what: str) -> None
     assert float(expected[steady].abs().max()) > 0.05
 
 
-class CementedHalves(Bodies):
+class CementedHalves(FreeBodies):
     """A ball of two glasses: the second one fills the half x > 0 and reaches a rounding error beyond the first one."""
 
-    box = BOX.double()
-
     def __init__(self) -> None:
-        super().__init__([1.5, 1.7], 0.02)
+        super().__init__([1.5, 1.7], 0.02, BOX.double())
         self.radii = torch.tensor([0.8, 0.8 + 2e-7], dtype=torch.float64)
 
     def signed_distances(self, positions: Tensor) -> tuple[Tensor, Tensor]:
