@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import functools
 import importlib
 from typing import Any
 
 from nerfro.core.errors import NerfroError
 
 
-@functools.cache
 def optional(module: str, extra: str, purpose: str, alternative: str = "") -> Any:
     """Import a module of an optional package where it is used.
 

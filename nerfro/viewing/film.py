@@ -41,11 +41,14 @@ def find_ffmpeg() -> str:
     """
     if (path := shutil.which("ffmpeg")) is not None:
         return path
-    purpose, alternative = "a film in .mp4 format needs ffmpeg", ", or install ffmpeg, or set film=[gif] or film=[]"
+    purpose = "a film in .mp4 format needs ffmpeg"
     try:
-        return optional("imageio_ffmpeg", "video", purpose, alternative).get_ffmpeg_exe()
-    except RuntimeError as error:
-        raise NerfroError(f"{purpose} ({error}); pip install 'nerfro[video]'{alternative}") from error
+        return optional("imageio_ffmpeg", "video", purpose).get_ffmpeg_exe()
+    except (NerfroError, RuntimeError) as error:
+        raise NerfroError(
+            f"{purpose}, which is not installed; install ffmpeg, or pip install 'nerfro[video]', or set film=[gif] or "
+            "film=[]"
+        ) from error
 
 
 def _write_mp4(file: Path, frames: Sequence[Path], seconds: float) -> None:
