@@ -114,15 +114,6 @@ def test_learned_absorption_starts_from_a_given_one_of_any_size() -> None:
         torch.testing.assert_close(started, torch.full((1, 3), coefficient))
 
 
-def test_checkpoints_with_absorption_per_world_unit_are_read() -> None:
-    learning = Ball(0.8, learn=["absorption"])
-    name = "materials.0._absorption"
-    assert name in learning.state_dict()
-    learning.load_state_dict({name: torch.tensor([-1.0, 0.0, 1.0])})
-    expected = torch.nn.functional.softplus(torch.tensor([[-1.0, 0.0, 1.0]]))
-    torch.testing.assert_close(learning.absorption, expected)
-
-
 def test_absorption_is_given_for_all_bodies_or_for_each() -> None:
     torch.testing.assert_close(Ball(absorption=[0.4]).absorption, torch.full((1, 3), 0.4))
     assert Ball().absorption is None
