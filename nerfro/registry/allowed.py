@@ -121,13 +121,14 @@ def _not_allowed(where: str, name: str, value: object, advice: str) -> NerfroErr
     return NerfroError(f"{where}{name}={shown} is not allowed; {advice}")
 
 
-def validate(schema: type[Settings], values: object, prefix: str = "") -> Settings:
+def validate(schema: type[Settings], values: object, prefix: str = "", complete: bool = True) -> Settings:
     """Check the values of the settings in a dataclass and in nested dataclasses, and return the dataclass.
 
     Args:
         schema: the dataclass.
         values: mapping with the values; the others have their defaults.
         prefix: full name of the node, with a dot at the end.
+        complete: whether to refuse missing settings of the node.
 
     Raises:
         NerfroError: a setting is unknown or missing, or its value is not allowed.
@@ -140,7 +141,7 @@ def validate(schema: type[Settings], values: object, prefix: str = "") -> Settin
     require_names(prefix, fields, values)
     own = {str(name): value for name, value in values.items() if not is_missing(value)}
     for name, field in fields.items():
-        if name not in own and is_missing(default_of(field)):
+        if complete and name not in own and is_missing(default_of(field)):
             raise MissingSettingError(f"{prefix}{name}")
         nested = schema_of(hints[name])
         if nested is None or name not in own or isinstance(own[name], nested):

@@ -278,7 +278,7 @@ def check_trained(config: DictConfig, origin: Path) -> DictConfig:
     """
     try:
         typed = cast(DictConfig, OmegaConf.merge(OmegaConf.structured(untyped(TrainConfig())), config))
-        validate(TrainConfig, plain(typed))
+        validate(TrainConfig, plain(typed), complete=False)
         content = typed.content
         if content.box_min is not None or content.box_max is not None:
             corners_of_box(content.box_min or [], content.box_max or [])

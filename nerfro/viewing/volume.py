@@ -60,7 +60,7 @@ def sample_field(
     box = space.cpu().box
     field, device = scene.field, scene.renderer.scene.device
     sides = box[1] - box[0]
-    counts = ((resolution - 1) * sides / sides.max()).ceil().long() + 1
+    counts = ((resolution - 1) * (sides / sides.max())).ceil().long() + 1
     axes = [torch.linspace(float(a), float(b), int(n)) for a, b, n in zip(*box, counts, strict=True)]
     positions = space.expand(torch.cartesian_prod(*axes))
     chunks = track("sample field", positions.split(POINTS_AT_ONCE), disable=not progress)

@@ -196,7 +196,7 @@ class Snell(PathSampler):
         return smallest_cosine(path, medium) > _STEADY
 
     def releases_gil(self, medium: Medium) -> bool:
-        return self.tracer(medium).releases_gil
+        return not self.traces_triangles and self.tracer(medium).releases_gil
 
     @torch.no_grad()
     def trace(self, rays: Rays, medium: Medium, branching: Branching | None = None) -> SnellTrace:
