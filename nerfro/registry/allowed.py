@@ -147,9 +147,10 @@ def validate(schema: type[Settings], values: object, prefix: str = "", complete:
         if nested is None or name not in own or isinstance(own[name], nested):
             continue
         if dataclasses.is_dataclass(hints[name]):
-            own[name] = validate(nested, own[name], f"{prefix}{name}.")
+            own[name] = validate(nested, own[name], f"{prefix}{name}.", complete)
         elif isinstance(own[name], Mapping):
-            own[name] = {key: validate(nested, node, f"{prefix}{name}.{key}.") for key, node in own[name].items()}
+            nodes = own[name].items()
+            own[name] = {key: validate(nested, node, f"{prefix}{name}.{key}.", complete) for key, node in nodes}
     return schema(**convert(prefix, hints, own))
 
 
