@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 _LIBRARY = torch.library.Library("nerfro", "FRAGMENT")
+REFERENCES: dict[str, Callable[..., Any]] = {}  # implementation in PyTorch of each operator with gradients, by name
 
 
 def operator(schema: str, reference: Callable[..., Any], on_cpu: Callable[..., Any]) -> Callable[..., Any]:
@@ -24,6 +25,7 @@ def operator(schema: str, reference: Callable[..., Any], on_cpu: Callable[..., A
         on_cpu: differentiable implementation by operators without gradients.
     """
     name = _define(schema)
+    REFERENCES[name] = reference
     _LIBRARY.impl(name, reference, "CompositeImplicitAutograd")
     for key in ("CPU", "AutogradCPU"):
         _LIBRARY.impl(name, on_cpu, key)

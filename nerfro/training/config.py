@@ -310,11 +310,11 @@ def check_run(config: DictConfig) -> None:
         configure(find("callbacks", str(name)), node or {})
     for plugin_type in ("loss", "phase"):
         build_each(plugin_type, config[plugin_type])
+    require_box(config)
     for node in (config.data, config.camera, config.sampler.points, config.field, config.background, config.model):
         check_node(node)
     if check_node(config.sampler.path).needs_medium:  # type: ignore[attr-defined]
         check_node(config.medium)
-    require_box(config)
     if config.background.get("image") and config.model.get("colour") == "srgb":
         raise NerfroError(
             "background.image holds linear radiance, but fields and background have sRGB values with "

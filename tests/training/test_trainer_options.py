@@ -192,13 +192,13 @@ def test_training_ends_with_the_table_of_means_and_the_files(train: Runner, tmp_
 
 
 def test_overfitting_repeats_batches(train: Runner, monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn, batch, updated = [], PixelBatches.batch, []
+    drawn, draw, updated = [], PixelBatches.draw, []
 
     def recorded(self: PixelBatches, step: int) -> Any:
         drawn.append(step)
-        return batch(self, step)
+        return draw(self, step)
 
-    monkeypatch.setattr(PixelBatches, "batch", recorded)
+    monkeypatch.setattr(PixelBatches, "draw", recorded)
     monkeypatch.setattr(DensityGridSampler, "update", lambda self, fields, draws: updated.append(draws.step))
     finished = train("trainer.max_steps=6", "trainer.overfit_batches=2", "evaluation.every=0")
     assert set(drawn) <= {0, 1, 2}  # the thread that traces ahead draws one more
