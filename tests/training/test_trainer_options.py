@@ -166,7 +166,6 @@ def test_unusual_precision_and_size_train(options: list[str], train: Runner, tmp
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["content.space=all", "field=nerf", "sampler/points=stratified"], "add field=volume sampler/points=volume"),
         (["background.image=sky.exr", "model.colour=srgb"], "take model.colour=linear"),
         (
             [f"loss.{name}.weight=0" for name in ("photometric", "background", "smoothness", "total_variation")],
@@ -176,6 +175,12 @@ def test_unusual_precision_and_size_train(options: list[str], train: Runner, tmp
 )
 def test_settings_without_an_effect_are_refused(options: list[str], message: str, train: Runner) -> None:
     assert message in train(*options, "trainer.max_steps=4", code=1).error
+
+
+def test_all_of_space_needs_a_component_with_a_grid(train_here: Runner, tiny_scene: Path, tmp_path: Path) -> None:
+    options = [f"data.root={tiny_scene}", "content.space=all", "field=nerf", "sampler/points=stratified"]
+    ended = train_here(*options, "trainer.max_steps=1", f"hydra.run.dir={tmp_path / 'run'}", code=1)
+    assert "add field=volume sampler/points=volume" in ended.error
 
 
 def test_training_ends_with_the_table_of_means_and_the_files(train: Runner, tmp_path: Path) -> None:
