@@ -114,9 +114,9 @@ class Plugin:
 
     def fields(self) -> Iterator[tuple[str, str, object]]:
         """Yield the name, type and default of each setting."""
+        node = self.node
         for name, hint in self.hints.items():
-            default = self.node[name]
-            yield name, type_name(hint), "required" if is_missing(default) else default
+            yield name, type_name(hint), "required" if is_missing(node[name]) else node[name]
 
 
 _plugins: dict[tuple[str, str], Plugin] = {}
