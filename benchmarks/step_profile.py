@@ -30,9 +30,14 @@ _BEGIN = "transfer_batch_to_device"
 
 
 def main() -> None:
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
-    calls = calls_of_step(sys.argv[1:])
+    allowed = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set()
+    try:
+        if allowed:
+            os.sched_setaffinity(0, {min(allowed)})
+        calls = calls_of_step(sys.argv[1:])
+    finally:
+        if allowed:
+            os.sched_setaffinity(0, allowed)
     modules = [module for module, _ in calls]
     moves = sum(before != after for before, after in pairwise(modules))
     of_module = Counter(modules)

@@ -55,7 +55,9 @@ class PretendedGpu(TorchFunctionMode):
             self._waited(name)
         if here and getattr(func, "namespace", None) == "nerfro":
             with self:  # the tensors dispatch as those of the CPU
-                return REFERENCES[name.partition(".")[0]](*args, **kwargs)
+                # As PyTorch passes them to an operator.
+                values = [list(value) if isinstance(value, tuple) else value for value in args]
+                return REFERENCES[name.partition(".")[0]](*values, **kwargs)
         if name in ("to", "cpu"):
             return self._to(*args, *(["cpu"] if name == "cpu" else []), **kwargs)
         if "device" in kwargs and kwargs["device"] is not None:

@@ -163,9 +163,9 @@ def test_mistake_on_the_command_line_gives_a_one_line_error(
 def test_field_missed_by_all_rays_is_refused_before_training(
     train_here: Runner, tiny_run: list[str], tmp_path: Path
 ) -> None:
-    sky = "background=skybox", "background.width=8"
-    run = [text for text in tiny_run if text not in sky]
-    run += ["trainer.max_steps=1", "evaluation.every=0", "background=constant"]
+    other = "background=skybox", "background.width=8", "content.space=unbounded"
+    run = [text for text in tiny_run if text not in other]
+    run += ["trainer.max_steps=1", "evaluation.every=0", "background=constant", "content.space=box"]
     away = ["content.box_min=[50,50,50]", "content.box_max=[51,51,51]"]
     refused = train_here(*run, *away, f"hydra.run.dir={tmp_path / 'away'}", code=1).error
     assert "no ray of the training views meets the field's box from [50.0, 50.0, 50.0]" in refused

@@ -112,6 +112,19 @@ def test_training_benchmark_prints_complete_tables(part: tuple, num_rows: int, r
     assert len(table_rows(run("training", *part))) == num_rows
 
 
+def test_profile_of_a_step_lists_each_module_once(
+    run: Run, tiny_default_run: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):  # which the benchmark sets
+        monkeypatch.setenv(name, "1")
+    lines = run("step_profile", *tiny_default_run)
+    (summary,) = (line for line in lines if line.endswith(" returns"))
+    modules, _, calls = (int(part.split()[0]) for part in summary.split(",")[:3])
+    rows = [row for row in table_rows(lines) if row.startswith("| nerfro.")]
+    assert len(rows) == modules == len({row.split("|")[1] for row in rows})
+    assert sum(int(row.split("|")[2]) for row in rows) == calls > 100
+
+
 def test_rendering_benchmark_prints_complete_tables(run: Run, trained_run: Path) -> None:
     assert (
         len(table_rows(run("training", "view", trained_run / "checkpoints" / "last.ckpt", "--side", 8, "--turns", 1)))

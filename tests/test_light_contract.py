@@ -38,7 +38,7 @@ from nerfro.training.optimizer import GroupConfig, OptimizerConfig
 
 def split_path(of_straight: float) -> Path:
     """Two polylines for each example ray: bent by a ball, and straight on, which brings the given share."""
-    both = Path.joined([example_path(), straight_path(example_rays())])
+    both = Path.joined([replace(example_path(), record=None), straight_path(example_rays())])
     order = torch.stack([torch.arange(NUM_RAYS), torch.arange(NUM_RAYS) + NUM_RAYS], 1).flatten()
     share = torch.tensor([1 - of_straight, of_straight]).repeat(NUM_RAYS)
     ray = torch.arange(NUM_RAYS).repeat_interleave(2)

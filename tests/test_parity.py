@@ -131,7 +131,7 @@ def test_parity_of_the_losses_and_their_gradients(
     fine_only = losses["photometric"](renderings[1:], batch, model.scene)
     assert_relative(fine_only, recorded["loss_rgb_fine"], 1e-3)
     assert_relative(values["photometric"] - fine_only, recorded["loss_rgb_coarse"], 1e-3)
-    assert_relative(values["background"], recorded["loss_background"], 1e-3)
+    assert_relative(values["background"], recorded["loss_boundary"], 1e-3)
     assert_relative(values["smoothness"], recorded["loss_smoothness"], 1e-3)
     total = sum(loss.weight_at(0) * values[name] for name, loss in losses.items())
     assert_relative(total, recorded["loss_total"], 1e-3)

@@ -275,7 +275,7 @@ def test_photographs_pass_every_stage_once(
     assert links == [f"{folder}/IMG_{i}.png" for folder in ("images", "masks") for i in range(3)]
     calibrate, preprocess, straight, solid, vessel, train, *_ = (options for _, options in pretended.ran)
     assert "target=colmap" in calibrate
-    data = ["data=opencv", f"data.root={pretended.out}", "data.far=9.0"]
+    data = ["data=opencv", f"data.root={pretended.out}", "data.far=9"]
     assert preprocess[:4] == [*data, "medium.resolution=64"]
     assert preprocess[-1] == "keep=1"
     scene = f"scene={pretended.out / 'surface' / 'scene.json'}"

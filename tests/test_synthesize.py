@@ -2,8 +2,8 @@
 
 import json
 import shlex
-from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from PIL import Image
 from torch.nn.functional import max_pool2d
@@ -17,7 +17,9 @@ from nerfro.geometry.mesh import load_mesh
 from nerfro.registry.allowed import validate
 from nerfro.synthetic.dataset import ViewSplits
 from nerfro.synthetic.options import SynthesizeConfig
+from nerfro.synthetic.scene import SyntheticScene
 from nerfro.synthetic.scenes.photographs import Photographs
+from nerfro.synthetic.surface import SurfaceMesh
 from nerfro.synthetic.synthesis import synthesize
 from tests.conftest import refused
 from tests.exact_silhouettes import overlaps_of_convex_body
@@ -56,8 +58,9 @@ def test_embedded_scene_is_complete_and_small():
 
 @pytest.mark.parametrize("data", [ViewSplits, Photographs])
 def test_printed_command_quotes_the_folder(data, tmp_path):
-    folder = tmp_path / "torus [1]"
-    words = shlex.split(data(configured(), SimpleNamespace(ior=1.5), folder).next_command())
+    folder, empty = tmp_path / "torus [1]", SurfaceMesh(*[np.empty((0, 3))] * 3)
+    scene = SyntheticScene(ior=1.5, glass=empty, interior=empty, sky=None)
+    words = shlex.split(data(configured(), scene, folder).next_command())
     assert {f'data.root="{folder}"', f'out="{folder}"'} & set(words)
 
 

@@ -142,8 +142,11 @@ def register(kind: str, name: str) -> Callable[[Part], Part]:
     _require_kind(kind)
 
     def wrap(cls: Part) -> Part:
-        add(kind, name, cls)
-        return validated(f"{kind}={name}")(cls)
+        check = validated(f"{kind}={name}")
+        # The check replaces the constructor of a class, but cannot change a function in place.
+        option = cls if isinstance(cls, type) else check(cls)
+        add(kind, name, option)
+        return check(cls) if isinstance(cls, type) else option
 
     return wrap
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 
 def smoothstep(low: float, high: float, x: np.ndarray) -> np.ndarray:
@@ -11,7 +12,7 @@ def smoothstep(low: float, high: float, x: np.ndarray) -> np.ndarray:
     return t * t * (3 - 2 * t)
 
 
-def mix(first: np.ndarray, second: np.ndarray, weight: np.ndarray) -> np.ndarray:
+def mix(first: ArrayLike, second: ArrayLike, weight: ArrayLike) -> np.ndarray:
     """Blend colours [..., 3]: `first` where weight [...] is 0, `second` where it is 1."""
     weight = np.asarray(weight, np.float64)[..., None]
     return np.asarray(first) * (1 - weight) + np.asarray(second) * weight
