@@ -40,13 +40,14 @@ class Solids(NamedTuple):
     block_start: Int[np.ndarray, "K"]
     block_shape: Int[np.ndarray, "K 3"]
     inverse_block: Float[np.ndarray, "K 3"]
-    iors: Float[np.ndarray, "K"]
-    absorbs: Bool[np.ndarray, "K"]
-    nested: bool  # whether each body is bounded by all previous bodies
-    shell: float  # half width of the smooth interfaces, world units
+    # Refractive index of air and of each body, and whether each absorbs light.
+    iors: Float[np.ndarray, " media"]
+    absorbs: Bool[np.ndarray, " media"]
     # Corners of the box of all bodies, world units.
     box_low: Float[np.ndarray, "3"]
     box_high: Float[np.ndarray, "3"]
+    nested: bool  # whether each body is bounded by all previous bodies
+    shell: float  # half width of the smooth interfaces, world units
 
 
 class Grid(NamedTuple):

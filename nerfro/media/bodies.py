@@ -176,8 +176,9 @@ class Bodies(Medium):
         from nerfro.kernels.lookup import Solids
 
         low, high = self.box.double().cpu().numpy()
-        indices, absorbs = self.indices.double().cpu().numpy(), self.absorbs.cpu().numpy()
-        return Solids._make((*self.grids.packed, indices, absorbs, self.nested, self.shell, low, high))
+        indices = np.append(1.0, self.indices.double().cpu().numpy())
+        absorbs = np.append(False, self.absorbs.cpu().numpy())
+        return Solids(*self.grids.packed, indices, absorbs, low, high, self.nested, self.shell)
 
     @property
     def bodies(self) -> Bodies:

@@ -11,9 +11,9 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from nerfro.core.types import Path, Rays
+from nerfro.kernels.arrays import input_arrays
 from nerfro.media.bodies import Bodies
 from nerfro.paper.voxel_grid import VoxelGrid
-from nerfro.samplers.paths.compiled import ray_arrays
 
 if TYPE_CHECKING:
     from nerfro.paper.index_cpu import Voxels
@@ -32,11 +32,11 @@ def eikonal_on_grid(
     bodies = medium.bodies
     packed = (_voxels(cast(VoxelGrid, medium)), NO_SOLIDS) if bodies is None else (NO_VOXELS, bodies.packed())
     settings = step, tolerance, max_steps
-    *columns, counts, refracted, exceeded = march_adaptive(*ray_arrays(rays), *packed, settings, _CAPACITY)
+    *columns, counts, refracted, exceeded = march_adaptive(*_arrays(rays), *packed, settings, _CAPACITY)
     width = max(int(counts.max(initial=2)), 2)
     if width > _CAPACITY:  # trace the rays with more vertices again
         rows = np.nonzero(counts > _CAPACITY)[0]
-        again = march_adaptive(*ray_arrays(rays[torch.from_numpy(rows)]), *packed, settings, width)[:3]
+        again = march_adaptive(*_arrays(rays[torch.from_numpy(rows)]), *packed, settings, width)[:3]
         for i, (short, long) in enumerate(zip(columns, again, strict=True)):
             columns[i] = np.concatenate([short, np.repeat(short[:, -1:], width - _CAPACITY, axis=1)], axis=1)
             columns[i][rows] = long
@@ -48,8 +48,12 @@ def uniform_on_grid(rays: Rays, medium: VoxelGrid, num_steps: int) -> Path:
     """Evaluate `eikonal.march_uniform` with Euler steps by the compiled kernel, on the CPU for rays on any device."""
     from nerfro.paper.eikonal_cpu import march_uniform
 
-    *vertices, refracted = march_uniform(*ray_arrays(rays), _voxels(medium), num_steps)
+    *vertices, refracted = march_uniform(*_arrays(rays), _voxels(medium), num_steps)
     return _path(rays, vertices, refracted)
+
+
+def _arrays(rays: Rays) -> list[np.ndarray]:
+    return input_arrays(rays.origins, rays.directions, rays.near, rays.far)
 
 
 def _voxels(medium: VoxelGrid) -> Voxels:

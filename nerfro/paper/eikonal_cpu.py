@@ -128,7 +128,7 @@ def march_uniform(origins, directions, near, far, voxels, num_steps):
 @compiled
 def _box_of(voxels, solids):
     """Return the corners of the medium's box."""
-    if len(solids.iors) == 0:
+    if len(solids.low) == 0:
         return voxels.low, voxels.high
     return solids.box_low, solids.box_high
 
@@ -136,7 +136,7 @@ def _box_of(voxels, solids):
 @compiled
 def _look_up(voxels, solids, x, y, z):
     """Return the index, its gradient, and a lower bound of the distance without a change of the index."""
-    if len(solids.iors) > 0:
+    if len(solids.low) > 0:
         return solid_index(solids, x, y, z)
     n, gx, gy, gz = voxel_index(voxels.table, voxels.low, voxels.inverse_spacing, x, y, z)
     bx, by, bz = blocks_from(voxels.low, voxels.inverse_spacing, x, y, z)
@@ -146,7 +146,7 @@ def _look_up(voxels, solids, x, y, z):
 @compiled
 def _step_length(solids, step, dx, dy, dz, gx, gy, gz):
     """Return the length of the next step, which depends on the slant in a shell (`media.bodies.Bodies.step_length`)."""
-    if len(solids.iors) == 0:
+    if len(solids.low) == 0:
         return step
     slope = math.sqrt(gx * gx + gy * gy + gz * gz)
     if slope == 0.0:

@@ -33,7 +33,7 @@ _corners, _lengths, _counts, _numbers = np.empty((0, 3)), np.empty(0), np.empty(
 _values, _bounds, _bytes = np.empty(0, np.float32), np.empty((0, 3, 2), np.float32), np.empty(0, np.int8)
 NO_SOLIDS = Solids(
     _corners, _corners, _corners, _lengths, _values, _numbers, _counts, _bounds, _bytes, _numbers, _counts, _corners,
-    _lengths, np.empty(0, np.bool_), False, 0.0, *np.empty((2, 3)),
+    _lengths, np.empty(0, np.bool_), np.empty(3), np.empty(3), False, 0.0,
 )  # fmt: skip
 
 
@@ -69,8 +69,8 @@ def solid_index(solids, x, y, z):
     shell, nested = solids.shell, solids.nested
     n, gx, gy, gz, clearance = 1.0, 0.0, 0.0, 0.0, math.inf
     within, rx, ry, rz = 1.0, 0.0, 0.0, 0.0
-    for body in range(len(solids.iors)):
-        ior = solids.iors[body]
+    for body in range(len(solids.low)):
+        ior = solids.iors[body + 1]
         nx, ny, nz, beyond = nearest_in_box(solids.low[body], solids.high[body], x, y, z)
         phi, px, py, pz = spline_value_gradient(solids.coefficients, grid_of(solids, body), nx, ny, nz)
         if beyond > 0.0 and phi > 0.0:  # the shell is inside of the box

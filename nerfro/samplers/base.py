@@ -48,9 +48,7 @@ class PathSampler(nn.Module, ABC):
 
     def trace(self, rays: Rays, medium: Medium) -> SnellTrace:
         """Trace rays, and count the events of each polyline; samplers without sharp surfaces count none."""
-        path = self(rays, medium)
-        none = torch.zeros_like(path.ray)
-        return SnellTrace(path, none, none.bool())
+        return SnellTrace.without_events(self(rays, medium))
 
     def trace_main(self, rays: Rays, medium: Medium) -> Path:
         """Trace only the first polyline of each ray, which is enough to find the exit directions."""

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 
-@dataclass(frozen=True)
-class Branching:
+class Branching(NamedTuple):
     """Rule for splitting: light splits if both parts have enough weight; otherwise, the heavier part takes all weight.
 
     Therefore the weights of all polylines of a ray sum to 1 (with `main_only`, one of them is followed), and a ray has

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -42,14 +43,11 @@ class SnellTrace(NamedTuple):
     num_events: Int[Tensor, "P"]
     exceeded: Bool[Tensor, "P"]
 
-
-class Crossed(NamedTuple):
-    """Bodies and surface of vertices, see `OpticalRecord`. The default is a vertex in air."""
-
-    body: Int[Tensor, "A"] | int = 0
-    surface: Int[Tensor, "A"] | int = 0
-    far_side: Int[Tensor, "A"] | int = 0
-    triangle: Int[Tensor, "A"] | int = -1
+    @classmethod
+    def without_events(cls, path: Path) -> SnellTrace:
+        """Return the trace of paths that meet no sharp surface."""
+        none = torch.zeros_like(path.ray)
+        return cls(path, none, none.bool())
 
 
 class PolylineBuilder:
@@ -57,7 +55,7 @@ class PolylineBuilder:
 
     def __init__(self, num_rays: int, like: Float[Tensor, "..."]) -> None:
         self._vertices = like.new_zeros(num_rays, 4, 7)
-        self._crossed = torch.zeros(num_rays, 4, len(Crossed._fields), dtype=torch.int32, device=like.device)
+        self._crossed = torch.zeros(num_rays, 4, 4, dtype=torch.int32, device=like.device)
         self.counts = torch.zeros(num_rays, dtype=torch.long, device=like.device)
 
     def append(
@@ -66,9 +64,15 @@ class PolylineBuilder:
         positions: Float[Tensor, "A 3"],
         directions: Float[Tensor, "A 3"],
         s: Float[Tensor, "A"],
-        crossed: Crossed = Crossed(),  # noqa: B008 - immutable
+        crossed: Sequence[Int[Tensor, "A"] | int] = (0, 0, 0, -1),
     ) -> None:
-        """Add one vertex to each of the given rows."""
+        """Add one vertex to each of some rows.
+
+        Args:
+            rows: rows, each at most once.
+            positions, directions, s: the vertices.
+            crossed: body, surface, far side and triangle of each vertex, see `OpticalRecord`; by default those in air.
+        """
         if len(rows) and int(self.counts[rows].max()) == self._vertices.shape[1]:
             self._vertices = torch.cat([self._vertices, torch.zeros_like(self._vertices)], 1)
             self._crossed = torch.cat([self._crossed, torch.zeros_like(self._crossed)], 1)
@@ -95,34 +99,25 @@ class PolylineBuilder:
         rows = torch.arange(len(s), device=s.device)
         self.append(rows, positions + ahead[:, None] * directions, directions, s + ahead)
 
-    def path(
-        self,
-        rays: Rays,
-        refracted: Bool[Tensor, "P"],
-        ray: Int[Tensor, "P"] | None = None,
-        weight: Float[Tensor, "P"] | None = None,
-    ) -> Path:
+    def path(self, rays: Rays, refracted: Bool[Tensor, "P"]) -> Path:
         """Return the finished paths in the precision and on the device of the rays; short rows repeat the last vertex.
 
         Args:
-            rays: traced rays.
+            rays: ray of each row.
             refracted: whether each row met the medium.
-            ray, weight: if rays split, ray of each row and share of its light.
         """
         like = rays.origins
         capacity = int(self.counts.max()) if len(self.counts) else 2
         index = torch.arange(capacity, device=self.counts.device).minimum(self.counts[:, None] - 1)[..., None]
-        vertices = self._vertices.gather(1, index.expand(-1, -1, 7)).to(like)
-        crossed = self._crossed.gather(1, index.expand(-1, -1, self._crossed.shape[-1])).to(like.device)
+        vertices = self._vertices.take_along_dim(index, 1).to(like)
+        crossed = self._crossed.take_along_dim(index, 1).to(like.device)
         *numbers, triangle = crossed.unbind(-1)
-        record = OpticalRecord.of_bodies(*(values.to(torch.int8) for values in numbers))
-        record = replace(record, triangle=triangle)
-        if ray is not None:
-            ray = ray.to(like.device)
-        radii = rays.radii if ray is None else rays.radii[ray]
-        path = Path.unbranched(
-            vertices[..., :3], vertices[..., 3:6], vertices[..., 6], refracted.to(like.device), radii, record
+        record = replace(OpticalRecord.of_bodies(*(values.to(torch.int8) for values in numbers)), triangle=triangle)
+        return Path.unbranched(
+            vertices[..., :3], vertices[..., 3:6], vertices[..., 6], refracted.to(like.device), rays.radii, record
         )
-        if ray is None or weight is None:
-            return path
-        return replace(path, splits=True, ray=ray, throughput=weight.to(like)[:, None].expand(-1, 3))
+
+
+def split(path: Path, ray: Int[Tensor, "P"], weight: Float[Tensor, "P"]) -> Path:
+    """Return polylines of rays that split, given the ray of each polyline and its share of the light of the ray."""
+    return replace(path, splits=True, ray=ray, throughput=weight[:, None].expand(-1, 3))

@@ -73,12 +73,6 @@ def indices_of(medium: Medium, like: Tensor) -> Float[Tensor, " media"]:
     return torch.cat([like.new_ones(1), medium.iors.to(like)])
 
 
-def start_of(path: Path, rays: Rays) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"], Float[Tensor, "P"]]:
-    """Return position, direction and arc length of the first vertices, with gradients with respect to the rays."""
-    origins, d, s = (path.broadcast_to_polylines(values) for values in (rays.origins, rays.directions, rays.near))
-    return origins + s[:, None] * d, d, s
-
-
 def replay(path: Path, rays: Rays, medium: Medium, intersect: Intersect, branching: Branching = ONE_PATH) -> Path:
     """Replay paths of refractions and reflections, with gradients with respect to rays, indices and surfaces.
 
@@ -87,7 +81,8 @@ def replay(path: Path, rays: Rays, medium: Medium, intersect: Intersect, branchi
     """
     record = path.record
     assert record is not None
-    x, d, s = start_of(path, rays)
+    origins, d, s = (path.broadcast_to_polylines(values) for values in (rays.origins, rays.directions, rays.near))
+    x = origins + s[:, None] * d
     num_paths, num_vertices = path.s.shape
     rows, column = torch.arange(num_paths, device=s.device), torch.zeros_like(path.ray)
     vertices: list[Vertices] = [(rows, column, x, d, s)]
@@ -162,19 +157,15 @@ def intersect_solid(medium: Bodies, surface: Int[Tensor, "P S"]) -> Intersect:
     """
 
     def intersect(rows: Tensor, column: int, x: Tensor, d: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
-        body = surface[rows, column].long() - 1
+        body = surface[rows, column].long()[:, None, None] - 1
         phi, gradients = medium.signed_distances(x + length[:, None] * d)
-        slope = (_of_body(gradients, body) * d).sum(-1).detach()
+        slope = (gradients.take_along_dim(body, 1)[:, 0] * d).sum(-1).detach()
         slope = torch.copysign(slope.abs().clamp(min=_MIN_COSINE), slope)
-        length = with_gradient(length, length - phi.gather(-1, body[:, None])[:, 0] / slope)
+        length = with_gradient(length, length - phi.gather(-1, body[:, 0])[:, 0] / slope)
         _, gradients = medium.signed_distances(x + length[:, None] * d)
-        return length, functional.normalize(_of_body(gradients, body), dim=-1)
+        return length, functional.normalize(gradients.take_along_dim(body, 1)[:, 0], dim=-1)
 
     return intersect
-
-
-def _of_body(gradients: Float[Tensor, "P K 3"], body: Int[Tensor, "P"]) -> Float[Tensor, "P 3"]:
-    return gradients.gather(1, body[:, None, None].expand(-1, 1, 3))[:, 0]
 
 
 def intersect_triangles(triangles: Triangles, triangle: Int[Tensor, "P S"]) -> Intersect:

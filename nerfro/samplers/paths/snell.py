@@ -11,7 +11,7 @@ import torch
 from annotated_types import Ge, Le
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import one_hot
+from torch.nn import functional
 
 from nerfro.core.errors import NerfroError
 from nerfro.core.types import Path, Rays
@@ -63,12 +63,6 @@ class Tracer(ABC):
         assert path.record is not None
         return intersect_solid(self.medium, path.record.surface_body)
 
-    def at_wavelengths(self, wavelengths: Sequence[float]) -> Sequence[Tracer]:
-        """Return one tracer for each wavelength; the tracer itself if the medium has no dispersion."""
-        if not self.medium.disperses:
-            return [self]
-        return [type(self)(self.medium.at_wavelength(wavelength)) for wavelength in wavelengths]
-
 
 class GridTracer(Tracer):
     """Trace zero levels of distance grids by the compiled kernel."""
@@ -81,10 +75,6 @@ class GridTracer(Tracer):
 
 class TriangleTracer(Tracer):
     """Trace triangles of meshes."""
-
-    def __init__(self, medium: Bodies) -> None:
-        super().__init__(medium)
-        medium.intersector  # noqa: B018 (created once, before the variants of all wavelengths share it)
 
     def trace(self, rays: Rays, max_events: int, branching: Branching) -> SnellTrace:
         return _trace_triangles(rays, self.medium, max_events, branching)
@@ -104,18 +94,11 @@ class ReferenceTracer(Tracer):
 class StraightTracer(Tracer):
     """Leave rays straight in a vacuum."""
 
-    def __init__(self) -> None:
-        pass
-
     def trace(self, rays: Rays, max_events: int, branching: Branching) -> SnellTrace:
-        none = torch.zeros(len(rays), dtype=torch.long, device=rays.near.device)
-        return SnellTrace(straight_path(rays), none, none.bool())
+        return SnellTrace.without_events(straight_path(rays))
 
     def replay(self, path: Path, rays: Rays, branching: Branching) -> Path:
         return replay_straight(path, rays)
-
-    def at_wavelengths(self, wavelengths: Sequence[float]) -> Sequence[Tracer]:
-        return [self]
 
 
 @register("sampler/path", "snell")
@@ -150,27 +133,32 @@ class Snell(PathSampler):
         self.interface, self.max_events, self.traces_triangles = interface, max_events, interface == "mesh"
         self.branching = Branching({"none": 0, "first": 1, "all": max_events}[branches], least_weight)
 
-    def tracer(self, medium: Medium) -> Tracer:
-        """Return the tracer for the surfaces of a medium.
+    def tracers(self, medium: Medium) -> list[Tracer]:
+        """Return the tracers for the surfaces of a medium: one for each wavelength if the medium disperses, else one.
 
         Raises:
             NerfroError: the medium has no surfaces, or no triangles for `interface=mesh`.
         """
-        if medium.is_vacuum:
-            return StraightTracer()
         bodies = medium.bodies
+        if medium.is_vacuum:
+            return [StraightTracer(medium)]  # type: ignore[arg-type]
         if bodies is None:
             raise NerfroError(
                 "sampler/path=snell needs a medium with a surface; take medium=sdf_grid, or sampler/path=eikonal"
             )
         if self.interface == "sdf":
-            return GridTracer(bodies) if len(bodies.grids) else ReferenceTracer(bodies)
-        if not bodies.meshes:
+            tracer = GridTracer if len(bodies.grids) else ReferenceTracer
+        elif bodies.meshes:
+            tracer = TriangleTracer
+            bodies.intersector  # noqa: B018 (created once, before the variants of all wavelengths share it)
+        else:
             raise NerfroError(
                 "sampler.path.interface=mesh needs a medium made of meshes; give each body of medium=sdf_grid a "
                 "mesh, or set sampler.path.interface=sdf"
             )
-        return TriangleTracer(bodies)
+        if not bodies.disperses:
+            return [tracer(bodies)]
+        return [tracer(bodies.at_wavelength(wavelength)) for wavelength in self.wavelengths]
 
     @torch.no_grad()
     def forward(self, rays: Rays, medium: Medium) -> Path:
@@ -179,15 +167,14 @@ class Snell(PathSampler):
 
     @torch.no_grad()
     def trace_main(self, rays: Rays, medium: Medium) -> Path:
-        tracer = self.tracer(medium).at_wavelengths(self.wavelengths)[0]
-        return tracer.trace(rays, self.max_events, replace(self.branching, main_only=True)).path
+        return self.tracers(medium)[0].trace(rays, self.max_events, self.branching._replace(main_only=True)).path
 
     def replay(self, path: Path, rays: Rays, medium: Medium) -> Path:
         """Return the path with gradients with respect to rays, indices and distance grids; see `samplers.paths.replay`.
 
         Gradients are unbounded at grazing and critical angles; omit paths whose `smallest_cosine` is below 0.15.
         """
-        tracers = self.tracer(medium).at_wavelengths(self.wavelengths)
+        tracers = self.tracers(medium)
         if len(tracers) == 1:
             return tracers[0].replay(path, rays, self.branching)
         return _replay_in_bands(path, rays, tracers, self.branching)
@@ -196,12 +183,12 @@ class Snell(PathSampler):
         return smallest_cosine(path, medium) > _STEADY
 
     def releases_gil(self, medium: Medium) -> bool:
-        return not self.traces_triangles and self.tracer(medium).releases_gil
+        return not self.traces_triangles and self.tracers(medium)[0].releases_gil
 
     @torch.no_grad()
     def trace(self, rays: Rays, medium: Medium, branching: Branching | None = None) -> SnellTrace:
         """Trace rays and count events; `branching` replaces the rule of the sampler."""
-        tracers = self.tracer(medium).at_wavelengths(self.wavelengths)
+        tracers = self.tracers(medium)
         settings = self.max_events, branching or self.branching
         return tracers[0].trace(rays, *settings) if len(tracers) == 1 else _traced_in_bands(rays, tracers, *settings)
 
@@ -223,7 +210,7 @@ def _traced_in_bands(rays: Rays, tracers: Sequence[Tracer], max_events: int, bra
     band = torch.cat([torch.full_like(ray, number) for number, ray in enumerate(of_rays)])
     num_bands = len(tracers) // 3
     # Straight polylines have all colours.
-    colours = one_hot(torch.div(band, num_bands, rounding_mode="floor"), 3).to(path.s) / num_bands
+    colours = functional.one_hot(torch.div(band, num_bands, rounding_mode="floor"), 3).to(path.s) / num_bands
     colours = torch.where(path.refracted[:, None], colours, 1.0)
     ray = torch.cat(of_rays)
     order = ray.argsort(stable=True)
@@ -335,8 +322,7 @@ def trace_interfaces(rays: Rays, medium: Bodies, max_events: int, branching: Bra
         before, after, body = _first_crossing(medium, x, d, inside, before, after)
         after, bodies = _closed_gaps(medium, x, d, inside, after, body, min_step)
         _, normals = medium.signed_distances(x + after[:, None] * d)
-        normal = normals.gather(1, body[:, None, None].expand(-1, 1, 3))[:, 0]
-        normal = normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
+        normal = functional.normalize(normals.take_along_dim(body[:, None, None], 1)[:, 0], dim=-1)
         front.apply_interface(rows, before, after, bodies, normal)
     return front.finish(rays)
 
@@ -384,7 +370,7 @@ def _closed_gaps(
     """
     if inside.shape[1] == 1:
         return after, body[:, None]
-    flipped = inside ^ one_hot(body, inside.shape[1]).bool()
+    flipped = inside ^ functional.one_hot(body, inside.shape[1]).bool()
     leaves = (medium.deciding_body(inside) > 0) & (medium.deciding_body(flipped) == 0)
     phi, _ = medium.signed_distances(x + (after + min_step)[:, None] * d)
     behind = leaves[:, None] & ((phi < 0) != flipped)

@@ -22,15 +22,6 @@ from nerfro.samplers.paths.surface_search_cpu import Line, advance, first_surfac
 _BLOCK = 64  # number of rays for which a thread allocates scratch memory once
 
 
-class Settings(NamedTuple):
-    """Settings of the trace, see `samplers.paths.snell.Snell` and `samplers.paths.branching.Branching`."""
-
-    max_events: int
-    max_split_events: int  # first events of a polyline at which light may split
-    least_weight: float
-    main_only: bool
-
-
 class Branch(NamedTuple):
     """State of a branch of light at the last vertex."""
 
@@ -41,49 +32,23 @@ class Branch(NamedTuple):
     num_events: int
 
 
-class Event(NamedTuple):
-    """Refraction, reflection or splitting of light at a surface."""
-
-    line: Line  # line of the part that is followed first
-    reflected: bool  # whether the first part is reflected
-    mirrored: Line  # line of the reflected part, which becomes a pending branch if light splits
-    share: float  # share of the light in the pending branch; 0 if light does not split
-
-
 class TracedRows(NamedTuple):
-    """Polylines of one ray, one row each (P rows, S vertices); fields as in `types.Path`."""
+    """Polylines of one ray, one row each (P rows, S vertices)."""
 
-    positions: Float[np.ndarray, "P S 3"]
-    directions: Float[np.ndarray, "P S 3"]
-    s: Float[np.ndarray, "P S"]
-    body: Int8[np.ndarray, "P S"]
-    surface: Int8[np.ndarray, "P S"]
-    across: Int8[np.ndarray, "P S"]
+    vertices: Float[np.ndarray, "P S 7"]  # position, direction and arc length
+    crossed: Int8[np.ndarray, "P S 3"]  # `body`, `surface_body` and `far_side` of `types.OpticalRecord`
     weight: Float[np.ndarray, "P"]
-    num_vertices: Int[np.ndarray, "P"]
-    num_events: Int[np.ndarray, "P"]
-    exceeded: Bool[np.ndarray, "P"]  # whether the limit of events was met
-
-
-class Pending(NamedTuple):
-    """Stack of reflected branches that are followed later (K bodies)."""
-
-    line: Float[np.ndarray, "pending 6"]
-    s: Float[np.ndarray, " pending"]
-    weight: Float[np.ndarray, " pending"]
-    num_vertices: Int[np.ndarray, " pending"]
-    num_events: Int[np.ndarray, " pending"]
-    surface: Int[np.ndarray, " pending"]  # surface of the reflection
-    across: Int[np.ndarray, " pending"]  # body behind this surface
-    inside: Bool[np.ndarray, "pending K"]
+    numbers: Int[np.ndarray, "P 3"]  # number of vertices, number of events, and whether the limit of events was met
 
 
 class Scratch(NamedTuple):
-    """Memory of a thread."""
+    """Memory of a thread, with the stack of reflected branches that are followed later (K bodies)."""
 
     inside: Bool[np.ndarray, "K"]  # whether the ray is inside each body's surface
     crossings: Float[np.ndarray, "K"]  # see `first_surface`
-    pending: Pending
+    pending: Float[np.ndarray, "pending 8"]  # line, arc length and weight
+    pending_numbers: Int[np.ndarray, "pending 4"]  # vertices, events, surface of the reflection, body behind it
+    pending_inside: Bool[np.ndarray, "pending K"]
 
 
 @compiled
@@ -95,21 +60,7 @@ def _deciding_body(inside, solids):
             number = body + 1
         elif solids.nested:
             break
-    if solids.nested and number > 0 and solids.iors[number - 1] == 1.0 and not solids.absorbs[number - 1]:
-        return 0
-    return number
-
-
-@compiled
-def _index(number, solids):
-    """Return the refractive index of a body by number from 1; number 0 is air."""
-    return solids.iors[number - 1] if number > 0 else 1.0
-
-
-@compiled
-def _absorbs(number, solids):
-    """Return whether a body absorbs light, by number from 1; number 0 is air."""
-    return number > 0 and solids.absorbs[number - 1]
+    return 0 if solids.nested and solids.iors[number] == 1.0 and not solids.absorbs[number] else number
 
 
 @compiled
@@ -144,7 +95,7 @@ def _reflected(line, nx, ny, nz, ratio):
 
 
 @compiled
-def _event(solids, hit, line_before, line_behind, ratio, settings, branch):
+def _event(solids, hit, line_before, line_behind, ratio, branching, branch):
     """Decide whether light is refracted, reflected or split at a surface.
 
     Args:
@@ -152,36 +103,40 @@ def _event(solids, hit, line_before, line_behind, ratio, settings, branch):
         hit: body whose surface is met.
         line_before, line_behind: arriving line, with its start just before and just behind the surface.
         ratio: ratio of the index before the surface to the index behind the surface.
-        settings: settings of the trace.
+        branching: rule for splitting.
         branch: arriving branch.
+
+    Returns:
+        Line of the part that is followed first; whether this part is reflected; line of the reflected part, which
+        becomes a pending branch if light splits; and its share of the light, 0 if light does not split.
     """
     x, y, z = line_behind.x, line_behind.y, line_behind.z
     _, nx, ny, nz = spline_value_gradient(solids.coefficients, grid_of(solids, hit), x, y, z)
     norm = math.sqrt(nx * nx + ny * ny + nz * nz)
     nx, ny, nz = nx / norm, ny / norm, nz / norm
     transmitted, total = _transmitted(line_behind, nx, ny, nz, ratio)
-    if not total and branch.num_events >= settings.max_split_events:
-        return Event(transmitted, False, transmitted, 0.0)
+    if not total and branch.num_events >= branching.max_split_events:
+        return transmitted, False, transmitted, 0.0
     mirrored, share = _reflected(line_before, nx, ny, nz, ratio)
     if total:
-        return Event(mirrored, True, mirrored, 0.0)
-    if branch.weight * min(share, 1.0 - share) >= settings.least_weight:
-        return Event(transmitted, False, mirrored, share)
+        return mirrored, True, mirrored, 0.0
+    if branch.weight * min(share, 1.0 - share) >= branching.least_weight:
+        return transmitted, False, mirrored, share
     if share > 0.5:
-        return Event(mirrored, True, mirrored, 0.0)
-    return Event(transmitted, False, mirrored, 0.0)
+        return mirrored, True, mirrored, 0.0
+    return transmitted, False, mirrored, 0.0
 
 
 @compiled
 def _put_vertex(rows, row, branch, body, surface, across):
     """Append the vertex of a branch to a row; beyond the capacity of the row, vertices are only counted."""
     i, line = branch.num_vertices, branch.line
-    if i < rows.s.shape[1]:
-        position, direction = rows.positions[row, i], rows.directions[row, i]
-        position[0], position[1], position[2] = line.x, line.y, line.z
-        direction[0], direction[1], direction[2] = line.dx, line.dy, line.dz
-        rows.s[row, i] = branch.s
-        rows.body[row, i], rows.surface[row, i], rows.across[row, i] = body, surface, across
+    if i < rows.vertices.shape[1]:
+        vertex, crossed = rows.vertices[row, i], rows.crossed[row, i]
+        for j in range(6):
+            vertex[j] = line[j]
+        vertex[6] = branch.s
+        crossed[0], crossed[1], crossed[2] = body, surface, across
     return Branch(line, branch.s, branch.weight, i + 1, branch.num_events)
 
 
@@ -193,21 +148,21 @@ def _put_end(solids, rows, row, branch, far, exceeded):
         x, y, z, dx, dy, dz = line
         ahead = max(ahead, distance_out(solids.box_low, solids.box_high, x, y, z, dx, dy, dz))
     end = Branch(advance(line, ahead), branch.s + ahead, branch.weight, branch.num_vertices, branch.num_events)
-    rows.weight[row], rows.num_events[row], rows.exceeded[row] = branch.weight, branch.num_events, exceeded
-    rows.num_vertices[row] = branch.num_vertices + 1
+    rows.weight[row], numbers = branch.weight, rows.numbers[row]
+    numbers[0], numbers[1], numbers[2] = branch.num_vertices + 1, branch.num_events, exceeded
     return _put_vertex(rows, row, end, 0, 0, 0).num_vertices
 
 
 @compiled
 def _push(scratch, size, branch, mirrored, s, weight, surface, across):
     """Put the reflected part of a branch on the stack; returns the size of the stack."""
-    pending = scratch.pending
+    light, numbers = scratch.pending[size], scratch.pending_numbers[size]
     for i in range(6):
-        pending.line[size, i] = mirrored[i]
-    pending.s[size], pending.weight[size], pending.surface[size], pending.across[size] = s, weight, surface, across
-    pending.num_vertices[size], pending.num_events[size] = branch.num_vertices, branch.num_events + 1
+        light[i] = mirrored[i]
+    light[6], light[7] = s, weight
+    numbers[0], numbers[1], numbers[2], numbers[3] = branch.num_vertices, branch.num_events + 1, surface, across
     for body in range(len(scratch.inside)):
-        pending.inside[size, body] = scratch.inside[body]
+        scratch.pending_inside[size, body] = scratch.inside[body]
     return size + 1
 
 
@@ -223,19 +178,18 @@ def _resume(solids, scratch, top, rows, former, row):
         former: previous row, which shares the vertices before the reflection.
         row: row to begin.
     """
-    pending, inside = scratch.pending, scratch.inside
+    inside = scratch.inside
     for body in range(len(inside)):
-        inside[body] = pending.inside[top, body]
-    count = pending.num_vertices[top]
-    for i in range(min(count, rows.s.shape[1])):
-        for axis in range(3):
-            rows.positions[row, i, axis] = rows.positions[former, i, axis]
-            rows.directions[row, i, axis] = rows.directions[former, i, axis]
-        rows.s[row, i], rows.body[row, i] = rows.s[former, i], rows.body[former, i]
-        rows.surface[row, i], rows.across[row, i] = rows.surface[former, i], rows.across[former, i]
-    x, y, z, dx, dy, dz = pending.line[top]
-    branch = Branch(Line(x, y, z, dx, dy, dz), pending.s[top], pending.weight[top], count, pending.num_events[top])
-    return _put_vertex(rows, row, branch, _deciding_body(inside, solids), pending.surface[top], pending.across[top])
+        inside[body] = scratch.pending_inside[top, body]
+    count, num_events, surface, across = scratch.pending_numbers[top]
+    for i in range(min(count, rows.vertices.shape[1])):
+        for j in range(7):
+            rows.vertices[row, i, j] = rows.vertices[former, i, j]
+        for j in range(3):
+            rows.crossed[row, i, j] = rows.crossed[former, i, j]
+    x, y, z, dx, dy, dz, s, weight = scratch.pending[top]
+    branch = Branch(Line(x, y, z, dx, dy, dz), s, weight, count, num_events)
+    return _put_vertex(rows, row, branch, _deciding_body(inside, solids), surface, across)
 
 
 @compiled
@@ -276,7 +230,7 @@ def _flip(scratch):
 
 
 @compiled
-def _follow(solids, settings, scratch, rows, row, branch, num_pending):
+def _follow(solids, max_events, branching, scratch, rows, row, branch, num_pending):
     """Follow a branch from event to event, until there is no surface ahead or the limit of events is met.
 
     Returns:
@@ -290,29 +244,30 @@ def _follow(solids, settings, scratch, rows, row, branch, num_pending):
             return branch, False, num_pending
         body = _deciding_body(inside, solids)
         across, behind = _cross(solids, scratch, body, hit, after)
-        n_before, n_across = _index(body, solids), _index(across, solids)
+        n_before, n_across = solids.iors[body], solids.iors[across]
         far = advance(here, behind)
         if n_before == n_across:
             branch = Branch(far, branch.s + behind, branch.weight, branch.num_vertices, branch.num_events)
-            if body != across and (_absorbs(body, solids) or _absorbs(across, solids)):
+            if body != across and (solids.absorbs[body] or solids.absorbs[across]):
                 branch = _put_vertex(rows, row, branch, across, hit + 1, across)
             continue
-        if branch.num_events >= settings.max_events:
+        if branch.num_events >= max_events:
             return branch, True, num_pending
-        event = _event(solids, hit, advance(here, before), far, n_before / n_across, settings, branch)
-        weight = branch.weight
-        if event.share > 0.0:
-            if not settings.main_only:
+        ratio, weight = n_before / n_across, branch.weight
+        arriving = advance(here, before)
+        line, is_reflected, mirrored, share = _event(solids, hit, arriving, far, ratio, branching, branch)
+        if share > 0.0:
+            if not branching.main_only:
                 _flip(scratch)
-                s, share = branch.s + before, weight * event.share
-                num_pending = _push(scratch, num_pending, branch, event.mirrored, s, share, hit + 1, across)
+                s = branch.s + before
+                num_pending = _push(scratch, num_pending, branch, mirrored, s, weight * share, hit + 1, across)
                 _flip(scratch)
-            weight *= 1.0 - event.share
-        if event.reflected:
+            weight *= 1.0 - share
+        if is_reflected:
             _flip(scratch)
-        length = before if event.reflected else behind
-        branch = Branch(event.line, branch.s + length, weight, branch.num_vertices, branch.num_events + 1)
-        branch = _put_vertex(rows, row, branch, body if event.reflected else across, hit + 1, across)
+        length = before if is_reflected else behind
+        branch = Branch(line, branch.s + length, weight, branch.num_vertices, branch.num_events + 1)
+        branch = _put_vertex(rows, row, branch, body if is_reflected else across, hit + 1, across)
 
 
 @compiled
@@ -322,6 +277,7 @@ def _trace_ray(solids, line, near, far, settings, scratch, rows):
     Entries after the last vertex of a row are undefined. Polylines beyond the capacity are only counted.
     """
     inside, last_row = scratch.inside, len(rows.weight) - 1
+    max_events, branching = settings
     branch = Branch(advance(line, near), near, 1.0, 0, 0)
     x, y, z, dx, dy, dz = branch.line
     enter, leave = box_span(solids.box_low, solids.box_high, x, y, z, dx, dy, dz)
@@ -335,7 +291,7 @@ def _trace_ray(solids, line, near, far, settings, scratch, rows):
     branch = Branch(entry, near + max(enter, 0.0), 1.0, branch.num_vertices, 0)
     row, num_polylines, most_vertices, num_pending = 0, 0, 0, 0
     while True:
-        branch, exceeded, num_pending = _follow(solids, settings, scratch, rows, row, branch, num_pending)
+        branch, exceeded, num_pending = _follow(solids, max_events, branching, scratch, rows, row, branch, num_pending)
         num_polylines += 1
         most_vertices = max(most_vertices, _put_end(solids, rows, row, branch, far, exceeded))
         if num_pending == 0:
@@ -352,7 +308,7 @@ def trace_snell(origins, directions, near, far, solids, settings, max_vertices, 
     Args:
         origins, directions, near, far: rays [R, ...].
         solids: bodies, a `kernels.lookup.Solids`.
-        settings: settings of the trace.
+        settings: largest number of events of a polyline, and the `Branching`.
         max_vertices: largest number of vertices of a polyline, S.
         max_polylines: largest number of polylines of a ray, P.
 
@@ -362,32 +318,24 @@ def trace_snell(origins, directions, near, far, solids, settings, max_vertices, 
         counts [R, 2]: number of polylines of each ray, and largest number of vertices, which may exceed P and S.
     """
     num_rays, dtype = origins.shape[0], origins.dtype
-    num_bodies, num_pending = len(solids.iors), settings.max_split_events
-    polylines, vertices = (num_rays, max_polylines), (num_rays, max_polylines, max_vertices)
+    num_bodies, num_pending, polylines = len(solids.low), settings[1].max_split_events, (num_rays, max_polylines)
     rows = TracedRows(
-        np.empty((*vertices, 3), dtype), np.empty((*vertices, 3), dtype), np.empty(vertices, dtype),
-        np.empty(vertices, np.int8), np.empty(vertices, np.int8), np.empty(vertices, np.int8),
-        np.empty(polylines, dtype), np.empty(polylines, np.int64),
-        np.empty(polylines, np.int64), np.empty(polylines, np.bool_),
+        np.empty((*polylines, max_vertices, 7), dtype), np.empty((*polylines, max_vertices, 3), np.int8),
+        np.empty(polylines, dtype), np.empty((*polylines, 3), np.int64),
     )  # fmt: skip
     counts = np.empty((num_rays, 2), np.int64)
     for block in prange((num_rays + _BLOCK - 1) // _BLOCK):
-        pending = Pending(
-            np.empty((num_pending, 6)), np.empty(num_pending), np.empty(num_pending), np.empty(num_pending, np.int64),
-            np.empty(num_pending, np.int64), np.empty(num_pending, np.int64), np.empty(num_pending, np.int64),
-            np.empty((num_pending, num_bodies), np.bool_),
+        scratch = Scratch(
+            np.empty(num_bodies, np.bool_), np.empty(num_bodies), np.empty((num_pending, 8)),
+            np.empty((num_pending, 4), np.int64), np.empty((num_pending, num_bodies), np.bool_),
         )  # fmt: skip
-        scratch = Scratch(np.empty(num_bodies, np.bool_), np.empty(num_bodies), pending)
         for ray in range(block * _BLOCK, min((block + 1) * _BLOCK, num_rays)):
             x, d = origins[ray], directions[ray]
             line = Line(
                 np.float64(x[0]), np.float64(x[1]), np.float64(x[2]),
                 np.float64(d[0]), np.float64(d[1]), np.float64(d[2]),
             )  # fmt: skip
-            row = TracedRows(
-                rows.positions[ray], rows.directions[ray], rows.s[ray], rows.body[ray], rows.surface[ray],
-                rows.across[ray], rows.weight[ray], rows.num_vertices[ray], rows.num_events[ray], rows.exceeded[ray],
-            )  # fmt: skip
+            row = TracedRows(rows.vertices[ray], rows.crossed[ray], rows.weight[ray], rows.numbers[ray])
             start, end = np.float64(near[ray]), np.float64(far[ray])
             counts[ray] = _trace_ray(solids, line, start, end, settings, scratch, row)
     return rows, counts
@@ -405,20 +353,16 @@ def polylines_of_width(rows, ray, place, width):
     Returns:
         positions, directions, s, body, surface and across.
     """
-    number, max_vertices, dtype = len(ray), rows.s.shape[2], rows.s.dtype
+    number, max_vertices, dtype = len(ray), rows.vertices.shape[2], rows.vertices.dtype
     positions, directions = np.empty((number, width, 3), dtype), np.empty((number, width, 3), dtype)
-    s = np.empty((number, width), dtype)
-    body, surface, across = (
-        np.empty((number, width), np.int8), np.empty((number, width), np.int8), np.empty((number, width), np.int8)
-    )  # fmt: skip
+    s, crossed = np.empty((number, width), dtype), np.empty((3, number, width), np.int8)
     for p in prange(number):
-        r, b = ray[p], place[p]
-        last = min(rows.num_vertices[r, b], max_vertices, width) - 1
+        vertices, bodies = rows.vertices[ray[p], place[p]], rows.crossed[ray[p], place[p]]
+        last = min(rows.numbers[ray[p], place[p], 0], max_vertices, width) - 1
         for i in range(width):
             j = min(i, last)
             for axis in range(3):
-                positions[p, i, axis] = rows.positions[r, b, j, axis]
-                directions[p, i, axis] = rows.directions[r, b, j, axis]
-            s[p, i], body[p, i] = rows.s[r, b, j], rows.body[r, b, j]
-            surface[p, i], across[p, i] = rows.surface[r, b, j], rows.across[r, b, j]
-    return positions, directions, s, body, surface, across
+                positions[p, i, axis], directions[p, i, axis] = vertices[j, axis], vertices[j, 3 + axis]
+                crossed[axis, p, i] = bodies[j, axis]
+            s[p, i] = vertices[j, 6]
+    return positions, directions, s, crossed[0], crossed[1], crossed[2]

@@ -18,24 +18,21 @@ def first_normals(path: Path, medium: Medium) -> Float[Tensor, "R 3"]:
 
     If the index varies continuously, the normals of its level surfaces at the first bend of each path are returned.
     """
-    normals = path.directions.new_zeros(len(path.s), 3)
-    rows = path.refracted.nonzero()[:, 0]  # only few rays of an image
-    normals[rows] = _bent_normals(path[rows], medium).to(normals)
-    return path.main_polyline(normals)
-
-
-def _bent_normals(path: Path, medium: Medium) -> Float[Tensor, "P 3"]:
-    """Compute the normals of polylines that intersect the medium."""
-    rows = torch.arange(len(path.s), device=path.s.device)
-    before, after = path.directions[:, :-1], path.directions[:, 1:]
-    body = torch.zeros_like(path.s).long() if path.record is None else path.record.body.long()
-    n = indices_of(medium, path.s).detach()[body]
+    turning = path.refracted.nonzero()[:, 0]  # only few rays of an image
+    bent = path[turning]
+    rows = torch.arange(len(turning), device=path.s.device)
+    before, after = bent.directions[:, :-1], bent.directions[:, 1:]
+    body = torch.zeros_like(bent.s).long() if bent.record is None else bent.record.body.long()
+    n = indices_of(medium, bent.s).detach()[body]
     events = (before != after).any(-1) | (n[:, :-1] != n[:, 1:])
     first = events.byte().argmax(-1)
     arriving = before[rows, first]
     if medium.bodies is not None:
         normals = turning_normals(arriving, after[rows, first], n[rows, first], n[rows, first + 1])
     else:
-        _, normals = medium(path.positions[rows, first + 1])
+        _, normals = medium(bent.positions[rows, first + 1])
     towards = -(normals * arriving).sum(-1, keepdim=True).sign()
-    return torch.where(events.any(-1, keepdim=True), functional.normalize(normals * towards, dim=-1), 0.0)
+    normals = torch.where(events.any(-1, keepdim=True), functional.normalize(normals * towards, dim=-1), 0.0)
+    all_normals = path.directions.new_zeros(len(path.s), 3)
+    all_normals[turning] = normals.to(all_normals)
+    return path.main_polyline(all_normals)

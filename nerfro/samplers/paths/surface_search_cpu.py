@@ -10,14 +10,7 @@ import math
 from typing import NamedTuple
 
 from nerfro.kernels.compilation import compiled
-from nerfro.kernels.lookup import (
-    block_at,
-    block_number,
-    blocks_from,
-    box_span,
-    grid_of,
-    spline_value,
-)
+from nerfro.kernels.lookup import block_at, block_number, blocks_from, box_span, grid_of, spline_value
 
 # Tolerance of roots, and distance of a step beyond the wall of a block, as fractions of the shortest step.
 _ROOT_TOLERANCE, _BEYOND_WALL = 1e-6, 1e-3
@@ -51,16 +44,8 @@ def _distance_at(coefficients, grid, line, t):
 
 
 @compiled
-def lengths_of_block(rx, ry, rz):
-    """Return the length of a line per block along each axis, given the blocks per unit length."""
-    qx, qy, qz = math.inf, math.inf, math.inf
-    if rx != 0.0:
-        qx = 1.0 / rx
-    if ry != 0.0:
-        qy = 1.0 / ry
-    if rz != 0.0:
-        qz = 1.0 / rz
-    return qx, qy, qz
+def _inverse(rate):
+    return 1.0 / rate if rate != 0.0 else math.inf
 
 
 @compiled
@@ -172,7 +157,7 @@ def _surface_ahead(solids, body, inside, line, limit):
     # Direction and start in units of blocks, and arc lengths for one block along each axis.
     rx, ry, rz = dx * small[0], dy * small[1], dz * small[2]
     bx, by, bz = blocks_from(solids.low[body], small, x, y, z)
-    qx, qy, qz = lengths_of_block(rx, ry, rz)
+    qx, qy, qz = _inverse(rx), _inverse(ry), _inverse(rz)
     beyond = _BEYOND_WALL * min_step
     # Signed distances at the last point and at the point before; NaN if unknown.
     before, at_before, at_point, across = t, math.nan, math.nan, False

@@ -14,7 +14,7 @@ from nerfro.core.types import Rays
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.media.bodies import Bodies
 from nerfro.samplers.paths.branching import Branching
-from nerfro.samplers.paths.polylines import Crossed, PolylineBuilder, SnellTrace
+from nerfro.samplers.paths.polylines import PolylineBuilder, SnellTrace, split
 from nerfro.samplers.paths.replay import indices_of
 from nerfro.samplers.paths.snell_law import reflectance, refract
 
@@ -116,7 +116,7 @@ class Wavefront:
     ) -> None:
         """Record the present positions of rows as vertices; see `Path` for the numbers."""
         body = self.medium.deciding_body(self.inside[rows])
-        self.lines.append(rows, self.x[rows], self.d[rows], self.s[rows], Crossed(body, surface, across, triangle))
+        self.lines.append(rows, self.x[rows], self.d[rows], self.s[rows], (body, surface, across, triangle))
 
     def apply_interface(
         self,
@@ -201,6 +201,9 @@ class Wavefront:
         """Append the last vertices, and return the trace in the precision and on the device of the rays."""
         refracted, device = self.lines.counts > 1, rays.origins.device
         self.lines.append_ends(self.far[self.ray], self.box, refracted, self.x, self.d, self.s)
-        split = (self.ray, self.weight) if self.branching.max_split_events else (None, None)
-        path = self.lines.path(rays, refracted, *split)
+        if not self.branching.max_split_events:
+            path = self.lines.path(rays, refracted)
+        else:
+            ray = self.ray.to(device)
+            path = split(self.lines.path(rays[ray], refracted), ray, self.weight.to(rays.origins))
         return SnellTrace(path, self.num_events.to(device), self.exceeded.to(device))
