@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from nerfro.core.errors import NerfroError
 from nerfro.core.types import Path
 from nerfro.core.variants import variant
+from nerfro.geometry.box import corners_of_box
 from nerfro.geometry.intersection import LayeredIntersector, Triangles
 from nerfro.geometry.mesh import TriangleMesh, local_origin
 from nerfro.kernels.available import require_bytes
@@ -22,7 +23,7 @@ from nerfro.kernels.constants import constant
 from nerfro.kernels.tolerances import MIN_COSINE, SAFE_SHARE, STEPS_PER_SHELL
 from nerfro.media.base import Medium, Scalars, Vectors
 from nerfro.media.distance_grid import DistanceGrid, DistanceGrids
-from nerfro.media.grid_box import BYTES_PER_VERTEX, grid_box
+from nerfro.media.grid_box import BYTES_PER_VERTEX, check_margin
 from nerfro.media.material import Material
 from nerfro.media.surface import Grid, Surface
 from nerfro.registry.allowed import Positive, Resolution
@@ -30,6 +31,7 @@ from nerfro.registry.allowed import Positive, Resolution
 if TYPE_CHECKING:
     from nerfro.kernels.lookup import Solids
 
+_AIR = 4  # voxels around a body if the box of its grid is not given
 _COLOURS = ("red", "green", "blue")
 # Paths record bodies as 8-bit integers.
 _MAX_BODIES = 127
@@ -70,8 +72,26 @@ class GridSettings:
     cache: bool = True
 
     def box(self, surface: Surface) -> Float[np.ndarray, "2 3"]:
-        """Return the corners of the grid of a surface, world units."""
-        return grid_box(self.box_min, self.box_max, surface.bounds, self.resolution)
+        """Return the corners of the grid of a surface, world units.
+
+        A flat body gets a box at least half as thick as it is long, because voxels should not be much longer than wide.
+
+        Raises:
+            NerfroError: one corner is given without the other, the corners do not make a box, or the surface does not
+                fit into it.
+        """
+        low, high = surface.bounds
+        if self.box_min is not None and self.box_max is not None:
+            box = corners_of_box(self.box_min, self.box_max)
+            check_margin(surface.bounds, box, self.resolution, 2)
+            return box
+        if self.box_min is not None or self.box_max is not None:
+            raise NerfroError(
+                "medium.box_min and medium.box_max belong together; give both, or neither for the bounds of the mesh"
+            )
+        sides = np.maximum(high - low, 0.5 * (high - low).max())
+        share = min(2 * _AIR / (self.resolution - 1), 0.5)
+        return 0.5 * (low + high) + np.array([[-0.5], [0.5]]) * sides / (1 - share)
 
     def require_memory(self, num_bodies: int) -> None:
         """Refuse grids that need more memory than is available."""
@@ -310,10 +330,7 @@ class Bodies(Medium):
         phi, normals = self.signed_distances(positions)
         in_box = ((positions >= self.box[0]) & (positions <= self.box[1])).all(-1)
         n, gradient = torch.ones_like(phi[..., 0]), torch.zeros_like(positions)
-        within, rise = (
-            torch.ones_like(n)[..., None],
-            torch.zeros_like(positions),
-        )  # product of steps, its gradient
+        within, rise = torch.ones_like(n)[..., None], torch.zeros_like(positions)  # product of steps, its gradient
         for body, ior in enumerate(self.iors.unbind()):
             t = (0.5 - 0.5 * phi[..., body] / self.shell).clamp(0, 1)
             step = (t * t * (3 - 2 * t))[..., None]

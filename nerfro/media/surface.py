@@ -140,3 +140,10 @@ def direction(name: str, values: Sequence[float]) -> Float[np.ndarray, "3"]:
     if len(values) != 3 or not length > 0:
         raise NerfroError(f"{name}={list(values)} is no direction; give three numbers, not all of them 0")
     return np.array(values, np.float64) / length
+
+
+def vector(name: str, values: Sequence[float]) -> Float[np.ndarray, "3"]:
+    """Return three numbers as an array."""
+    if len(values) != 3:
+        raise NerfroError(f"surface.{name}={list(values)} is not allowed; give three numbers")
+    return np.array(values, np.float64)

@@ -12,10 +12,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerfro.core.errors import NerfroError
+from nerfro.geometry.bodies import bodies_of
+from nerfro.geometry.mesh import TriangleMesh
+from nerfro.geometry.orientation import area_vectors
 from nerfro.media.bodies import Bodies, Body, GridSettings
 from nerfro.media.body_settings import BodySettings, expanded, make_material
 from nerfro.media.distance_grid import DistanceGrid
-from nerfro.media.lids import find_lid
 from nerfro.media.material import Learns, Material, learned_quantities
 from nerfro.media.surface import Grid, MeshSurface, Surface, cached_distances, direction
 from nerfro.registry.allowed import Coordinate, NotNegative, Positive, Resolution
@@ -124,6 +126,30 @@ def with_lengths(medium: Bodies, lengths: VesselLengths) -> Bodies:
     if levels and lengths.level is not None:
         grids.append(DistanceGrid(cavity.heights - lengths.level * lengths.unit, cavity.box))
     return medium.with_grids(grids)
+
+
+def find_lid(mesh: TriangleMesh, up: Float[np.ndarray, "3"]) -> Bool[np.ndarray, "F"]:
+    """Find the lid of a mesh: the connected level triangles around the highest level triangle.
+
+    Triangles count as level if their normals are within 45 degrees of up.
+
+    Args:
+        mesh: outer surface of the vessel.
+        up: unit vector.
+
+    Returns:
+        Whether each triangle belongs to the lid; false everywhere if no triangle is level.
+    """
+    triangles = mesh.triangles
+    normals = area_vectors(triangles)
+    level = normals @ up > np.cos(np.pi / 4) * np.linalg.norm(normals, axis=-1)
+    if not level.any():
+        return level
+    component = bodies_of(TriangleMesh(mesh.vertices, mesh.faces[level]))
+    highest = (triangles[level].mean(1) @ up).argmax()
+    lid = np.zeros_like(level)
+    lid[level] = component == component[highest]
+    return lid
 
 
 class CavityGrid(DistanceGrid):

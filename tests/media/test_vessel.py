@@ -9,8 +9,7 @@ import trimesh
 
 from nerfro.geometry.mesh import load_mesh
 from nerfro.media.bodies import Bodies
-from nerfro.media.lids import find_lid
-from nerfro.media.vessel import make_vessel
+from nerfro.media.vessel import find_lid, make_vessel
 from nerfro.samplers.paths.snell import Snell, trace_interfaces
 from nerfro.viewing.surface import surface_of
 from tests.closed_forms import angle, make_rays

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from nerfro.media.surface import Grid, Surface
-from nerfro.media.surfaces.vectors import vector
+from nerfro.media.surface import Grid, Surface, vector
 from nerfro.registry.allowed import Coordinate, Positive
 from nerfro.registry.registration import register
 

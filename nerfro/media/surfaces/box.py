@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nerfro.core.errors import NerfroError
-from nerfro.media.surface import Grid, Surface
-from nerfro.media.surfaces.vectors import vector
+from nerfro.media.surface import Grid, Surface, vector
 from nerfro.registry.allowed import Coordinate, NotNegative, Positive
 from nerfro.registry.registration import register
 

@@ -11,8 +11,7 @@ from jaxtyping import Float
 from nerfro.core.errors import NerfroError
 from nerfro.geometry.mesh import merge_vertices
 from nerfro.geometry.revolve import revolve
-from nerfro.media.surface import MeshSurface, direction
-from nerfro.media.surfaces.vectors import vector
+from nerfro.media.surface import MeshSurface, direction, vector
 from nerfro.registry.allowed import Coordinate
 from nerfro.registry.registration import register
 
