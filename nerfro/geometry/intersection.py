@@ -16,8 +16,30 @@ from nerfro.geometry.normals import corner_normals
 from nerfro.geometry.orientation import patches
 
 
+class Planes:
+    """Planes of triangles in double precision.
+
+    Attributes:
+        corners: corners of each triangle, world units.
+    """
+
+    corners: Float[Tensor, "F 3 3"]
+
+    def areas(self, face: Int[Tensor, "*batch"]) -> Float[Tensor, "*batch 3"]:
+        """Return normals by the right-hand rule, with a length of twice the area of the triangle."""
+        a, b, c = self.corners[face].unbind(-2)
+        return torch.linalg.cross(b - a, c - a)
+
+    def distance(
+        self, x: Float[Tensor, "*#batch 3"], d: Float[Tensor, "*#batch 3"], face: Int[Tensor, "*#batch"]
+    ) -> Float[Tensor, "*#batch"]:
+        """Return the distance to a triangle's plane along each ray."""
+        normal = self.areas(face)
+        return ((self.corners[face, 0] - x) * normal).sum(-1) / (d * normal).sum(-1)
+
+
 @dataclass(frozen=True)
-class Triangles:
+class Triangles(Planes):
     """Triangles of several bodies in double precision.
 
     Attributes:
@@ -38,18 +60,6 @@ class Triangles:
         body = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])
         return cls(*map(torch.from_numpy, (corners, normals, body)))
 
-    def areas(self, face: Int[Tensor, "*batch"]) -> Float[Tensor, "*batch 3"]:
-        """Return normals by the right-hand rule, with a length of twice the area of the triangle."""
-        a, b, c = self.corners[face].unbind(-2)
-        return torch.linalg.cross(b - a, c - a)
-
-    def distance(
-        self, x: Float[Tensor, "*#batch 3"], d: Float[Tensor, "*#batch 3"], face: Int[Tensor, "*#batch"]
-    ) -> Float[Tensor, "*#batch"]:
-        """Return the distance to a triangle's plane along each ray."""
-        normal = self.areas(face)
-        return ((self.corners[face, 0] - x) * normal).sum(-1) / (d * normal).sum(-1)
-
     def normal(self, x: Float[Tensor, "R 3"], face: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
         """Interpolate unit normals at points of triangles with barycentric coordinates."""
         corners, normal = self.corners[face], self.areas(face)
@@ -59,7 +69,7 @@ class Triangles:
         return torch.nn.functional.normalize((weights[..., None] * self.normals[face]).sum(1), dim=-1)
 
 
-class MeshIntersector:
+class MeshIntersector(Planes):
     """First hits of rays with triangles, which are given by the corners."""
 
     def __init__(self, corners: Float[Tensor, "F 3 3"] | Float[np.ndarray, "F 3 3"]) -> None:
@@ -73,10 +83,10 @@ class MeshIntersector:
             ) from error
         self._scene = EmbreeScene()
         # Embree computes in single precision, which is most accurate around the origin.
-        corners = torch.as_tensor(corners, dtype=torch.float64)
-        self._centre = corners.mean((0, 1))
+        self.corners = torch.as_tensor(corners, dtype=torch.float64)
+        self._centre = self.corners.mean((0, 1))
         # The scene does not keep the mesh alive.
-        self._mesh = EmbreeMesh(self._scene, (corners - self._centre).float().numpy())
+        self._mesh = EmbreeMesh(self._scene, (self.corners - self._centre).float().numpy())
 
     def first_hits(self, x: Float[Tensor, "R 3"], d: Float[Tensor, "R 3"]) -> Int[Tensor, "R"]:
         """Return the first triangle that each ray hits, -1 for none."""

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 # A point of a triangle (barycentric coordinates) and a deviation from its normal, without symmetry, so that lines do
 # not pass through edges of regular meshes.
@@ -57,6 +55,8 @@ def patches(faces: Int[np.ndarray, "F 3"]) -> tuple[Int[np.ndarray, "F"], Bool[n
 
     Triangles of a patch are connected by edges that belong to exactly two triangles.
     """
+    from trimesh.graph import connected_component_labels
+
     start, end = faces.reshape(-1), np.roll(faces, -1, 1).reshape(-1)
     edge = np.minimum(start, end) * (faces.max() + 1) + np.maximum(start, end)
     order = np.argsort(edge, kind="stable")
@@ -67,8 +67,7 @@ def patches(faces: Int[np.ndarray, "F 3"]) -> tuple[Int[np.ndarray, "F"], Bool[n
     num = len(faces)
     other = b // 3 + np.where(start[a] == start[b], num, 0)
     links = np.concatenate([[a // 3, other], [a // 3 + num, (other + num) % (2 * num)]], axis=1)
-    graph = coo_array((np.ones(links.shape[1], bool), tuple(links)), (2 * num, 2 * num))
-    _, label = connected_components(graph, directed=False)
+    label = connected_component_labels(links.T, 2 * num)
     return np.minimum(label[:num], label[num:]), label[:num] > label[num:]
 
 

@@ -56,9 +56,9 @@ def thickness(mesh: TriangleMesh) -> Float[np.ndarray, " points"]:
     generator = np.random.default_rng(0)
     face = generator.choice(len(size), _NUM_POINTS, p=size / size.sum())
     weights = generator.dirichlet(np.ones(3), _NUM_POINTS)
-    inwards = -normals[face] / size[face, None]
-    start = (weights[..., None] * triangles[face]).sum(1) + 1e-5 * np.ptp(mesh.bounds, 0).max() * inwards
-    hit = MeshIntersector(triangles).first_hits(torch.from_numpy(start), torch.from_numpy(inwards)).numpy()
-    start, inwards, hit = start[hit >= 0], inwards[hit >= 0], hit[hit >= 0]
-    opposite = normals[hit]
-    return ((triangles[hit, 0] - start) * opposite).sum(1) / (inwards * opposite).sum(1)
+    inwards = torch.from_numpy(-normals[face] / size[face, None])
+    below = 1e-5 * np.ptp(mesh.bounds, 0).max() * inwards
+    start = torch.from_numpy((weights[..., None] * triangles[face]).sum(1)) + below
+    intersector = MeshIntersector(triangles)
+    hit = intersector.first_hits(start, inwards)
+    return intersector.distance(start[hit >= 0], inwards[hit >= 0], hit[hit >= 0]).numpy()
