@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from typing import ClassVar
 
 import numpy as np
@@ -24,53 +23,8 @@ NEAREST = 1e-6
 # Cells along each side of the grid of observed cells, and number of cameras that must see a cell close to a camera.
 _OBSERVED_CELLS, _MIN_CAMERAS = 64, 3
 
+ToArcLength = Callable[[Float[Tensor, "P N"]], Float[Tensor, "P N"]]
 Corners = Sequence[Sequence[float]] | Float[np.ndarray, "2 3"] | Float[Tensor, "2 3"]
-
-
-@dataclass(frozen=True)
-class ArcLength:
-    """Length along polylines that counts arc length from `first` on."""
-
-    first: Float[Tensor, "P"]
-    total: Float[Tensor, "P"]
-
-    def arc_length(self, length: Float[Tensor, "P N"]) -> Float[Tensor, "P N"]:
-        """Convert lengths from 0 to `total` to arc lengths."""
-        return self.first[:, None] + length
-
-
-@dataclass(frozen=True)
-class ContractedLength:
-    """Length of polylines in contracted space, from an arc length to practical infinity.
-
-    If necessary, the first segment is extended backwards, and the last one forwards, beyond the ends of the path.
-
-    Attributes:
-        cumulative: contracted length at the start of each segment, and in total.
-        start_length: signed contracted length from the segment's closest approach to its start.
-        closest: arc length of the segment's closest approach to the centre.
-        impact: distance of the closest approach from the centre (impact parameter).
-        radius: radius of the ball beyond which space is contracted.
-    """
-
-    cumulative: Float[Tensor, "P segment_ends"]
-    start_length: Float[Tensor, "P S"]
-    closest: Float[Tensor, "P S"]
-    impact: Float[Tensor, "P S"]
-    radius: float
-
-    @property
-    def total(self) -> Float[Tensor, "P"]:
-        return self.cumulative[:, -1]
-
-    def arc_length(self, length: Float[Tensor, "P N"]) -> Float[Tensor, "P N"]:
-        """Convert contracted lengths from 0 to `total` to arc lengths."""
-        last = self.start_length.shape[1] - 1
-        segment = (torch.searchsorted(self.cumulative, length.contiguous().double()) - 1).clamp(0, last)
-        start_length, closest, impact, before = (
-            x.gather(1, segment) for x in (self.start_length, self.closest, self.impact, self.cumulative)
-        )
-        return closest + world_length(start_length + length - before, impact, self.radius)
 
 
 class Space(nn.Module, ABC):
@@ -143,10 +97,14 @@ class Space(nn.Module, ABC):
         """Return the arc lengths between which paths from near to far may be in the space."""
         return path.near, path.far
 
-    def measure(self, path: Path) -> ArcLength | ContractedLength:
-        """Measure paths in the space, in the coordinates of grids."""
+    def measure(self, path: Path) -> tuple[Float[Tensor, "P"], ToArcLength]:
+        """Measure paths in the space, in the coordinates of grids.
+
+        Returns:
+            Length of each path, and a function that converts lengths from 0 to this length to arc lengths.
+        """
         first, last = self.span(path)
-        return ArcLength(first, last - first)
+        return last - first, lambda length: first[:, None] + length
 
     def observed(self, cameras: Cameras | None = None) -> Bool[Tensor, "cells cells cells"] | None:
         """Find the cells of a coarse grid that photographs can determine, all without cameras.
@@ -257,19 +215,33 @@ class Contracted(Space):
         nearest = torch.minimum(edges[:-1], edges[1:])
         return ((nearest[:, None, None] + nearest[:, None] + nearest).flatten() < 1).nonzero()[:, 0]
 
-    def measure(self, path: Path) -> ContractedLength:
+    def measure(self, path: Path) -> tuple[Float[Tensor, "P"], ToArcLength]:
+        """Measure paths from `near` to practical infinity.
+
+        If necessary, the first segment is extended backwards, and the last one forwards, beyond the ends of the path.
+        """
         assert self.near is not None
         positions, directions, s = (x.detach().double() for x in (path.positions, path.directions, path.s))
         offsets = self.centre - positions
         along = (offsets * directions).sum(-1)
+        # Distance of each segment's closest approach from the centre, and arc length there.
         impact = (offsets.square().sum(-1) - along.square()).clamp(min=0).sqrt()
         closest = s + along
         start = torch.cat([s[:, 1:2].clamp(max=self.near), s[:, 1:]], 1)
         end = torch.cat([s[:, 1:], closest[:, -1:] + FAR * impact[:, -1:].clamp(min=self.radius)], 1)
+        # Signed contracted length from the closest approach to the start of each segment.
         start_length = contracted_length(start - closest, impact, self.radius)
         lengths = contracted_length(end - closest, impact, self.radius) - start_length
         cumulative = torch.cat([torch.zeros_like(lengths[:, :1]), lengths.cumsum(1)], 1)
-        return ContractedLength(cumulative, start_length, closest, impact, self.radius)
+
+        def arc_length(length: Float[Tensor, "P N"]) -> Float[Tensor, "P N"]:
+            segment = torch.searchsorted(cumulative, length.contiguous().double()) - 1
+            segment = segment.clamp(0, start_length.shape[1] - 1)
+            columns = (start_length, closest, impact, cumulative)
+            start, middle, distance, before = (values.gather(1, segment) for values in columns)
+            return middle + world_length(start + length - before, distance, self.radius)
+
+        return cumulative[:, -1], arc_length
 
     @torch.no_grad()
     def observed(self, cameras: Cameras | None = None) -> Bool[Tensor, "cells cells cells"]:

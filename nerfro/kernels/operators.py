@@ -7,11 +7,12 @@ devices. `torch.compile`, fake tensors and the profiler see operators, but not t
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 
+Function = TypeVar("Function", bound=Callable)
 _LIBRARY = torch.library.Library("nerfro", "FRAGMENT")
 REFERENCES: dict[str, Callable[..., Any]] = {}  # implementation in PyTorch of each operator with gradients, by name
 
@@ -30,6 +31,11 @@ def operator(schema: str, reference: Callable[..., Any], on_cpu: Callable[..., A
     for key in ("CPU", "AutogradCPU"):
         _LIBRARY.impl(name, on_cpu, key)
     return getattr(torch.ops.nerfro, name).default
+
+
+def select(tensor: torch.Tensor, on_cpu: Function, reference: Function) -> Function:
+    """Select the implementation of a function of objects that hold a tensor by its device; see `operator`."""
+    return on_cpu if tensor.device.type == "cpu" else reference
 
 
 def kernel(schema: str, fake: Callable[..., Any]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:

@@ -17,6 +17,7 @@ from nerfro.core.types import Path, Rendering, Samples
 from nerfro.fields.base import Field
 from nerfro.geometry.space import Space
 from nerfro.kernels.arrays import arrays
+from nerfro.kernels.operators import select
 from nerfro.registry.allowed import Count, Share
 from nerfro.registry.registration import register
 from nerfro.samplers.base import PointSampler
@@ -88,23 +89,14 @@ class DensityGridSampler(PointSampler):
 
     @torch.no_grad()
     def choose_ahead(self, path: Path, draws: Draws | None) -> Samples:
-        samples = (self.draw_compiled if path.s.device.type == "cpu" else self.draw)(path, draws)
+        samples = select(path.s, self.draw_compiled, self.draw)(path, draws)
         return samples if draws is None else replace(samples, occupied=self._queried(path, samples))
 
-    def _quantiles(self, path: Path, draws: Draws | None) -> Float[Tensor, "P E"]:
-        """Compute the values of the cumulative weights at which edges of samples lie.
-
-        In training, polylines of rays that split have samples in proportion to their weight. Missing intervals are at
-        the end of a polyline and have no length.
-        """
-        if draws is None:
-            return spread_uniform(path, self.num_samples_evaluation + 1, None)
-        num = self._num_intervals(path)[:, None]
-        edge = torch.arange(self.num_samples + 1, device=num.device).minimum(num)
-        return (edge + draws.for_rays(path.ray, self.num_samples + 1).gather(1, edge)) / (num + 1)
-
     def _num_intervals(self, path: Path) -> Int[Tensor, "P"]:
-        """Number of intervals of each polyline in training."""
+        """Number of intervals of each polyline in training: in proportion to its weight, if rays split.
+
+        Missing intervals are at the end of a polyline and have no length.
+        """
         if not path.splits:
             return torch.full_like(path.ray, self.num_samples)
         return (self.num_samples * _weight(path)).ceil().clamp(min=min(self.num_samples, _MIN_SAMPLES)).long()
@@ -122,15 +114,22 @@ class DensityGridSampler(PointSampler):
 
     def draw(self, path: Path, draws: Draws | None) -> Samples:
         """Draw samples with PyTorch; the reference implementation of the compiled kernel."""
-        u, space, dtype = self._quantiles(path, draws), self.space, path.s.dtype
-        length = space.measure(path)
-        places = torch.linspace(0, 1, self.num_bins + 1, device=u.device) * length.total[:, None]
-        positions, _ = path.at(length.arc_length(midpoints(places)).to(dtype))
-        estimated = (self.lookup(space.contract(positions)) * places.diff(dim=1)).clamp(max=self._max_bin_depth)
+        space, dtype = self.space, path.s.dtype
+        if draws is None:
+            u = spread_uniform(path, self.num_samples_evaluation + 1, None)
+        else:
+            num = self._num_intervals(path)[:, None]
+            edge = torch.arange(self.num_samples + 1, device=num.device).minimum(num)
+            u = (edge + draws.for_rays(path.ray, self.num_samples + 1).gather(1, edge)) / (num + 1)
+        total, arc_length = space.measure(path)
+        places = torch.linspace(0, 1, self.num_bins + 1, device=u.device) * total[:, None]
+        positions, _ = path.at(arc_length(midpoints(places)).to(dtype))
+        most = -math.log1p(-self.max_bin_alpha) if self.max_bin_alpha < 1 else math.inf
+        estimated = (self.lookup(space.contract(positions)) * places.diff(dim=1)).clamp(max=most)
         weights, _ = volume_weights(estimated, torch.ones_like(estimated))
         share = weights / weights.sum(-1, keepdim=True).clamp(min=1e-6)
         places = invert_cdf(places, share + self._floor, u)
-        middles, edges = (length.arc_length(at).to(dtype) for at in (midpoints(places), places))
+        middles, edges = (arc_length(at).to(dtype) for at in (midpoints(places), places))
         samples, widths = Samples.along(path, middles, edges), places.diff(dim=1)
         depth = self.lookup(space.contract(samples.positions)) * widths
         lengths = (widths / space.scale(samples.positions)).to(dtype)
@@ -161,11 +160,6 @@ class DensityGridSampler(PointSampler):
         return self._samples(Samples(positions, directions, s, edges, path.radii, occupied), *contracted)
 
     @property
-    def _max_bin_depth(self) -> float:
-        """Optical depth of a bin whose opacity is `max_bin_alpha`."""
-        return -math.log1p(-self.max_bin_alpha) if self.max_bin_alpha < 1 else math.inf
-
-    @property
     def _floor(self) -> float:
         """Weight of each bin that spreads the fraction `uniform` of the samples evenly, where weights sum to one."""
         return self.uniform / (1 - self.uniform) / self.num_bins
@@ -187,22 +181,17 @@ class DensityGridSampler(PointSampler):
         words = draws.words(torch.arange(math.ceil(num_cells * self.update_fraction), device=device), 4, "density grid")
         cells = words[:, 0] * num_cells >> 32
         cells = cells if inside is None else inside[cells]
-        corners = torch.stack(
-            [cells // self.resolution**2, cells // self.resolution % self.resolution, cells % self.resolution], dim=-1
-        )
+        corners = torch.stack(torch.unravel_index(cells, self.density.shape), -1)
         unit = (corners + (words[:, 1:] >> 8) * 2.0**-24) / self.resolution
         low, high = self.space.box
-        density = self._query(fields[-1], low + unit * (high - low))
+        contracted = low + unit * (high - low)
+        positions = self.space.expand(contracted)
+        density = fields[-1].density(positions) / self.space.scale(positions)  # per unit of contracted length
+        density = torch.where(self.space.exists(contracted), density, 0.0)
         flat = self.density.view(-1)
         # A cell that is drawn twice must not depend on the order of writing, because runs must be repeatable.
         flat[cells] = flat[cells] * self.decay
         flat.scatter_reduce_(0, cells, density.to(flat), "amax")
-
-    def _query(self, field: Field, contracted: Float[Tensor, "M 3"]) -> Float[Tensor, "M"]:
-        """Density of a field at contracted positions, per unit of contracted length."""
-        positions = self.space.expand(contracted)
-        density = field.density(positions) / self.space.scale(positions)
-        return torch.where(self.space.exists(contracted), density, 0.0)
 
 
 def _weight(path: Path) -> Float[Tensor, "P"]:

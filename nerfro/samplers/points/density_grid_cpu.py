@@ -110,7 +110,7 @@ def _world_length(length, impact, radius):
 
 @compiled
 def _contracted_segments(path, centre, radius, near, segments):
-    """Fill the segments of `geometry.space.ContractedLength` for one polyline; return its total."""
+    """Fill the segments of `geometry.space.Contracted.measure` for one polyline; return its total."""
     positions, directions, s = path
     cumulative, start_length, closest, impact = segments
     total, last = 0.0, len(s) - 1
@@ -130,13 +130,6 @@ def _contracted_segments(path, centre, radius, near, segments):
         start_length[segment] = _contracted_length(start - closest[segment], impact[segment], radius)
         total += _contracted_length(end - closest[segment], impact[segment], radius) - start_length[segment]
     return total
-
-
-@compiled
-def _even_segments(s, cumulative):
-    """Fill the cumulative lengths where space is not contracted: arc length from the camera."""
-    for segment in range(len(s)):
-        cumulative[segment] = s[segment]
 
 
 @compiled
@@ -299,7 +292,8 @@ def _predict(path, grid, settings, segments, weights):
         last = _contracted_segments(path, grid.centre, grid.radius, settings.near, segments)
     else:
         first, last = _span(path, grid.low, grid.high)
-        _even_segments(path[2], segments.cumulative)
+        for segment, s in enumerate(path[2]):  # arc length from the camera
+            segments.cumulative[segment] = s
     width = (last - first) / len(weights)
     if width > 0.0:
         if grid.radius > 0.0:

@@ -15,6 +15,7 @@ from nerfro.core.types import Path, Rendering, Samples
 from nerfro.geometry.space import Space, Unbounded
 from nerfro.registry.registration import register
 from nerfro.samplers.base import PointSampler
+from nerfro.samplers.points.stepfun import midpoints
 
 # Width of the interval of the last point sample, behind which the background is seen: in world units for
 # `draw=vertices`, as in the authors' code, and relative to the length of the path for other arc lengths.
@@ -55,14 +56,11 @@ class Stratified(PointSampler):
         if self.draw == "vertices":
             return self._draw_vertices(path, draws)
         near, far = self.space.span(path)
-        cones = self.cast == "cones"
-        fractions = self._cone_fractions(path, draws) if cones else self._point_fractions(path, draws)
-        s = near[:, None] + fractions * (far - near)[:, None]
-        return cone_samples(path, s) if cones else point_samples(path, s)
-
-    def _point_fractions(self, path: Path, draws: Draws | None) -> Float[Tensor, "P N"]:
+        if self.cast == "cones":
+            return cone_samples(path, near[:, None] + self._cone_fractions(path, draws) * (far - near)[:, None])
         bins = torch.arange(self.num_samples, device=path.s.device, dtype=path.s.dtype)
-        return (bins + self._offsets(path, draws)) / self.num_samples
+        fractions = (bins + self._offsets(path, draws)) / self.num_samples
+        return point_samples(path, near[:, None] + fractions * (far - near)[:, None])
 
     def _offsets(self, path: Path, draws: Draws | None) -> Float[Tensor, "P N"]:
         if draws is not None:
@@ -73,9 +71,8 @@ class Stratified(PointSampler):
         like = path.s
         fractions = torch.linspace(0.0, 1.0, self.num_samples + 1, device=like.device, dtype=like.dtype)
         if draws is not None:  # as in mip-NeRF, each edge moves by up to half a bin
-            middle = 0.5 * (fractions[1:] + fractions[:-1])
-            low = torch.cat([fractions[:1], middle])
-            high = torch.cat([middle, fractions[-1:]])
+            middle = midpoints(fractions)
+            low, high = torch.cat([fractions[:1], middle]), torch.cat([middle, fractions[-1:]])
             return low + (high - low) * draws.for_rays(path.ray, len(fractions)).to(like)
         return fractions.expand(len(like), -1)
 
@@ -89,8 +86,7 @@ class Stratified(PointSampler):
         offsets = (self._offsets(path, draws) * steps).long()  # floor: 0 .. steps - 1
         vertex = torch.arange(self.num_samples, device=path.s.device) * steps + offsets
         s = path.s.gather(1, vertex)
-        index = vertex[..., None].expand(-1, -1, 3)
-        positions, directions = path.positions.gather(1, index), path.directions.gather(1, index)
+        positions, directions = (x.take_along_dim(vertex[..., None], 1) for x in (path.positions, path.directions))
         return Samples(positions, directions, s, torch.cat([s, s[:, -1:] + LAST_DELTA], dim=1), path.radii)
 
 
@@ -111,4 +107,4 @@ def point_samples(path: Path, s: Float[Tensor, "P N"], last: float | None = None
 
 def cone_samples(path: Path, edges: Float[Tensor, "P E"]) -> Samples:
     """Create samples at the middle of intervals between ascending edges."""
-    return Samples.along(path, 0.5 * (edges[:, 1:] + edges[:, :-1]), edges)
+    return Samples.along(path, midpoints(edges), edges)
