@@ -137,17 +137,6 @@ def test_empty_blocks_contain_no_surface() -> None:
     assert (reach[(near > 3**0.5 * (block + 2 * 3 / 42)) & (positions.abs().amax(-1) < 1.2)] > 0).all()
 
 
-def test_mesh_becomes_a_distance_that_is_smooth_where_the_mesh_is(tmp_path: Path) -> None:
-    trimesh.creation.icosphere(3, 0.8).export(tmp_path / "ball.ply")
-    medium = make_bodies(str(tmp_path / "ball.ply"), resolution=64, cache=False)
-    directions = torch.nn.functional.normalize(torch.randn(500, 3), dim=-1)
-    phi, normals = medium.signed_distances(0.8 * directions)
-    assert phi.abs().max() < 5e-4
-    cosine = (torch.nn.functional.normalize(normals[:, 0], dim=-1) * directions).sum(-1)
-    # Facets of this mesh are 5 degrees wide.
-    assert torch.rad2deg(torch.acos(cosine.clamp(max=1)).quantile(0.95)) < 0.5
-
-
 def test_bad_solids_are_named(tmp_path: Path) -> None:
     trimesh.creation.icosphere(2, 0.8).export(tmp_path / "ball.ply")
     mesh = str(tmp_path / "ball.ply")

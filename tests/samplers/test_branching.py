@@ -15,7 +15,6 @@ from nerfro.media.bodies import Bodies
 from nerfro.samplers.paths import compiled
 from nerfro.samplers.paths.replay import smallest_cosine
 from nerfro.samplers.paths.snell import Snell, trace_interfaces
-from nerfro.samplers.paths.snell_law import reflectance
 from tests.closed_forms import Ball, FreeBodies, RoundedBox, Slab, beam, make_rays, random_rays
 from tests.samplers.nested import NestedBalls, nested_grid, nested_mesh
 
@@ -36,19 +35,6 @@ def _fresnel(cosine: Tensor, n: float) -> Tensor:
 
 def _weights(path: Path) -> Tensor:
     return path.throughput[:, 0].double()
-
-
-def test_reflectance_matches_fresnel_in_both_directions() -> None:
-    angles = torch.tensor([0.01, 0.3, 0.8, 1.2, 1.5], dtype=torch.float64)
-    d = torch.stack([angles.sin(), 0 * angles, angles.cos()], -1)
-    normal = torch.tensor([0.0, 0, 1]).double().expand_as(d)
-    ones = torch.ones_like(angles)
-    entering = reflectance(d, normal, ones, 1.5 * ones)
-    torch.testing.assert_close(entering, _fresnel(angles.cos(), 1.5))
-    inside = torch.asin(angles.sin() / 1.5)
-    back = torch.stack([inside.sin(), 0 * inside, inside.cos()], -1)
-    torch.testing.assert_close(reflectance(back, -normal, 1.5 * ones, ones), entering)
-    assert float(reflectance(d[3:4], normal[3:4], 1.5 * ones[:1], ones[:1])) == 1
 
 
 @pytest.mark.parametrize("branches", ["first", "all"])

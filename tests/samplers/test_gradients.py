@@ -26,22 +26,6 @@ def _double(*values: float) -> Tensor:
 # --- Snell's law ---
 
 
-@pytest.mark.parametrize("impact", [0.1, 0.5, 0.9])
-@pytest.mark.parametrize("n", [1.33, 1.52])
-def test_deviation_of_a_ball_has_the_derivative_of_its_closed_form(n: float, impact: float) -> None:
-    index = _double(n).requires_grad_()
-    x = _double(-math.sqrt(1 - impact**2), impact, 0)[None]
-    inside, _ = refract(_double(1, 0, 0)[None], x, ONES, index)
-    leaving = x - 2 * (x * inside).sum(-1, keepdim=True) * inside
-    out, reflected = refract(inside, leaving, index, ONES)
-    assert not reflected.any()
-    deviation = -torch.atan2(out[0, 1], out[0, 0])
-    t = math.asin(impact / n)
-    assert float(deviation.detach()) == pytest.approx(2 * (math.asin(impact) - t))
-    (slope,) = torch.autograd.grad(deviation, index)
-    assert float(slope) == pytest.approx(2 * math.tan(t) / n, rel=1e-10)
-
-
 def test_gradients_are_finite_on_crossing_the_critical_angle() -> None:
     # cos and sin of 45 degrees and n = sqrt 2: within rounding of critical, and some steps to either side.
     offsets = torch.cat(

@@ -35,15 +35,11 @@ def test_training_draws_one_sample_from_each_bin(bent: Path) -> None:
     assert (place.std(0) > 0.2).all()
 
 
-def test_evaluation_takes_the_middles_of_the_bins(bent: Path) -> None:
-    samples = Stratified(16)(bent, None)
-    expected = ((torch.arange(16) + 0.5) / 16).expand(200, -1)
+@pytest.mark.parametrize("offset", [0.5, 0.0])
+def test_evaluation_takes_one_position_in_each_bin(bent: Path, offset: float) -> None:
+    samples = Stratified(16, offset=offset)(bent, None)
+    expected = ((torch.arange(16) + offset) / 16).expand(200, -1)
     torch.testing.assert_close(fractions(bent, samples.s), expected, atol=1e-5, rtol=0)
-
-
-def test_offset_moves_the_samples_of_evaluation(bent: Path) -> None:
-    samples = Stratified(16, offset=0.0)(bent, None)
-    torch.testing.assert_close(samples.s[:, 0], bent.near)
 
 
 def test_intervals_reach_from_sample_to_sample_and_the_last_is_thin(bent: Path) -> None:
