@@ -84,13 +84,13 @@ def _score_views(
         target, mask = views.images[view], None if views.masks is None else views.masks[view]
         name = f"{prefix}_{view:03d}"
         for treatment, scored in scores.items():
-            gain, part = torch.ones(3), slice(None)
+            gain = torch.ones(3)
             if treatment == EXPOSED:
                 to_srgb, shown = scene.colour_space.to_srgb, radiance[:, left].flatten(0, 1)
                 gain = fit_gain(to_srgb, shown, target[:, left].flatten(0, 1))
-                part = slice(width // 2, None)
             rgb = scene.colour_space.to_display(radiance, gain)
             save_png(folder / ("images" if treatment == AS_GIVEN else f"images_{treatment}") / f"{name}.png", rgb)
+            part = slice(width // 2, None) if treatment == EXPOSED else slice(None)
             coverage = None if mask is None else mask[:, part].contiguous()
             scored.append(metrics.score(name, rgb[:, part].contiguous(), target[:, part].contiguous(), coverage))
     return {treatment: metrics.result(scored) for treatment, scored in scores.items()}
