@@ -8,13 +8,13 @@ Examples:
 from __future__ import annotations
 
 import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
+from nerfro.cli.entry import entry_point
 from nerfro.cli.overrides import print_next
-from nerfro.cli.parsing import command
 from nerfro.poses.calibrate import calibrate
 from nerfro.poses.options import CalibrateConfig
 
 
-@command("calibrate", CalibrateConfig)
+@entry_point("calibrate", CalibrateConfig)
 def main(options: CalibrateConfig) -> None:
     """Detect the board, estimate lens and poses, write the data set, and print the next command."""
     capture = calibrate(options)

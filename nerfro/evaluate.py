@@ -8,12 +8,12 @@ Examples:
 from __future__ import annotations
 
 import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
-from nerfro.cli.parsing import command
+from nerfro.cli.entry import entry_point
 from nerfro.evaluation.request import EvaluateConfig
 from nerfro.pipeline.evaluate import evaluate
 
 
-@command("evaluate", EvaluateConfig)
+@entry_point("evaluate", EvaluateConfig)
 def main(options: EvaluateConfig) -> None:
     """Score the test views of a checkpoint, or a folder of images."""
     evaluate(options=options)

@@ -8,12 +8,12 @@ Examples:
 from __future__ import annotations
 
 import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
-from nerfro.cli.parsing import command
+from nerfro.cli.entry import entry_point
 from nerfro.pipeline.export import export
 from nerfro.viewing.exports import ExportConfig
 
 
-@command("export", ExportConfig)
+@entry_point("export", ExportConfig)
 def main(options: ExportConfig) -> None:
     """Check the request, load the scene, and write the file."""
     export(options=options)

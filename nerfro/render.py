@@ -8,12 +8,12 @@ Examples:
 from __future__ import annotations
 
 import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
-from nerfro.cli.parsing import command
+from nerfro.cli.entry import entry_point
 from nerfro.pipeline.render import render
 from nerfro.viewing.render_request import RenderConfig
 
 
-@command("render", RenderConfig)
+@entry_point("render", RenderConfig)
 def main(options: RenderConfig) -> None:
     """Check the request, load the scene, render the missing frames, and encode films."""
     render(options=options)

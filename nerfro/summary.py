@@ -8,11 +8,11 @@ Examples:
 from __future__ import annotations
 
 import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
-from nerfro.cli.parsing import command
+from nerfro.cli.entry import entry_point
 from nerfro.report.summary import SummaryConfig, summarize
 
 
-@command("summary", SummaryConfig)
+@entry_point("summary", SummaryConfig)
 def main(options: SummaryConfig) -> None:
     """Read and compare runs, and print and write the result."""
     summarize(options)

@@ -8,12 +8,12 @@ Examples:
 from __future__ import annotations
 
 import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
-from nerfro.cli.parsing import command
+from nerfro.cli.entry import entry_point
 from nerfro.synthetic.options import SynthesizeConfig
 from nerfro.synthetic.synthesis import synthesize
 
 
-@command("synthesize", SynthesizeConfig)
+@entry_point("synthesize", SynthesizeConfig)
 def main(options: SynthesizeConfig) -> None:
     """Render the missing images, and print the next command."""
     data = synthesize(options)

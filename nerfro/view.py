@@ -15,7 +15,7 @@ from annotated_types import Ge, Le
 from omegaconf import MISSING
 
 import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
-from nerfro.cli.parsing import command
+from nerfro.cli.entry import entry_point
 from nerfro.training.load import load
 from nerfro.viewing.page import make_page
 from nerfro.viewing.server import PageServer, open_page
@@ -45,7 +45,7 @@ class ViewConfig:
     device: str = "auto"
 
 
-@command("view", ViewConfig)
+@entry_point("view", ViewConfig)
 def main(options: ViewConfig) -> None:
     """Serve the page until Ctrl-C."""
     scene = load(options.checkpoint, options.device, options.root)

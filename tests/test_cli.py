@@ -14,7 +14,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import OverrideParseException
 from hydra.types import RunMode
 
-from nerfro.cli.calls import parsed
+from nerfro.cli.calls import values_of
 from nerfro.cli.composition import BoundedFiles, Composer
 from nerfro.cli.entry import _flags
 from nerfro.cli.failures import errors_in_one_line, in_one_line
@@ -137,7 +137,7 @@ def test_bodies_are_settings_of_the_medium(tmp_path: Path, capsys: pytest.Captur
 
 def test_keyword_arguments_become_lists_and_numbers() -> None:
     values = {"a": (1, 2.5), "b": np.array([[0.0, 1.0]]), "c": {"d": (np.float32(0.5), np.True_)}, "e": "x y"}
-    assert parsed(as_overrides(values)) == {"a": [1, 2.5], "b": [[0.0, 1.0]], "c": {"d": [0.5, True]}, "e": "x y"}
+    assert values_of(as_overrides(values)) == {"a": [1, 2.5], "b": [[0.0, 1.0]], "c": {"d": [0.5, True]}, "e": "x y"}
 
 
 def test_groups_of_parameters_are_added_to_those_of_the_experiment() -> None:

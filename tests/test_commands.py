@@ -87,6 +87,12 @@ def test_missing_option_is_reported_with_an_example(run_here: Runner, unchecked:
     assert done.err == "nerfro: error: checkpoint=... is missing; for example: nerfro view checkpoint=outputs/first\n"
 
 
+def test_commands_without_groups_know_flags_of_hydra_for_help_and_configuration(run_here: Runner, cache: Path) -> None:
+    assert "port=8008" in run_here("view", "--help", "hydra", code=None).out
+    assert "checkpoint: x\n" in run_here("view", "--cfg=job", "checkpoint=x").out
+    assert "--multirun is not an option" in run_here("view", "-m", "checkpoint=x", code=1).err
+
+
 def test_ctrl_c_during_the_imports_ends_in_one_line() -> None:
     program = (
         "import sys, nerfro.cli.startup\nsys.argv = ['x']\nnerfro.cli.startup.begin('plugins')\nraise KeyboardInterrupt"
@@ -160,9 +166,7 @@ def test_pages_open_in_graphical_browsers_and_are_printed_over_ssh(
     assert "ssh -L 83:localhost:83 HOST" in capsys.readouterr().out
 
 
-COMMANDS = {
-    file.stem for file in PACKAGE_DIR.glob("*.py") if re.search(r"\n@(entry_point|command)", file.read_text())
-} | {
+COMMANDS = {file.stem for file in PACKAGE_DIR.glob("*.py") if "\n@entry_point" in file.read_text()} | {
     "demo",
     "plugins",
 }

@@ -17,10 +17,10 @@ from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
+from nerfro.cli.calls import values_of
 from nerfro.cli.composition import added, quoted
-from nerfro.cli.options import Described, describe, describe_command, store_schema, usage
+from nerfro.cli.options import Described, describe, has_groups, store_schema, usage
 from nerfro.cli.overrides import full_key, is_scene_file
-from nerfro.cli.parsing import values_of
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import CONF_DIR, PACKAGE_DIR
 from nerfro.registry.allowed import MissingSettingError, plain, untyped, validate
@@ -47,7 +47,7 @@ COMMAND = re.compile(
 JOB_FILE = re.compile(r"^```bash\n(.*?)^```", re.DOTALL | re.MULTILINE)
 FLAG = re.compile(r" (?:--cfg \w+|-p \S+|-m|\.\.\.)(?= |$)", re.MULTILINE)
 # The schema of a command, and its options that are texts.
-ENTRY_POINT = re.compile(r'^@(?:entry_point|command)\("(\w+)", (\w+).*?(?:verbatim=\((.*)\))?\)', re.MULTILINE)
+ENTRY_POINT = re.compile(r'^@entry_point\("(\w+)", (\w+).*?(?:verbatim=\((.*)\))?\)', re.MULTILINE)
 
 
 @functools.cache
@@ -72,12 +72,7 @@ def commands(page: str) -> Iterator[tuple[str, list[str]]]:
 @functools.cache
 def described(command: str, num_plugins: int) -> Described:
     """Describe the options of a command; with another number of plugins, again."""
-    describe_it = describe_command if has_groups(command) else describe
-    return describe_it(command, entry_points()[command][0])
-
-
-def has_groups(command: str) -> bool:
-    return (CONF_DIR / f"{command}.yaml").is_file()
+    return describe(command, entry_points()[command][0])
 
 
 @functools.cache

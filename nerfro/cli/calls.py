@@ -20,9 +20,9 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from nerfro.cli.composition import Composer, Expand
 from nerfro.cli.failures import in_one_line
-from nerfro.cli.options import describe_command
+from nerfro.cli.options import describe
 from nerfro.core.errors import NerfroError
-from nerfro.registry.allowed import validate
+from nerfro.registry.allowed import plain, validate
 from nerfro.registry.registration import plugin_of
 
 Options = TypeVar("Options")
@@ -47,10 +47,19 @@ def options_of(
     return validate(schema, {**values, **settings, **changes})
 
 
-def parsed(overrides: Sequence[str]) -> dict[str, Any]:
-    """Parse overrides such as `lens=radial` to settings."""
-    overrides_of_hydra = OverridesParser.create().parse_overrides(list(overrides))
-    return {override.get_key_element(): override.value() for override in overrides_of_hydra}
+def values_of(arguments: Sequence[str]) -> dict[str, Any]:
+    """Convert arguments such as `views=test` or `subdivision.side=2` to nested values.
+
+    Raises:
+        NerfroError: an argument has several values.
+    """
+    values = OmegaConf.create({})
+    for override in OverridesParser.create().parse_overrides(list(arguments)):
+        key, text = override.key_or_group, override.input_line
+        if override.is_sweep_override() or override.is_delete():
+            raise NerfroError(f"{text} cannot be used here; write {key}=VALUE, and lists in brackets")
+        OmegaConf.update(values, key, override.value(), force_add=True)
+    return plain(values)
 
 
 def changed_settings(options: object) -> dict[str, Any]:
@@ -122,7 +131,7 @@ def composed(
         with composer.hydra() as hydra:
             job = hydra.compose_config(command, arguments, RunMode.RUN, with_log_configuration=False, from_shell=False)
     except HydraException as error:
-        describe_command(command, schema).require_known(arguments)
+        describe(command, schema).require_known(arguments)
         raise NerfroError(in_one_line(error)) from error
     with open_dict(job):
         job.hydra.runtime.output_dir = job.hydra.run.dir

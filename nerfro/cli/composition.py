@@ -122,8 +122,11 @@ def quoted(argument: str, keys: tuple[str, ...]) -> str:
 
 
 def added(argument: str) -> str:
-    """Add the plus sign with which Hydra selects an option of a group without a default, as in `experiment=glass`."""
-    return f"+{argument}" if argument.partition("=")[0] in ADDED_GROUPS else argument
+    """Add the plus sign with which Hydra adds patterns, and options of groups without a default (experiment=glass)."""
+    if argument.startswith("optimizer.groups="):
+        # Hydra reads names with dots inside of a mapping, such as `cameras.exposure`, without quotes.
+        argument = argument.replace('"', "")
+    return f"+{argument}" if argument.partition("=")[0] in (*ADDED_GROUPS, "optimizer.groups") else argument
 
 
 class _ConfigLoader(GuardedConfigLoader):
@@ -164,7 +167,7 @@ class _ConfigLoader(GuardedConfigLoader):
 
     def load_sweep_config(self, master_config: DictConfig, sweep_overrides: list[str]) -> DictConfig:
         """Compose the configuration of a job; its `hydra.job.override_dirname` names what differs between jobs."""
-        overrides = [full_key(override) for override in sweep_overrides]
+        overrides = [added(full_key(override)) for override in sweep_overrides]
         config = super().load_sweep_config(master_config, overrides)
         excluded = config.hydra.job.config.override_dirname.exclude_keys
         task = cast(list[str], OmegaConf.to_container(master_config.hydra.overrides.task, resolve=False))

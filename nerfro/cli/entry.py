@@ -1,8 +1,9 @@
-"""Entry points of commands: help, flags, and the checked configuration."""
+"""Entry points of commands: help, flags, and the checked configuration or options."""
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import functools
 import importlib
 import os
@@ -10,22 +11,24 @@ import sys
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
+from nerfro.cli.calls import values_of
 from nerfro.cli.composition import Composer, Expand, missing_with_example
 from nerfro.cli.failures import errors_in_one_line, in_one_line
-from nerfro.cli.options import describe_command, recall, remember
+from nerfro.cli.options import describe, has_groups, recall, remember
 from nerfro.core.errors import NerfroError
 from nerfro.core.trust import leave_current_directory
+from nerfro.registry.allowed import validate
 from nerfro.registry.registration import discover
 
-Task = Callable[[DictConfig], float | None]
+Task = Callable[[Any], float | None]
 
 
 def entry_point(
@@ -35,10 +38,10 @@ def entry_point(
     check: Callable[[DictConfig], None] | None = None,
     expand: Expand | None = None,
 ) -> Callable[[Task], Callable[[], None]]:
-    """Decorate the main function of a command with configuration groups, which receives a checked configuration.
+    """Decorate the main function of a command, which receives a checked configuration.
 
-    The defaults list of the YAML file must begin with `<command>_schema`. Otherwise Hydra does not refuse misspelt keys
-    of the root.
+    A command without a YAML file in conf/ has no groups, and receives its options as a dataclass. The defaults list of
+    the YAML file must begin with `<command>_schema`. Otherwise Hydra does not refuse misspelt keys of the root.
 
     Args:
         command: name of the command, and of its YAML file in conf/.
@@ -59,21 +62,41 @@ def entry_point(
 
 
 def _run(composer: Composer, task: Task, arguments: list[str]) -> None:
-    """Answer questions about the command, or run a job or a sweep."""
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise, Hydra prints its own report and exits
-    command, failures = composer.command, list[Exception]()
-    parser = get_args_parser()
+    """Answer questions about the command, or run it."""
+    command, parser = composer.command, get_args_parser()
     flags = _flags(parser, arguments)
-    asks_hydra = flags.help and "hydra" in arguments
+    asks_hydra = flags.help and "hydra" in arguments and has_groups(command)
     if not asks_hydra and (flags.help or (program() == command and recall(command) is None)):
         discover()
-        described = describe_command(command, composer.schema)
+        described = describe(command, composer.schema)
         remember(command, described)
         described.answer(arguments)
-    flags.overrides = overrides = [] if asks_hydra else composer.overrides(flags.overrides)
+    flags.overrides = [] if asks_hydra else composer.overrides(flags.overrides)
+    if has_groups(command):
+        _run_by_hydra(composer, task, flags, parser)
+    else:
+        _run_without_groups(composer, task, flags)
+
+
+def _run_without_groups(composer: Composer, task: Task, flags: Namespace) -> None:
+    for name, value in vars(flags).items():
+        if value and name not in ("overrides", "help", "cfg", "resolve"):
+            raise NerfroError(f"--{name.replace('_', '-')} is not an option; write key=value, or see --help")
+    discover()
+    with missing_with_example(composer.command):
+        options: Any = validate(composer.schema, values_of(flags.overrides))
+    if flags.cfg:
+        print(OmegaConf.to_yaml(OmegaConf.create(dataclasses.asdict(options))), end="")
+    else:
+        task(options)
+
+
+def _run_by_hydra(composer: Composer, task: Task, flags: Namespace, parser: ArgumentParser) -> None:
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise, Hydra prints its own report and exits
+    command, overrides, failures = composer.command, flags.overrides, list[Exception]()
     name = flags.config_name or command
     with composer.hydra([flags.config_dir] if flags.config_dir else []) as hydra, _run_folder():
-        if asks_hydra or flags.hydra_help:
+        if flags.help or flags.hydra_help:
             hydra.hydra_help(name, args_parser=parser, args=flags)
         elif flags.cfg:
             hydra.show_cfg(name, overrides, flags.cfg, flags.package, flags.resolve)
@@ -109,7 +132,7 @@ def _job(task: Task, command: str, failures: list[Exception]) -> Task:
     return job
 
 
-def _job_of_sweep(task: Callable[[DictConfig], float | None], config: DictConfig) -> float | None:
+def _job_of_sweep(task: Task, config: DictConfig) -> float | None:
     discover()  # the process may be a launcher's worker
     try:
         return task(config)

@@ -87,7 +87,7 @@ class Described:
         Raises:
             NerfroError: a setting or an option does not exist.
         """
-        if {"-h", "--help"} & {*arguments} and "hydra" not in arguments:
+        if {"-h", "--help"} & {*arguments} and not ("hydra" in arguments and self.choices):
             print(self.help)
             sys.exit()
         # Other folders of configurations may have other groups.
@@ -127,23 +127,20 @@ class Described:
                     raise NerfroError(f"{full_name} is not a setting; {nearest_of(name, names)}")
 
 
+def has_groups(command: str) -> bool:
+    """Return whether Hydra composes the configuration of a command from groups and the YAML file of its name."""
+    return (CONF_DIR / f"{command}.yaml").is_file()
+
+
 def describe(command: str, schema: type) -> Described:
-    """Describe a command without configuration groups; its plugins must have been discovered.
+    """Describe the options of a command; its plugins must have been discovered.
 
     Args:
         command: name of the command.
         schema: dataclass of the options.
     """
-    return Described(_page(command, list(schema_options(schema, {})), {}), _names(schema), {})
-
-
-def describe_command(command: str, schema: type) -> Described:
-    """Describe a command with configuration groups; its plugins must have been discovered.
-
-    Args:
-        command: name of the command, and of its YAML file.
-        schema: dataclass of the configuration.
-    """
+    if not has_groups(command):
+        return Described(_page(command, list(schema_options(schema, {})), {}), _names(schema), {})
     store_schema(command, schema)
     with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
         config = compose(command, return_hydra_config=True)
@@ -197,10 +194,8 @@ def _page(command: str, options: Sequence[Option], choices: Mapping[str, Sequenc
         sections.setdefault(option.name.rpartition(".")[0].partition(".")[0], []).append(option)
     for section, members in sections.items():
         lines += [f"Options of {section}:" if section else "Options:", *map(str, members), ""]
-    if (CONF_DIR / f"{command}.yaml").is_file():
-        lines.append("`--help hydra` explains the flags of Hydra, such as -m for sweeps and --cfg job.")
-    else:
-        lines.append("`--cfg job` prints the options.")
+    of_hydra = "`--help hydra` explains the flags of Hydra, such as -m for sweeps and --cfg job."
+    lines.append(of_hydra if has_groups(command) else "`--cfg job` prints the options.")
     return "\n".join(lines).replace("`", "")
 
 

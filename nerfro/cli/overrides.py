@@ -21,10 +21,8 @@ def command_line(command: str, options: Sequence[str]) -> str:
 
 
 def full_key(override: str) -> str:
-    """Replace the short name of a setting by the full one, and add the plus sign with which Hydra adds patterns."""
-    override = re.sub(r"^([+~]*)(\w+)(?=[.=])", lambda key: key[1] + SHORT_NAMES.get(key[2], key[2]), override)
-    # Hydra reads names with dots inside of a mapping, such as `cameras.exposure`, without quotes.
-    return f"+{override}".replace('"', "") if override.startswith("optimizer.groups=") else override
+    """Replace the short name of a setting by the full one."""
+    return re.sub(r"^([+~]*)(\w+)(?=[.=])", lambda key: key[1] + SHORT_NAMES.get(key[2], key[2]), override)
 
 
 def is_given(option: str, overrides: Iterable[str]) -> bool:

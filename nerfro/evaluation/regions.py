@@ -13,27 +13,19 @@ def object_pixels(coverage: Float[Tensor, "H W"]) -> Bool[Tensor, "H W"]:
     return coverage >= 0.5
 
 
-def crop_rectangle(inside: Bool[Tensor, "H W"], dilation: int = 35) -> tuple[slice, slice]:
+def crop_rectangle(inside: Bool[Tensor, "H W"]) -> tuple[slice, slice]:
     """Return the bounding rectangle of the dilated mask, the region of the paper's scores on real scenes.
 
-    All pixels of the rectangle count. Dilation by a centred box of odd side d moves each side of the bounding rectangle
-    by (d - 1) / 2 pixels, up to the border of the image, so the mask itself is not dilated.
+    All pixels of the rectangle count. Dilation by a centred box of 35 pixels moves each side of the bounding rectangle
+    by 17 pixels, up to the border of the image, so the mask itself is not dilated.
 
     Args:
-        inside: mask of the object.
-        dilation: side of the box in pixels, odd.
+        inside: mask of the object, not empty.
 
     Returns:
         Slices of rows and columns.
-
-    Raises:
-        NerfroError: the mask is empty, or the dilation is even.
     """
-    if dilation < 1 or dilation % 2 == 0:
-        raise NerfroError(f"dilation={dilation} has no centre; take an odd number of pixels, or 1 for no dilation")
-    if not inside.any():
-        raise NerfroError("the mask is empty, so there is no object to crop; score the full image only")
-    margin = dilation // 2
+    margin = 17
     occupied = [inside.any(1 - axis).nonzero() for axis in (0, 1)]
     first, last = [max(int(i.min()) - margin, 0) for i in occupied], [int(i.max()) + margin + 1 for i in occupied]
     return slice(first[0], min(last[0], inside.shape[0])), slice(first[1], min(last[1], inside.shape[1]))

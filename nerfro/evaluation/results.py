@@ -106,7 +106,7 @@ class RunMetrics:
         steps: number of optimizer steps; None for images of another program.
         train_seconds: wall-clock time of training in seconds, without evaluation; None without training.
         rays_per_second: training throughput; None without training.
-        treatments: scores of the same views with corrected cameras or exposures; see `nerfro.evaluation.treatments`.
+        treatments: scores of the same views with corrected cameras or exposures; see `nerfro.evaluation.scoring`.
         steps_by_phase: number of steps of each phase of the training, such as `background` and `scene`.
     """
 

@@ -1,9 +1,14 @@
-"""Scores of the rendered views of a split, or of a folder of images."""
+"""Scores of the rendered views of a split, or of a folder of images.
+
+Training refines cameras and exposures of training views only. Scores of test views that use such corrections, called
+treatments, are listed separately, so that the scores under `test` always belong to the cameras and exposures of the
+data set.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -16,38 +21,25 @@ from nerfro.evaluation.error_sheets import write_error_sheet
 from nerfro.evaluation.folders import ImagePair
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.render_view import render_view
-from nerfro.evaluation.results import EvaluationResult, ViewScores
+from nerfro.evaluation.results import AS_GIVEN, EXPOSED, EvaluationResult, ViewScores
 from nerfro.files.images import save_png
 from nerfro.rendering import Renderer
 from nerfro.samplers.subdivision import Subdivision
 
 
-@dataclass(frozen=True)
-class ScoringProtocol:
-    """Treatment of rendered images before they are scored.
+def score_split(
+    renderer: Renderer, views: Views, metrics: ImageMetrics, folder: Path, subdivision: Subdivision, prefix: str
+) -> tuple[EvaluationResult, dict[str, EvaluationResult]]:
+    """Score views with the given cameras, and once more for each applicable treatment.
 
-    Attributes:
-        subfolder: name of the folder of the images.
-        right_halves: score only the right half of each view, with the gain that is fitted on the left half of the
-            photograph.
-    """
+    The treatments build on each other:
 
-    subfolder: str
-    right_halves: bool = False
+    - `aligned`: test cameras are moved by the similarity transformation from the given to the refined training cameras,
+      and use the estimated lens.
+    - `exposed`: in addition, each view and channel has a gain. Gains are fitted on the left halves of the photographs,
+      and the right halves are scored.
 
-
-def score_views(
-    renderer: Renderer,
-    views: Views,
-    metrics: ImageMetrics,
-    folder: Path,
-    subdivision: Subdivision,
-    prefix: str,
-    protocols: Sequence[ScoringProtocol],
-) -> list[EvaluationResult]:
-    """Render all views, write 8-bit sRGB images to `folder/<subfolder>/<prefix>_NNN.png`, and compute their scores.
-
-    The memory holds the rays and images of one view and the samples of `renderer.chunk_size` rays.
+    The images are 8-bit sRGB, `folder/images/<prefix>_NNN.png` and `folder/images_<treatment>/<prefix>_NNN.png`.
 
     Args:
         renderer: trained model.
@@ -56,29 +48,52 @@ def score_views(
         folder: folder of the evaluation.
         subdivision: which pixels get several rays.
         prefix: beginning of the names of the views, which end with a number of three digits.
-        protocols: treatments of each rendered image.
 
     Returns:
-        Scores by each protocol.
+        Scores with the given cameras, and the scores of each treatment by name.
+    """
+    scene, results, treatments = renderer.scene, dict[str, EvaluationResult](), [AS_GIVEN]
+    settings = metrics, folder, subdivision, prefix
+    if scene.camera.moves:
+        results = _score_views(renderer, views, *settings, treatments)
+        views, treatments = replace(views, cameras=scene.camera.aligned(views.cameras)), ["aligned"]
+    if scene.camera.exposure is not None:
+        treatments = [*treatments, EXPOSED]
+    results |= _score_views(renderer, views, *settings, treatments)
+    return results.pop(AS_GIVEN), results
+
+
+def _score_views(
+    renderer: Renderer,
+    views: Views,
+    metrics: ImageMetrics,
+    folder: Path,
+    subdivision: Subdivision,
+    prefix: str,
+    treatments: Sequence[str],
+) -> dict[str, EvaluationResult]:
+    """Render all views once, and write and score the images by each treatment, of which only `exposed` changes images.
+
+    The memory holds the rays and images of one view and the samples of `renderer.chunk_size` rays.
     """
     scene, height, width = renderer.scene, views.cameras.height, views.cameras.width
     cameras, left = views.cameras.to(scene.device), slice(width // 2)
-    scores: list[list[ViewScores]] = [[] for _ in protocols]
+    scores: dict[str, list[ViewScores]] = {treatment: [] for treatment in treatments}
     for view in track("evaluate", range(len(views))):
         radiance = render_view(renderer, cameras, view, subdivision).radiance.view(height, width, 3).cpu()
         target, mask = views.images[view], None if views.masks is None else views.masks[view]
         name = f"{prefix}_{view:03d}"
-        for protocol, scored in zip(protocols, scores, strict=True):
+        for treatment, scored in scores.items():
             gain = torch.ones(3)
-            if protocol.right_halves:
+            if treatment == EXPOSED:
                 to_srgb, shown = scene.colour_space.to_srgb, radiance[:, left].flatten(0, 1)
                 gain = fit_gain(to_srgb, shown, target[:, left].flatten(0, 1))
             rgb = scene.colour_space.to_display(radiance, gain)
-            save_png(folder / protocol.subfolder / f"{name}.png", rgb)
-            part = slice(width // 2, None) if protocol.right_halves else slice(None)
+            save_png(folder / ("images" if treatment == AS_GIVEN else f"images_{treatment}") / f"{name}.png", rgb)
+            part = slice(width // 2, None) if treatment == EXPOSED else slice(None)
             coverage = None if mask is None else mask[:, part].contiguous()
             scored.append(metrics.score(name, rgb[:, part].contiguous(), target[:, part].contiguous(), coverage))
-    return [metrics.result(scored) for scored in scores]
+    return {treatment: metrics.result(scored) for treatment, scored in scores.items()}
 
 
 def score_folders(

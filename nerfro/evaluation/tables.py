@@ -16,7 +16,6 @@ import rich.console
 import rich.table
 import rich.text
 
-from nerfro.core.errors import NerfroError
 from nerfro.evaluation.image_metrics import image_metrics
 from nerfro.evaluation.results import (
     AS_GIVEN,
@@ -106,14 +105,6 @@ class Table:
     medals: bool = False
     notes: tuple[str, ...] = ()
 
-    def __post_init__(self) -> None:
-        for row in (*self.rows, *self.summary):
-            for numbers in (row.values, row.spreads or row.values):
-                if len(numbers) != len(self.columns):
-                    raise NerfroError(
-                        f"table {self.title!r}: {len(numbers)} values of {row.label!r} for {len(self.columns)} columns"
-                    )
-
     def medal_of(self, row: int, column: int) -> str:
         """Return the medal of a number in `rows`, one of `MEDALS`, or an empty string.
 
@@ -168,7 +159,7 @@ def regions_table(result: EvaluationResult, title: str) -> Table:
 
 
 def treatments_table(metrics: RunMetrics, title: str) -> Table:
-    """Tabulate the mean scores of the views under each treatment (see `nerfro.evaluation.treatments`)."""
+    """Tabulate the mean scores of the views under each treatment (see `nerfro.evaluation.scoring`)."""
     treated = {
         f"{name}, right halves" if name == EXPOSED else name: result.means()
         for name, result in metrics.treatments.items()
@@ -204,12 +195,10 @@ def write_scores(metrics: RunMetrics, title: str, folder: Path, brief: bool = Fa
         rich.print(to_rich(treatments_table(metrics, "with fitted exposures or cameras; compare rows of equal pixels")))
 
 
-def write_table(table: Table, stem: Path | str) -> list[Path]:
-    """Write `<stem>.csv`, `<stem>.md` and `<stem>.tex`, and return the three paths."""
-    texts = {f"{stem}.csv": to_csv(table), f"{stem}.md": to_markdown(table), f"{stem}.tex": to_latex(table)}
-    for path, text in texts.items():
-        write_atomically(path, text)
-    return list(map(Path, texts))
+def write_table(table: Table, stem: Path) -> None:
+    """Write `<stem>.csv`, `<stem>.md` and `<stem>.tex`."""
+    for suffix, form in FORMATS.items():
+        write_atomically(f"{stem}{suffix}", form(table))
 
 
 def to_rich(table: Table) -> rich.console.Group:
@@ -304,6 +293,9 @@ def to_latex(table: Table) -> str:
     lines += [r"\bottomrule", r"\end{tabular}"]
     lines += [rf"\par\smallskip{{\footnotesize {_latex(note)}}}" for note in table.notes]
     return "\n".join([*lines, r"\end{table}"]) + "\n"
+
+
+FORMATS = {".csv": to_csv, ".md": to_markdown, ".tex": to_latex}
 
 
 def _scores_table(

@@ -15,9 +15,8 @@ from nerfro.evaluation.folders import match_folders
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.request import EvaluateConfig, find_device, own_folder, record, require_one_task
 from nerfro.evaluation.results import RunMetrics
-from nerfro.evaluation.scoring import score_folders
+from nerfro.evaluation.scoring import score_folders, score_split
 from nerfro.evaluation.tables import write_scores
-from nerfro.evaluation.treatments import score_split
 from nerfro.files.foreign_config import read_foreign_config
 from nerfro.files.images import load_png
 from nerfro.training.callbacks import Throughput, steps_by_phase

@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from nerfro.capture.preprocess import preprocess
 from nerfro.capture.preprocess_options import MESH
-from nerfro.cli.calls import Composition, changed_settings, composed, options_of, parsed
+from nerfro.cli.calls import Composition, changed_settings, composed, options_of, values_of
 from nerfro.cli.overrides import as_overrides, is_given, not_given, of_groups
 from nerfro.core.errors import NerfroError, warn
 from nerfro.core.paths import resolve_path, user_path
@@ -93,7 +93,7 @@ def _calibrate(config: DictConfig, capture: Capture, out: Path) -> Capture:
             f"images in the browser, outlines={{{photographs[0].stem}:[[COLUMN,ROW],...],...}}, or masks=FOLDER"
         )
     settings = {"images": out / "images", "out": out, "target": "colmap", "overwrite": True}
-    settings |= {"mask_labels": capture.settings.get("mask_labels")} | parsed(shlex.split(config.calibrate))
+    settings |= {"mask_labels": capture.settings.get("mask_labels")} | values_of(shlex.split(config.calibrate))
     options = options_of(CalibrateConfig, None, settings)
     stage = Stage("calibrate", as_overrides(changed_settings(options)), out / REPORT, out / PLOT)
     return replace(stage.run(lambda: calibrate(options), lambda: Capture(out)), settings=capture.settings)

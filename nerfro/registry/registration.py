@@ -203,8 +203,8 @@ def build(node: object, **parts: object) -> Any:
             require_lightning(node)
             return instantiate(node, **parts)
         except (InstantiationException, OmegaConfBaseException) as error:
-            cause = error.__cause__ or error
-            raise NerfroError(f"{target}: {_first_line(cause)}; check this object's fields in conf/") from error
+            reason = str(error.__cause__ or error).strip().split("\n", 1)[0]
+            raise NerfroError(f"{target}: {reason}; check this object's fields in conf/") from error
     plugin = plugin_of(node)
     return create(plugin, node, **{name: parts[name] for name in plugin.parts if name in parts})
 
@@ -439,7 +439,3 @@ def _parameters(cls: Any) -> list[tuple[inspect.Parameter, Any]]:
         if not any(parameter.kind == parameter.VAR_KEYWORD for parameter in own):
             return [pair for pair in parameters.values() if pair[0].kind != inspect.Parameter.VAR_KEYWORD]
     return list(parameters.values())
-
-
-def _first_line(error: BaseException) -> str:
-    return str(error).strip().split("\n", 1)[0]

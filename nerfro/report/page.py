@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -18,63 +17,21 @@ from nerfro.files.drawing import magma
 from nerfro.files.templates import fill_template
 from nerfro.report.comparison import Comparison
 from nerfro.report.runs import EvaluatedRun, device, duration, shown
-from nerfro.report.views import PNG_SIDE, SceneImages, Selection, embed_image, scene_images
+from nerfro.report.views import PNG_SIDE, Selection, embed_image, scene_images
 
 _TEMPLATES = PACKAGE_DIR / "report"
-
-
-@dataclass(frozen=True)
-class SceneSection:
-    """Section of one scene.
-
-    Attributes:
-        id: unique identifier on the page.
-        title: title of the scene.
-        images: views, or None if these cannot be shown.
-        reason: reason for missing views.
-    """
-
-    id: str
-    title: str
-    images: SceneImages | None
-    reason: str
-
-
-@dataclass(frozen=True)
-class RunOrigin:
-    """Origin of one run, as text."""
-
-    method: str
-    scene: str
-    seed: int
-    folder: str
-    facts: Mapping[str, str]
-    config: str
-
-
-@dataclass(frozen=True)
-class Section:
-    """Section of the runs with one budget."""
-
-    id: str
-    title: str
-    table: Table
-    methods: Sequence[str]
-    scenes: Sequence[SceneSection]
-    runs: Sequence[RunOrigin]
 
 
 def report_page(compared: Sequence[tuple[Comparison, Table]], unfinished: Sequence[str], selection: Selection) -> str:
     """Create the page; `unfinished` contains one line about each run without scores."""
     sections = [
-        Section(
-            id=f"b{number}",
-            title=comparison.budget.title,
-            table=table,
-            methods=comparison.methods,
-            scenes=_scenes(f"b{number}", comparison, selection),
-            runs=[_run_origin(comparison, run) for run in comparison.runs],
-        )
+        {
+            "id": f"b{number}",
+            "title": comparison.budget.title,
+            "table": table,
+            "scenes": _scenes(f"b{number}", comparison, selection),
+            "runs": [_run_origin(comparison, run) for run in comparison.runs],
+        }
         for number, (comparison, table) in enumerate(compared)
     ]
     ramp = magma(torch.linspace(0, 1, 256)[None], 1)
@@ -89,7 +46,8 @@ def report_page(compared: Sequence[tuple[Comparison, Table]], unfinished: Sequen
     )
 
 
-def _scenes(prefix: str, comparison: Comparison, selection: Selection) -> list[SceneSection]:
+def _scenes(prefix: str, comparison: Comparison, selection: Selection) -> list[dict[str, Any]]:
+    """Return the section of each scene: its identifier on the page, title, and images or the reason for their lack."""
     sections = []
     for number, (test_set, title) in enumerate(comparison.scenes.items()):
         images, reason = None, ""
@@ -97,11 +55,12 @@ def _scenes(prefix: str, comparison: Comparison, selection: Selection) -> list[S
             images = scene_images(comparison, test_set, selection)
         except NerfroError as error:  # a missing data set does not prevent the rest of the page
             reason = str(error)
-        sections.append(SceneSection(f"{prefix}s{number}", title, images, reason))
+        sections.append({"id": f"{prefix}s{number}", "title": title, "images": images, "reason": reason})
     return sections
 
 
-def _run_origin(comparison: Comparison, run: EvaluatedRun) -> RunOrigin:
+def _run_origin(comparison: Comparison, run: EvaluatedRun) -> dict[str, Any]:
+    """Return the origin of a run, as text."""
     cell = next(cell for cell, runs in comparison.cells.items() if run in runs)
     facts, metrics = run.facts, run.metrics
     commit = facts.get("commit") or "not a git checkout"
@@ -115,8 +74,9 @@ def _run_origin(comparison: Comparison, run: EvaluatedRun) -> RunOrigin:
         "settings of algorithms": "; ".join(facts["algorithms"]) or "none",
     }
     config = OmegaConf.to_yaml(OmegaConf.create(json.loads(json.dumps(run.config))))
-    method, test_set = cell
-    return RunOrigin(method, comparison.scenes[test_set], run.seed, shown(run.folder), texts, config)
+    method, scene = cell[0], comparison.scenes[cell[1]]
+    origin = {"method": method, "scene": scene, "seed": run.seed, "folder": shown(run.folder)}
+    return {**origin, "facts": texts, "config": config}
 
 
 def _spent(steps: int | None, seconds: float | None, rays_per_second: float | None) -> str:

@@ -10,7 +10,7 @@ import rich
 
 from nerfro.core.paths import user_path
 from nerfro.evaluation.results import FULL, Region
-from nerfro.evaluation.tables import Table, to_rich, write_table
+from nerfro.evaluation.tables import FORMATS, Table, to_rich, write_table
 from nerfro.files.atomic import refuse_existing, write_atomically
 from nerfro.files.folder_lock import lock_folder
 from nerfro.registry.allowed import Natural
@@ -61,8 +61,8 @@ class SummaryConfig:
         metrics: columns of the tables; by default psnr, ssim, lpips, flip and the metrics of plugins, as far as
             runs have them.
         region: region of the scores: full, mask or crop.
-        methods: titles of experiments, in the order of the rows.
-        scenes: titles of scenes, by the last component of the data folder.
+        methods: titles of experiments, in the order of the rows, beside those of the experiments of nerfro.
+        scenes: titles of scenes, by the last component of the data folder, beside those of known scenes.
         views: number of evenly spread views per scene in the report; 0 for all.
         overwrite: whether to replace files in `out`.
     """
@@ -72,8 +72,8 @@ class SummaryConfig:
     report: bool = False
     metrics: list[str] | None = None
     region: Literal["full", "mask", "crop"] = FULL
-    methods: dict[str, str] = field(default_factory=_METHODS.copy)
-    scenes: dict[str, str] = field(default_factory=_SCENES.copy)
+    methods: dict[str, str] = field(default_factory=dict)
+    scenes: dict[str, str] = field(default_factory=dict)
     views: Natural = 8
     overwrite: bool = False
 
@@ -92,7 +92,7 @@ def summarize(options: SummaryConfig) -> None:
         return
     out = user_path(folder)
     with lock_folder(out, "out"):
-        names = [name + suffix for name in tables for suffix in (".csv", ".md", ".tex")]
+        names = [name + suffix for name in tables for suffix in FORMATS]
         written = [*names, "report.html"] if options.report else names
         refuse_existing([out / name for name in written], options.overwrite)
         _print(tables, unfinished)

@@ -14,8 +14,8 @@ from nerfro.core.distributed import leave
 from nerfro.core.provenance import AlgorithmSettings
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.results import RunMetrics
+from nerfro.evaluation.scoring import score_split
 from nerfro.evaluation.tables import write_scores
-from nerfro.evaluation.treatments import score_split
 from nerfro.fields.networks import compile_networks
 from nerfro.rendering.scene_file import SceneFile
 from nerfro.samplers.subdivision import Subdivision
