@@ -6,11 +6,12 @@ devices. `torch.compile`, fake tensors and the profiler see operators, but not t
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
-import numpy as np
 import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 _LIBRARY = torch.library.Library("nerfro", "FRAGMENT")
 REFERENCES: dict[str, Callable[..., Any]] = {}  # implementation in PyTorch of each operator with gradients, by name
@@ -42,15 +43,66 @@ def kernel(schema: str, fake: Callable[..., Any]) -> Callable[[Callable[..., Any
 
     def define(function: Callable[..., Any]) -> Callable[..., Any]:
         def on_tensors(*arguments: Any) -> Any:
-            results = function(*[
-                values.detach().contiguous().numpy() if isinstance(values, torch.Tensor) else values
-                for values in arguments
-            ])  # fmt: skip
-            return torch.from_numpy(results) if isinstance(results, np.ndarray) else (*map(torch.from_numpy, results),)
+            return (*map(torch.from_numpy, function(*map(_array, arguments))),)
 
         return cpu_operator(schema, fake)(on_tensors)
 
     return define
+
+
+def kernel_with_gradients(
+    schema: str, result: Callable[..., Tensor], fill: Callable[..., None], gradients: Mapping[int, Callable[..., None]]
+) -> Callable[..., Tensor]:
+    """Define operators for a function and its gradients, each by a function that fills a NumPy array.
+
+    Args:
+        schema: name and arguments, `name(Tensor x, int n)`; tensors precede other arguments.
+        result: function of the arguments, as tensors, that creates the result without its values.
+        fill: function of the arguments, as NumPy arrays, and the result.
+        gradients: function for the gradient of an argument, by the number of the argument. It takes the arguments, the
+            gradient of the result, and zeros of the shape of the argument, to which it adds the gradient.
+
+    Returns:
+        Differentiable function of CPU tensors.
+    """
+    name, _, names = schema.rstrip(")").partition("(")
+    forward = _filled(f"{name}_forward({names}) -> Tensor", result, fill)
+    backward = {
+        number: _filled(f"{name}_gradient_{number}({names}, Tensor gradient) -> Tensor", _zeros_like(number), function)
+        for number, function in gradients.items()
+    }
+
+    class Kernel(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx: Any, *arguments: Any) -> Tensor:
+            ctx.save_for_backward(*(value for value in arguments if isinstance(value, Tensor)))
+            ctx.others = [value for value in arguments if not isinstance(value, Tensor)]
+            return forward(*arguments)
+
+        @staticmethod
+        @once_differentiable
+        def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+            arguments, learns = (*ctx.saved_tensors, *ctx.others, gradient), ctx.needs_input_grad
+            return tuple(backward[i](*arguments) if learns[i] and i in backward else None for i in range(len(learns)))
+
+    return Kernel.apply
+
+
+def _zeros_like(number: int) -> Callable[..., Tensor]:
+    return lambda *arguments: arguments[number].new_zeros(arguments[number].shape)
+
+
+def _filled(schema: str, result: Callable[..., Tensor], fill: Callable[..., None]) -> Callable[..., Tensor]:
+    def run(*arguments: Any) -> Tensor:
+        values = result(*arguments)
+        fill(*map(_array, arguments), values.numpy())
+        return values
+
+    return cpu_operator(schema, result)(run)
+
+
+def _array(value: Any) -> Any:
+    return value.detach().contiguous().numpy() if isinstance(value, Tensor) else value
 
 
 def cpu_operator(schema: str, fake: Callable[..., Any]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:

@@ -12,7 +12,7 @@ from tests.processes import printed_by
 IMPORTS_ONLY = """
 import numba
 before = {name: value for name, value in vars(numba.config).items() if name.isupper()}
-import nerfro.backgrounds.cube_map_cpu, nerfro.geometry.occupancy, nerfro.samplers.paths.snell_cpu
+import nerfro.backgrounds.cube_map, nerfro.geometry.occupancy, nerfro.samplers.paths.snell_cpu
 after = {name: value for name, value in vars(numba.config).items() if name.isupper()}
 print({name: after[name] for name in after if before.get(name) != after[name]})
 try:
