@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -21,10 +21,9 @@ from jaxtyping import Float, Int
 from numba import prange
 from torch import Tensor
 
-from nerfro.kernels.compilation import compiled, compiled_parallel
+from nerfro.kernels.compilation import compiled, compiled_parallel, num_threads
 from nerfro.kernels.constants import constant
 from nerfro.kernels.operators import kernel_with_gradients, operator
-from nerfro.kernels.threads import num_threads
 
 _ONE = np.float32(1)
 
@@ -55,9 +54,6 @@ class CubeLevels:
     @cached_property
     def num_padded(self) -> int:
         return sum(self.padded_sizes)
-
-    def __len__(self) -> int:
-        return len(self.resolutions)
 
 
 def project(directions: Float[Tensor, "P 3"]) -> tuple[Int[Tensor, "P"], Float[Tensor, "P 2"]]:
@@ -126,7 +122,7 @@ def lookup_in_torch(
         resolutions: of all levels, see `CubeLevels`.
     """
     levels = CubeLevels(tuple(resolutions))
-    padded_offsets = tuple(sum(levels.padded_sizes[:level]) for level in range(len(levels)))
+    padded_offsets = tuple(sum(levels.padded_sizes[:level]) for level in range(len(resolutions)))
     resolution, offset, padded_offset = (
         constant(values, texels.device) for values in (levels.resolutions, levels.offsets, padded_offsets)
     )
@@ -147,32 +143,12 @@ def lookup_in_torch(
     return (texels.index_select(0, texel.flatten()).view(*texel.shape, 3) * weights[..., None]).sum((1, 2))
 
 
-def _sum_of_levels(
-    face: np.ndarray, coordinates: np.ndarray, texels: np.ndarray, padded: np.ndarray, resolutions: list[int],
-    total: Float[np.ndarray, "P 3"],
-) -> None:  # fmt: skip
-    _forward(face, coordinates, padded, *_layout(tuple(resolutions)), texels, total)
-
-
-def _gradient_of_coordinates(
-    face: np.ndarray, coordinates: np.ndarray, texels: np.ndarray, padded: np.ndarray, resolutions: list[int],
-    gradient: np.ndarray, of_coordinates: Float[np.ndarray, "P 2"],
-) -> None:  # fmt: skip
-    layout = _layout(tuple(resolutions))
-    _backward_to_coordinates(face, coordinates, padded, *layout, texels, gradient, of_coordinates)
-
-
 def _gradient_of_texels(
-    face: np.ndarray, coordinates: np.ndarray, texels: np.ndarray, padded: np.ndarray, resolutions: list[int],
+    face: np.ndarray, coordinates: np.ndarray, texels: np.ndarray, padded: np.ndarray, resolutions: np.ndarray,
     gradient: np.ndarray, of_texels: Float[np.ndarray, "T 3"],
 ) -> None:  # fmt: skip
     threads = min(num_threads(), len(resolutions))
-    _backward(threads, face, coordinates, padded, *_layout(tuple(resolutions)), gradient, of_texels)
-
-
-@lru_cache(maxsize=64)
-def _layout(resolutions: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    return np.array(resolutions), np.array(CubeLevels(resolutions).offsets)
+    _backward(threads, face, coordinates, padded, resolutions, gradient, of_texels)
 
 
 @compiled
@@ -207,26 +183,26 @@ def _weights(u, v, missing):
 
 
 @compiled_parallel
-def _forward(face, coordinates, padded, resolutions, offsets, texels, total):
+def _forward(face, coordinates, texels, padded, resolutions, total):
     for p in prange(face.shape[0]):
-        padded_offset = 0
+        offset, padded_offset = 0, 0
         for level in range(resolutions.shape[0]):
             n = resolutions[level]
             (a, b, c, d), u, v, missing = _taps(face[p], coordinates[p, 0], coordinates[p, 1], n, padded, padded_offset)
             w0, w1, w2, w3 = _weights(u, v, missing)
-            of_level = texels[offsets[level] :]
+            of_level = texels[offset:]
             for channel in range(3):
                 total[p, channel] += (
                     w0 * of_level[a, channel] + w1 * of_level[b, channel]
                     + w2 * of_level[c, channel] + w3 * of_level[d, channel]
                 )  # fmt: skip
-            padded_offset += 6 * (n + 2) * (n + 2)
+            offset, padded_offset = offset + 6 * n * n, padded_offset + 6 * (n + 2) * (n + 2)
 
 
 @compiled_parallel
-def _backward(threads, face, coordinates, padded, resolutions, offsets, gradient, texels):
+def _backward(threads, face, coordinates, padded, resolutions, gradient, texels):
     for thread in prange(threads):
-        padded_offset = 0
+        offset, padded_offset = 0, 0
         for level in range(resolutions.shape[0]):
             n = resolutions[level]
             if level % threads == thread:
@@ -235,16 +211,16 @@ def _backward(threads, face, coordinates, padded, resolutions, offsets, gradient
                     texel, u, v, missing = _taps(face[p], x, y, n, padded, padded_offset)
                     weight = _weights(u, v, missing)
                     for corner in range(4):
-                        entry = offsets[level] + texel[corner]
+                        entry = offset + texel[corner]
                         for channel in range(3):
                             texels[entry, channel] += weight[corner] * gradient[p, channel]
-            padded_offset += 6 * (n + 2) * (n + 2)
+            offset, padded_offset = offset + 6 * n * n, padded_offset + 6 * (n + 2) * (n + 2)
 
 
 @compiled_parallel
-def _backward_to_coordinates(face, coordinates, padded, resolutions, offsets, texels, gradient, of_coordinates):
+def _backward_to_coordinates(face, coordinates, texels, padded, resolutions, gradient, of_coordinates):
     for p in prange(face.shape[0]):
-        padded_offset = 0
+        offset, padded_offset = 0, 0
         along_x, along_y = np.float32(0), np.float32(0)
         # Derivative of the loss with respect to the weight of each of the four texels.
         gain = np.empty(4, np.float32)
@@ -252,7 +228,7 @@ def _backward_to_coordinates(face, coordinates, padded, resolutions, offsets, te
             n = resolutions[level]
             texel, u, v, missing = _taps(face[p], coordinates[p, 0], coordinates[p, 1], n, padded, padded_offset)
             for corner in range(4):
-                entry = offsets[level] + texel[corner]
+                entry = offset + texel[corner]
                 gain[corner] = np.float32(0)
                 for channel in range(3):
                     gain[corner] += gradient[p, channel] * texels[entry, channel]
@@ -261,7 +237,7 @@ def _backward_to_coordinates(face, coordinates, padded, resolutions, offsets, te
             scale = np.float32(0.5 * n)
             along_x += scale * ((_ONE - v) * (gain[1] - gain[0]) + v * (gain[3] - gain[2]))
             along_y += scale * ((_ONE - u) * (gain[2] - gain[0]) + u * (gain[3] - gain[1]))
-            padded_offset += 6 * (n + 2) * (n + 2)
+            offset, padded_offset = offset + 6 * n * n, padded_offset + 6 * (n + 2) * (n + 2)
         of_coordinates[p, 0], of_coordinates[p, 1] = along_x, along_y
 
 
@@ -269,7 +245,7 @@ _SCHEMA = "cube_lookup(Tensor face, Tensor coordinates, Tensor texels, Tensor pa
 _on_cpu = kernel_with_gradients(
     _SCHEMA,
     lambda face, coordinates, texels, padded, resolutions: texels.new_zeros(len(face), 3),
-    _sum_of_levels,
-    {1: _gradient_of_coordinates, 2: _gradient_of_texels},
+    _forward,
+    {1: _backward_to_coordinates, 2: _gradient_of_texels},
 )
 lookup = operator(f"{_SCHEMA} -> Tensor", lookup_in_torch, _on_cpu)

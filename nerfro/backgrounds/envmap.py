@@ -146,7 +146,7 @@ class EnvironmentMap(Background):
         raw = torch.zeros_like(coordinates[:, :1])
         padded = self.padded.split([levels.num_padded for levels in self._groups])
         for texels, of_group, levels in zip((self.texels, self.fitted_texels), padded, self._groups, strict=True):
-            if len(levels) > 0:
+            if levels.resolutions:
                 raw = raw + cube_map.lookup(face, coordinates, texels, of_group, levels.resolutions)
         return raw
 

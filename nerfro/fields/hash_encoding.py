@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -23,10 +23,9 @@ from jaxtyping import Float, Int
 from numba import prange
 from torch import Tensor
 
-from nerfro.kernels.compilation import compiled, compiled_parallel
+from nerfro.kernels.compilation import compiled, compiled_parallel, num_threads, share
 from nerfro.kernels.constants import constant
 from nerfro.kernels.operators import kernel_with_gradients, operator
-from nerfro.kernels.threads import num_threads, share
 
 # Features per vertex. The compiled kernels assume two, which one 64-bit load fetches.
 NUM_FEATURES = 2
@@ -67,9 +66,6 @@ class GridLevels:
     @cached_property
     def dense(self) -> tuple[bool, ...]:
         return tuple((n + 1) ** 3 <= size for n, size in zip(self.resolutions, self.sizes, strict=True))
-
-    def __len__(self) -> int:
-        return len(self.resolutions)
 
 
 def grid_levels(num_levels: int, base_resolution: int, finest_resolution: int, log2_table_size: int) -> GridLevels:
@@ -121,40 +117,35 @@ def _vertices_in_torch(
 
 
 def _encode(
-    positions: Float[np.ndarray, "3 points"], table: Float[np.ndarray, "T 2"], resolutions: list[int],
-    sizes: list[int], features: Float[np.ndarray, "points F"],
+    positions: Float[np.ndarray, "3 points"], table: Float[np.ndarray, "T 2"], resolutions: Int[np.ndarray, "L"],
+    sizes: Int[np.ndarray, "L"], features: Float[np.ndarray, "points F"],
 ) -> None:  # fmt: skip
-    layout, num_points = _layout(tuple(resolutions), tuple(sizes)), positions.shape[1]
+    num_points = positions.shape[1]
 
     def encode(part: int) -> None:
-        _forward(positions, table, *layout, (part * _PART, min((part + 1) * _PART, num_points)), features)
+        _forward(positions, table, resolutions, sizes, (part * _PART, min((part + 1) * _PART, num_points)), features)
 
     share(encode, -(-num_points // _PART))
 
 
-def _gradient_of_positions(
-    positions: Float[np.ndarray, "3 points"], table: Float[np.ndarray, "T 2"], resolutions: list[int],
-    sizes: list[int], gradient: Float[np.ndarray, "points F"], of_positions: Float[np.ndarray, "3 points"],
-) -> None:  # fmt: skip
-    _backward_to_positions(positions, table, gradient, *_layout(tuple(resolutions), tuple(sizes)), of_positions)
-
-
 def _gradient_of_table(
-    positions: Float[np.ndarray, "3 points"], table: Float[np.ndarray, "T 2"], resolutions: list[int],
-    sizes: list[int], gradient: Float[np.ndarray, "points F"], of_table: Float[np.ndarray, "T 2"],
+    positions: Float[np.ndarray, "3 points"], table: Float[np.ndarray, "T 2"], resolutions: Int[np.ndarray, "L"],
+    sizes: Int[np.ndarray, "L"], gradient: Float[np.ndarray, "points F"], of_table: Float[np.ndarray, "T 2"],
 ) -> None:  # fmt: skip
-    layout, threads = _layout(tuple(resolutions), tuple(sizes)), num_threads()
+    threads = num_threads()
     # Threads of Numba share the levels themselves.
     parts = _LEVEL_PARTS if threads == 1 else 1
-    share(lambda part: _backward(positions, gradient, *layout, (part, parts, threads), of_table), parts)
+    share(lambda part: _backward(positions, resolutions, sizes, gradient, (part, parts, threads), of_table), parts)
 
 
-@lru_cache(maxsize=16)
-def _layout(
-    resolutions: tuple[int, ...], sizes: tuple[int, ...]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    levels = GridLevels(resolutions, sizes)
-    return np.array(resolutions), np.array(sizes), np.array(levels.offsets), np.array(levels.dense)
+@compiled
+def _layout(resolutions, sizes, level):
+    """Return whether a level is dense, its bit mask, its first entry and the first entry of the next level."""
+    first = 0
+    for coarser in range(level):
+        first += sizes[coarser]
+    side = resolutions[level] + 1
+    return side * side * side <= sizes[level], _UINT(sizes[level] - 1), first, first + sizes[level]
 
 
 @compiled
@@ -227,7 +218,7 @@ def _interpolate(cells, fractions, edges, entries, dense, mask, features, first)
 
 
 @compiled_parallel
-def _forward(positions, table, resolutions, sizes, offsets, dense, span, features):
+def _forward(positions, table, resolutions, sizes, span, features):
     first, end = span
     for block in prange((end - first + _BLOCK - 1) // _BLOCK):
         start = first + block * _BLOCK
@@ -235,8 +226,8 @@ def _forward(positions, table, resolutions, sizes, offsets, dense, span, feature
         cells, fractions = np.empty((3, size), _UINT), np.empty((3, size), np.float32)
         edges = np.empty((4, size), _UINT)
         for level in range(resolutions.shape[0]):
-            is_dense, mask = dense[level], _UINT(sizes[level] - 1)
-            entries = table[offsets[level] : offsets[level] + sizes[level]]
+            is_dense, mask, first_entry, end_entry = _layout(resolutions, sizes, level)
+            entries = table[first_entry:end_entry]
             _locate(positions, start, size, resolutions[level], is_dense, cells, fractions, edges)
             # Two calls with a constant each, so that the compiled loop over the points has no branch.
             if is_dense:
@@ -258,7 +249,7 @@ def _slope(x, y, low_low, high_low, low_high, high_high):
 
 
 @compiled_parallel
-def _backward_to_positions(positions, table, gradient, resolutions, sizes, offsets, dense, of_positions):
+def _backward_to_positions(positions, table, resolutions, sizes, gradient, of_positions):
     num_points = positions.shape[1]
     for block in prange((num_points + _BLOCK - 1) // _BLOCK):
         start = block * _BLOCK
@@ -267,8 +258,9 @@ def _backward_to_positions(positions, table, gradient, resolutions, sizes, offse
         edges = np.empty((4, size), _UINT)
         slopes = np.zeros((3, size), np.float32)
         for level in range(resolutions.shape[0]):
-            is_dense, mask, scale = dense[level], _UINT(sizes[level] - 1), np.float32(resolutions[level])
-            entries = table[offsets[level] : offsets[level] + sizes[level]]
+            is_dense, mask, first_entry, end_entry = _layout(resolutions, sizes, level)
+            scale = np.float32(resolutions[level])
+            entries = table[first_entry:end_entry]
             _locate(positions, start, size, resolutions[level], is_dense, cells, fractions, edges)
             for p in range(size):
                 first, second = gradient[start + p, 2 * level] * scale, gradient[start + p, 2 * level + 1] * scale
@@ -290,7 +282,7 @@ def _backward_to_positions(positions, table, gradient, resolutions, sizes, offse
 
 
 @compiled_parallel
-def _backward(positions, gradient, resolutions, sizes, offsets, dense, division, table):
+def _backward(positions, resolutions, sizes, gradient, division, table):
     num_points, (part, parts, threads) = positions.shape[1], division
     # Levels are distributed in turn, because fine levels cost more than coarse levels.
     for thread in prange(threads):
@@ -299,8 +291,8 @@ def _backward(positions, gradient, resolutions, sizes, offsets, dense, division,
         for start in range(0, num_points, _BLOCK):
             size = min(num_points - start, _BLOCK)
             for level in range(part + parts * thread, resolutions.shape[0], parts * threads):
-                is_dense, mask = dense[level], _UINT(sizes[level] - 1)
-                entries = table[offsets[level] : offsets[level] + sizes[level]]
+                is_dense, mask, first_entry, end_entry = _layout(resolutions, sizes, level)
+                entries = table[first_entry:end_entry]
                 _locate(positions, start, size, resolutions[level], is_dense, cells, fractions, edges)
                 for p in range(size):
                     i, x, y, z = cells[0, p], fractions[0, p], fractions[1, p], fractions[2, p]
@@ -326,7 +318,7 @@ _of_columns = kernel_with_gradients(
     _SCHEMA,
     lambda positions, table, resolutions, sizes: positions.new_empty(positions.shape[1], NUM_FEATURES * len(sizes)),
     _encode,
-    {0: _gradient_of_positions, 1: _gradient_of_table},
+    {0: _backward_to_positions, 1: _gradient_of_table},
 )
 hash_encode = operator(
     f"{_SCHEMA} -> Tensor",

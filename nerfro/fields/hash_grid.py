@@ -16,10 +16,8 @@ from nerfro.core.cameras import Cameras
 from nerfro.core.types import FieldValues, Samples
 from nerfro.data.base import Views
 from nerfro.fields import hash_encoding
-from nerfro.fields.base import Field
-from nerfro.fields.networks import radiance
+from nerfro.fields.base import Field, evaluate_selected, radiance
 from nerfro.fields.relu_mlp import ReluMLP
-from nerfro.fields.selection import evaluate_selected
 from nerfro.fields.spherical_harmonics import MAX_BANDS, spherical_harmonics
 from nerfro.geometry.space import Space
 from nerfro.registry.allowed import Depth, Positive, Width

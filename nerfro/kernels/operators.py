@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -33,23 +34,6 @@ def operator(schema: str, reference: Callable[..., Any], on_cpu: Callable[..., A
     return getattr(torch.ops.nerfro, name).default
 
 
-def kernel(schema: str, fake: Callable[..., Any]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Define an operator without gradients by a function that takes and returns NumPy arrays.
-
-    Args:
-        schema: name, arguments and results, see `operator`.
-        fake: function of the arguments, as tensors, that creates results of the right shapes and types without values.
-    """
-
-    def define(function: Callable[..., Any]) -> Callable[..., Any]:
-        def on_tensors(*arguments: Any) -> Any:
-            return (*map(torch.from_numpy, function(*map(_array, arguments))),)
-
-        return cpu_operator(schema, fake)(on_tensors)
-
-    return define
-
-
 def kernel_with_gradients(
     schema: str, result: Callable[..., Tensor], fill: Callable[..., None], gradients: Mapping[int, Callable[..., None]]
 ) -> Callable[..., Tensor]:
@@ -58,7 +42,7 @@ def kernel_with_gradients(
     Args:
         schema: name and arguments, `name(Tensor x, int n)`; tensors precede other arguments.
         result: function of the arguments, as tensors, that creates the result without its values.
-        fill: function of the arguments, as NumPy arrays, and the result.
+        fill: function of the arguments and the result; tensors and lists are NumPy arrays.
         gradients: function for the gradient of an argument, by the number of the argument. It takes the arguments, the
             gradient of the result, and zeros of the shape of the argument, to which it adds the gradient.
 
@@ -66,6 +50,7 @@ def kernel_with_gradients(
         Differentiable function of CPU tensors.
     """
     name, _, names = schema.rstrip(")").partition("(")
+    num_tensors = names.count("Tensor ")
     forward = _filled(f"{name}_forward({names}) -> Tensor", result, fill)
     backward = {
         number: _filled(f"{name}_gradient_{number}({names}, Tensor gradient) -> Tensor", _zeros_like(number), function)
@@ -75,15 +60,18 @@ def kernel_with_gradients(
     class Kernel(torch.autograd.Function):
         @staticmethod
         def forward(ctx: Any, *arguments: Any) -> Tensor:
-            ctx.save_for_backward(*(value for value in arguments if isinstance(value, Tensor)))
-            ctx.others = [value for value in arguments if not isinstance(value, Tensor)]
+            ctx.save_for_backward(*arguments[:num_tensors])
+            ctx.others = arguments[num_tensors:]
             return forward(*arguments)
 
         @staticmethod
         @once_differentiable
         def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-            arguments, learns = (*ctx.saved_tensors, *ctx.others, gradient), ctx.needs_input_grad
-            return tuple(backward[i](*arguments) if learns[i] and i in backward else None for i in range(len(learns)))
+            gradients: list[Tensor | None] = [None] * len(ctx.needs_input_grad)
+            for number, function in backward.items():
+                if ctx.needs_input_grad[number]:
+                    gradients[number] = function(*ctx.saved_tensors, *ctx.others, gradient)
+            return tuple(gradients)
 
     return Kernel.apply
 
@@ -95,18 +83,24 @@ def _zeros_like(number: int) -> Callable[..., Tensor]:
 def _filled(schema: str, result: Callable[..., Tensor], fill: Callable[..., None]) -> Callable[..., Tensor]:
     def run(*arguments: Any) -> Tensor:
         values = result(*arguments)
-        fill(*map(_array, arguments), values.numpy())
+        converted = [
+            value.detach().contiguous().numpy() if isinstance(value, Tensor)
+            else np.array(value) if isinstance(value, list) else value
+            for value in arguments
+        ]  # fmt: skip
+        fill(*converted, values.numpy())
         return values
 
     return cpu_operator(schema, result)(run)
 
 
-def _array(value: Any) -> Any:
-    return value.detach().contiguous().numpy() if isinstance(value, Tensor) else value
-
-
 def cpu_operator(schema: str, fake: Callable[..., Any]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Define an operator without gradients by a function of CPU tensors; the arguments are those of `kernel`."""
+    """Define an operator without gradients by a function of CPU tensors.
+
+    Args:
+        schema: name, arguments and results, see `operator`.
+        fake: function of the arguments that creates results of the right shapes and types without values.
+    """
 
     def define(function: Callable[..., Any]) -> Callable[..., Any]:
         name = _define(schema)
@@ -120,3 +114,8 @@ def cpu_operator(schema: str, fake: Callable[..., Any]) -> Callable[[Callable[..
 def _define(schema: str) -> str:
     _LIBRARY.define(schema, tags=(torch.Tag.pt2_compliant_tag,))
     return schema.partition("(")[0]
+
+
+def arrays(*tensors: Tensor) -> list[np.ndarray]:
+    """Return tensors on any device as NumPy arrays without gradients; contiguous ones on the CPU share memory."""
+    return [tensor.detach().cpu().contiguous().numpy() for tensor in tensors]

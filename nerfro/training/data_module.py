@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from nerfro.core.types import Batch
 from nerfro.data.base import Views
-from nerfro.kernels.threads import HELPERS
+from nerfro.kernels.compilation import HELPERS
 from nerfro.rendering import RayTracer, Renderer
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.training.module import TrainingModule
@@ -134,7 +134,7 @@ class Prefetcher(Generic[Made]):
     """Make the batch of the next step in a thread. The batches do not depend on the thread.
 
     The thread uses one core, and kernels release Python and the threads of Numba (`kernels.compilation`). When idle,
-    the thread helps with the current step (`kernels.threads.share`).
+    the thread helps with the current step (`kernels.compilation.share`).
 
     Args:
         make: function that makes the batch of a step.

@@ -20,8 +20,7 @@ from omegaconf import DictConfig
 import nerfro.training.lightning_callbacks  # noqa: F401 - registers callbacks
 from nerfro.core.errors import NerfroError
 from nerfro.evaluation.request import report_unused_gpu
-from nerfro.kernels.allocator import keep_freed_memory
-from nerfro.kernels.available import fast_bfloat16
+from nerfro.kernels.available import fast_bfloat16, keep_freed_memory
 from nerfro.registry.registration import build, create, find
 from nerfro.training.callbacks import Checkpoints, SharedTimer, Throughput, TrainingProgress
 from nerfro.training.checkpoint_files import CheckpointFiles

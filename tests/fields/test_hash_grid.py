@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from nerfro.core.types import Samples
+from nerfro.fields.base import evaluate_selected
 from nerfro.fields.hash_encoding import hash_encode_in_torch
 from nerfro.fields.hash_grid import HashGridField
-from nerfro.fields.selection import evaluate_selected
 from nerfro.fields.spherical_harmonics import spherical_harmonics_in_torch
 from nerfro.geometry.space import Box, Contracted, Space, inside_box
 from tests.exact_silhouettes import cameras_around

@@ -11,9 +11,8 @@ from jaxtyping import Int
 from torch import Tensor
 
 from nerfro.core.types import OpticalRecord, Path, Rays
-from nerfro.kernels.arrays import arrays
 from nerfro.kernels.lookup import Solids
-from nerfro.kernels.operators import kernel
+from nerfro.kernels.operators import arrays, cpu_operator
 from nerfro.samplers.paths.branching import Branching
 from nerfro.samplers.paths.polylines import SnellTrace
 from nerfro.samplers.paths.snell_cpu import Settings, TracedRows, polylines_of_width, trace_snell
@@ -61,7 +60,7 @@ def _shapes(
     return counts[0], *of_vertices, s, *of_bodies, weight, counts[1], counts[2], exceeded
 
 
-@kernel(
+@cpu_operator(
     "trace_snell(Tensor origins, Tensor directions, Tensor near, Tensor far, Tensor[] solids, bool nested, float shell,"
     " int max_events, int max_split_events, float least_weight, bool main_only) -> (Tensor ray, Tensor positions, "
     "Tensor exit_directions, Tensor s, Tensor body, Tensor surface, Tensor far_side, Tensor weight, "
@@ -69,9 +68,9 @@ def _shapes(
     _shapes,
 )
 def _trace(
-    origins: np.ndarray, directions: np.ndarray, near: np.ndarray, far: np.ndarray, solids: list[Tensor], nested: bool,
-    shell: float, max_events: int, max_split_events: int, least_weight: float, main_only: bool,
-) -> list[np.ndarray]:  # fmt: skip
+    origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, solids: list[Tensor], nested: bool, shell: float,
+    max_events: int, max_split_events: int, least_weight: float, main_only: bool,
+) -> tuple[Tensor, ...]:  # fmt: skip
     """Trace rays; returns ray, vertices and numbers of each polyline, see `TracedRows`.
 
     Args:
@@ -80,25 +79,26 @@ def _trace(
         nested, shell: numbers of `kernels.lookup.Solids`.
         max_events, max_split_events, least_weight, main_only: see `snell_cpu.Settings`.
     """
+    rays = arrays(origins, directions, near, far)
     names = [name for name in Solids._fields if name not in ("nested", "shell")]
-    arrays: dict[str, Any] = {name: values.numpy() for name, values in zip(names, solids, strict=True)}
-    packed = Solids(**arrays, nested=nested, shell=shell)
+    of_bodies: dict[str, Any] = {name: values.numpy() for name, values in zip(names, solids, strict=True)}
+    packed = Solids(**of_bodies, nested=nested, shell=shell)
     settings = Settings(max_events, max_split_events, least_weight, main_only)
     max_polylines = _MAX_POLYLINES if max_split_events and not main_only else 1
-    rows, counts = trace_snell(origins, directions, near, far, packed, settings, _MAX_VERTICES, max_polylines)
+    rows, counts = trace_snell(*rays, packed, settings, _MAX_VERTICES, max_polylines)
     kept, needed = (counts <= (max_polylines, _MAX_VERTICES)).all(1), counts.max(0, initial=1)
     width = max(int(needed[1]), 2)
     columns = _polylines(rows, np.where(kept, counts[:, 0], 0), width)
     if not kept.all():
         rest = (~kept).nonzero()[0]
-        few = [values[rest] for values in (origins, directions, near, far)]
-        rows, counts = trace_snell(few[0], few[1], few[2], few[3], packed, settings, width, int(needed[0]))
+        few = [values[rest] for values in rays]
+        rows, counts = trace_snell(*few, packed, settings, width, int(needed[0]))
         again = _polylines(rows, counts[:, 0], width)
         pairs = zip(columns, [rest[again[0]], *again[1:]], strict=True)
         joined = [np.concatenate(pair) for pair in pairs]
         order = np.argsort(joined[0], kind="stable")
         columns = [column[order] for column in joined]
-    return columns
+    return (*map(torch.from_numpy, columns),)
 
 
 def _polylines(rows: TracedRows, counts: Int[np.ndarray, "R"], width: int) -> list[np.ndarray]:
@@ -117,5 +117,5 @@ def _polylines(rows: TracedRows, counts: Int[np.ndarray, "R"], width: int) -> li
 
 
 def ray_arrays(rays: Rays) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    origins, directions, near, far = arrays(rays.origins.cpu(), rays.directions.cpu(), rays.near.cpu(), rays.far.cpu())
+    origins, directions, near, far = arrays(rays.origins, rays.directions, rays.near, rays.far)
     return origins, directions, near, far
