@@ -17,13 +17,12 @@ from nerfro.core.cameras import Cameras
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import user_path
 from nerfro.core.types import Batch
-from nerfro.losses.base import Loss
+from nerfro.losses.base import Loss, Objective, ObjectiveValue
 from nerfro.registry.allowed import plain, validate
 from nerfro.registry.registration import discover
 from nerfro.rendering import Renderer, Scene
 from nerfro.training.config import build_each
 from nerfro.training.inputs import INPUTS, inputs_of
-from nerfro.training.objective import Objective, ObjectiveValue
 from nerfro.training.optimizer import OptimizerConfig, learning_rate_factor
 from nerfro.training.run_folder import load_checkpoint, restore
 
