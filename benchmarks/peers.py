@@ -15,7 +15,7 @@ import statistics
 
 from training import MESH, PLAIN, Training, paper_recipe
 
-from nerfro.kernels.allocator import keep_freed_memory
+from nerfro.kernels.available import keep_freed_memory
 
 AUTHORS = "authors' code (jax 0.10.2), index grid of 256^3"
 # Quantity, program, and the lowest and highest reported value.

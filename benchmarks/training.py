@@ -43,8 +43,7 @@ from nerfro.core.types import Batch
 from nerfro.evaluation.render_view import render_view
 from nerfro.evaluation.results import read_metrics_json
 from nerfro.fields.hash_grid import HashGridField
-from nerfro.kernels.allocator import keep_freed_memory
-from nerfro.kernels.available import fast_bfloat16
+from nerfro.kernels.available import fast_bfloat16, keep_freed_memory
 from nerfro.rendering import RayTracer
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.training.data_module import RayDataModule

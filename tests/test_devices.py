@@ -23,7 +23,7 @@ from tests.test_experiments import SMALL, shrunk
 STEP = 100_000
 
 # Rays are traced on the CPU, and travel there and back.
-TRACING = ("kernels/arrays.py", "samplers/paths/compiled.py", "paper/compiled.py", "paper/eikonal.py")
+TRACING = ("kernels/operators.py", "samplers/paths/compiled.py", "paper/compiled.py", "paper/eikonal.py")
 TRACING += ("samplers/paths/snell.py", "samplers/paths/polylines.py", "samplers/paths/wavefront.py")
 TRACING += ("geometry/intersection.py", "media/bodies.py")
 
@@ -34,7 +34,7 @@ ONCE = "kernels/constants.py: constant (tensor)"
 # Triangles are met on the CPU in a replay as well. Some rays are traced again with more vertices.
 TO_CPU = {"core/rays.py: <genexpr> (to)", "samplers/paths/replay.py: indices_of (to)"}
 AGAIN = "core/rays.py: __getitem__ (__getitem__)"
-SELECTED = "fields/selection.py: evaluate_selected (nonzero)"
+SELECTED = "fields/base.py: evaluate_selected (nonzero)"
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,7 @@ import pytest
 import torch
 from scipy import stats
 
-from nerfro.core.draws import Draws
-from nerfro.core.philox import philox4x32
+from nerfro.core.draws import Draws, philox4x32
 from nerfro.kernels.philox import _philox4x32, fill_uniform
 
 # Counter, key and words of philox4x32-10 in Random123's known answers (kat_vectors).

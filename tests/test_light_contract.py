@@ -13,10 +13,9 @@ from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.core.light import to_linear, to_srgb
 from nerfro.core.types import Exits, FieldValues, Path
 from nerfro.files import lat_long
-from nerfro.losses.background import BackgroundRegularizer
 from nerfro.losses.base import Loss
-from nerfro.losses.distortion import Distortion
-from nerfro.losses.photometric import Photometric
+from nerfro.losses.density import Distortion
+from nerfro.losses.radiance import BackgroundRegularizer, Photometric
 from nerfro.models.refractive import RefractiveModel
 from nerfro.paper.hierarchical import Hierarchical
 from nerfro.rendering import composite

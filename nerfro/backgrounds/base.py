@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 
-import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
-from torch.func import functional_call
 
 from nerfro.core.types import Exits
 from nerfro.data.component import Component
@@ -39,23 +37,3 @@ class Background(Component, nn.Module, ABC):
     def detail(self) -> float:
         """Angle in degrees of the finest detail that gradient descent learns."""
         return 0.35
-
-
-def background_radiance(
-    background: Background, exits: Exits, teaches: Bool[Tensor, "P"] | None = None
-) -> Float[Tensor, "P 3"]:
-    """Evaluate the background radiance, with gradients of the parameters from selected exits only.
-
-    Args:
-        background: the background.
-        exits: last segments of polylines.
-        teaches: exits from which the parameters learn; None for all. The exits themselves always have gradients.
-    """
-    radiance = background(exits)
-    if teaches is None or not radiance.requires_grad:
-        return radiance
-    fixed = radiance.detach()
-    if exits.directions.requires_grad:
-        parameters = {name: parameter.detach() for name, parameter in background.named_parameters()}
-        fixed = functional_call(background, parameters, (exits,))
-    return torch.where(teaches[:, None], radiance, fixed)

@@ -1,23 +1,31 @@
-"""An equi-angular cube map with several resolutions, in plain PyTorch.
+"""An equi-angular cube map with several resolutions.
 
 Face 2 a + b is the side of the cube at the positive (b = 0) or negative (b = 1) end of axis a. The first texture
 coordinate of a face is the angle towards axis a + 1 (modulo 3), and the second the angle towards axis a + 2. All texels
 have the same width in angle, which keeps their solid angles within a factor of 1.4.
 
-`lookup` runs on GPUs, and is the reference implementation of the kernels in `nerfro.backgrounds.cube_map_cpu`.
+`lookup_in_torch` runs on GPUs, and is the reference implementation of the compiled kernels for CPUs. Threads divide the
+directions in the forward pass and the levels in the backward pass, where no two threads may write to the same texel.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
+from numba import prange
 from torch import Tensor
 
+from nerfro.kernels.compilation import compiled, compiled_parallel, num_threads
 from nerfro.kernels.constants import constant
+from nerfro.kernels.operators import kernel_with_gradients, operator
+
+_ONE = np.float32(1)
 
 
 @dataclass(frozen=True)
@@ -46,9 +54,6 @@ class CubeLevels:
     @cached_property
     def num_padded(self) -> int:
         return sum(self.padded_sizes)
-
-    def __len__(self) -> int:
-        return len(self.resolutions)
 
 
 def project(directions: Float[Tensor, "P 3"]) -> tuple[Int[Tensor, "P"], Float[Tensor, "P 2"]]:
@@ -99,12 +104,12 @@ def _directions(centres: Float[Tensor, "n"]) -> Float[Tensor, "T 3"]:
     return unproject(face, torch.stack([column, row], dim=-1))
 
 
-def lookup(
+def lookup_in_torch(
     face: Int[Tensor, "P"],
     coordinates: Float[Tensor, "P 2"],
     texels: Float[Tensor, "T 3"],
     padded: Int[Tensor, " padded"],
-    levels: CubeLevels,
+    resolutions: Sequence[int],
 ) -> Float[Tensor, "P 3"]:
     """Sum the bilinear interpolations of all levels, which are continuous over the sphere.
 
@@ -114,9 +119,10 @@ def lookup(
         face, coordinates: see `project`.
         texels: of all levels.
         padded: `padded_texels` of all levels, flattened, one level after the other.
-        levels: layout of the texels.
+        resolutions: of all levels, see `CubeLevels`.
     """
-    padded_offsets = tuple(sum(levels.padded_sizes[:level]) for level in range(len(levels)))
+    levels = CubeLevels(tuple(resolutions))
+    padded_offsets = tuple(sum(levels.padded_sizes[:level]) for level in range(len(resolutions)))
     resolution, offset, padded_offset = (
         constant(values, texels.device) for values in (levels.resolutions, levels.offsets, padded_offsets)
     )
@@ -135,3 +141,111 @@ def lookup(
     texel = padded.index_select(0, index.flatten()).view(index.shape) + offset[:, None]
     # The gradient of index_select is one index_add; that of indexing with brackets sorts all indices first.
     return (texels.index_select(0, texel.flatten()).view(*texel.shape, 3) * weights[..., None]).sum((1, 2))
+
+
+def _gradient_of_texels(
+    face: np.ndarray, coordinates: np.ndarray, texels: np.ndarray, padded: np.ndarray, resolutions: np.ndarray,
+    gradient: np.ndarray, of_texels: Float[np.ndarray, "T 3"],
+) -> None:  # fmt: skip
+    threads = min(num_threads(), len(resolutions))
+    _backward(threads, face, coordinates, padded, resolutions, gradient, of_texels)
+
+
+@compiled
+def _taps(face, x, y, n, padded, padded_offset):
+    """Return four texels of a level, the position between them, and the missing one at a cube corner (or -1)."""
+    x = (x + _ONE) * np.float32(0.5 * n) + np.float32(0.5)
+    y = (y + _ONE) * np.float32(0.5 * n) + np.float32(0.5)
+    column, row = max(min(np.int64(x), n), 0), max(min(np.int64(y), n), 0)
+    u, v = x - np.float32(column), y - np.float32(row)
+    if 0 < column < n and 0 < row < n:  # between texels of one face
+        inside = (face * n + row - 1) * n + column - 1
+        return (inside, inside + 1, inside + n, inside + n + 1), u, v, -1
+    at_corner = (column == 0 or column == n) and (row == 0 or row == n)
+    missing = (1 if column == n else 0) + (2 if row == n else 0) if at_corner else -1
+    width = n + 2
+    first = padded_offset + (face * width + row) * width + column
+    texels = (padded[first], padded[first + 1], padded[first + width], padded[first + width + 1])
+    return texels, u, v, missing
+
+
+@compiled
+def _weights(u, v, missing):
+    """Return the weights of the four texels; the missing one is the mean of the other three."""
+    w0, w1, w2, w3 = (_ONE - u) * (_ONE - v), u * (_ONE - v), (_ONE - u) * v, u * v
+    if missing >= 0:
+        absent = (w0 if missing == 0 else w1 if missing == 1 else w2 if missing == 2 else w3) / np.float32(3)
+        w0 = np.float32(0) if missing == 0 else w0 + absent
+        w1 = np.float32(0) if missing == 1 else w1 + absent
+        w2 = np.float32(0) if missing == 2 else w2 + absent
+        w3 = np.float32(0) if missing == 3 else w3 + absent
+    return w0, w1, w2, w3
+
+
+@compiled_parallel
+def _forward(face, coordinates, texels, padded, resolutions, total):
+    for p in prange(face.shape[0]):
+        offset, padded_offset = 0, 0
+        for level in range(resolutions.shape[0]):
+            n = resolutions[level]
+            (a, b, c, d), u, v, missing = _taps(face[p], coordinates[p, 0], coordinates[p, 1], n, padded, padded_offset)
+            w0, w1, w2, w3 = _weights(u, v, missing)
+            of_level = texels[offset:]
+            for channel in range(3):
+                total[p, channel] += (
+                    w0 * of_level[a, channel] + w1 * of_level[b, channel]
+                    + w2 * of_level[c, channel] + w3 * of_level[d, channel]
+                )  # fmt: skip
+            offset, padded_offset = offset + 6 * n * n, padded_offset + 6 * (n + 2) * (n + 2)
+
+
+@compiled_parallel
+def _backward(threads, face, coordinates, padded, resolutions, gradient, texels):
+    for thread in prange(threads):
+        offset, padded_offset = 0, 0
+        for level in range(resolutions.shape[0]):
+            n = resolutions[level]
+            if level % threads == thread:
+                for p in range(face.shape[0]):
+                    x, y = coordinates[p, 0], coordinates[p, 1]
+                    texel, u, v, missing = _taps(face[p], x, y, n, padded, padded_offset)
+                    weight = _weights(u, v, missing)
+                    for corner in range(4):
+                        entry = offset + texel[corner]
+                        for channel in range(3):
+                            texels[entry, channel] += weight[corner] * gradient[p, channel]
+            offset, padded_offset = offset + 6 * n * n, padded_offset + 6 * (n + 2) * (n + 2)
+
+
+@compiled_parallel
+def _backward_to_coordinates(face, coordinates, texels, padded, resolutions, gradient, of_coordinates):
+    for p in prange(face.shape[0]):
+        offset, padded_offset = 0, 0
+        along_x, along_y = np.float32(0), np.float32(0)
+        # Derivative of the loss with respect to the weight of each of the four texels.
+        gain = np.empty(4, np.float32)
+        for level in range(resolutions.shape[0]):
+            n = resolutions[level]
+            texel, u, v, missing = _taps(face[p], coordinates[p, 0], coordinates[p, 1], n, padded, padded_offset)
+            for corner in range(4):
+                entry = offset + texel[corner]
+                gain[corner] = np.float32(0)
+                for channel in range(3):
+                    gain[corner] += gradient[p, channel] * texels[entry, channel]
+            if missing >= 0:
+                gain[missing] = (gain[0] + gain[1] + gain[2] + gain[3] - gain[missing]) / np.float32(3)
+            scale = np.float32(0.5 * n)
+            along_x += scale * ((_ONE - v) * (gain[1] - gain[0]) + v * (gain[3] - gain[2]))
+            along_y += scale * ((_ONE - u) * (gain[2] - gain[0]) + u * (gain[3] - gain[1]))
+            offset, padded_offset = offset + 6 * n * n, padded_offset + 6 * (n + 2) * (n + 2)
+        of_coordinates[p, 0], of_coordinates[p, 1] = along_x, along_y
+
+
+_SCHEMA = "cube_lookup(Tensor face, Tensor coordinates, Tensor texels, Tensor padded, int[] resolutions)"
+_on_cpu = kernel_with_gradients(
+    _SCHEMA,
+    lambda face, coordinates, texels, padded, resolutions: texels.new_zeros(len(face), 3),
+    _forward,
+    {1: _backward_to_coordinates, 2: _gradient_of_texels},
+)
+lookup = operator(f"{_SCHEMA} -> Tensor", lookup_in_torch, _on_cpu)

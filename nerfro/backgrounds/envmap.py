@@ -16,7 +16,6 @@ from torch import Tensor, nn
 
 from nerfro.backgrounds import cube_map
 from nerfro.backgrounds.base import Background
-from nerfro.backgrounds.cube_map_cpu import lookup
 from nerfro.core.errors import NerfroError
 from nerfro.core.types import Exits
 from nerfro.data.base import Views
@@ -147,8 +146,8 @@ class EnvironmentMap(Background):
         raw = torch.zeros_like(coordinates[:, :1])
         padded = self.padded.split([levels.num_padded for levels in self._groups])
         for texels, of_group, levels in zip((self.texels, self.fitted_texels), padded, self._groups, strict=True):
-            if len(levels) > 0:
-                raw = raw + lookup(face, coordinates, texels, of_group, levels)
+            if levels.resolutions:
+                raw = raw + cube_map.lookup(face, coordinates, texels, of_group, levels.resolutions)
         return raw
 
     def texels_of_levels(self) -> list[tuple[Float[Tensor, "T 3"], Int[Tensor, " padded"]]]:
@@ -183,17 +182,16 @@ class EnvironmentMap(Background):
         for n, (values, of_level), earlier in levels:
             wide = observed.widths > _MAX_TEXELS * 0.5 * math.pi / n
             weights = observed.weights.masked_fill(wide, 0)[:, None].expand(-1, 3)
-            positions, level = (face, coordinates), cube_map.CubeLevels((n,))
             with torch.enable_grad():
                 change = torch.zeros_like(values, requires_grad=True)
-                changed = lookup(*positions, change, of_level, level)
+                changed = cube_map.lookup(face, coordinates, change, of_level, (n,))
             sums, counts = (
                 torch.autograd.grad(changed, change, gradient, retain_graph=True)[0]
                 for gradient in (weights * residual, weights)
             )
             change = sums / (counts + earlier[:, None] + 1)
             values += change
-            residual -= lookup(*positions, change, of_level, level)
+            residual -= cube_map.lookup(face, coordinates, change, of_level, (n,))
             total.append(counts[:, 0])
         return torch.cat(total)
 

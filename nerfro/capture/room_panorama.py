@@ -38,7 +38,7 @@ class RoomPanorama(Background):
         super().__init__()
         self.middle, self.colours, self.distances, self.steps = middle, colours, distances, steps
         side = round((len(distances) / 6) ** 0.5)
-        self._levels, self._padded = cube_map.CubeLevels((side,)), cube_map.padded_texels(side).flatten()
+        self._side, self._padded = side, cube_map.padded_texels(side).flatten()
 
     def forward(self, exits: Exits) -> Float[Tensor, "P 3"]:
         """Look up the radiance along exit rays, differentiable by their positions and directions."""
@@ -55,7 +55,7 @@ class RoomPanorama(Background):
         seen, lengths = directions, torch.zeros_like(along)
         texels = self.distances[:, None].expand(-1, 3)
         for _ in range(self.steps):
-            distance = cube_map.lookup(*cube_map.project(seen), texels, self._padded, self._levels)[:, :1]
+            distance = cube_map.lookup_in_torch(*cube_map.project(seen), texels, self._padded, [self._side])[:, :1]
             lengths = ((along.square() - square + distance.square()).clamp(min=0).sqrt() - along).clamp(min=0)
             seen = starts + lengths * directions
         return lengths

@@ -1,16 +1,23 @@
-"""Base class of radiance fields."""
+"""Base class of radiance fields, evaluation at selected samples, and the activation of radiance."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from nerfro.core.cameras import Cameras
 from nerfro.core.types import FieldValues, Samples
 from nerfro.data.component import Component
+
+# Activation whose squared sigmoid is 1 / 240 in sRGB.
+_BLACK = -4.0
+Decoder = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+"""Maps positions and unit directions [points, 3] to density [points] and radiance [points, 3]."""
 
 
 class Field(Component, nn.Module, ABC):
@@ -50,3 +57,51 @@ class Field(Component, nn.Module, ABC):
         Returns:
             Density [P, N] and colour [P, N, 3].
         """
+
+
+def evaluate_selected(decoder: Decoder, samples: Samples, selected: Bool[Tensor, "P N"] | None = None) -> FieldValues:
+    """Evaluate a decoder at selected samples that may be occupied; elsewhere, density and radiance are zero.
+
+    On a GPU, counting the selected samples costs one synchronization with the host.
+
+    Args:
+        decoder: see `Decoder`.
+        samples: all samples.
+        selected: samples to evaluate; None for all.
+    """
+    positions, directions = samples.positions.flatten(0, 1), samples.directions.flatten(0, 1)
+    if samples.occupied is not None:
+        selected = samples.occupied if selected is None else selected & samples.occupied
+    if selected is None:
+        density, colour = decoder(positions, directions)
+        return FieldValues(density.view(samples.s.shape), colour.view(samples.positions.shape))
+    index = selected.flatten().nonzero().squeeze(1)
+    density, colour = decoder(positions.index_select(0, index), directions.index_select(0, index))
+    # Out of place, so that gradients flow from the full tensors back to the selected samples.
+    all_density = density.new_zeros(selected.numel()).index_copy(0, index, density)
+    all_radiance = colour.new_zeros(selected.numel(), 3).index_copy(0, index, colour)
+    return FieldValues(all_density.view(selected.shape), all_radiance.view(*selected.shape, 3))
+
+
+def radiance(raw: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """Convert raw outputs to linear radiance in [0, 1] by a squared sigmoid.
+
+    The square approximates sRGB, which stores about the root of radiance. Early in training, black explains thin fog in
+    front of a bright sky best, and the gradient of a saturated sigmoid would vanish. Therefore gradients that would
+    decrease values below `_BLACK`, the smallest pixel value above 0, are blocked.
+    """
+    return torch.sigmoid(_ClampBlack.apply(raw.float())).square()
+
+
+class _ClampBlack(torch.autograd.Function):
+    """Clamp values at `_BLACK`; below, pass only gradients that increase the values."""
+
+    @staticmethod
+    def forward(ctx: Any, raw: Tensor) -> Tensor:
+        ctx.save_for_backward(raw)
+        return raw.clamp(min=_BLACK)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        (raw,) = ctx.saved_tensors
+        return torch.where((raw < _BLACK) & (gradient > 0), 0.0, gradient)

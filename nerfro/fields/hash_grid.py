@@ -16,13 +16,9 @@ from nerfro.core.cameras import Cameras
 from nerfro.core.types import FieldValues, Samples
 from nerfro.data.base import Views
 from nerfro.fields import hash_encoding
-from nerfro.fields.base import Field
-from nerfro.fields.hash_encoding_cpu import hash_encode
-from nerfro.fields.networks import radiance
+from nerfro.fields.base import Field, evaluate_selected, radiance
 from nerfro.fields.relu_mlp import ReluMLP
-from nerfro.fields.selection import evaluate_selected
-from nerfro.fields.spherical_harmonics import MAX_BANDS
-from nerfro.fields.spherical_harmonics_cpu import spherical_harmonics
+from nerfro.fields.spherical_harmonics import MAX_BANDS, spherical_harmonics
 from nerfro.geometry.space import Space
 from nerfro.registry.allowed import Depth, Positive, Width
 from nerfro.registry.registration import register
@@ -162,4 +158,5 @@ class HashGridField(Field):
 
     def encode(self, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points F"]:
         """Encode contracted positions in single precision."""
-        return hash_encode(self._unit(positions), self.table, self.levels)
+        levels = self.levels
+        return hash_encoding.hash_encode(self._unit(positions), self.table, levels.resolutions, levels.sizes)

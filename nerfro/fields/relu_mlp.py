@@ -6,7 +6,6 @@ gradients nor activations are copied: ReLU and its gradient work in place, and o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any, Literal
 
@@ -17,8 +16,8 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from nerfro.kernels.available import fast_bfloat16
+from nerfro.kernels.compilation import share
 from nerfro.kernels.operators import cpu_operator, operator
-from nerfro.kernels.threads import share
 
 # Rows of a product. oneDNN compiles and caches a program for each shape. Batches differ in the number of points, so
 # each step would add 5 MB of programs. Rows of zeros therefore pad the number of points to a multiple of _STEP.
@@ -73,9 +72,7 @@ class _ReluMLP(torch.autograd.Function):
         parts, weights = tensors[:num_parts], tensors[num_parts:]
         layers = [weight.to(dtype) for weight in weights]
         ctx.parts, ctx.weight_dtype = [(part.shape[1], part.dtype) for part in parts], weights[0].dtype
-        if not any(ctx.needs_input_grad):
-            return _evaluated(parts, layers)[: len(parts[0])]
-        result, *activations = _evaluated_and_kept(parts, layers)
+        result, *activations = _evaluate(parts, layers, any(ctx.needs_input_grad))
         ctx.save_for_backward(*activations, *layers)
         return result[: len(parts[0])]
 
@@ -96,8 +93,18 @@ class _ReluMLP(torch.autograd.Function):
         return None, None, *of_parts, *gradients[len(widths) :]
 
 
-def _evaluate(parts: Sequence[Tensor], layers: Sequence[Tensor], keep: bool) -> list[Tensor]:
-    """Return the result and the inputs of all layers, with rows of zeros that pad the points.
+def _num_rows(parts: list[Tensor]) -> int:
+    return -(-len(parts[0]) // _STEP) * _STEP
+
+
+def _shapes(parts: list[Tensor], layers: list[Tensor], keep: bool) -> list[Tensor]:
+    widths = [sum(part.shape[1] for part in parts), *(len(layer) for layer in layers[:-1])] if keep else []
+    return [parts[0].new_empty(_num_rows(parts), n, dtype=layers[0].dtype) for n in (len(layers[-1]), *widths)]
+
+
+@cpu_operator("relu_mlp_forward(Tensor[] parts, Tensor[] layers, bool keep) -> Tensor[]", _shapes)
+def _evaluate(parts: list[Tensor], layers: list[Tensor], keep: bool) -> list[Tensor]:
+    """Return the result and, with `keep`, the inputs of all layers, with rows of zeros that pad the points.
 
     Without `keep`, all blocks share the memory of the inputs of one block, which stays in the CPU's cache.
     """
@@ -126,28 +133,7 @@ def _evaluate(parts: Sequence[Tensor], layers: Sequence[Tensor], keep: bool) -> 
     else:
         for number in range(num_blocks):
             evaluate(number)
-    return [result, *activations]
-
-
-def _num_rows(parts: Sequence[Tensor]) -> int:
-    return -(-len(parts[0]) // _STEP) * _STEP
-
-
-def _shapes(parts: list[Tensor], layers: list[Tensor]) -> list[Tensor]:
-    widths = [len(layers[-1]), sum(part.shape[1] for part in parts), *(len(layer) for layer in layers[:-1])]
-    return [parts[0].new_empty(_num_rows(parts), width, dtype=layers[0].dtype) for width in widths]
-
-
-@cpu_operator(
-    "relu_mlp_forward(Tensor[] parts, Tensor[] layers) -> Tensor", lambda parts, layers: _shapes(parts, layers)[0]
-)
-def _evaluated(parts: list[Tensor], layers: list[Tensor]) -> Tensor:
-    return _evaluate(parts, layers, False)[0]
-
-
-@cpu_operator("relu_mlp_kept(Tensor[] parts, Tensor[] layers) -> Tensor[]", _shapes)
-def _evaluated_and_kept(parts: list[Tensor], layers: list[Tensor]) -> list[Tensor]:
-    return _evaluate(parts, layers, True)
+    return [result, *activations] if keep else [result]
 
 
 def _shapes_of_gradients(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from nerfro.core.philox import philox4x32
+from nerfro.core.draws import philox4x32
 from nerfro.kernels.compilation import compiled
 
 _philox4x32 = compiled(philox4x32)

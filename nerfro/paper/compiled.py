@@ -11,7 +11,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from nerfro.core.types import Path, Rays
-from nerfro.kernels.arrays import input_arrays
+from nerfro.kernels.operators import arrays
 from nerfro.media.bodies import Bodies
 from nerfro.paper.voxel_grid import VoxelGrid
 
@@ -53,7 +53,7 @@ def uniform_on_grid(rays: Rays, medium: VoxelGrid, num_steps: int) -> Path:
 
 
 def _arrays(rays: Rays) -> list[np.ndarray]:
-    return input_arrays(rays.origins, rays.directions, rays.near, rays.far)
+    return arrays(rays.origins, rays.directions, rays.near, rays.far)
 
 
 def _voxels(medium: VoxelGrid) -> Voxels:

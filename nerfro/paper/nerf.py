@@ -11,8 +11,7 @@ from torch import Tensor
 
 from nerfro.core.types import FieldValues, Samples
 from nerfro.data.base import Views
-from nerfro.fields.base import Field
-from nerfro.fields.selection import evaluate_selected
+from nerfro.fields.base import Field, evaluate_selected
 from nerfro.geometry.space import Space, Unbounded
 from nerfro.paper.encoding import DIRECTION_DEGREE, positional_encoding
 from nerfro.paper.mlp import RadianceMLP, in_blocks

@@ -18,9 +18,9 @@ from nerfro.geometry.interpolation import neighbours, smooth, trilinear
 from nerfro.geometry.mesh import local_origin, require_inside
 from nerfro.geometry.occupancy import occupancy_fraction
 from nerfro.geometry.signed_distance import distance_to_set
-from nerfro.kernels.arrays import input_arrays
 from nerfro.kernels.available import require_bytes
 from nerfro.kernels.constants import constant
+from nerfro.kernels.operators import arrays
 from nerfro.media.base import Medium, Scalars, Vectors
 from nerfro.media.grid_box import BYTES_PER_VERTEX, check_margin
 from nerfro.media.surface import MeshSurface
@@ -137,7 +137,7 @@ class VoxelGrid(Medium):
         """Table and clearance grid in the memory of the host."""
         # The arrays of 256^3 vertices have 340 MB, so a copy from a GPU for each batch would be slow.
         if self._on_host is None or self._on_host[0] is not self.table:
-            self._on_host = self.table, input_arrays(self.table, self.clearance_grid)
+            self._on_host = self.table, arrays(self.table, self.clearance_grid)
         return self._on_host[1]
 
     @property

@@ -8,7 +8,7 @@ from nerfro.cli.calls import options_of
 from nerfro.core.paths import user_path
 from nerfro.files.cache import file_hash
 from nerfro.files.folder_lock import lock_folder
-from nerfro.kernels.allocator import keep_freed_memory
+from nerfro.kernels.available import keep_freed_memory
 from nerfro.training.load import checkpoint_of, load
 from nerfro.training.run import Run
 from nerfro.viewing.film import find_ffmpeg, write_film

@@ -110,7 +110,7 @@ class RayTracer:
         position = cameras.fx.new_tensor([0.5, NEIGHBOUR]).repeat_interleave(len(pixels))
         both = estimate(pixel_rays(cameras, pixels.repeat(2), position[:, None].expand(-1, 2)), view.repeat(2))
         rays, path = both[: len(pixels)], self._paths(both[: len(pixels)])
-        angle = divergence(cameras, pixels, main_exits(path), self._main_exits(both[len(pixels) :]))
+        angle = divergence(cameras, pixels, main_exits(path), self._renderer.exit_directions(both[len(pixels) :]))
         divided = angle >= self.subdivision.divergence
         if contrasts is not None and self.subdivision.contrast is not None:
             bent = (path.main_polyline(path.refracted) & ~divided).nonzero()[:, 0]
@@ -130,8 +130,3 @@ class RayTracer:
     @torch.no_grad()
     def _paths(self, rays: Rays) -> Path:
         return self._renderer.path_sampler(rays, self._renderer.scene.medium)
-
-    @torch.no_grad()
-    def _main_exits(self, rays: Rays) -> Float[Tensor, "R 3"]:
-        """Trace the exit directions of the main polylines; other branches are not traced."""
-        return self._renderer.path_sampler.trace_main(rays, self._renderer.scene.medium).exit_directions

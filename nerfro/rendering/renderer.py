@@ -11,22 +11,24 @@ from typing import ClassVar, Literal
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
+from torch.func import functional_call
 
-from nerfro.backgrounds.base import Background, background_radiance
+from nerfro.backgrounds.base import Background
 from nerfro.camera.base import CameraModel
 from nerfro.camera.given import GivenCamera
+from nerfro.core.light import ColourSpace
 from nerfro.core.rays import Rays
-from nerfro.core.types import Batch, Exits, Path, Rendering, Samples
+from nerfro.core.types import Batch, Exits, FieldValues, Path, Rendering, Samples
 from nerfro.data.component import Component
 from nerfro.fields.base import Field
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.geometry.space import Space, Unbounded
 from nerfro.media.base import Medium
 from nerfro.registry.allowed import validated
-from nerfro.rendering.colour_space import ColourSpace
 from nerfro.rendering.scene import Scene
 from nerfro.samplers.base import PathSampler, PointSampler
 from nerfro.samplers.paths.surface_normals import first_normals
+from nerfro.samplers.points.stepfun import volume_weights
 
 
 @dataclass(frozen=True)
@@ -166,10 +168,16 @@ class Renderer(Component, nn.Module, ABC):
         Returns:
             Background radiance of each polyline, in the colour space of the scene.
         """
-        teaches = None
-        if batch is not None:
-            teaches = path.broadcast_to_polylines(batch.teaches_background[batch.ray_pixel])
-        return background_radiance(self.scene.background, path.exits(directions), teaches)
+        background, exits = self.scene.background, path.exits(directions)
+        radiance = background(exits)
+        if batch is None or not radiance.requires_grad:
+            return radiance
+        fixed = radiance.detach()
+        if exits.directions.requires_grad:  # the exits of all rays have gradients
+            parameters = {name: parameter.detach() for name, parameter in background.named_parameters()}
+            fixed = functional_call(background, parameters, (exits,))
+        teaches = path.broadcast_to_polylines(batch.teaches_background[batch.ray_pixel])
+        return torch.where(teaches[:, None], radiance, fixed)
 
     def trace(self, rays: Rays, path: Path | None = None) -> Path:
         """Trace rays, or add gradients and absorption to paths that were traced before."""
@@ -178,6 +186,7 @@ class Renderer(Component, nn.Module, ABC):
         learns = self.paths_learn and torch.is_grad_enabled()
         return medium.with_absorption(self._replayed(path, rays) if learns else path)
 
+    @torch.no_grad()
     def exit_directions(self, rays: Rays) -> Float[Tensor, "R 3"]:
         """Return the unit exit direction of the main polyline of each ray; other branches are not traced."""
         return self.path_sampler.trace_main(rays, self.scene.medium).exit_directions
@@ -260,3 +269,31 @@ class Renderer(Component, nn.Module, ABC):
             meets |= (enter <= leave) & (leave >= 0)
         meets[path.ray[path.refracted]] = True
         return meets
+
+
+def composite(
+    samples: Samples, field_values: FieldValues, background_radiance: Float[Tensor, "P 3"], path: Path
+) -> Rendering:
+    """Composite one sampling level: C = sum_i w_i c_i + T_{N+1} C'(d_N) (paper, Eqn. 5).
+
+    The radiance of a ray is the sum over its polylines. In absorbing media, the radiance of samples and of the
+    background is multiplied by the transmittance of the medium.
+
+    Args:
+        samples: N samples on each of P polylines.
+        field_values: density [P, N] per world unit, and radiance [P, N, 3] of the samples.
+        background_radiance: background radiance in the exit direction of each polyline.
+        path: the polylines of R rays.
+
+    Returns:
+        Radiance [R, 3] of the rays, with the weights and the transmittance of the polylines.
+    """
+    # Sums over a ray stay in single precision.
+    density, radiance = field_values.density.float(), field_values.radiance.float()
+    weights, transmittance = volume_weights(density, samples.deltas)
+    background_radiance = background_radiance.float()
+    if path.absorbs:
+        radiance = radiance * path.transmitted(samples.s)
+        background_radiance = background_radiance * path.transmitted(path.far[:, None])[:, 0]
+    radiance = (weights[..., None] * radiance).sum(-2) + transmittance[:, None] * background_radiance
+    return Rendering(path.sum_polylines(radiance), weights, transmittance, background_radiance, samples, path)

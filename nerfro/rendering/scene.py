@@ -12,10 +12,10 @@ from nerfro.camera.base import CameraModel
 from nerfro.camera.given import GivenCamera
 from nerfro.core.cameras import Cameras
 from nerfro.core.errors import NerfroError
+from nerfro.core.light import ColourSpace
 from nerfro.fields.base import Field
 from nerfro.geometry.space import Space, Unbounded
 from nerfro.media.base import Medium
-from nerfro.rendering.colour_space import ColourSpace
 
 
 class Scene(nn.Module):

@@ -141,7 +141,9 @@ def _ball(
     """Derive the ball between the cameras: the box around it, its radius and the arc length of the first samples."""
     poses = cameras.camera_to_world.double().cpu().numpy()
     centres, forward = poses[:, :, 3], -poses[:, :, 2]
-    middle = common_target(centres, forward, _depth(cameras)) if box is None else box.mean(0)
+    # A typical depth from the bounds of the data: the harmonic mean of near and far.
+    depth = 2 / (1 / max(cameras.near, 1e-3 * cameras.far) + 1 / cameras.far)
+    middle = common_target(centres, forward, depth) if box is None else box.mean(0)
     distances = np.linalg.norm(centres - middle, axis=1)
     radius = _RADIUS_SHARE * float(np.median(distances)) if content.radius is None else content.radius
     if not radius > 0:
@@ -163,11 +165,6 @@ def common_target(
     values, axes = np.linalg.eigh(across.mean(0))
     offset = axes.T @ (across @ (centres - typical)[:, :, None])[:, :, 0].mean(0)
     return typical + axes @ np.where(values > _PARALLEL, offset / np.maximum(values, _PARALLEL), 0.0)
-
-
-def _depth(cameras: Cameras) -> float:
-    """Return a typical depth from the bounds of the data: the harmonic mean of near and far."""
-    return 2 / (1 / max(cameras.near, 1e-3 * cameras.far) + 1 / cameras.far)
 
 
 def _box(config: DictConfig, medium: Medium) -> Float[np.ndarray, "2 3"] | None:

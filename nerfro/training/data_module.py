@@ -9,13 +9,12 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Generic, TypeVar, cast
 
 import torch
-from jaxtyping import Float
 from lightning.pytorch import LightningDataModule, Trainer
-from torch import Tensor, nn
+from torch import nn
 
 from nerfro.core.types import Batch
 from nerfro.data.base import Views
-from nerfro.kernels.threads import HELPERS
+from nerfro.kernels.compilation import HELPERS
 from nerfro.rendering import RayTracer, Renderer
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.training.module import TrainingModule
@@ -24,8 +23,6 @@ from nerfro.training.validation import ValidationPixels
 
 # Number of validations for each validation image, so that the curve has more points; each costs a few steps.
 _VALIDATIONS_PER_IMAGE = 5
-# Number of a validation view that stands for a validation without an image.
-NO_IMAGE = -1
 # Weights of linear layers; the default field has 9,000, the networks of the paper 1.2 million.
 _LARGE = 100_000
 # Threads of PyTorch beside the tracing thread, for networks without large layers. A step on 16 threads took 1.6 times
@@ -88,21 +85,18 @@ class RayDataModule(LightningDataModule):
         """Return the part of the batches that belongs to the process of a Trainer."""
         return self.batches.for_rank(trainer.global_rank, trainer.world_size)
 
-    def val_dataloader(self) -> RotatingView | list[int]:
-        return [] if self.validation is None else RotatingView(self)
+    def val_dataloader(self) -> list[int]:
+        return [] if self.validation is None else [0]  # `validation_step` chooses the view
 
-    def validation_psnr(self) -> Float[Tensor, ""]:
-        """Compute the PSNR of the validation pixels in dB, with rays as in training."""
-        assert self.trainer is not None
-        assert self.validation_pixels is not None
-        return self.validation_pixels.psnr(
-            cast(TrainingModule, self.trainer.lightning_module).renderer, self.subdivision
-        )
+    def due_view(self, step: int) -> int | None:
+        """Return the view of the next validation image if one is due in a step; the views take turns."""
+        image, since = divmod(step, max(self.every, 1))
+        return image % len(self.validation or [0]) if since < validation_interval(self.every) else None
 
     def transfer_batch_to_device(self, batch: int, device: torch.device, dataloader_idx: int) -> Batch | int:
         assert self.trainer is not None
         if not self.trainer.training:
-            return batch  # the number of a validation view, or none
+            return batch
         return self._batch(batch) if self._ahead is None else self._ahead(batch)
 
     def _batch(self, step: int) -> Batch:
@@ -134,7 +128,7 @@ class Prefetcher(Generic[Made]):
     """Make the batch of the next step in a thread. The batches do not depend on the thread.
 
     The thread uses one core, and kernels release Python and the threads of Numba (`kernels.compilation`). When idle,
-    the thread helps with the current step (`kernels.threads.share`).
+    the thread helps with the current step (`kernels.compilation.share`).
 
     Args:
         make: function that makes the batch of a step.
@@ -143,7 +137,7 @@ class Prefetcher(Generic[Made]):
     """
 
     def __init__(self, make: Callable[[int], Made], spare_core: bool = True) -> None:
-        self._make = make
+        self._make = torch.no_grad()(make)
         self._step, self._begun = -1, Future[Made]()
         # PyTorch has a number of threads per thread, and new threads inherit the last one.
         self._num_threads = torch.get_num_threads()
@@ -164,17 +158,13 @@ class Prefetcher(Generic[Made]):
         self._begin(self._step + 1)
 
     def _begin(self, step: int) -> None:
-        self._step, self._begun = step, self._thread.submit(self._without_gradients, step)
+        self._step, self._begun = step, self._thread.submit(self._make, step)
 
     def close(self) -> None:
         """End the thread, and return its core to PyTorch."""
         HELPERS.remove(self._thread)
         self._thread.shutdown(cancel_futures=True)
         torch.set_num_threads(self._num_threads)
-
-    def _without_gradients(self, step: int) -> Made:
-        with torch.no_grad():
-            return self._make(step)
 
 
 def multiplies_large_matrices(renderer: Renderer) -> bool:
@@ -192,20 +182,3 @@ def can_prefetch(renderer: Renderer) -> bool:
 def validation_interval(every: int) -> int:
     """Return the number of steps between two validations, given the number between two images; 0 for never."""
     return 0 if every == 0 else max(1, every // _VALIDATIONS_PER_IMAGE)
-
-
-class RotatingView:
-    """Yield the next validation view if an image is due, otherwise `NO_IMAGE`."""
-
-    def __init__(self, module: RayDataModule) -> None:
-        self._module = module
-
-    def __len__(self) -> int:
-        return 1
-
-    def __iter__(self) -> Iterator[int]:
-        module = self._module
-        assert module.trainer is not None
-        image, since = divmod(module.trainer.global_step, max(module.every, 1))
-        due = since < validation_interval(module.every)
-        yield image % len(module.validation or [0]) if due else NO_IMAGE

@@ -102,7 +102,7 @@ class TrainingLog(Callback):
         loggers = [logger for logger in trainer.loggers if isinstance(logger, (TensorBoardLogger, WandbLogger))]
         if not loggers:
             return
-        rays = _middle_row(trainer.datamodule.validation.cameras.to(pl_module.device), batch)  # type: ignore[attr-defined]
+        rays = _middle_row(trainer.datamodule.validation.cameras.to(pl_module.device), outputs["view"])  # type: ignore[attr-defined]
         with torch.inference_mode():
             renderings: list[Rendering] = renderer(rays)
         maps = torch.cat([outputs["depth"], outputs["opacity"]], 1)[..., None].expand(-1, -1, 3)

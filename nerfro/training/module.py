@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,14 +18,13 @@ from nerfro.core.cameras import Cameras
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import user_path
 from nerfro.core.types import Batch
-from nerfro.losses.base import Loss
+from nerfro.losses.base import Loss, Objective, ObjectiveValue
 from nerfro.registry.allowed import plain, validate
 from nerfro.registry.registration import discover
 from nerfro.rendering import Renderer, Scene
 from nerfro.training.config import build_each
 from nerfro.training.inputs import INPUTS, inputs_of
-from nerfro.training.objective import Objective, ObjectiveValue
-from nerfro.training.optimizer import OptimizerConfig, learning_rate_factor
+from nerfro.training.optimizer import OptimizerConfig
 from nerfro.training.run_folder import load_checkpoint, restore
 
 
@@ -109,7 +109,7 @@ class TrainingModule(LightningModule):
 
     def training_step(self, batch: Batch, batch_index: int) -> dict[str, Tensor]:
         """Compute the loss of a batch, and the mean squared error of its pixels (sRGB)."""
-        value = self.objective(self.renderer.render_batch(batch), batch, self.scene, self.global_step)
+        value = self.objective(self.renderer.render_batch(batch), batch, self.renderer.scene, self.global_step)
         self._log_step(value)
         return {"loss": self._with_all_parameters(value.total), "squared_error": value.squared_error}
 
@@ -133,10 +133,6 @@ class TrainingModule(LightningModule):
         self.log("loss/total", value.total)
         self.log_dict({f"scene/{name}": measurement for name, measurement in self.scene.measurements().items()})
 
-    def _full_precision(self) -> torch.autocast:
-        """Turn mixed precision off for rays, because rounded directions would miss their pixels."""
-        return torch.autocast(self.device.type, enabled=False)
-
     def log(self, *args: Any, **kwargs: Any) -> None:
         """Log a value, but only in training steps with output; see `_log_step`."""
         if self._is_logged_step or not self.trainer.training:
@@ -152,7 +148,7 @@ class TrainingModule(LightningModule):
         # At the end of the previous step, the update would follow the checkpoint, and a resumed run would miss it.
         if self.global_step > 0:
             draws = replace(batch.draws, step=self.global_step)  # a repeated batch repeats its number
-            self.renderer.point_sampler.update(list(self.scene.fields), draws)  # type: ignore[arg-type]
+            self.renderer.point_sampler.update(list(self.renderer.scene.fields), draws)  # type: ignore[arg-type]
         self.trainer.datamodule.prefetch()  # type: ignore[attr-defined]
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
@@ -174,23 +170,23 @@ class TrainingModule(LightningModule):
         fused = self._trainer is None or not self._trainer.gradient_clip_val
         return torch.optim.Adam(groups, eps=self.optimizer_config.adam_epsilon, fused=fused)
 
-    def validation_step(self, view: int, batch_index: int) -> dict[str, Tensor] | None:
+    def validation_step(self, batch: int, batch_index: int) -> dict[str, Any] | None:
         if not self.trainer.is_global_zero:
             return None  # one process evaluates, the others wait
         data = self.trainer.datamodule  # type: ignore[attr-defined]
-        with self._full_precision():
-            psnr = data.validation_psnr()
+        views, view = data.validation, data.due_view(self.global_step)
+        # Mixed precision is off for rays, because rounded directions would miss their pixels.
+        with torch.autocast(self.device.type, enabled=False):
+            psnr = data.validation_pixels.psnr(self.renderer, data.subdivision)
+            rays = None if view is None else views.cameras.to(self.device).image_rays(view)
         self.log("val/psnr", psnr, prog_bar=True, batch_size=1, rank_zero_only=True)
-        if view < 0:
-            return None  # no image is due
-        views = data.validation
+        if rays is None:
+            return None
         target = views.images[view].to(self.device)
-        with self._full_precision():
-            rays = views.cameras.to(self.device).image_rays(view)
         rendered = self.renderer.render(rays)
         prediction = self.scene.colour_space.to_display(rendered.radiance).reshape(target.shape)
         depth, opacity = (m.reshape(target.shape[:2]) for m in (rendered.depth / views.cameras.far, rendered.opacity))
-        return {"prediction": prediction, "target": target, "depth": depth, "opacity": opacity}
+        return {"view": view, "prediction": prediction, "target": target, "depth": depth, "opacity": opacity}
 
 
 def training_progress(trainer: Trainer) -> float:
@@ -205,3 +201,12 @@ def training_progress(trainer: Trainer) -> float:
         if remaining is not None and elapsed + remaining > 0:
             progress = max(progress, elapsed / (elapsed + remaining))
     return min(progress, 1.0)
+
+
+def learning_rate_factor(step: int, progress: float, config: OptimizerConfig) -> float:
+    """Return the factor of the initial learning rates: log-linear decay times the sine warm-up of mip-NeRF."""
+    factor = (config.final_learning_rate / config.learning_rate) ** progress
+    if config.warmup_steps > 0:
+        ascent = math.sin(0.5 * math.pi * min(step / config.warmup_steps, 1.0))
+        factor *= config.warmup_factor + (1.0 - config.warmup_factor) * ascent
+    return factor

@@ -1,9 +1,8 @@
-"""Settings of Adam, groups of parameters by name, and the learning rate schedule."""
+"""Settings of Adam and of the learning rate, and groups of parameters by name."""
 
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -107,12 +106,3 @@ def require_matches(where: str, patterns: Iterable[str], names: Iterable[str]) -
                 f"{where}: {pattern} matches no learned parameter; choose from {', '.join(learned) or 'none'}, with * "
                 "for any text"
             )
-
-
-def learning_rate_factor(step: int, progress: float, config: OptimizerConfig) -> float:
-    """Return the factor of the initial learning rates: log-linear decay times the sine warm-up of mip-NeRF."""
-    factor = (config.final_learning_rate / config.learning_rate) ** progress
-    if config.warmup_steps > 0:
-        ascent = math.sin(0.5 * math.pi * min(step / config.warmup_steps, 1.0))
-        factor *= config.warmup_factor + (1.0 - config.warmup_factor) * ascent
-    return factor

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from omegaconf import DictConfig
 from torch import Tensor
 
-from nerfro.core.cameras import Cameras, Window, central_window
+from nerfro.core.cameras import Window, central_window
 from nerfro.core.distributed import share_of
 from nerfro.core.draws import Draws
 from nerfro.core.errors import NerfroError, warn
@@ -31,6 +31,9 @@ class PixelBatches:
 
     Therefore a resumed run has the same pixels as an undisturbed run. Only usable pixels are drawn. See
     `training.config.BatchesConfig` for the options.
+
+    Attributes:
+        cameras: cameras of all views in the data set.
     """
 
     def __init__(
@@ -48,8 +51,7 @@ class PixelBatches:
         self.batch_size, self.batching, self.seed = batch_size, batching, seed
         self.precrop_steps = precrop_steps
         self._share = slice(batch_size)
-        cameras = views.cameras
-        self._cameras = cameras
+        self.cameras = cameras = views.cameras
         self._pixels = PixelStore(views.images)
         self._full = central_window(cameras.height, cameras.width, 1.0)
         self._crop = central_window(cameras.height, cameras.width, precrop_fraction if precrop_steps > 0 else 1.0)
@@ -81,7 +83,7 @@ class PixelBatches:
     def to(self, device: torch.device | str, dtype: torch.dtype | None = None) -> PixelBatches:
         """Return the same sequence on another device, with cameras in another precision."""
         moved = copy.copy(self)
-        moved._cameras, moved._pixels = self._cameras.to(device, dtype), self._pixels.to(device)
+        moved.cameras, moved._pixels = self.cameras.to(device, dtype), self._pixels.to(device)
         return moved
 
     @property
@@ -113,7 +115,7 @@ class PixelBatches:
 
     def draw(self, step: int) -> Pixels:
         """Draw the pixels of a step, a function of seed and step that is equal on every device."""
-        cameras = self._cameras
+        cameras = self.cameras
         height, width = cameras.height, cameras.width
         window = self._full if step >= self.precrop_steps else self._crop
         view, pixel = self._draw(np.random.default_rng([self.seed, step]), window)
@@ -134,14 +136,14 @@ class PixelBatches:
     @property
     def num_pixels(self) -> int:
         """Number of pixels of all views."""
-        return len(self._cameras) * self._cameras.height * self._cameras.width
+        return len(self.cameras) * self.cameras.height * self.cameras.width
 
     def rows(self, part: int, num_parts: int) -> Int[Tensor, "Q"]:
         """Return the usable pixels of every `num_parts`-th row by number (view, row, column), equal in all processes.
 
         Rows are counted through all views. If masks exclude pixels, a row has the next usable pixels.
         """
-        cameras = self._cameras
+        cameras = self.cameras
         width, window = cameras.width, self._full
         usable = None if self._usable is None else self._usable[window]
         total = self.num_pixels if usable is None else int(usable.starts[-1])
@@ -155,7 +157,7 @@ class PixelBatches:
 
     def of_each_view(self, num_pixels: int, step: int) -> Int[Tensor, "V Q"]:
         """Draw random usable pixels of every view; for a view without usable pixels, the first pixel is returned."""
-        cameras = self._cameras
+        cameras = self.cameras
         generator = np.random.default_rng([self.seed, step, num_pixels, len(cameras)])
         size, shape = cameras.height * cameras.width, (len(cameras), num_pixels)
         if self._usable is None:
@@ -168,24 +170,19 @@ class PixelBatches:
             within = np.where(counts > 0, within.reshape(shape), 0)
         return self._to_device(within + size * np.arange(len(cameras))[:, None])
 
-    @property
-    def cameras(self) -> Cameras:
-        """Cameras of all views in the data set."""
-        return self._cameras
-
     def photographed(self, pixels: Int[Tensor, "Q"]) -> Float[Tensor, "Q 3"]:
         """Return the colours of pixels by number (view, row, column), sRGB in [0, 1]."""
         return self._pixels[pixels]
 
     def _to_device(self, array: np.ndarray) -> Tensor:
-        return torch.from_numpy(array).to(self._cameras.device, non_blocking=True)
+        return torch.from_numpy(array).to(self.cameras.device, non_blocking=True)
 
     def _draw(self, generator: np.random.Generator, window: Window) -> tuple[np.ndarray | np.int64, np.ndarray]:
         """Draw views, and pixels of the window by number (row, column)."""
         usable = None if self._usable is None else self._usable[window]
         num_pixels = window.height * window.width
         if self.batching == "single_image":
-            view = generator.integers(len(self._cameras))
+            view = generator.integers(len(self.cameras))
             first, end = (0, num_pixels) if usable is None else usable.starts[view : view + 2]
             # `choice` does not permute all pixels and is therefore fast.
             drawn = generator.choice(end - first, self.batch_size, replace=False, shuffle=False)
@@ -193,7 +190,7 @@ class PixelBatches:
         if usable is not None:
             views, pixels = usable.find(generator.integers(usable.starts[-1], size=self.batch_size))
         else:
-            views = generator.integers(len(self._cameras), size=self.batch_size)
+            views = generator.integers(len(self.cameras), size=self.batch_size)
             pixels = generator.integers(num_pixels, size=self.batch_size)
         if self._of_object is not None:
             of_object, count = self._of_object[window], round(self._object_fraction * self.batch_size)

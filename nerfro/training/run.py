@@ -88,7 +88,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetr
     groups = training.module.parameter_groups()
     num_steps = require_same_run(folder, checkpoint, config, groups, training.views.cameras)
     throughput, interruption = Throughput(), StopOnSignal()
-    callbacks = [interruption, Viewer(config, training.source, test)]
+    callbacks = [interruption, *([Viewer(config, training.source, test)] if config.viewer else [])]
     trainer = make_trainer(config, folder, throughput, callbacks, num_steps)
     require_match(renderer.scene.medium, training.views)
     memory = check_before_training(renderer, training.data, trainer)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import re
 import warnings
@@ -11,25 +12,25 @@ from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as pl
+import torch
+from lightning.fabric.plugins import TorchCheckpointIO
 from lightning.pytorch.callbacks import Callback, Timer
 from lightning.pytorch.loggers import CSVLogger, WandbLogger
-from lightning.pytorch.profilers import AdvancedProfiler, Profiler, PyTorchProfiler, SimpleProfiler
+from lightning.pytorch.profilers import AdvancedProfiler, PyTorchProfiler, SimpleProfiler
 from lightning.pytorch.strategies import DDPStrategy
 from omegaconf import DictConfig
 
 import nerfro.training.lightning_callbacks  # noqa: F401 - registers callbacks
 from nerfro.core.errors import NerfroError
 from nerfro.evaluation.request import report_unused_gpu
-from nerfro.kernels.allocator import keep_freed_memory
-from nerfro.kernels.available import fast_bfloat16
+from nerfro.files.atomic import atomic_file
+from nerfro.kernels.available import fast_bfloat16, keep_freed_memory
 from nerfro.registry.registration import build, create, find
-from nerfro.training.callbacks import Checkpoints, SharedTimer, Throughput, TrainingProgress
-from nerfro.training.checkpoint_files import CheckpointFiles
+from nerfro.training.callbacks import Checkpoints, OverfittingWarning, SharedTimer, Throughput, TrainingProgress
 from nerfro.training.config import training_device
 from nerfro.training.data_module import validation_interval
 from nerfro.training.log import TrainingLog, keep_rows
 from nerfro.training.run_folder import CONFIG_FILE, LAST_CHECKPOINT, in_sweep
-from nerfro.training.validation import OverfittingWarning
 
 # Arguments of the Trainer with an implementation in nerfro.
 _OWN = ("profiler", "fast_dev_run", "overfit_batches", "limit_test_batches")
@@ -50,7 +51,7 @@ def make_trainer(
         extra: further callbacks.
         num_steps: number of steps of the checkpoint from which the run resumes.
     """
-    seconds, every = config.checkpoint.every_seconds, config.evaluation.every
+    seconds, every, profiler = config.checkpoint.every_seconds, config.evaluation.every, config.trainer.profiler
     checkpoints = Checkpoints(
         dirpath=folder / LAST_CHECKPOINT.parent,
         filename=LAST_CHECKPOINT.stem,
@@ -62,7 +63,7 @@ def make_trainer(
     callbacks = [create(find("callbacks", str(name)), node or {}) for name, node in config.callbacks.items()]
     ours: dict[str, Any] = {
         "default_root_dir": str(folder),
-        "profiler": _profiler(config.trainer.profiler, folder),
+        "profiler": None if profiler is None else _PROFILERS[profiler](dirpath=folder / "profile", filename=profiler),
         "callbacks": [
             *([checkpoints] if config.trainer.enable_checkpointing else []),
             throughput,
@@ -99,11 +100,6 @@ def make_trainer(
     if trainer.world_size > 1 and config.ckpt_path == "last" and not (folder / CONFIG_FILE).is_file():
         raise NerfroError("several processes could disagree about the last run; name its file in ckpt_path")
     return trainer
-
-
-def _profiler(name: str | None, folder: Path) -> Profiler | None:
-    """Build a profiler of Lightning with reports in the run folder."""
-    return None if name is None else _PROFILERS[name](dirpath=folder / "profile", filename=name)
 
 
 def print_profile(folder: Path) -> None:
@@ -195,3 +191,17 @@ def quieten_lightning() -> None:
         ".*Experiment logs directory .* exists and is not empty.*",  # `keep_rows` keeps the rows
     ):
         warnings.filterwarnings("ignore", message)
+
+
+class CheckpointFiles(TorchCheckpointIO):
+    """Write checkpoints of Lightning atomically: the old checkpoint stays until the new one is complete.
+
+    Lightning writes to the temporary folder of the system. If the folder is on another disk, the file is copied over
+    the old checkpoint, and a process that is killed during the copy leaves no checkpoint.
+    """
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
+        content = io.BytesIO()
+        torch.save(checkpoint, content)
+        with atomic_file(path) as stream:
+            stream.write(content.getbuffer())

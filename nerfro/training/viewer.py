@@ -18,7 +18,7 @@ from nerfro.viewing.trained_scene import TrainedScene
 
 
 class Viewer(Callback):
-    """Serve the page to this machine if `viewer` is set, with current weights and losses.
+    """Serve the page to this machine, with current weights and losses.
 
     With several processes, the first one serves the page.
 
@@ -36,7 +36,7 @@ class Viewer(Callback):
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         # Errors of the page and of its port are raised before the first step.
-        if self._config.viewer and trainer.is_global_zero:
+        if trainer.is_global_zero:
             assert isinstance(pl_module, TrainingModule)
             bake_surface(pl_module.renderer)
             self._server = PageServer("localhost", self._config.viewer_port)

@@ -6,7 +6,7 @@ from torch.nn.functional import mse_loss
 
 from nerfro.camera.exposure import Exposure, fit_gain
 from nerfro.core.light import to_srgb
-from nerfro.losses.photometric import Photometric
+from nerfro.losses.radiance import Photometric
 from nerfro.models.refractive import RefractiveModel
 from nerfro.testing import NUM_RAYS, example_batch, example_components
 

@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from nerfro.core.types import Samples
-from nerfro.fields import hash_encoding
+from nerfro.fields.base import evaluate_selected
+from nerfro.fields.hash_encoding import hash_encode_in_torch
 from nerfro.fields.hash_grid import HashGridField
-from nerfro.fields.selection import evaluate_selected
-from nerfro.fields.spherical_harmonics import spherical_harmonics
+from nerfro.fields.spherical_harmonics import spherical_harmonics_in_torch
 from nerfro.geometry.space import Box, Contracted, Space, inside_box
 from tests.exact_silhouettes import cameras_around
 
@@ -86,9 +86,9 @@ def decoded_in_double(
     """Density and colour by plain PyTorch in double precision."""
     unit = (positions - field.space.box[0]) / field.space.side
     plain = torch.nn.Sequential.forward  # the layers of ReluMLP, without its kernel in single precision
-    encoded = hash_encoding.hash_encode(unit, field.table.double(), field.levels)
+    encoded = hash_encode_in_torch(unit, field.table.double(), field.levels.resolutions, field.levels.sizes)
     geometry = plain(field.density_mlp.double(), encoded)
-    inputs = torch.cat([geometry, spherical_harmonics(directions, field.direction_bands)], -1)
+    inputs = torch.cat([geometry, spherical_harmonics_in_torch(directions, field.direction_bands)], -1)
     raw = plain(field.colour_mlp.double(), inputs) + geometry[:, 1:4]
     return field.initial_density * geometry[:, 0].exp(), torch.sigmoid(raw).square()
 

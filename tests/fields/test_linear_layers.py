@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from nerfro.fields.relu_mlp import relu_mlp
-from nerfro.kernels import threads
+from nerfro.kernels import compilation
 from nerfro.paper.linear import Linear
 from tests.gradients import require_equal_gradients
 
@@ -60,7 +60,7 @@ def test_blocks_equal_sequential_with_one_and_two_threads(monkeypatch: pytest.Mo
     for mine, theirs in zip(alone, evaluated(mlp), strict=True):
         torch.testing.assert_close(mine, theirs, rtol=1e-4, atol=1e-4)
     with ThreadPoolExecutor(1) as helper:
-        monkeypatch.setattr(threads, "HELPERS", [helper])
+        monkeypatch.setattr(compilation, "HELPERS", [helper])
         helped = evaluated(lambda x: relu_mlp([x], weights(mlp), False))
     assert all(torch.equal(mine, theirs) for mine, theirs in zip(alone, helped, strict=True))
 

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from nerfro.core.light import to_srgb
-from nerfro.fields.networks import compile_networks, radiance
+from nerfro.fields.base import radiance
+from nerfro.fields.networks import compile_networks
 from nerfro.geometry.space import Box, inside_box
 from nerfro.paper.mip_nerf import MipNerfField
 from nerfro.paper.mlp import RGB_PADDING, RadianceMLP, SkipMLP, padded_sigmoid

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from nerfro.files.atomic import atomic_file, write_atomically
-from nerfro.training.checkpoint_files import CheckpointFiles
+from nerfro.training.trainer import CheckpointFiles
 from tests.conftest import refused
 
 

@@ -8,7 +8,7 @@ from tests.processes import printed_by
 
 SCRIPT = """
 import resource, torch
-from nerfro.kernels.allocator import keep_freed_memory
+from nerfro.kernels.available import keep_freed_memory
 
 def faults():
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt

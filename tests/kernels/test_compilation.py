@@ -7,7 +7,7 @@ from pathlib import Path
 import numba
 import pytest
 
-import nerfro.fields.hash_encoding_cpu  # noqa: F401  # whose sources are listed
+import nerfro.fields.hash_encoding  # noqa: F401  # whose sources are listed
 from nerfro.kernels import compilation
 from nerfro.kernels.compilation import compiled, compiled_parallel
 from tests.processes import printed_by

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from nerfro.backgrounds import cube_map, cube_map_cpu
-from nerfro.fields import hash_encoding, hash_encoding_cpu, relu_mlp
-from nerfro.fields.spherical_harmonics_cpu import spherical_harmonics
+from nerfro.backgrounds import cube_map
+from nerfro.fields import hash_encoding, relu_mlp
+from nerfro.fields.spherical_harmonics import spherical_harmonics
 from nerfro.samplers.paths import compiled
 from nerfro.testing import example_rays
 from tests.closed_forms import grid_points, sampled
@@ -25,7 +25,7 @@ CUBE = cube_map.CubeLevels((1, 2))
 
 def hash_encode() -> tuple[Any, ...]:
     positions, table = torch.rand(5, 3), torch.rand(LEVELS.num_entries, 2)
-    return hash_encoding_cpu._hash_encode, positions, table, LEVELS.resolutions, LEVELS.sizes
+    return hash_encoding.hash_encode, positions, table, LEVELS.resolutions, LEVELS.sizes
 
 
 def harmonics() -> tuple[Any, ...]:
@@ -39,7 +39,7 @@ def mlp() -> tuple[Any, ...]:
 def cube_lookup() -> tuple[Any, ...]:
     face, coordinates = cube_map.project(torch.nn.functional.normalize(torch.randn(5, 3), dim=-1))
     padded = torch.cat([cube_map.padded_texels(n).flatten() for n in CUBE.resolutions])
-    return cube_map_cpu._lookup, face, coordinates, torch.randn(CUBE.num_texels, 3), padded, CUBE.resolutions
+    return cube_map.lookup, face, coordinates, torch.randn(CUBE.num_texels, 3), padded, CUBE.resolutions
 
 
 LEARNING = [hash_encode, harmonics, mlp, cube_lookup]

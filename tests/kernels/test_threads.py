@@ -6,13 +6,13 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import torch
 
-from nerfro.kernels import threads
+from nerfro.kernels import compilation
 from tests.processes import printed_by
 
 IMPORTS_ONLY = """
 import numba
 before = {name: value for name, value in vars(numba.config).items() if name.isupper()}
-import nerfro.backgrounds.cube_map_cpu, nerfro.geometry.occupancy, nerfro.samplers.paths.snell_cpu
+import nerfro.backgrounds.cube_map, nerfro.geometry.occupancy, nerfro.samplers.paths.snell_cpu
 after = {name: value for name, value in vars(numba.config).items() if name.isupper()}
 print({name: after[name] for name in after if before.get(name) != after[name]})
 try:
@@ -69,10 +69,10 @@ def test_idle_thread_takes_tasks(busy: bool, monkeypatch: pytest.MonkeyPatch) ->
         return f"{number} {threading.current_thread() is threading.main_thread()}"
 
     with ThreadPoolExecutor(1) as helper:
-        monkeypatch.setattr(threads, "HELPERS", [helper])
+        monkeypatch.setattr(compilation, "HELPERS", [helper])
         if busy:
             helper.submit(end.wait, 10)
-        names = threads.share(name, 6)
+        names = compilation.share(name, 6)
         end.set()
     assert [called.split()[0] for called in names] == [*"012345"]
     assert {called.split()[1] for called in names} == {"True"} | ({"False"} if not busy else set())
@@ -87,20 +87,20 @@ def test_error_of_a_helping_thread_is_raised(monkeypatch: pytest.MonkeyPatch) ->
             raise ValueError("no helper")
 
     with ThreadPoolExecutor(1) as helper:
-        monkeypatch.setattr(threads, "HELPERS", [helper])
+        monkeypatch.setattr(compilation, "HELPERS", [helper])
         with pytest.raises(ValueError, match="no helper"):
-            threads.share(fail, 2)
+            compilation.share(fail, 2)
 
 
 def test_helping_threads_write_to_inference_tensors(monkeypatch: pytest.MonkeyPatch) -> None:
     both_threads = threading.Barrier(2)
     with ThreadPoolExecutor(1) as helper, torch.inference_mode():
-        monkeypatch.setattr(threads, "HELPERS", [helper])
+        monkeypatch.setattr(compilation, "HELPERS", [helper])
         values = torch.zeros(2)
 
         def write(number: int) -> None:
             both_threads.wait(10)
             values[number] = 1.0
 
-        threads.share(write, 2)
+        compilation.share(write, 2)
     assert values.tolist() == [1.0, 1.0]

@@ -6,13 +6,12 @@ import pytest
 import torch
 
 from nerfro.core.types import Path, Rendering, Samples
-from nerfro.losses import distortion as plugin
+from nerfro.losses.density import Distortion, distortion
 from nerfro.registry.registration import discover
 from nerfro.rendering import Scene
 from nerfro.testing import example_batch
 
 discover()
-Distortion, distortion = plugin.Distortion, plugin.distortion
 
 SCENE = Mock(spec=Scene)
 

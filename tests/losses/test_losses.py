@@ -12,9 +12,7 @@ from torch.nn.functional import conv2d
 from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.core.light import to_srgb
 from nerfro.core.types import Batch, Rendering
-from nerfro.losses.background import BackgroundRegularizer
-from nerfro.losses.photometric import Photometric
-from nerfro.losses.total_variation import TotalVariation, direction_pairs
+from nerfro.losses.radiance import BackgroundRegularizer, Photometric, TotalVariation, direction_pairs
 from nerfro.models.refractive import RefractiveModel
 from nerfro.paper.smoothness import Smoothness, tile_roughness
 from nerfro.registry.registration import create, find

@@ -9,8 +9,7 @@ import torch
 from nerfro.core.types import FieldValues, Path, Rays, Rendering, Samples
 from nerfro.losses.backdrop import Backdrop
 from nerfro.losses.base import Loss
-from nerfro.losses.near_camera import NearCamera
-from nerfro.losses.opaque import Opaque
+from nerfro.losses.density import NearCamera, Opaque
 from nerfro.rendering import Scene, composite
 from nerfro.samplers.paths.straight import Straight
 from nerfro.testing import example_batch, example_path, example_space

@@ -11,8 +11,8 @@ import torch
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Timer
 
-from nerfro.training.module import training_progress
-from nerfro.training.optimizer import GroupConfig, OptimizerConfig, learning_rate_factor
+from nerfro.training.module import learning_rate_factor, training_progress
+from nerfro.training.optimizer import GroupConfig, OptimizerConfig
 from tests.conftest import refused
 
 PAPER = OptimizerConfig(learning_rate=5e-4, final_learning_rate=5e-6, warmup_steps=2500, warmup_factor=0.01)

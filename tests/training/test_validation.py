@@ -10,7 +10,6 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import torch
-from lightning.pytorch import Trainer
 
 from nerfro.camera.given import GivenCamera
 from nerfro.core.light import to_srgb
@@ -21,9 +20,10 @@ from nerfro.rendering import ColourSpace, RayTracer, Renderer, Scene
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.points.stratified import Stratified
 from nerfro.samplers.subdivision import Subdivision
-from nerfro.training.data_module import NO_IMAGE, RayDataModule, RotatingView, validation_interval
+from nerfro.training.callbacks import OverfittingWarning
+from nerfro.training.data_module import RayDataModule, validation_interval
 from nerfro.training.pixel_batches import PixelBatches
-from nerfro.training.validation import OverfittingWarning, ValidationPixels
+from nerfro.training.validation import ValidationPixels
 from tests.closed_forms import Ball
 from tests.conftest import Runner, repaint
 
@@ -170,9 +170,8 @@ def test_validations_are_five_times_as_frequent_as_images(every: int, looks: int
     module = RayDataModule(Mock(spec=PixelBatches), BlenderData(str(tiny_scene), near=2.0, far=6.0).load("val"), every)
     shown = {}
     for step in range(looks, 10 * every + 1, looks):
-        module.trainer = Mock(spec=Trainer, global_step=step)  # type: ignore[assignment]
-        (view,) = RotatingView(module)
-        if view != NO_IMAGE:
+        view = module.due_view(step)
+        if view is not None:
             shown[step] = view
     assert len(shown) == 10
     assert list(shown.values()) == [1, 0] * 5, "one view after the other"

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from nerfro.core.types import OpticalRecord, Path, Rays
 from nerfro.kernels.lookup import Solids
-from nerfro.kernels.operators import kernel
+from nerfro.kernels.operators import arrays, cpu_operator
 from nerfro.samplers.paths.branching import Branching
 from nerfro.samplers.paths.polylines import SnellTrace, split
 from nerfro.samplers.paths.snell_cpu import TracedRows, polylines_of_width, trace_snell
@@ -55,16 +55,16 @@ def _shapes(origins: Tensor, *_: Any) -> tuple[Tensor, ...]:
     return ray, *of_vertices, *of_bodies, origins.new_empty(rows), numbers
 
 
-@kernel(
+@cpu_operator(
     "trace_snell(Tensor origins, Tensor directions, Tensor near, Tensor far, Tensor[] solids, bool nested, float shell,"
     " int max_events, int max_split_events, float least_weight, bool main_only) -> (Tensor ray, Tensor positions, "
     "Tensor exit_directions, Tensor s, Tensor body, Tensor surface, Tensor far_side, Tensor weight, Tensor numbers)",
     _shapes,
 )
 def _trace(
-    origins: np.ndarray, directions: np.ndarray, near: np.ndarray, far: np.ndarray, solids: list[Tensor], nested: bool,
-    shell: float, max_events: int, max_split_events: int, least_weight: float, main_only: bool,
-) -> list[np.ndarray]:  # fmt: skip
+    origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, solids: list[Tensor], nested: bool, shell: float,
+    max_events: int, max_split_events: int, least_weight: float, main_only: bool,
+) -> tuple[Tensor, ...]:  # fmt: skip
     """Trace rays; returns ray, vertices and numbers of each polyline, see `TracedRows`.
 
     Args:
@@ -74,23 +74,24 @@ def _trace(
         max_events: largest number of events of a polyline.
         max_split_events, least_weight, main_only: see `Branching`.
     """
+    rays = arrays(origins, directions, near, far)
     packed = Solids(*(values.numpy() for values in solids), nested, shell)
     settings = max_events, Branching(max_split_events, least_weight, main_only)
     max_polylines = _MAX_POLYLINES if max_split_events and not main_only else 1
-    rows, counts = trace_snell(origins, directions, near, far, packed, settings, _MAX_VERTICES, max_polylines)
+    rows, counts = trace_snell(*rays, packed, settings, _MAX_VERTICES, max_polylines)
     kept, needed = (counts <= (max_polylines, _MAX_VERTICES)).all(1), counts.max(0, initial=1)
     width = max(int(needed[1]), 2)
     columns = _polylines(rows, np.where(kept, counts[:, 0], 0), width)
     if not kept.all():
         rest = (~kept).nonzero()[0]
-        few = [values[rest] for values in (origins, directions, near, far)]
+        few = [values[rest] for values in rays]
         rows, counts = trace_snell(*few, packed, settings, width, int(needed[0]))
         again = _polylines(rows, counts[:, 0], width)
         pairs = zip(columns, [rest[again[0]], *again[1:]], strict=True)
         joined = [np.concatenate(pair) for pair in pairs]
         order = np.argsort(joined[0], kind="stable")
         columns = [column[order] for column in joined]
-    return columns
+    return (*map(torch.from_numpy, columns),)
 
 
 def _polylines(rows: TracedRows, counts: Int[np.ndarray, "R"], width: int) -> list[np.ndarray]:

@@ -16,8 +16,7 @@ from nerfro.core.draws import Draws
 from nerfro.core.types import Path, Rendering, Samples
 from nerfro.fields.base import Field
 from nerfro.geometry.space import Space
-from nerfro.kernels.arrays import arrays
-from nerfro.kernels.operators import select
+from nerfro.kernels.operators import arrays, select
 from nerfro.registry.allowed import Count, Share
 from nerfro.registry.registration import register
 from nerfro.samplers.base import PointSampler

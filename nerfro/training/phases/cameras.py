@@ -122,11 +122,6 @@ class CameraSteps(Phase):
         # The step is accepted even if the error rises, because the scene was trained with the current cameras, which
         # are therefore a local minimum.
         step = Step(difference, settings.error_scale * difference, settings.max_pixels, fraction)
-        priors = [_prior(prior) for prior in state.values()]
+        priors = [PriorInformation(**prior) for prior in state.values()]
         gauss_newton_step(camera, batches.cameras, pixels, batches.photographed, shown, step, priors)
         return True
-
-
-def _prior(state: dict[str, Tensor]) -> PriorInformation:
-    """Read a prior of the state of the phase."""
-    return PriorInformation(state["mean"], state["information"])

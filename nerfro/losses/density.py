@@ -1,4 +1,4 @@
-"""Distortion loss on arc length."""
+"""Losses on the density along paths."""
 
 from __future__ import annotations
 
@@ -56,3 +56,40 @@ def distortion(weights: Float[Tensor, "P N"], edges: Float[Tensor, "P N+1"]) -> 
     between = 2 * (weights * (midpoints * weights_before - moments_before)).sum(-1)
     within = (weights.square() * (edges[:, 1:] - edges[:, :-1])).sum(-1) / 3
     return between + within
+
+
+@register("loss", "near_camera")
+class NearCamera(Loss):
+    """Penalize density between the cameras and the content, with a weight that decreases with the distance.
+
+    The weight of a sample at arc length s is max(1 - s / d, 0), where d is the distance of the camera from the centre
+    of the space of the run. Few rays cross the space close to a camera. Floating density in this space contradicts no
+    photograph, but hides the scene from other directions. The loss is similar to the occlusion loss of FreeNeRF (Yang
+    et al. 2023, Eqn. 8).
+    """
+
+    weight = 1e-2
+    needs_box = True
+
+    def forward(self, renderings: list[Rendering], batch: Batch, scene: Scene) -> Float[Tensor, ""]:
+        rendering = renderings[-1]
+        path = rendering.path
+        cameras = (path.positions[:, 0] - path.near[:, None] * path.directions[:, 0]).detach()
+        distance = (cameras - scene.space.centre).norm(dim=-1).clamp(min=1e-6)
+        closeness = (1 - rendering.samples.s / distance[:, None]).clamp(min=0)
+        return batch.per_pixel(path.sum_polylines((rendering.weights * closeness).sum(-1))).mean()
+
+
+@register("loss", "opaque")
+class Opaque(Loss):
+    """Penalize the squared final transmittance of each ray, for fields that cover all of space.
+
+    Without this loss, a background of constant colour would replace objects of the same colour. The loss is the
+    expected squared error that a background of random grey levels (variance 1) would cause.
+    """
+
+    weight = 1e-2
+
+    def forward(self, renderings: list[Rendering], batch: Batch, scene: Scene) -> Float[Tensor, ""]:
+        passed = renderings[-1].transmittance.square()
+        return batch.per_pixel(renderings[-1].path.sum_polylines(passed)).mean()
