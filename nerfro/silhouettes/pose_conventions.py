@@ -12,7 +12,7 @@ from torch import Tensor
 from nerfro.core.errors import NerfroError
 from nerfro.core.provenance import AlgorithmSettings
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.silhouettes.silhouettes import mesh_silhouettes, pixel_stride
+from nerfro.silhouettes.silhouettes import intersection_over_union, mesh_silhouettes, pixel_stride
 from nerfro.silhouettes.visual_hull import Silhouettes, carve_mesh, find_box
 
 # The silhouettes of a visual hull agree with its masks; a smaller overlap or agreement indicates an error in the input.
@@ -56,9 +56,8 @@ _ALTERNATIVES: tuple[tuple[str, bool, _Turn], ...] = (
 def overlap(mesh: TriangleMesh, silhouettes: Silhouettes, max_pixels: int = OVERLAP_PIXELS) -> Float[np.ndarray, "V"]:
     """Compute the intersection over union of the silhouette of a mesh with each mask; 1 where both are empty."""
     stride = pixel_stride(silhouettes.cameras, max_pixels)
-    ours, theirs = mesh_silhouettes(mesh, silhouettes.cameras, stride), silhouettes.masks[:, ::stride, ::stride] > 0.5
-    both, either = (ours & theirs).sum((1, 2)).double(), (ours | theirs).sum((1, 2))
-    return torch.where(either > 0, both / either, 1.0).numpy()
+    theirs = silhouettes.masks[:, ::stride, ::stride] > 0.5
+    return intersection_over_union(mesh_silhouettes(mesh, silhouettes.cameras, stride).numpy(), theirs.numpy())
 
 
 def coarse_agreement(
