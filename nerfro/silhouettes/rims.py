@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -14,9 +14,8 @@ from torch import Tensor
 from nerfro.core.cameras import Cameras
 from nerfro.core.errors import NerfroError
 from nerfro.core.provenance import AlgorithmSettings
-from nerfro.geometry.mesh import TriangleMesh
 from nerfro.geometry.normals import unit
-from nerfro.silhouettes.moving_mesh import MeshGeometry, MovingMesh
+from nerfro.silhouettes.moving_mesh import MeshGeometry
 from nerfro.silhouettes.visual_hull import Silhouettes
 
 # By view: the index of the outline pixel nearest to each pixel.
@@ -59,24 +58,6 @@ class Rims(NamedTuple):
     weight: Float[np.ndarray, " contour"]  # robust weight of the misfit
     width: Float[np.ndarray, " contour"]  # width of a pixel at the point, world units
     view: Int[np.ndarray, " contour"]
-
-
-class RimFinder:
-    """Finder of the contour points of a fixed surface for changing cameras.
-
-    Args:
-        mesh: surface.
-        silhouettes: silhouettes of the masks.
-    """
-
-    def __init__(self, mesh: TriangleMesh, silhouettes: Silhouettes) -> None:
-        self._surface = MovingMesh(mesh.faces).geometry(mesh.vertices)
-        self._silhouettes, self._outlines = silhouettes, outlines_of(silhouettes)
-
-    def find(self, cameras: Cameras | None = None) -> Rims:
-        """Find the contour points, by default for the cameras of the silhouettes."""
-        silhouettes = self._silhouettes if cameras is None else replace(self._silhouettes, cameras=cameras)
-        return find_rims(self._surface, silhouettes, self._outlines)
 
 
 def outlines_of(silhouettes: Silhouettes) -> Outlines:

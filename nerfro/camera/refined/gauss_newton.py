@@ -22,6 +22,7 @@ from nerfro.camera.refined.least_squares import (
     axes_across,
     normal_equations,
     robust_weights,
+    shortened,
     with_priors,
 )
 from nerfro.camera.refined.pixel_units import object_distances
@@ -89,12 +90,8 @@ def gauss_newton_step(
     matrix, vector = normal_equations(slopes.double(), error.double(), weights.double(), view, len(cameras))
     variance = (weights[:, None] * error.square()).sum() / (3 * weights.sum()).clamp(min=TINY)
     matrix, vector = with_priors(matrix, vector, camera.parameter_vector(), variance, priors)
-    motion, lens = camera.split(-torch.linalg.solve(matrix, vector))
-    motion, lens = (
-        change * (step.max_pixels / change.norm(dim=-1, keepdim=True).clamp(min=TINY)).clamp(max=1)
-        for change in (motion, lens)
-    )
-    camera.move(step.fraction * motion.to(angle), step.fraction * lens.to(angle))
+    changes = camera.split(-torch.linalg.solve(matrix, vector))
+    camera.move(*(step.fraction * shortened(change, step.max_pixels).to(angle) for change in changes))
 
 
 def informative_pixels(

@@ -37,6 +37,11 @@ def axes_across(directions: Float[Tensor, "R 3"]) -> tuple[Float[Tensor, "R 3"],
     return first, torch.linalg.cross(directions, first)
 
 
+def shortened(steps: Float[Tensor, "*steps N"], longest: float) -> Float[Tensor, "*steps N"]:
+    """Shorten vectors to a largest length."""
+    return steps * (longest / steps.norm(dim=-1, keepdim=True).clamp(min=TINY)).clamp(max=1)
+
+
 def robust_weights(error: Float[Tensor, "R 3"], scale: float) -> Float[Tensor, "R"]:
     """Compute Geman-McClure weights of errors of three channels.
 
