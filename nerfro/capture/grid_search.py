@@ -6,7 +6,6 @@ The errors of each candidate are summed by view, so that random samples of the v
 from __future__ import annotations
 
 import itertools
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Num
@@ -38,24 +37,12 @@ def mean_errors(
     return (weights @ sums.T) / (weights @ counts)[:, None].clip(1)
 
 
-class Minimum(NamedTuple):
-    """Minima of quadratic functions.
-
-    Attributes:
-        values: the minima, or the best candidates for functions without a minimum near the grid.
-        curvatures: second derivatives of the functions by each index.
-    """
-
-    values: Float[np.ndarray, "resamples indices"]
-    curvatures: Float[np.ndarray, "resamples indices"]
-
-
 def quadratic_minimum(
     candidates: Float[np.ndarray, "candidates indices"],
     errors: Float[np.ndarray, "resamples candidates"],
     axes: Float[np.ndarray, "indices indices"],
     max_extrapolation: float = 1.5,
-) -> Minimum:
+) -> tuple[Float[np.ndarray, "resamples indices"], Float[np.ndarray, "resamples indices"]]:
     """Fit a quadratic function to the errors of all candidates by least squares, and find its minimum.
 
     Args:
@@ -63,6 +50,10 @@ def quadratic_minimum(
         errors: one set of errors for each weighting.
         axes: half axes of the grid, in columns.
         max_extrapolation: largest distance of the minimum from the centre of the grid, relative to the half axes.
+
+    Returns:
+        The minima, or the best candidates for functions without a minimum near the grid; and the second derivatives of
+        the functions by each index.
     """
     count, centre = candidates.shape[1], candidates.mean(0)
     inverse = np.linalg.inv(axes)
@@ -79,7 +70,7 @@ def quadratic_minimum(
     minimum = -np.linalg.solve(invertible, coefficients[:, 1 : 1 + count, None])[..., 0]
     near = convex & (np.abs(minimum).max(1) < max_extrapolation)
     minimum = np.where(near[:, None], minimum, x[errors.argmin(1)])
-    return Minimum(centre + minimum @ axes.T, np.diagonal(inverse.T @ hessian @ inverse, axis1=1, axis2=2))
+    return centre + minimum @ axes.T, np.diagonal(inverse.T @ hessian @ inverse, axis1=1, axis2=2)
 
 
 def parabola_minimum(

@@ -47,14 +47,14 @@ class ObjectErrors:
 
     Args:
         observations: observations of the object and its surroundings.
-        progress: called with the number of bodies.
+        advance: called once for each body.
         settings: number of pixels, and smallest weight.
     """
 
     def __init__(
         self,
         observations: Observations,
-        progress: Callable[[int], None] = lambda count: None,
+        advance: Callable[[], None] = lambda: None,
         settings: ObjectErrorSettings = ObjectErrorSettings(),
     ) -> None:
         settings.use()
@@ -62,7 +62,7 @@ class ObjectErrors:
         self._pixels = observations.through.some(settings.num_pixels)
         self._scale = robust_scale(self._surroundings)
         self._sampler = Snell(branches="all", least_weight=settings.min_weight)
-        self._progress, self._num_bodies = progress, 0
+        self._advance = advance
         self.counts = np.bincount(self._pixels.view, minlength=len(self._pixels.cameras)).astype(np.float64)
         self.samples = bootstrap_weights(self.counts)
 
@@ -71,8 +71,7 @@ class ObjectErrors:
         path = self._sampler(self._pixels.rays, body)
         radiance = path.sum_polylines(self._surroundings.background(path.exits())).clamp(max=1)
         error = geman_mcclure(radiance - self._pixels.radiance, self._scale).double()
-        self._num_bodies += 1
-        self._progress(self._num_bodies)
+        self._advance()
         return np.bincount(self._pixels.view, error, len(self.counts))
 
     def mean(self, errors: Float[np.ndarray, "V"]) -> float:

@@ -29,14 +29,11 @@ class RoomPanorama(Background):
         middle: centre of the panorama.
         colours: linear radiance by direction.
         distances: distance of each texel (see `cube_map.texel_directions`), world units.
-        steps: number of iterations of the lookup; few suffice, because the object is small beside its surroundings.
     """
 
-    def __init__(
-        self, middle: Float[Tensor, "3"], colours: EnvironmentMap, distances: Float[Tensor, "T"], steps: int = 5
-    ) -> None:
+    def __init__(self, middle: Float[Tensor, "3"], colours: EnvironmentMap, distances: Float[Tensor, "T"]) -> None:
         super().__init__()
-        self.middle, self.colours, self.distances, self.steps = middle, colours, distances, steps
+        self.middle, self.colours, self.distances = middle, colours, distances
         side = round((len(distances) / 6) ** 0.5)
         self._levels, self._padded = cube_map.CubeLevels((side,)), cube_map.padded_texels(side).flatten()
 
@@ -54,7 +51,7 @@ class RoomPanorama(Background):
         square = starts.square().sum(-1, keepdim=True)
         seen, lengths = directions, torch.zeros_like(along)
         texels = self.distances[:, None].expand(-1, 3)
-        for _ in range(self.steps):
+        for _ in range(5):  # few suffice, because the object is small beside its surroundings
             distance = cube_map.lookup(*cube_map.project(seen), texels, self._padded, self._levels)[:, :1]
             lengths = ((along.square() - square + distance.square()).clamp(min=0).sqrt() - along).clamp(min=0)
             seen = starts + lengths * directions

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
@@ -15,13 +14,13 @@ from torch import Tensor
 from torch.nn import functional
 
 from nerfro.backgrounds.base import Background
-from nerfro.backgrounds.cube_map import project
+from nerfro.backgrounds.cube_map import nearest_texel
 from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.core.cameras import Cameras
 from nerfro.core.draws import Draws
 from nerfro.core.errors import NerfroError
 from nerfro.core.light import to_linear
-from nerfro.core.progress import fraction_bar
+from nerfro.core.progress import track
 from nerfro.core.provenance import AlgorithmSettings
 from nerfro.core.rays import Rays
 from nerfro.core.types import WORLD_ORIGIN, Exits
@@ -176,15 +175,11 @@ class Surroundings:
         """Test whether the radiance in the exit directions is known."""
         if self.seen is None:
             return torch.ones(len(exits.directions), dtype=torch.bool)
-        return self.seen[_texel(exits.directions, self.seen.shape[-1])]
+        return self.seen.flatten()[nearest_texel(exits.directions, self.seen.shape[-1])]
 
 
 def learn_surroundings(
-    beside: Pixels,
-    mesh: TriangleMesh,
-    near: bool | None,
-    progress: Callable[[float], None] = lambda done: None,
-    settings: SurroundingsSettings = SurroundingsSettings(),
+    beside: Pixels, mesh: TriangleMesh, near: bool | None, settings: SurroundingsSettings = SurroundingsSettings()
 ) -> Surroundings:
     """Reconstruct the surroundings of an object from the pixels beside the object.
 
@@ -193,7 +188,6 @@ def learn_surroundings(
         mesh: surface of the object.
         near: whether the surroundings are so near that parallel rays see different points; None decides by validation
             views.
-        progress: called with the completed fraction.
         settings: steps and limits.
     """
     settings.use()
@@ -204,19 +198,17 @@ def learn_surroundings(
         # Texels are as wide as pixels, and at most half as many, because unobserved texels would be noise.
         side = min(1.5 * float(beside.cameras.fx.mean()) * math.pi / 2, math.sqrt(len(training) / 12))
         levels = [4 * 2**level for level in range(16) if 4 * 2**level <= max(16, side)]
-        background = EnvironmentMap(levels)
-        _learn(background, training, settings.sky_steps, settings.sky_pixels, settings.rates, progress)
         n = max(1, min(settings.seen_texels, int(math.sqrt(len(training) / (6 * settings.seen_pixels)))))
         seen = torch.zeros(6, n, n, dtype=torch.bool)
-        seen[_texel(training.rays.directions, n)] = True
-        sky = Surroundings(background, seen, _unexplained(background, validation), validation.radiance)
+        seen.view(-1)[nearest_texel(training.rays.directions, n)] = True
+        size = settings.sky_steps, settings.sky_pixels
+        sky = _learned(EnvironmentMap(levels), seen, training, validation, size, settings.rates)
         if near is False or sky.unexplained <= settings.max_sky_residual:
             return sky
     middle = torch.from_numpy(mesh.bounds.mean(0)).float()
     distance = (beside.cameras.camera_to_world[:, :, 3] - middle).norm(dim=-1)
-    field = Room(mesh.bounds, float(distance.mean()))
-    _learn(field, training, settings.near_steps, settings.near_pixels, settings.rates, progress)
-    room = Surroundings(field, None, _unexplained(field, validation), validation.radiance)
+    field, size = Room(mesh.bounds, float(distance.mean())), (settings.near_steps, settings.near_pixels)
+    room = _learned(field, None, training, validation, size, settings.rates)
     return room if sky is None or room.unexplained < sky.unexplained else sky
 
 
@@ -228,22 +220,16 @@ class Observations:
         mesh: surface of the object.
         room: whether the surroundings are near; None decides by validation views.
         shift: origin of the observations in the coordinates of views and mesh.
-        settings: settings of the surroundings.
 
     Attributes:
         views: the photographs, with poses relative to `shift`.
     """
 
     def __init__(
-        self,
-        views: Views,
-        mesh: TriangleMesh,
-        room: bool | None,
-        shift: Float[np.ndarray, "3"] = WORLD_ORIGIN,
-        settings: SurroundingsSettings = SurroundingsSettings(),
+        self, views: Views, mesh: TriangleMesh, room: bool | None, shift: Float[np.ndarray, "3"] = WORLD_ORIGIN
     ) -> None:
         self.views = replace(views, cameras=views.cameras.relative_to(shift))
-        self.shift, self._mesh, self._room, self._settings = shift, mesh.relative_to(shift), room, settings
+        self.shift, self._mesh, self._room = shift, mesh.relative_to(shift), room
 
     @property
     def distance(self) -> Literal["near", "far"] | None:
@@ -260,15 +246,14 @@ class Observations:
     @cached_property
     def surroundings(self) -> Surroundings:
         """Reconstructed surroundings; prints their type and accuracy."""
-        with fraction_bar("surroundings") as progress:
-            learned = learn_surroundings(self._divided[0], self._mesh, self._room, progress, self._settings)
+        learned = learn_surroundings(self._divided[0], self._mesh, self._room)
         distance, explained = "near" if isinstance(learned.background, Room) else "far away", 1 - learned.unexplained
         print(f"surroundings: {distance}; {explained:.1%} of the variance of validation views is explained")
         return learned
 
     @cached_property
     def _divided(self) -> tuple[Pixels, Pixels]:
-        return divide_pixels(self.views, self._mesh, self._settings)
+        return divide_pixels(self.views, self._mesh)
 
 
 class Room(Background):
@@ -311,43 +296,42 @@ class Room(Background):
         return rendered.radiance, rendered.depth
 
 
-def _learn(
-    background: Background,
-    pixels: Pixels,
-    steps: int,
-    batch: int,
+def _learned(
+    background: EnvironmentMap | Room,
+    seen: Bool[Tensor, "6 n n"] | None,
+    training: Pixels,
+    validation: Pixels,
+    size: tuple[int, int],
     rates: tuple[float, float],
-    progress: Callable[[float], None],
-) -> None:
-    batch = min(batch, max(1024, len(pixels) // 16))
+) -> Surroundings:
+    """Learn a background by gradient descent, and measure its error.
+
+    Args:
+        background: the background, which is changed.
+        seen: see `Surroundings`.
+        training, validation: pixels beside the object.
+        size: number of steps, and largest number of pixels in each.
+        rates: first and last learning rate.
+    """
+    steps, batch = size[0], min(size[1], max(1024, len(training) // 16))
     generator = torch.Generator().manual_seed(0)
     first, last = rates
     optimizer = torch.optim.Adam(background.parameters(), first, eps=1e-15)
     with torch.enable_grad():
-        for step in range(steps):
+        for step in track("surroundings", range(steps)):
             optimizer.param_groups[0]["lr"] = first * (last / first) ** (step / steps)
-            drawn = pixels[torch.randint(len(pixels), (batch,), generator=generator)]
+            drawn = training[torch.randint(len(training), (batch,), generator=generator)]
             exits = Exits.unbent(drawn.rays)
             draws = (Draws(0, step, torch.arange(batch)),) if isinstance(background, Room) else ()
             predicted = background(exits, *draws)
             # A photograph clips radiance at 1, so brighter predictions of clipped pixels are no error.
-            seen = torch.where(drawn.radiance >= 1, predicted.clamp(max=1), predicted)
+            clipped = torch.where(drawn.radiance >= 1, predicted.clamp(max=1), predicted)
             optimizer.zero_grad()
-            functional.mse_loss(seen, drawn.radiance).backward()
+            functional.mse_loss(clipped, drawn.radiance).backward()
             optimizer.step()
             if isinstance(background, Room):
                 background.sampler.update([background.field], Draws(0, step + 1, torch.arange(batch)))
-            progress((step + 1) / steps)
     background.eval().requires_grad_(False)
-
-
-@torch.no_grad()
-def _unexplained(background: Background, pixels: Pixels) -> float:
-    error = background(Exits.unbent(pixels.rays)).clamp(max=1) - pixels.radiance
-    return float(error.square().mean() / pixels.radiance.var(0).mean().clamp(min=1e-4))
-
-
-def _texel(directions: Float[Tensor, "P 3"], n: int) -> tuple[Tensor, Tensor, Tensor]:
-    face, coordinates = project(directions)
-    column, row = ((coordinates + 1) / 2 * n).long().clamp(0, n - 1).unbind(-1)
-    return face, row, column
+    error = background(Exits.unbent(validation.rays)).clamp(max=1) - validation.radiance
+    unexplained = float(error.square().mean() / validation.radiance.var(0).mean().clamp(min=1e-4))
+    return Surroundings(background, seen, unexplained, validation.radiance)
