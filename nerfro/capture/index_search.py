@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from nerfro.capture.grid_search import MIN_VIEWS, bootstrap_weights, mean_errors, quadratic_minimum, standard_error
+from nerfro.capture.object_errors import MIN_VIEWS, bootstrap_weights, mean_errors, quadratic_minimum, standard_error
 from nerfro.capture.preprocess_options import INDEX, Request, index_settings
 from nerfro.capture.surroundings import Observations, Pixels, Room, Surroundings, robust_scale
 from nerfro.core.errors import NerfroError, warn

@@ -23,8 +23,7 @@ from nerfro.data.masks import EVIDENCE, REVOLUTION, masked_views, method_of, wit
 from nerfro.files.folder_lock import lock_folder
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.rendering.scene_file import SceneFile, with_scene
-from nerfro.silhouettes.overlaps import choose_wrong_masks, report_overlaps
-from nerfro.silhouettes.pose_conventions import require_consistent_poses
+from nerfro.silhouettes.agreement import choose_wrong_masks, report_overlaps, require_consistent_poses
 from nerfro.silhouettes.surface import make_mesh, read_silhouettes
 from nerfro.silhouettes.visual_hull import Silhouettes
 

@@ -26,7 +26,7 @@ from nerfro.media.body_settings import expanded
 from nerfro.registry.allowed import Count, Natural, NotNegative, plain, refuse_unused, validate
 from nerfro.registry.registration import build
 from nerfro.rendering.scene_file import SCENE, SceneFile, take_bodies
-from nerfro.silhouettes.overlaps import REPORT, SHEET
+from nerfro.silhouettes.agreement import REPORT, SHEET
 from nerfro.silhouettes.revolution import Symmetry
 from nerfro.silhouettes.upright import find_up
 

@@ -30,8 +30,7 @@ from nerfro.backgrounds.base import Background
 from nerfro.backgrounds.cube_map import texel_directions
 from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.capture.preprocess_options import FIGURES
-from nerfro.capture.room_panorama import RoomPanorama, panorama_of
-from nerfro.capture.surroundings import Observations, Pixels, Room, Surroundings
+from nerfro.capture.surroundings import Observations, Pixels, Room, RoomPanorama, Surroundings, panorama_of
 from nerfro.core.errors import NerfroError, warn
 from nerfro.core.progress import counting_bar
 from nerfro.core.provenance import AlgorithmSettings
@@ -43,8 +42,8 @@ from nerfro.geometry.mesh import TriangleMesh
 from nerfro.media.base import Medium
 from nerfro.media.bodies import Bodies
 from nerfro.samplers.paths.snell import Snell
+from nerfro.silhouettes.agreement import overlap
 from nerfro.silhouettes.moving_mesh import MovingMesh
-from nerfro.silhouettes.pose_conventions import overlap
 from nerfro.silhouettes.rims import find_rims, outlines_of
 from nerfro.silhouettes.silhouettes import mesh_silhouettes
 from nerfro.silhouettes.visual_hull import Silhouettes

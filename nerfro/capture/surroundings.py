@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
+from nerfro.backgrounds import cube_map
 from nerfro.backgrounds.base import Background
-from nerfro.backgrounds.cube_map import nearest_texel
 from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.core.cameras import Cameras
 from nerfro.core.draws import Draws
@@ -28,7 +28,9 @@ from nerfro.data.base import Views
 from nerfro.fields.hash_grid import HashGridField
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.geometry.space import Contracted
+from nerfro.media.bodies import Bodies
 from nerfro.rendering import composite
+from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.paths.straight import straight_path
 from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.samplers.subdivision import pixel_rays
@@ -175,7 +177,7 @@ class Surroundings:
         """Test whether the radiance in the exit directions is known."""
         if self.seen is None:
             return torch.ones(len(exits.directions), dtype=torch.bool)
-        return self.seen.flatten()[nearest_texel(exits.directions, self.seen.shape[-1])]
+        return self.seen.flatten()[cube_map.nearest_texel(exits.directions, self.seen.shape[-1])]
 
 
 def learn_surroundings(
@@ -200,7 +202,7 @@ def learn_surroundings(
         levels = [4 * 2**level for level in range(16) if 4 * 2**level <= max(16, side)]
         n = max(1, min(settings.seen_texels, int(math.sqrt(len(training) / (6 * settings.seen_pixels)))))
         seen = torch.zeros(6, n, n, dtype=torch.bool)
-        seen.view(-1)[nearest_texel(training.rays.directions, n)] = True
+        seen.view(-1)[cube_map.nearest_texel(training.rays.directions, n)] = True
         size = settings.sky_steps, settings.sky_pixels
         sky = _learned(EnvironmentMap(levels), seen, training, validation, size, settings.rates)
         if near is False or sky.unexplained <= settings.max_sky_residual:
@@ -335,3 +337,66 @@ def _learned(
     error = background(Exits.unbent(validation.rays)).clamp(max=1) - validation.radiance
     unexplained = float(error.square().mean() / validation.radiance.var(0).mean().clamp(min=1e-4))
     return Surroundings(background, seen, unexplained, validation.radiance)
+
+
+class RoomPanorama(Background):
+    """A panorama with depth around a point; the lookup intersects exit rays from other positions with the depth.
+
+    A radiance field has no useful gradient for the refinement of a surface, because its details are finer than the
+    displacements. A panorama can be blurred, and depth makes the lookup follow the exit ray. The panorama lacks
+    surfaces that are hidden from the point.
+
+    Args:
+        middle: centre of the panorama.
+        colours: linear radiance by direction.
+        distances: distance of each texel (see `cube_map.texel_directions`), world units.
+    """
+
+    def __init__(self, middle: Float[Tensor, "3"], colours: EnvironmentMap, distances: Float[Tensor, "T"]) -> None:
+        super().__init__()
+        self.middle, self.colours, self.distances = middle, colours, distances
+        side = round((len(distances) / 6) ** 0.5)
+        self._levels, self._padded = cube_map.CubeLevels((side,)), cube_map.padded_texels(side).flatten()
+
+    def forward(self, exits: Exits) -> Float[Tensor, "P 3"]:
+        """Look up the radiance along exit rays, differentiable by their positions and directions."""
+        assert exits.positions is not None
+        starts = exits.positions - self.middle
+        with torch.no_grad():
+            lengths = self._lengths(starts, exits.directions)
+        return self.colours(Exits(starts + lengths * exits.directions))
+
+    def _lengths(self, starts: Float[Tensor, "P 3"], directions: Float[Tensor, "P 3"]) -> Float[Tensor, "P 1"]:
+        """Intersect exit rays with the depth of the panorama by fixed-point iteration; returns arc lengths."""
+        along = (starts * directions).sum(-1, keepdim=True)
+        square = starts.square().sum(-1, keepdim=True)
+        seen, lengths = directions, torch.zeros_like(along)
+        texels = self.distances[:, None].expand(-1, 3)
+        for _ in range(5):  # few suffice, because the object is small beside its surroundings
+            distance = cube_map.lookup(*cube_map.project(seen), texels, self._padded, self._levels)[:, :1]
+            lengths = ((along.square() - square + distance.square()).clamp(min=0).sqrt() - along).clamp(min=0)
+            seen = starts + lengths * directions
+        return lengths
+
+
+@torch.no_grad()
+def panorama_of(room: Room, medium: Bodies, middle: Float[Tensor, "3"], side: int = 192) -> RoomPanorama:
+    """Render a panorama of near surroundings from the surface of an object outwards.
+
+    Args:
+        room: the surroundings.
+        medium: the object.
+        middle: centre of the panorama.
+        side: texels per side of a face; 192 are half a degree each.
+    """
+    radius = float((medium.box[1] - medium.box[0]).norm())
+    radiance, distances = [], []
+    for directions in cube_map.texel_directions(side).split(16384):
+        ones = torch.ones(len(directions))
+        inwards = Rays(middle + radius * directions, -directions, 0 * ones, 0 * ones, 2 * radius * ones)
+        path = Snell()(inwards, medium)
+        starts = torch.where(path.refracted[:, None], path.positions[:, 1], middle)
+        seen, distance = room.seen(Exits(directions, starts))
+        radiance.append(seen)
+        distances.append(distance + (starts - middle).norm(dim=-1))
+    return RoomPanorama(middle, EnvironmentMap.of_texels(torch.cat(radiance)), torch.cat(distances))

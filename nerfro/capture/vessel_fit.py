@@ -13,8 +13,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
-from nerfro.capture.grid_search import mean_errors, parabola_minimum, standard_error
-from nerfro.capture.object_errors import COMMON_INDICES, ObjectErrors, ObjectErrorSettings
+from nerfro.capture.object_errors import (
+    COMMON_INDICES,
+    ObjectErrors,
+    ObjectErrorSettings,
+    mean_errors,
+    parabola_minimum,
+    standard_error,
+)
 from nerfro.capture.surroundings import Observations
 from nerfro.core.errors import NerfroError, warn
 from nerfro.core.progress import counting_bar

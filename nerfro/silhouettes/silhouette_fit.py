@@ -17,8 +17,15 @@ from nerfro.core.provenance import AlgorithmSettings
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.silhouettes.creases import CreaseSettings, Sides, has_creases, sharpened
 from nerfro.silhouettes.moving_mesh import MeshGeometry, MovingMesh, solve_symmetric
-from nerfro.silhouettes.pixel_sides import PixelSideSettings, by_pixel_sides
-from nerfro.silhouettes.rims import Outlines, Rims, RimSettings, find_rims, outlines_of
+from nerfro.silhouettes.rims import (
+    Outlines,
+    PixelSideSettings,
+    Rims,
+    RimSettings,
+    by_pixel_sides,
+    find_rims,
+    outlines_of,
+)
 from nerfro.silhouettes.silhouettes import VALIDATION_EVERY, is_antialiased
 from nerfro.silhouettes.visual_hull import Silhouettes
 

@@ -13,7 +13,7 @@ from nerfro.core.progress import fraction_bar
 from nerfro.core.provenance import AlgorithmSettings
 from nerfro.data.base import Views
 from nerfro.geometry.mesh import TriangleMesh, num_decimals
-from nerfro.silhouettes.pose_conventions import overlap
+from nerfro.silhouettes.agreement import overlap
 from nerfro.silhouettes.revolution import RevolutionSettings, Symmetry, fit_revolution
 from nerfro.silhouettes.silhouette_fit import FitSettings, fit_surface
 from nerfro.silhouettes.silhouettes import border_pixels

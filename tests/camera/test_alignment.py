@@ -10,7 +10,7 @@ from torch import Tensor
 
 from benchmarks.cameras import disturbed
 from nerfro.camera.refined import gauss_newton
-from nerfro.camera.refined.least_squares import PriorInformation
+from nerfro.camera.refined.gauss_newton import PriorInformation
 from nerfro.camera.refined.outlines import align_to_outlines
 from nerfro.camera.refined.panorama import align
 from nerfro.camera.refined.refined import RefinedCamera

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerfro.camera.refined.least_squares import PriorInformation, normal_equations, shortened, with_priors
+from nerfro.camera.refined.gauss_newton import PriorInformation, normal_equations, shortened, with_priors
 from nerfro.camera.refined.refined import RefinedCamera
 from nerfro.core.cameras import Cameras
 from nerfro.core.progress import track

@@ -18,7 +18,7 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 from torch.nn import functional as F
 
-from nerfro.camera.refined.least_squares import TINY, PriorInformation, axes_across, robust_weights, shortened
+from nerfro.camera.refined.gauss_newton import TINY, PriorInformation, axes_across, robust_weights, shortened
 from nerfro.camera.refined.refined import RefinedCamera
 from nerfro.core.cameras import Cameras
 from nerfro.core.light import to_linear
