@@ -395,9 +395,10 @@ def find_medium(request: Request, observations: Observations, medium: Medium) ->
         print(f"{name}: {value:.5g}{spread}")
     for doubt in estimate.doubts:
         warn(f"the photographs do not determine the {' and '.join(estimate.names)}: {doubt}")
-    accuracy = {"standard_error": estimate.written_errors, "doubts": estimate.doubts}
-    figures = {"ior": [round(value, 5) for value in estimate.values.tolist()], **accuracy}
+    origin = Provenance(standard_error=estimate.written_errors, doubts=estimate.doubts)
+    values = [round(value, 5) for value in estimate.values.tolist()]
+    figures = {"ior": values, "standard_error": origin.standard_error, "doubts": origin.doubts}
     write_atomically(request.out / INDEX, json.dumps(figures, indent=1) + "\n")
     searched = bodies.with_indices(torch.from_numpy(estimate.values))
     settings = index_settings(request.config.medium, bodies.names, estimate.values)
-    return FoundMedium(searched, Provenance(**accuracy), settings)
+    return FoundMedium(searched, origin, settings)

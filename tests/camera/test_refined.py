@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from nerfro.camera.refined import pixel_units, refined
+from nerfro.camera.refined import refined
 from nerfro.camera.similarity import Similarity, motion_between, similarity
 from nerfro.core.cameras import Cameras
 from nerfro.core.lens import coefficients
@@ -97,9 +97,9 @@ def test_common_motion_of_all_cameras_is_removed() -> None:
 
 def test_each_parameter_unit_moves_points_by_one_pixel() -> None:
     given = cameras()
-    distances, h = pixel_units.object_distances(given), 1e-5
+    distances, h = refined.object_distances(given), 1e-5
     axis = (torch.arange(90) + 0.5).double() * SIZE / 90
-    motions = pixel_units.pixel_motions(given, distances)
+    motions = refined.pixel_motions(given, distances)
     for view in range(len(given)):
         one = given.select([view])
         u, v = (place.flatten() for place in torch.meshgrid(axis, axis, indexing="xy"))
@@ -137,5 +137,5 @@ def test_gauge_freedom_has_seven_dimensions_in_any_world_unit(scale: float) -> N
     given = cameras()
     poses = torch.cat([given.camera_to_world[..., :3], scale * given.camera_to_world[..., 3:]], -1)
     given = replace(given, camera_to_world=poses, near=scale * given.near, far=scale * given.far)
-    weights = pixel_units.even_weights(pixel_units.pixel_motions(given, pixel_units.object_distances(given)))
-    assert len(pixel_units.gauge_basis(poses, weights)) == 7
+    weights = refined.even_weights(refined.pixel_motions(given, refined.object_distances(given)))
+    assert len(refined.gauge_basis(poses, weights)) == 7

@@ -17,8 +17,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize, one_hot
 
-from nerfro.camera.refined.pixel_units import object_distances
-from nerfro.camera.refined.refined import RefinedCamera
+from nerfro.camera.refined.refined import RefinedCamera, object_distances
 from nerfro.core.cameras import Cameras
 from nerfro.core.rays import Rays
 from nerfro.core.robust import geman_mcclure_weight
