@@ -168,8 +168,7 @@ def refine_surface(
     settings.use()
     descent = _Descent(problem, learn_index, settings)
     error = float(descent.initial_errors.mean())
-    descent.start, smoothed = descent.smoothed(problem.medium, error)
-    steps, errors, best = [0, 0], [error, smoothed], descent.values()
+    steps, errors, best = [0, 0], [error, descent.start_error], descent.values()
     with counting_bar("surface", sum(stage.steps for stage in settings.stages)) as advance:
         for number, stage in enumerate(settings.stages):
             descent.begin(best, seed=number)
@@ -280,7 +279,6 @@ class _Descent:
     def __init__(self, problem: RefinementProblem, learn_index: bool, settings: RefinementSettings) -> None:
         self.problem, self.settings = problem, settings
         mesh, medium, silhouettes = problem.mesh, problem.medium, problem.silhouettes
-        self.start = medium  # from which the displacements count
         self.iors = nn.Parameter(medium.iors.clone(), requires_grad=learn_index)
         # Rays with internal reflections are left out: small errors of the surface turn them far.
         self.sampler = Snell(max_events=2 * len(medium.iors))
@@ -302,6 +300,8 @@ class _Descent:
         self.contour_deviation = settings.contour_deviation * float((distance / cameras.fx).mean())
         background = problem.surroundings.background
         self.panorama = panorama_of(background, medium, middle) if isinstance(background, Room) else background
+        # The displacements count from the smoothed surface.
+        self.start, self.start_error = self.smoothed(medium, float(self.initial_errors.mean()))
 
     def medium(self) -> Bodies:
         """Return the current medium."""
