@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.camera.refined import pixel_units
+from nerfro.camera.refined import refined
 from nerfro.camera.refined.refined import rotation_matrices
 from nerfro.camera.similarity import motion_between
 from nerfro.core.cameras import Cameras
@@ -78,12 +78,12 @@ def main() -> None:
 def disturbed(cameras: Cameras, angle: float, share: float, seed: int) -> Float[Tensor, "V 3 4"]:
     """Rotate poses by an angle (radians) and shift them by a fraction of the distance, without common motion."""
     generator = torch.Generator().manual_seed(seed)
-    poses, distances = cameras.camera_to_world.double(), pixel_units.object_distances(cameras)
+    poses, distances = cameras.camera_to_world.double(), refined.object_distances(cameras)
     units = torch.stack([torch.full_like(distances, angle), share * distances], -1).repeat_interleave(3, -1)
     axes = torch.randn(len(cameras), 2, 3, generator=generator, dtype=torch.float64)
-    weights = pixel_units.even_weights(pixel_units.pixel_motions(cameras, distances))
+    weights = refined.even_weights(refined.pixel_motions(cameras, distances))
     motion = torch.nn.functional.normalize(axes, dim=-1).flatten(1) * units
-    motion = pixel_units.project_out_gauge(motion, pixel_units.gauge_basis(poses, weights), weights)
+    motion = refined.project_out_gauge(motion, refined.gauge_basis(poses, weights), weights)
     axes = poses[..., :3]
     return torch.cat([axes @ rotation_matrices(motion[:, :3]), poses[..., 3:] + axes @ motion[:, 3:, None]], -1)
 
@@ -138,7 +138,7 @@ def decibels(psnr: float | None) -> str:
 def errors(poses: Float[Tensor, "V 3 4"], true: Cameras) -> tuple[Float[Tensor, "V"], Float[Tensor, "V"]]:
     """Return each camera's rotation error in degrees and position error in percent of the distance."""
     turn, shift = motion_between(true.camera_to_world, poses)
-    return turn, 100 * shift / pixel_units.object_distances(true)
+    return turn, 100 * shift / refined.object_distances(true)
 
 
 if __name__ == "__main__":

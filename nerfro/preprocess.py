@@ -23,8 +23,8 @@ from nerfro.rendering.scene_file import SCENE, with_scene
 @entry_point("preprocess", PreprocessConfig, expand=with_scene)
 def main(config: DictConfig) -> None:
     """Reconstruct the surface, search the index, refine the surface if requested, and print the next command."""
-    request = Request(Composition.of_job(config))
-    scene, file = preprocess_composed(request), request.folder / SCENE
+    request = Request(**vars(Composition.of_job(config)))
+    scene, file = preprocess_composed(request), request.out / SCENE
     print("for photographs in a room, add experiment=glass_room; for straight rays, experiment=straight")
     print_next("train on it", "train", as_overrides({"scene": file}))
     if scene.vessel:

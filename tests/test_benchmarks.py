@@ -21,7 +21,7 @@ import nerfro
 from benchmarks.capture import align_to_truth
 from nerfro.files.images import save_png
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.poses.video import extract_frames
+from nerfro.poses.collection import extract_frames
 from nerfro.train import main
 from tests import ball_photographs
 from tests.cameras_at import upright_cameras

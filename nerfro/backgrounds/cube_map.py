@@ -91,9 +91,15 @@ def padded_texels(resolution: int) -> Int[Tensor, "6 m m"]:
     """
     n = resolution
     # In double precision, because texels beside a corner project almost to the border of the neighbouring face.
-    face, coordinates = project(_directions((torch.arange(-1, n + 1, dtype=torch.float64) + 0.5) / n * 2 - 1))
+    directions = _directions((torch.arange(-1, n + 1, dtype=torch.float64) + 0.5) / n * 2 - 1)
+    return nearest_texel(directions, n).view(6, n + 2, n + 2).int()
+
+
+def nearest_texel(directions: Float[Tensor, "P 3"], resolution: int) -> Int[Tensor, "P"]:
+    """Return the texel of one level that each direction hits."""
+    (face, coordinates), n = project(directions), resolution
     column, row = ((coordinates + 1) / 2 * n).long().clamp(0, n - 1).unbind(-1)
-    return ((face * n + row) * n + column).view(6, n + 2, n + 2).int()
+    return (face * n + row) * n + column
 
 
 def _directions(centres: Float[Tensor, "n"]) -> Float[Tensor, "T 3"]:

@@ -18,9 +18,6 @@ class GivenCamera(CameraModel):
         exposure: whether to estimate a gain for each training view and colour channel.
     """
 
-    def __init__(self, exposure: bool = False) -> None:
-        super().__init__(exposure)
-
     def forward(self, rays: Rays, view: Int[Tensor, "R"]) -> Rays:
         """Return the rays unchanged."""
         return rays

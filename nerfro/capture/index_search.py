@@ -13,31 +13,25 @@ import itertools
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from nerfro.capture.grid_search import (
-    MIN_VIEWS,
-    Minimum,
-    bootstrap_weights,
-    mean_errors,
-    quadratic_minimum,
-    standard_error,
-)
-from nerfro.capture.preprocess_options import INDEX, Request, build_medium, index_settings
+from nerfro.capture.object_errors import MIN_VIEWS, bootstrap_weights, mean_errors, quadratic_minimum, standard_error
+from nerfro.capture.preprocess_options import INDEX, Request, index_settings
 from nerfro.capture.surroundings import Observations, Pixels, Room, Surroundings, robust_scale
 from nerfro.core.errors import NerfroError, warn
-from nerfro.core.progress import fraction_bar
+from nerfro.core.progress import counting_bar
 from nerfro.core.provenance import AlgorithmSettings
 from nerfro.core.robust import geman_mcclure, geman_mcclure_weight
 from nerfro.files.atomic import write_atomically
 from nerfro.media.base import Medium
 from nerfro.media.bodies import Bodies
 from nerfro.media.body_settings import expanded
+from nerfro.registry.allowed import plain
+from nerfro.registry.registration import build
 from nerfro.rendering.scene_file import Provenance
 from nerfro.samplers.paths.snell import Snell
 
@@ -133,11 +127,7 @@ class Estimate:
 
 
 def find_indices(
-    medium: Bodies,
-    through: Pixels,
-    surroundings: Surroundings,
-    progress: Callable[[float], None] = lambda done: None,
-    settings: IndexSettings = IndexSettings(),
+    medium: Bodies, through: Pixels, surroundings: Surroundings, settings: IndexSettings = IndexSettings()
 ) -> Estimate:
     """Search the indices of one or two bodies from coarse to fine grids.
 
@@ -145,7 +135,6 @@ def find_indices(
         medium: the bodies; each receives one index for all wavelengths.
         through: pixels inside the silhouette of the object.
         surroundings: known surroundings.
-        progress: called with the completed fraction.
         settings: range, grids and limits.
 
     Raises:
@@ -161,25 +150,16 @@ def find_indices(
     plan = settings.plans[num_bodies - 1]
     if isinstance(surroundings.background, Room):
         plan = plan._replace(coarse_pixels=settings.near_pixels // 4, fine_pixels=settings.near_pixels)
-    num_rays, pixels = settings.num_rays(plan, num_bodies), through.some(plan.fine_pixels)
-    search = _Search(medium, pixels, surroundings, lambda traced: progress(min(1, traced / num_rays)), settings)
-    coarse, coarse_errors = _coarse_search(search, plan, num_bodies)
-    values, grid = _refine_minimum(search, plan, coarse[coarse_errors.argmin()])
-    progress(1.0)
+    offsets = settings.range * _grid(plan.coarse_steps, num_bodies)
+    coarse = 0.5 * (settings.lowest + settings.highest + offsets)
+    with counting_bar("search", settings.num_rays(plan, num_bodies)) as advance:
+        search = _Search(medium, through.some(plan.fine_pixels), surroundings, advance, settings)
+        coarse_errors = mean_errors(*search.errors(coarse, plan.coarse_pixels, False))[0]
+        values, grid = _refine_minimum(search, plan, coarse[coarse_errors.argmin()])
     names = ["index"] if num_bodies == 1 else [f"index of body {body + 1}" for body in range(num_bodies)]
-    standard_errors = grid.standard_errors()
+    standard_errors = standard_error(grid.minima(bootstrap_weights(grid.counts))[0], grid.counts)
     doubts = _doubts(names, values, standard_errors, grid, search)
     return Estimate(names, values, standard_errors, np.column_stack([coarse, coarse_errors]), doubts)
-
-
-def _coarse_search(
-    search: _Search, plan: SearchPlan, num_bodies: int
-) -> tuple[Float[np.ndarray, "candidates indices"], Float[np.ndarray, " candidates"]]:
-    """Compute the mean errors of candidates over the whole range of the search."""
-    settings = search.settings
-    offsets = settings.range * _grid(plan.coarse_steps, num_bodies)
-    candidates = 0.5 * (settings.lowest + settings.highest + offsets)
-    return candidates, mean_errors(*search.errors(candidates, plan.coarse_pixels, False))[0]
 
 
 class _FineGrid(NamedTuple):
@@ -197,14 +177,11 @@ class _FineGrid(NamedTuple):
     sums: Float[np.ndarray, "candidates V"]
     counts: Float[np.ndarray, "V"]
 
-    def minimum(self) -> Minimum:
-        """Find the minimum of the mean errors."""
-        return quadratic_minimum(self.candidates, mean_errors(self.sums, self.counts), self.axes)
-
-    def standard_errors(self) -> Float[np.ndarray, " indices"]:
-        """Estimate the standard errors of the minimum from random samples of the views."""
-        errors = mean_errors(self.sums, self.counts, bootstrap_weights(self.counts))
-        return standard_error(quadratic_minimum(self.candidates, errors, self.axes).values, self.counts)
+    def minima(
+        self, weights: Float[np.ndarray, "resamples V"] | int = 1
+    ) -> tuple[Float[np.ndarray, "resamples indices"], Float[np.ndarray, "resamples indices"]]:
+        """Find the minima of the mean errors for weightings of the views, see `quadratic_minimum`."""
+        return quadratic_minimum(self.candidates, mean_errors(self.sums, self.counts, weights), self.axes)
 
 
 def _refine_minimum(
@@ -229,7 +206,7 @@ def _refine_minimum(
             centre = values.clip(settings.lowest + extent, settings.highest - extent)
             candidates = centre + offsets @ axes.T
             grid = _FineGrid(candidates, axes, *search.errors(candidates, num_pixels, True))
-            minimum = grid.minimum().values[0]
+            minimum = grid.minima()[0][0]
             values = minimum.clip(settings.lowest, settings.highest)
             if (np.abs(np.linalg.solve(axes, minimum - centre)) < 0.5).all():
                 break
@@ -253,7 +230,7 @@ def _doubts(
     settings, low, high = search.settings, search.settings.lowest, search.settings.highest
     known_fraction, num_views = grid.counts.sum() / search.num_pixels, np.count_nonzero(grid.counts)
     # Without a valley, the spread of the minima does not show whether the views agree.
-    standard_errors = np.where(grid.minimum().curvatures[0] > 0, standard_errors, np.inf)
+    standard_errors = np.where(grid.minima()[1][0] > 0, standard_errors, np.inf)
     doubts = []
     if known_fraction < settings.min_known:
         doubts.append(
@@ -278,19 +255,18 @@ def _doubts(
 
 
 class _Search:
-    """Errors of candidate indices at pixels of the object; `progress` is called with the number of traced rays."""
+    """Errors of candidate indices at pixels of the object; `advance` is called with numbers of traced rays."""
 
     def __init__(
         self,
         medium: Bodies,
         through: Pixels,
         surroundings: Surroundings,
-        progress: Callable[[int], None],
+        advance: Callable[[int], None],
         settings: IndexSettings,
     ) -> None:
         self.settings = settings
-        self._achromatic, self._surroundings = medium.achromatic(), surroundings
-        self._progress, self._num_traced = progress, 0
+        self._achromatic, self._surroundings, self._advance = medium.achromatic(), surroundings, advance
         medium = self._achromatic.with_indices(torch.full_like(medium.iors, 0.5 * (settings.lowest + settings.highest)))
         self._sampler = Snell(max_events=max(settings.max_events, 2 * len(medium.iors)))
         self._pixels = through[self._sampler(through.rays, medium).refracted]
@@ -361,8 +337,7 @@ class _Search:
             residuals, usable = self._residuals(pixels, values)
             usable_for_all &= usable
             errors.append(torch.where(usable, geman_mcclure(residuals, self._scale), self.unrelated))
-            self._num_traced += len(pixels)
-            self._progress(self._num_traced)
+            self._advance(len(pixels))
         used = usable_for_all if common else torch.ones_like(usable_for_all)
         view, num_views = pixels.view[used], len(pixels.cameras)
         sums = [torch.bincount(view, error[used].double(), num_views).numpy() for error in errors]
@@ -375,29 +350,17 @@ class FoundMedium:
 
     Attributes:
         medium: the medium.
-        estimate: the indices that were searched; None if they are known.
-        index_settings: settings of the medium for these indices.
+        provenance: accuracy of the indices that were searched, for the scene file.
+        index_settings: settings of the medium for these indices; empty if the indices are known.
     """
 
     medium: Medium
-    estimate: Estimate | None = None
+    provenance: Provenance = field(default_factory=Provenance)
     index_settings: dict[str, object] = field(default_factory=dict)
-
-    @property
-    def provenance(self) -> Provenance:
-        """Accuracy of the indices, for the scene file."""
-        if self.estimate is None:
-            return Provenance()
-        return Provenance(standard_error=self.estimate.written_errors, doubts=self.estimate.doubts)
-
-    @property
-    def is_doubtful(self) -> bool:
-        """Whether the photographs do not determine the indices."""
-        return self.estimate is not None and bool(self.estimate.doubts)
 
 
 def initial_medium(request: Request, location: str, settings: dict[str, object]) -> Medium:
-    """Build the medium with a surface; the indices are 1.5 unless they are given.
+    """Build the medium with a surface, so that an unsuitable surface is refused; the indices are 1.5 unless given.
 
     Args:
         request: options of the command.
@@ -408,11 +371,12 @@ def initial_medium(request: Request, location: str, settings: dict[str, object])
     if request.searches_index:
         names = [*expanded({name: config.get(name) for name in ("mesh", "bodies")} | settings)]
         settings |= index_settings(config, names, [1.5] * len(names))
-    return build_medium(request, settings)
+    medium: Medium = build(plain(config) | settings)
+    return medium
 
 
 def find_medium(request: Request, observations: Observations, medium: Medium) -> FoundMedium:
-    """Search the indices of a medium if they are not given.
+    """Search the indices of a medium if they are not given, print the result, and write index.json.
 
     Args:
         request: options of the command.
@@ -424,29 +388,17 @@ def find_medium(request: Request, observations: Observations, medium: Medium) ->
     bodies = medium.bodies
     if bodies is None:
         raise NerfroError("the index of this type of medium cannot be searched for; set medium.ior=, or medium=object")
-    estimate = _search_index(observations, bodies, request.folder)
-    searched = bodies.with_indices(torch.from_numpy(estimate.values))
-    return FoundMedium(searched, estimate, index_settings(request.config.medium, bodies.names, estimate.values))
-
-
-def _search_index(observations: Observations, medium: Bodies, folder: Path) -> Estimate:
-    """Search the indices of the bodies of a medium, print the result, and write index.json.
-
-    Args:
-        observations: observations of the object and its surroundings.
-        medium: the bodies.
-        folder: output folder.
-    """
-    through, surroundings = observations.through, observations.surroundings
-    with fraction_bar("search") as progress:
-        estimate = find_indices(medium, through, surroundings, progress)
+    estimate = find_indices(bodies, observations.through, observations.surroundings)
     for name, value, error in zip(estimate.names, estimate.values, estimate.standard_errors, strict=True):
         # At an end of the search range, all samples of the views have the same minimum.
         spread = f" +- {error:.2g} (standard error by resampling of the views)" if 0 < error < np.inf else ""
         print(f"{name}: {value:.5g}{spread}")
     for doubt in estimate.doubts:
         warn(f"the photographs do not determine the {' and '.join(estimate.names)}: {doubt}")
+    origin = Provenance(standard_error=estimate.written_errors, doubts=estimate.doubts)
     values = [round(value, 5) for value in estimate.values.tolist()]
-    figures = {"ior": values, "standard_error": estimate.written_errors, "doubts": estimate.doubts}
-    write_atomically(folder / INDEX, json.dumps(figures, indent=1) + "\n")
-    return estimate
+    figures = {"ior": values, "standard_error": origin.standard_error, "doubts": origin.doubts}
+    write_atomically(request.out / INDEX, json.dumps(figures, indent=1) + "\n")
+    searched = bodies.with_indices(torch.from_numpy(estimate.values))
+    settings = index_settings(request.config.medium, bodies.names, estimate.values)
+    return FoundMedium(searched, origin, settings)

@@ -23,8 +23,7 @@ from nerfro.data.masks import EVIDENCE, REVOLUTION, masked_views, method_of, wit
 from nerfro.files.folder_lock import lock_folder
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.rendering.scene_file import SceneFile, with_scene
-from nerfro.silhouettes.overlaps import choose_wrong_masks, report_overlaps
-from nerfro.silhouettes.pose_conventions import require_consistent_poses
+from nerfro.silhouettes.agreement import choose_wrong_masks, report_overlaps, require_consistent_poses
 from nerfro.silhouettes.surface import make_mesh, read_silhouettes
 from nerfro.silhouettes.visual_hull import Silhouettes
 
@@ -45,7 +44,7 @@ def preprocess(capture: Capture, overrides: Sequence[str] = (), **settings: obje
     """
     arguments = [*capture.overrides, *as_overrides(settings), *overrides]
     with composed("preprocess", PreprocessConfig, arguments, with_scene) as composition:
-        return preprocess_composed(Request(composition))
+        return preprocess_composed(Request(**vars(composition)))
 
 
 @torch.no_grad()
@@ -53,7 +52,7 @@ def preprocess_composed(request: Request) -> SceneFile:
     """Reconstruct surface and index for composed options, see `preprocess`."""
     AlgorithmSettings.used.clear()
     request.check()
-    with lock_folder(request.folder, "data.root" if request.config.out is None else "out"):
+    with lock_folder(request.out, "data.root" if request.config.out is None else "out"):
         return _preprocess(request)
 
 
@@ -65,22 +64,22 @@ def _preprocess(request: Request) -> SceneFile:
     outlined = with_other_splits(views, source, "train")
     if mesh is None or outlined.masks is not None:
         mesh, outlined, silhouettes = _fit_surface(request, outlined, mesh)
-    location = config.mesh or str(request.folder / MESH)
+    location = config.mesh or str(request.out / MESH)
     settings = surface_settings(request, views.cameras, mesh, source.origin)
     medium = initial_medium(request, location, settings)
     observations = Observations(views, mesh, config.room, medium.origin - source.origin)
     indexed = find_medium(request, observations, medium)
     if config.refine:
-        carved, location = mesh, str(request.folder / MESH)
-        if indexed.is_doubtful:
+        carved, location = mesh, str(request.out / MESH)
+        if indexed.provenance.doubts:
             warn("surface unchanged: refine=true needs the index, and the photographs do not determine the index")
         else:
-            mesh = refine(observations, mesh, indexed.medium, silhouettes, request.searches_index, request.folder)
-        mesh.relative_to(-source.origin).save(request.folder / MESH)
+            mesh = refine(observations, mesh, indexed.medium, silhouettes, request.searches_index, request.out)
+        mesh.relative_to(-source.origin).save(request.out / MESH)
         settings = surface_settings(request, views.cameras, mesh, source.origin)
         if mesh is not carved:
             if silhouettes is not None:
-                report_overlaps(outlined, mesh, silhouettes, None, request.folder, list_all=False)
+                report_overlaps(outlined, mesh, silhouettes, None, request.out, list_all=False)
             medium = initial_medium(request, location, settings)
             if (medium.origin != indexed.medium.origin).any():
                 observations = Observations(views, mesh, config.room, medium.origin - source.origin)
@@ -90,7 +89,7 @@ def _preprocess(request: Request) -> SceneFile:
         solid = indexed.medium.bodies
         assert solid is not None  # see Request.check
         vessel, fitted = find_vessel(solid, location, mesh, observations)
-        unsupported = unsupported_bodies(observations, solid, indexed.is_doubtful, fitted)
+        unsupported = unsupported_bodies(observations, solid, bool(indexed.provenance.doubts), fitted)
     estimated = settings | {"mesh": location} | indexed.index_settings
     origin = replace(indexed.provenance, unsupported=unsupported)
     scene = SceneFile(medium=estimated, vessel=vessel, surroundings=observations.distance, provenance=origin)
@@ -105,7 +104,7 @@ def _fit_surface(request: Request, views: Views, mesh: TriangleMesh | None) -> t
     Returns:
         The surface, the views whose masks are no projections, and the silhouettes of these masks.
     """
-    config, folder = request.config, request.folder
+    config, folder = request.config, request.out
     all_silhouettes = read_silhouettes(views, request.box is not None)
     methods = [None if frame.mask is None else method_of(frame.mask) for frame in views.frames]
     own = [i for i, method in enumerate(methods) if method in EVIDENCE]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import typing
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Annotated, Any
 import numpy as np
 from annotated_types import Ge, Le
 from jaxtyping import Float
-from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf import MISSING, DictConfig
 
 from nerfro.cli.calls import Composition
 from nerfro.cli.overrides import is_given
@@ -23,12 +22,11 @@ from nerfro.data.frames import require_root
 from nerfro.files.atomic import refuse_existing
 from nerfro.geometry.box import corners_of_box
 from nerfro.geometry.mesh import TriangleMesh, load_mesh, local_origin, num_decimals
-from nerfro.media.base import Medium
 from nerfro.media.body_settings import expanded
 from nerfro.registry.allowed import Count, Natural, NotNegative, plain, refuse_unused, validate
 from nerfro.registry.registration import build
 from nerfro.rendering.scene_file import SCENE, SceneFile, take_bodies
-from nerfro.silhouettes.overlaps import REPORT, SHEET
+from nerfro.silhouettes.agreement import REPORT, SHEET
 from nerfro.silhouettes.revolution import Symmetry
 from nerfro.silhouettes.upright import find_up
 
@@ -79,23 +77,11 @@ class PreprocessConfig:
 
 
 @dataclass(frozen=True)
-class Request:
-    """Composed options of `python -m nerfro.preprocess`."""
-
-    composition: Composition
+class Request(Composition):
+    """Composed options of `python -m nerfro.preprocess`, see `PreprocessConfig`."""
 
     @property
-    def config(self) -> DictConfig:
-        """The options, see `PreprocessConfig`."""
-        return self.composition.config
-
-    @property
-    def overrides(self) -> list[str]:
-        """The options that are given."""
-        return self.composition.overrides
-
-    @property
-    def folder(self) -> Path:
+    def out(self) -> Path:
         """Output folder."""
         return resolve_path(self.config.data.root) if self.config.out is None else user_path(self.config.out)
 
@@ -123,7 +109,7 @@ class Request:
         names += [SHEET, REPORT]
         names += [INDEX] if self.searches_index else []
         names += [FIGURES] if config.refine else []
-        return [self.folder / name for name in [*names, SCENE]]
+        return [self.out / name for name in [*names, SCENE]]
 
     def clear_files(self) -> None:
         """Refuse existing files, or with `overwrite` remove those of an earlier run that this one may not write.
@@ -133,7 +119,7 @@ class Request:
         """
         refuse_existing(self.files, self.config.overwrite)
         for name in (INDEX, FIGURES) if self.config.overwrite else ():
-            (self.folder / name).unlink(missing_ok=True)
+            (self.out / name).unlink(missing_ok=True)
 
     def check(self) -> None:
         """Check the options and the output folder.
@@ -164,7 +150,7 @@ class Request:
         if config.out is None and str(config.data.root).startswith(EMBEDDED_PREFIX):
             raise NerfroError(f"data.root={config.data.root} is part of nerfro and read-only; add out=FOLDER")
         if config.out is None:
-            require_root(self.folder)
+            require_root(self.out)
 
     def read(self) -> tuple[DataSource, TriangleMesh | None]:
         """Build the data set and read the given mesh, if any, with positions relative to `DataSource.origin`."""
@@ -215,18 +201,12 @@ def _ray_bounds(cameras: Cameras, mesh: TriangleMesh) -> dict[str, object]:
     return bounds
 
 
-def build_medium(request: Request, settings: dict[str, object]) -> Medium:
-    """Build the medium with further settings, so that an unsuitable surface is refused before training."""
-    medium = typing.cast(dict[str, object], OmegaConf.to_container(request.config.medium, resolve=True))
-    return typing.cast(Medium, build(medium | settings))
-
-
 def index_settings(medium: DictConfig, names: Iterable[str], iors: Iterable[float]) -> dict[str, object]:
     """Return the settings of the medium for the indices of its bodies, given the names of the bodies."""
     values = [round(float(ior), 4) for ior in iors]
     if medium.get("bodies") is None:
         return {"ior": values[0]}
-    bodies = typing.cast(dict[str, dict[str, Any]], OmegaConf.to_container(medium.bodies, resolve=True))
+    bodies = plain(medium.bodies)
     return {"bodies": {name: bodies[name] | {"ior": ior} for name, ior in zip(names, values, strict=True)}}
 
 
@@ -242,11 +222,10 @@ def write_scene(request: Request, estimated: SceneFile, cameras: Cameras, mesh: 
     Returns:
         The content of the scene file.
     """
-    config, composition = request.config, request.composition
-    medium = composition.described("medium") | estimated.medium
-    data = composition.described("data") | {"root": str(config.data.root)} | _ray_bounds(cameras, mesh)
+    medium = request.described("medium") | estimated.medium
+    data = request.described("data") | {"root": str(request.config.data.root)} | _ray_bounds(cameras, mesh)
     size = [cameras.width, cameras.height]
     scene = replace(estimated, data=data, bodies=take_bodies(medium), medium=medium, photograph=size)
-    scene.save(request.folder / SCENE)
+    scene.save(request.out / SCENE)
     print(f"results: {', '.join(str(file) for file in request.files if file.exists())}")
     return scene

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
 
@@ -31,10 +30,9 @@ from nerfro.backgrounds.base import Background
 from nerfro.backgrounds.cube_map import texel_directions
 from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.capture.preprocess_options import FIGURES
-from nerfro.capture.room_panorama import RoomPanorama, panorama_of
-from nerfro.capture.surroundings import Observations, Pixels, Room, Surroundings
+from nerfro.capture.surroundings import Observations, Pixels, Room, RoomPanorama, Surroundings, panorama_of
 from nerfro.core.errors import NerfroError, warn
-from nerfro.core.progress import fraction_bar
+from nerfro.core.progress import counting_bar
 from nerfro.core.provenance import AlgorithmSettings
 from nerfro.core.robust import geman_mcclure
 from nerfro.core.types import Exits, Path
@@ -44,8 +42,9 @@ from nerfro.geometry.mesh import TriangleMesh
 from nerfro.media.base import Medium
 from nerfro.media.bodies import Bodies
 from nerfro.samplers.paths.snell import Snell
-from nerfro.silhouettes.pose_conventions import overlap
-from nerfro.silhouettes.rims import RimFinder
+from nerfro.silhouettes.agreement import overlap
+from nerfro.silhouettes.moving_mesh import MovingMesh
+from nerfro.silhouettes.rims import find_rims, outlines_of
 from nerfro.silhouettes.silhouettes import mesh_silhouettes
 from nerfro.silhouettes.visual_hull import Silhouettes
 
@@ -152,18 +151,15 @@ class Refined:
     errors: list[float]
 
 
+@torch.no_grad()
 def refine_surface(
-    problem: RefinementProblem,
-    learn_index: bool = False,
-    progress: Callable[[float], None] = lambda done: None,
-    settings: RefinementSettings = RefinementSettings(),
+    problem: RefinementProblem, learn_index: bool = False, settings: RefinementSettings = RefinementSettings()
 ) -> Refined:
     """Refine the surface of the first body of a medium by the refractions in photographs.
 
     Args:
         problem: the surface and the photographs.
         learn_index: whether to refine the indices together with the surface.
-        progress: called with the completed fraction.
         settings: settings of the descent.
 
     Raises:
@@ -171,26 +167,24 @@ def refine_surface(
     """
     settings.use()
     descent = _Descent(problem, learn_index, settings)
-    error = descent.initial_error
-    smoothed = descent.smooth_start(error)
-    steps, errors, best = [0, 0], [error, smoothed], descent.values()
-    done, total = 0, sum(stage.steps for stage in settings.stages)
-    for number, stage in enumerate(settings.stages):
-        descent.begin(best, seed=number)
-        for step in range(stage.steps):
-            descent.step(stage, step)
-            progress((done + step + 1) / total)
-            if (step + 1) % settings.validate_every == 0:
-                steps.append(steps[-1] + settings.validate_every)
-                errors.append(descent.validation_error(descent.medium()))
-                if errors[-1] == min(errors):
-                    best = descent.values()
-                elif errors[-1] > (1 + settings.max_increase) * min(errors):
-                    break
-        done += stage.steps
-    descent.begin(best)
-    refined, smoothed = descent.smoothed(descent.medium(), min(errors))
-    progress(1.0)
+    error = float(descent.initial_errors.mean())
+    steps, errors, best = [0, 0], [error, descent.start_error], descent.values()
+    with counting_bar("surface", sum(stage.steps for stage in settings.stages)) as advance:
+        for number, stage in enumerate(settings.stages):
+            descent.begin(best, seed=number)
+            for step in range(stage.steps):
+                descent.step(stage, step)
+                advance()
+                if (step + 1) % settings.validate_every == 0:
+                    steps.append(steps[-1] + settings.validate_every)
+                    errors.append(descent.validation_error(descent.medium()))
+                    if errors[-1] == min(errors):
+                        best = descent.values()
+                    elif errors[-1] > (1 + settings.max_increase) * min(errors):
+                        advance(stage.steps - step - 1)
+                        break
+        descent.begin(best)
+        refined, smoothed = descent.smoothed(descent.medium(), min(errors))
     steps, errors = [*steps, steps[-1]], [*errors, smoothed]
     if smoothed > (1 - settings.min_gain) * error or not descent.keeps_outlines(refined):
         return Refined(problem.mesh, problem.medium, steps, errors)
@@ -228,8 +222,7 @@ def refine(
         silhouettes = replace(silhouettes, cameras=silhouettes.cameras.relative_to(observations.shift))
     problem = RefinementProblem(start, bodies, silhouettes, through, surroundings)
     try:
-        with fraction_bar("surface") as progress:
-            refined = refine_surface(problem, learn_index, progress, settings)
+        refined = refine_surface(problem, learn_index, settings)
     except NerfroError as reason:  # keep the results of the other steps
         warn(f"surface unchanged: {reason}")
         return mesh
@@ -286,7 +279,6 @@ class _Descent:
     def __init__(self, problem: RefinementProblem, learn_index: bool, settings: RefinementSettings) -> None:
         self.problem, self.settings = problem, settings
         mesh, medium, silhouettes = problem.mesh, problem.medium, problem.silhouettes
-        self.start = medium  # from which the displacements count
         self.iors = nn.Parameter(medium.iors.clone(), requires_grad=learn_index)
         # Rays with internal reflections are left out: small errors of the surface turn them far.
         self.sampler = Snell(max_events=2 * len(medium.iors))
@@ -300,27 +292,25 @@ class _Descent:
             raise NerfroError("no pixel shows known surroundings through the object; remove refine=true")
         self.validation, self.initial_errors = self.validation[is_valid], errors[is_valid]
         self.overlap = overlap(mesh, silhouettes).mean()
-        rims, cameras = RimFinder(mesh, silhouettes).find(), silhouettes.cameras
+        surface, cameras = MovingMesh(mesh.faces).geometry(mesh.vertices), silhouettes.cameras
+        rims = find_rims(surface, silhouettes, outlines_of(silhouettes))
         self.rims = torch.from_numpy(rims.points).float()
         middle = torch.from_numpy(mesh.bounds.mean(0)).float()
         distance = (cameras.camera_to_world[:, :, 3] - middle).norm(dim=-1)
         self.contour_deviation = settings.contour_deviation * float((distance / cameras.fx).mean())
         background = problem.surroundings.background
         self.panorama = panorama_of(background, medium, middle) if isinstance(background, Room) else background
+        # The displacements count from the smoothed surface.
+        self.start, self.start_error = self.smoothed(medium, float(self.initial_errors.mean()))
 
-    @torch.no_grad()
     def medium(self) -> Bodies:
-        """Return the current medium, without gradients."""
-        return self._medium()
-
-    def _medium(self) -> Bodies:
+        """Return the current medium."""
         return self.start.grown(self.offsets()).with_indices(self.iors)
 
     def values(self) -> list[Tensor]:
         """Return a copy of the learned values."""
         return [values.detach().clone() for values in self.learned]
 
-    @torch.no_grad()
     def begin(self, values: list[Tensor], seed: int = 0) -> None:
         """Set the learned values, and reset optimizer and random numbers."""
         for learned, value in zip(self.learned, values, strict=True):
@@ -341,7 +331,7 @@ class _Descent:
         self.optimizer.step()
 
     def _loss(self) -> Tensor:
-        medium, settings = self._medium(), self.settings
+        medium, settings = self.medium(), self.settings
         pixels = self.training[torch.randint(len(self.training), (settings.num_pixels,), generator=self.generator)]
         path, usable = self._traced(pixels, medium)
         rays = pixels.rays[usable]
@@ -354,12 +344,6 @@ class _Descent:
         contours = (square / (1 + square)).mean()
         return photometric + settings.contour_weight * contours + settings.roughness_weight * self.offsets.roughness()
 
-    def smooth_start(self, error: float) -> float:
-        """Smooth the initial surface, whose validation error is given, and return its new error; see `smoothed`."""
-        self.start, error = self.smoothed(self.start, error)
-        return error
-
-    @torch.no_grad()
     def smoothed(self, medium: Bodies, error: float) -> tuple[Bodies, float]:
         """Smooth the first body as far as the validation error decreases and the outlines stay.
 
@@ -385,11 +369,6 @@ class _Descent:
         after = overlap(_project_onto(self.problem.mesh, medium), self.problem.silhouettes).mean()
         return bool(self.overlap - after <= self.settings.max_overlap_loss)
 
-    @property
-    def initial_error(self) -> float:
-        """Mean robust error of the validation pixels for the given surface."""
-        return float(self.initial_errors.mean())
-
     def validation_error(self, medium: Bodies) -> float:
         """Compute the mean robust error of the validation pixels.
 
@@ -399,7 +378,6 @@ class _Descent:
         errors, is_valid = self._validation_errors(medium)
         return float(torch.where(is_valid, errors, self.initial_errors).mean())
 
-    @torch.no_grad()
     def _validation_errors(self, medium: Bodies) -> tuple[Float[Tensor, "Q"], Bool[Tensor, "Q"]]:
         """Compute the robust errors of the validation pixels, and whether their surroundings are known."""
         trace = self.sampler.trace(self.validation.rays, medium)
@@ -415,7 +393,6 @@ class _Descent:
         return trace.path, usable & self.sampler.steady(trace.path, medium)
 
 
-@torch.no_grad()
 def _blurred(panorama: EnvironmentMap | RoomPanorama, degrees: float, settings: RefinementSettings) -> Background:
     """Convolve surroundings with a Gaussian of the given standard deviation."""
     if degrees == 0:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
@@ -14,14 +13,14 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
+from nerfro.backgrounds import cube_map
 from nerfro.backgrounds.base import Background
-from nerfro.backgrounds.cube_map import project
 from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.core.cameras import Cameras
 from nerfro.core.draws import Draws
 from nerfro.core.errors import NerfroError
 from nerfro.core.light import to_linear
-from nerfro.core.progress import fraction_bar
+from nerfro.core.progress import track
 from nerfro.core.provenance import AlgorithmSettings
 from nerfro.core.rays import Rays
 from nerfro.core.types import WORLD_ORIGIN, Exits
@@ -29,7 +28,9 @@ from nerfro.data.base import Views
 from nerfro.fields.hash_grid import HashGridField
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.geometry.space import Contracted
+from nerfro.media.bodies import Bodies
 from nerfro.rendering import composite
+from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.paths.straight import straight_path
 from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.samplers.subdivision import pixel_rays
@@ -176,15 +177,11 @@ class Surroundings:
         """Test whether the radiance in the exit directions is known."""
         if self.seen is None:
             return torch.ones(len(exits.directions), dtype=torch.bool)
-        return self.seen[_texel(exits.directions, self.seen.shape[-1])]
+        return self.seen.flatten()[cube_map.nearest_texel(exits.directions, self.seen.shape[-1])]
 
 
 def learn_surroundings(
-    beside: Pixels,
-    mesh: TriangleMesh,
-    near: bool | None,
-    progress: Callable[[float], None] = lambda done: None,
-    settings: SurroundingsSettings = SurroundingsSettings(),
+    beside: Pixels, mesh: TriangleMesh, near: bool | None, settings: SurroundingsSettings = SurroundingsSettings()
 ) -> Surroundings:
     """Reconstruct the surroundings of an object from the pixels beside the object.
 
@@ -193,7 +190,6 @@ def learn_surroundings(
         mesh: surface of the object.
         near: whether the surroundings are so near that parallel rays see different points; None decides by validation
             views.
-        progress: called with the completed fraction.
         settings: steps and limits.
     """
     settings.use()
@@ -204,19 +200,17 @@ def learn_surroundings(
         # Texels are as wide as pixels, and at most half as many, because unobserved texels would be noise.
         side = min(1.5 * float(beside.cameras.fx.mean()) * math.pi / 2, math.sqrt(len(training) / 12))
         levels = [4 * 2**level for level in range(16) if 4 * 2**level <= max(16, side)]
-        background = EnvironmentMap(levels)
-        _learn(background, training, settings.sky_steps, settings.sky_pixels, settings.rates, progress)
         n = max(1, min(settings.seen_texels, int(math.sqrt(len(training) / (6 * settings.seen_pixels)))))
         seen = torch.zeros(6, n, n, dtype=torch.bool)
-        seen[_texel(training.rays.directions, n)] = True
-        sky = Surroundings(background, seen, _unexplained(background, validation), validation.radiance)
+        seen.view(-1)[cube_map.nearest_texel(training.rays.directions, n)] = True
+        size = settings.sky_steps, settings.sky_pixels
+        sky = _learned(EnvironmentMap(levels), seen, training, validation, size, settings.rates)
         if near is False or sky.unexplained <= settings.max_sky_residual:
             return sky
     middle = torch.from_numpy(mesh.bounds.mean(0)).float()
     distance = (beside.cameras.camera_to_world[:, :, 3] - middle).norm(dim=-1)
-    field = Room(mesh.bounds, float(distance.mean()))
-    _learn(field, training, settings.near_steps, settings.near_pixels, settings.rates, progress)
-    room = Surroundings(field, None, _unexplained(field, validation), validation.radiance)
+    field, size = Room(mesh.bounds, float(distance.mean())), (settings.near_steps, settings.near_pixels)
+    room = _learned(field, None, training, validation, size, settings.rates)
     return room if sky is None or room.unexplained < sky.unexplained else sky
 
 
@@ -228,22 +222,16 @@ class Observations:
         mesh: surface of the object.
         room: whether the surroundings are near; None decides by validation views.
         shift: origin of the observations in the coordinates of views and mesh.
-        settings: settings of the surroundings.
 
     Attributes:
         views: the photographs, with poses relative to `shift`.
     """
 
     def __init__(
-        self,
-        views: Views,
-        mesh: TriangleMesh,
-        room: bool | None,
-        shift: Float[np.ndarray, "3"] = WORLD_ORIGIN,
-        settings: SurroundingsSettings = SurroundingsSettings(),
+        self, views: Views, mesh: TriangleMesh, room: bool | None, shift: Float[np.ndarray, "3"] = WORLD_ORIGIN
     ) -> None:
         self.views = replace(views, cameras=views.cameras.relative_to(shift))
-        self.shift, self._mesh, self._room, self._settings = shift, mesh.relative_to(shift), room, settings
+        self.shift, self._mesh, self._room = shift, mesh.relative_to(shift), room
 
     @property
     def distance(self) -> Literal["near", "far"] | None:
@@ -260,15 +248,14 @@ class Observations:
     @cached_property
     def surroundings(self) -> Surroundings:
         """Reconstructed surroundings; prints their type and accuracy."""
-        with fraction_bar("surroundings") as progress:
-            learned = learn_surroundings(self._divided[0], self._mesh, self._room, progress, self._settings)
+        learned = learn_surroundings(self._divided[0], self._mesh, self._room)
         distance, explained = "near" if isinstance(learned.background, Room) else "far away", 1 - learned.unexplained
         print(f"surroundings: {distance}; {explained:.1%} of the variance of validation views is explained")
         return learned
 
     @cached_property
     def _divided(self) -> tuple[Pixels, Pixels]:
-        return divide_pixels(self.views, self._mesh, self._settings)
+        return divide_pixels(self.views, self._mesh)
 
 
 class Room(Background):
@@ -311,43 +298,105 @@ class Room(Background):
         return rendered.radiance, rendered.depth
 
 
-def _learn(
-    background: Background,
-    pixels: Pixels,
-    steps: int,
-    batch: int,
+def _learned(
+    background: EnvironmentMap | Room,
+    seen: Bool[Tensor, "6 n n"] | None,
+    training: Pixels,
+    validation: Pixels,
+    size: tuple[int, int],
     rates: tuple[float, float],
-    progress: Callable[[float], None],
-) -> None:
-    batch = min(batch, max(1024, len(pixels) // 16))
+) -> Surroundings:
+    """Learn a background by gradient descent, and measure its error.
+
+    Args:
+        background: the background, which is changed.
+        seen: see `Surroundings`.
+        training, validation: pixels beside the object.
+        size: number of steps, and largest number of pixels in each.
+        rates: first and last learning rate.
+    """
+    steps, batch = size[0], min(size[1], max(1024, len(training) // 16))
     generator = torch.Generator().manual_seed(0)
     first, last = rates
     optimizer = torch.optim.Adam(background.parameters(), first, eps=1e-15)
     with torch.enable_grad():
-        for step in range(steps):
+        for step in track("surroundings", range(steps)):
             optimizer.param_groups[0]["lr"] = first * (last / first) ** (step / steps)
-            drawn = pixels[torch.randint(len(pixels), (batch,), generator=generator)]
+            drawn = training[torch.randint(len(training), (batch,), generator=generator)]
             exits = Exits.unbent(drawn.rays)
             draws = (Draws(0, step, torch.arange(batch)),) if isinstance(background, Room) else ()
             predicted = background(exits, *draws)
             # A photograph clips radiance at 1, so brighter predictions of clipped pixels are no error.
-            seen = torch.where(drawn.radiance >= 1, predicted.clamp(max=1), predicted)
+            clipped = torch.where(drawn.radiance >= 1, predicted.clamp(max=1), predicted)
             optimizer.zero_grad()
-            functional.mse_loss(seen, drawn.radiance).backward()
+            functional.mse_loss(clipped, drawn.radiance).backward()
             optimizer.step()
             if isinstance(background, Room):
                 background.sampler.update([background.field], Draws(0, step + 1, torch.arange(batch)))
-            progress((step + 1) / steps)
     background.eval().requires_grad_(False)
+    error = background(Exits.unbent(validation.rays)).clamp(max=1) - validation.radiance
+    unexplained = float(error.square().mean() / validation.radiance.var(0).mean().clamp(min=1e-4))
+    return Surroundings(background, seen, unexplained, validation.radiance)
+
+
+class RoomPanorama(Background):
+    """A panorama with depth around a point; the lookup intersects exit rays from other positions with the depth.
+
+    A radiance field has no useful gradient for the refinement of a surface, because its details are finer than the
+    displacements. A panorama can be blurred, and depth makes the lookup follow the exit ray. The panorama lacks
+    surfaces that are hidden from the point.
+
+    Args:
+        middle: centre of the panorama.
+        colours: linear radiance by direction.
+        distances: distance of each texel (see `cube_map.texel_directions`), world units.
+    """
+
+    def __init__(self, middle: Float[Tensor, "3"], colours: EnvironmentMap, distances: Float[Tensor, "T"]) -> None:
+        super().__init__()
+        self.middle, self.colours, self.distances = middle, colours, distances
+        side = round((len(distances) / 6) ** 0.5)
+        self._side, self._padded = side, cube_map.padded_texels(side).flatten()
+
+    def forward(self, exits: Exits) -> Float[Tensor, "P 3"]:
+        """Look up the radiance along exit rays, differentiable by their positions and directions."""
+        assert exits.positions is not None
+        starts = exits.positions - self.middle
+        with torch.no_grad():
+            lengths = self._lengths(starts, exits.directions)
+        return self.colours(Exits(starts + lengths * exits.directions))
+
+    def _lengths(self, starts: Float[Tensor, "P 3"], directions: Float[Tensor, "P 3"]) -> Float[Tensor, "P 1"]:
+        """Intersect exit rays with the depth of the panorama by fixed-point iteration; returns arc lengths."""
+        along = (starts * directions).sum(-1, keepdim=True)
+        square = starts.square().sum(-1, keepdim=True)
+        seen, lengths = directions, torch.zeros_like(along)
+        texels = self.distances[:, None].expand(-1, 3)
+        for _ in range(5):  # few suffice, because the object is small beside its surroundings
+            distance = cube_map.lookup_in_torch(*cube_map.project(seen), texels, self._padded, [self._side])[:, :1]
+            lengths = ((along.square() - square + distance.square()).clamp(min=0).sqrt() - along).clamp(min=0)
+            seen = starts + lengths * directions
+        return lengths
 
 
 @torch.no_grad()
-def _unexplained(background: Background, pixels: Pixels) -> float:
-    error = background(Exits.unbent(pixels.rays)).clamp(max=1) - pixels.radiance
-    return float(error.square().mean() / pixels.radiance.var(0).mean().clamp(min=1e-4))
+def panorama_of(room: Room, medium: Bodies, middle: Float[Tensor, "3"], side: int = 192) -> RoomPanorama:
+    """Render a panorama of near surroundings from the surface of an object outwards.
 
-
-def _texel(directions: Float[Tensor, "P 3"], n: int) -> tuple[Tensor, Tensor, Tensor]:
-    face, coordinates = project(directions)
-    column, row = ((coordinates + 1) / 2 * n).long().clamp(0, n - 1).unbind(-1)
-    return face, row, column
+    Args:
+        room: the surroundings.
+        medium: the object.
+        middle: centre of the panorama.
+        side: texels per side of a face; 192 are half a degree each.
+    """
+    radius = float((medium.box[1] - medium.box[0]).norm())
+    radiance, distances = [], []
+    for directions in cube_map.texel_directions(side).split(16384):
+        ones = torch.ones(len(directions))
+        inwards = Rays(middle + radius * directions, -directions, 0 * ones, 0 * ones, 2 * radius * ones)
+        path = Snell()(inwards, medium)
+        starts = torch.where(path.refracted[:, None], path.positions[:, 1], middle)
+        seen, distance = room.seen(Exits(directions, starts))
+        radiance.append(seen)
+        distances.append(distance + (starts - middle).norm(dim=-1))
+    return RoomPanorama(middle, EnvironmentMap.of_texels(torch.cat(radiance)), torch.cat(distances))

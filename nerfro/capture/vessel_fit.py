@@ -13,11 +13,17 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
-from nerfro.capture.grid_search import mean_errors, parabola_minimum, standard_error
-from nerfro.capture.object_errors import COMMON_INDICES, ObjectErrors, ObjectErrorSettings
+from nerfro.capture.object_errors import (
+    COMMON_INDICES,
+    ObjectErrors,
+    ObjectErrorSettings,
+    mean_errors,
+    parabola_minimum,
+    standard_error,
+)
 from nerfro.capture.surroundings import Observations
 from nerfro.core.errors import NerfroError, warn
-from nerfro.core.progress import fraction_bar
+from nerfro.core.progress import counting_bar
 from nerfro.core.provenance import AlgorithmSettings
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.media.bodies import Bodies, GridSettings
@@ -77,11 +83,7 @@ class VesselFit:
 
 
 def find_vessel(
-    medium: Bodies,
-    location: str,
-    mesh: TriangleMesh,
-    observations: Observations,
-    settings: VesselFitSettings = VesselFitSettings(),
+    medium: Bodies, location: str, mesh: TriangleMesh, observations: Observations
 ) -> tuple[dict[str, object], Bodies | None]:
     """Fit a vessel to the photographs, print its lengths, and return the settings of the medium, and the medium.
 
@@ -90,7 +92,6 @@ def find_vessel(
         location: file of the outer surface.
         mesh: the outer surface.
         observations: observations of the object and its surroundings.
-        settings: settings of the fit.
 
     Returns:
         Settings of the vessel except its mesh, and the vessel; none if the surface leaves no cavity.
@@ -110,8 +111,7 @@ def find_vessel(
         return vessel(outer, lengths, Material(_GLASS), liquid, up, grid=grid)
 
     try:
-        with fraction_bar("vessel") as progress:
-            fit = fit_vessel(build, float(np.ptp(across, axis=0).max()), height, observations, progress, settings)
+        fit = fit_vessel(build, float(np.ptp(across, axis=0).max()), height, observations)
         rounded = {name: float(f"{length:.4g}") for name, length in fit.lengths.items()}
         fitted = build(VesselLengths(**rounded))
     except NerfroError as error:
@@ -133,7 +133,6 @@ def fit_vessel(
     width: float,
     height: float,
     observations: Observations,
-    progress: Callable[[float], None] = lambda done: None,
     settings: VesselFitSettings = VesselFitSettings(),
 ) -> VesselFit:
     """Fit wall, foot, fillet and level of an open vessel.
@@ -142,7 +141,6 @@ def fit_vessel(
         build: makes the vessel from its lengths, with water if they have a level.
         width, height: size of the outer surface, world units.
         observations: observations of the object and its surroundings.
-        progress: called with the completed fraction.
         settings: typical lengths, candidates and limits.
     """
     settings.use()
@@ -150,32 +148,32 @@ def fit_vessel(
     widest = typical | {"fillet": settings.max_fillet * width}  # distances are exact up to this depth
     empty, filled = build(VesselLengths(**widest)), build(VesselLengths(**widest, level=0.5 * height))
     work = 1 + len(settings.levels) + len(settings.rounds) * (len(typical) + 1) * settings.num_candidates
-    search = ObjectErrors(observations, lambda count: progress(min(1.0, count / work)), settings.errors)
     levels: list[dict[str, float]] = [{}, *({"level": level * height} for level in settings.levels)]
 
     def error_of(lengths: dict[str, float]) -> Float[np.ndarray, "V"]:
         return search.of(with_lengths(filled if "level" in lengths else empty, VesselLengths(**lengths)))
 
-    errors = [error_of(typical | level) for level in levels]
-    best = int(np.argmin([search.mean(error) for error in errors]))
-    typical |= levels[best] if best and search.decreases(errors[0], errors[best], settings.num_errors) else {}
-    lengths, standard_errors = dict(typical), dict[str, float]()
-    highest = settings.max_level * height
-    offsets = np.linspace(-1, 1, settings.num_candidates)
-    for factor, fraction in settings.rounds:
-        for name in typical:
-            is_level = name == "level"
-            half_width = fraction * height if is_level else np.log(factor)
-            middle = lengths[name] if is_level else np.log(lengths[name])
-            grid = middle + half_width * offsets
-            values = grid.clip(max=highest) if is_level else np.exp(grid)
-            sums = np.stack([error_of(lengths | {name: value}) for value in values.tolist()])
-            # Robust errors have narrow minima, which a quadratic function through all candidates would miss.
-            minimum = parabola_minimum(grid, mean_errors(sums, search.counts))[0]
-            minima = parabola_minimum(grid, mean_errors(sums, search.counts, search.samples))
-            spread = float(standard_error(minima, search.counts))
-            lengths[name] = float(min(minimum, highest) if is_level else np.exp(minimum))
-            standard_errors[name] = spread if is_level else spread * lengths[name]
+    with counting_bar("vessel", work) as advance:
+        search = ObjectErrors(observations, advance, settings.errors)
+        errors = [error_of(typical | level) for level in levels]
+        best = int(np.argmin([search.mean(error) for error in errors]))
+        typical |= levels[best] if best and search.decreases(errors[0], errors[best], settings.num_errors) else {}
+        lengths, standard_errors = dict(typical), dict[str, float]()
+        highest = settings.max_level * height
+        offsets = np.linspace(-1, 1, settings.num_candidates)
+        for factor, fraction in settings.rounds:
+            for name in typical:
+                is_level = name == "level"
+                half_width = fraction * height if is_level else np.log(factor)
+                middle = lengths[name] if is_level else np.log(lengths[name])
+                grid = middle + half_width * offsets
+                values = grid.clip(max=highest) if is_level else np.exp(grid)
+                sums = np.stack([error_of(lengths | {name: value}) for value in values.tolist()])
+                # Robust errors have narrow minima, which a quadratic function through all candidates would miss.
+                minimum = parabola_minimum(grid, mean_errors(sums, search.counts))[0]
+                minima = parabola_minimum(grid, mean_errors(sums, search.counts, search.samples))
+                spread = float(standard_error(minima, search.counts))
+                lengths[name] = float(min(minimum, highest) if is_level else np.exp(minimum))
+                standard_errors[name] = spread if is_level else spread * lengths[name]
     unknown = [name for name in typical if standard_errors[name] > settings.max_standard_error * lengths[name]]
-    progress(1.0)
     return VesselFit(lengths | {name: typical[name] for name in unknown}, standard_errors, unknown)

@@ -54,6 +54,14 @@ def track(description: str, items: Iterable[Item], total: int | None = None, **o
 
 
 @contextmanager
+def counting_bar(description: str, total: float) -> Iterator[Callable[..., None]]:
+    """Show a progress bar; the yielded function adds completed work, of 1 by default, up to the estimated total."""
+    with progress_bar(description, total) as progress:
+        yield lambda work=1: progress.update(min(work, total - progress.n))
+        progress.update(total - progress.n)
+
+
+@contextmanager
 def fraction_bar(description: str) -> Iterator[Callable[[float], None]]:
     """Show a progress bar; the yielded function sets the completed fraction in [0, 1]."""
     with progress_bar(description, 1.0) as progress:

@@ -55,6 +55,13 @@ def corner_normals(mesh: TriangleMesh) -> Float[np.ndarray, "F 3 3"]:
     return np.where(trusted, mesh.normals, smoothed)
 
 
+def axes_along(last: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """Return orthonormal axes in rows, of which the last one is a given unit vector."""
+    across = np.cross(last, np.eye(3)[np.abs(last).argmin()])
+    across /= np.linalg.norm(across)
+    return np.stack([across, np.cross(last, across), last])
+
+
 def unit(vectors: Float[np.ndarray, "vectors 3"]) -> Float[np.ndarray, "vectors 3"]:
     """Normalize vectors; zero vectors stay zero."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)

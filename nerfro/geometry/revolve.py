@@ -7,6 +7,7 @@ import trimesh
 from jaxtyping import Float
 
 from nerfro.geometry.mesh import TriangleMesh
+from nerfro.geometry.normals import axes_along
 
 
 def revolve(
@@ -21,7 +22,4 @@ def revolve(
     """
     size = np.ptp(profile, axis=0).max()  # trimesh drops triangles with areas below 1e-8
     body = trimesh.creation.revolve(profile / size, sections=160)
-    across = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
-    across /= np.linalg.norm(across)
-    vertices = size * body.vertices @ np.stack([across, np.cross(axis, across), axis]) + foot
-    return TriangleMesh(vertices, np.asarray(body.faces))
+    return TriangleMesh(size * body.vertices @ axes_along(axis) + foot, np.asarray(body.faces))

@@ -18,6 +18,7 @@ from nerfro.core.provenance import AlgorithmSettings
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.masks.outline_hull import AGREES, MAX_SIDE, MIN_VIEWS, OutlineHull, OutlineHullSettings
 from nerfro.poses.opencv import opencv
+from nerfro.silhouettes.silhouettes import intersection_over_union
 
 _NUM_COMPONENTS = 5  # mixture components per region in OpenCV's GrabCut
 
@@ -159,10 +160,10 @@ def check_tracked(
             "Segment Anything 2 does not find the same object in several images; outline the object in more images"
         )
     seen = outlines.seen_from([*given, *tracked], hull)
-    overlaps = {view: _overlap(mask, seen[view]) for view, mask in tracked.items()}
+    overlaps = {view: float(intersection_over_union(mask, seen[view])) for view, mask in tracked.items()}
     by_hull = [view for view in tracked if overlaps[view] < AGREES]
     masks = {**given, **tracked, **{view: seen[view] for view in by_hull}}
-    agreement = {view: _overlap(mask, seen[view]) for view, mask in given.items()}
+    agreement = {view: float(intersection_over_union(mask, seen[view])) for view, mask in given.items()}
     return Segmentation(masks, overlaps, by_hull, "visual hull", agreement, "Segment Anything 2")
 
 
@@ -199,36 +200,21 @@ def propagate(
     wanted = [view for view in range(len(images)) if view not in given]
     settings.use()
     outlines = OutlineHull(cameras, given, settings.hull)
-    strategy = _choose_strategy(images, outlines, given, wanted, hull_only, settings)
+    guide, shape, uses_grab_cut = _choose_strategy(images, outlines, given, wanted, hull_only, settings)
     accepted, overlaps = {}, {}
-    if strategy.uses_grab_cut:
+    if uses_grab_cut:
         for view in wanted:
-            region, cut = _guided(images[view], outlines, view, strategy.surface, settings)
-            overlaps[view] = _overlap(cut, region)
+            region, cut = _guided(images[view], outlines, view, guide, settings)
+            overlaps[view] = float(intersection_over_union(cut, region))
             if overlaps[view] >= AGREES:
                 accepted[view] = cut
             progress()
-    surface = OutlineHull(cameras, {**given, **accepted}, settings.hull).hull() if accepted else strategy.surface
+    surface = OutlineHull(cameras, {**given, **accepted}, settings.hull).hull() if accepted else guide
     by_hull = [view for view in wanted if view not in accepted]
     projections = outlines.seen_from([*by_hull, *given], surface)
     masks = {**given, **accepted, **{view: projections[view] for view in by_hull}}
-    agreement = {view: _overlap(mask, projections[view]) for view, mask in given.items()}
-    return Segmentation(masks, overlaps, by_hull, strategy.shape, agreement)
-
-
-@dataclass(frozen=True)
-class _Strategy:
-    """How missing masks are made.
-
-    Attributes:
-        surface: surface whose projections guide GrabCut, or are the masks; None only if no mask is missing.
-        shape: shape of the surface.
-        uses_grab_cut: whether GrabCut segments the views.
-    """
-
-    surface: TriangleMesh | None
-    shape: Shape
-    uses_grab_cut: bool
+    agreement = {view: float(intersection_over_union(mask, projections[view])) for view, mask in given.items()}
+    return Segmentation(masks, overlaps, by_hull, shape, agreement)
 
 
 def _choose_strategy(
@@ -238,7 +224,7 @@ def _choose_strategy(
     wanted: Sequence[int],
     hull_only: bool,
     settings: SegmentationSettings,
-) -> _Strategy:
+) -> tuple[TriangleMesh | None, Shape, bool]:
     """Choose between projections and GrabCut, and between a body of revolution and the visual hull (see `propagate`).
 
     Args:
@@ -249,12 +235,16 @@ def _choose_strategy(
         hull_only: do not use GrabCut.
         settings: settings of GrabCut.
 
+    Returns:
+        The surface whose projections guide GrabCut, or are the masks (None only if no mask is missing), its shape, and
+        whether GrabCut segments the views.
+
     Raises:
         NerfroError: too few views agree with the given masks.
     """
     body = outlines.revolution() if wanted and 2 <= len(given) <= settings.few else None
     if body is not None:
-        return _Strategy(body, "body of revolution", uses_grab_cut=False)
+        return body, "body of revolution", False
     if not hull_only and len(given) < MIN_VIEWS:
         _add_reference_views(images, outlines, settings)
     if wanted and len(outlines) < MIN_VIEWS:
@@ -276,7 +266,7 @@ def _choose_strategy(
         )
     are_few = MIN_VIEWS < len(given) <= settings.few
     uses_grab_cut = not hull_only and not (are_few and _hull_predicts_better(images, outlines, given, settings))
-    return _Strategy(hull, "visual hull", uses_grab_cut)
+    return hull, "visual hull", uses_grab_cut
 
 
 def _guided(
@@ -302,14 +292,8 @@ def _hull_predicts_better(
     gains = []
     for view, mask in given.items():
         region, cut = _guided(images[view], outlines, view, None, settings)
-        gains.append(_overlap(region, mask) - _overlap(cut, mask))
+        gains.append(intersection_over_union(region, mask) - intersection_over_union(cut, mask))
     return float(np.mean(gains)) > 0
-
-
-def _overlap(one: Bool[np.ndarray, "H W"], other: Bool[np.ndarray, "H W"]) -> float:
-    """Compute the intersection over union of two masks; 1 for empty masks."""
-    either = (one | other).sum()
-    return float((one & other).sum() / either) if either else 1.0
 
 
 def _add_reference_views(

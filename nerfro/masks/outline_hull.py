@@ -14,7 +14,7 @@ from nerfro.core.provenance import AlgorithmSettings
 from nerfro.geometry.lines import nearest_point
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.poses.opencv import opencv
-from nerfro.silhouettes.pose_conventions import GOOD_OVERLAP, coarse_agreement, overlap
+from nerfro.silhouettes.agreement import GOOD_OVERLAP, coarse_agreement, overlap
 from nerfro.silhouettes.revolution import fit_revolution
 from nerfro.silhouettes.silhouettes import mesh_silhouettes
 from nerfro.silhouettes.upright import camera_up

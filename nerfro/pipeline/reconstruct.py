@@ -33,7 +33,7 @@ from nerfro.poses.collection import collect_photographs
 from nerfro.poses.options import CalibrateConfig
 from nerfro.rendering.scene_file import SCENE, SceneFile, read_scene_file, with_scene
 from nerfro.report.summary import SummaryConfig, summarize
-from nerfro.silhouettes.overlaps import SHEET
+from nerfro.silhouettes.agreement import SHEET
 from nerfro.training.build import composed_training
 from nerfro.training.run import Run, run_training
 from nerfro.training.run_folder import CONFIG_FILE

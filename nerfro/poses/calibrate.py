@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 
@@ -17,10 +16,10 @@ from nerfro.files.atomic import refuse_existing
 from nerfro.files.folder_lock import lock_folder
 from nerfro.poses.boards import TagBoard, print_sheets, tag_grid, twelve_faces
 from nerfro.poses.calibrated_data import FILES, ray_range, split_views, write_calibrated
-from nerfro.poses.calibration import Calibration, LensModel, calibrate_by_tags
+from nerfro.poses.calibration import Calibration, calibrate_by_tags
 from nerfro.poses.options import CalibrateConfig
 from nerfro.poses.photographs import list_photographs, luminance, outside_mask
-from nerfro.poses.structure_from_motion import Pairs, SfmSettings, find_model, import_model
+from nerfro.poses.structure_from_motion import SfmSettings, find_model, import_model
 
 # Limits above which a warning is printed: reprojection error in pixels, and relative deviation of the focal length.
 _MAX_ERROR, _MAX_FOCAL_DEVIATION = 0.7, 0.02
@@ -40,25 +39,16 @@ def calibrate(options: CalibrateConfig | None = None, /, **settings: object) -> 
         NerfroError: an option is missing, the photographs do not determine the poses, or files exist.
     """
     options = options_of(CalibrateConfig, options, settings)
-    out = _checked_folder(options)
-    with lock_folder(out, "out"):
-        _calibrate(options, out)
-    return Capture(out)
-
-
-def _checked_folder(options: CalibrateConfig) -> Path:
-    """Check the options, and return the output folder.
-
-    Raises:
-        NerfroError: an option is missing.
-    """
     if options.out is None:
         raise NerfroError("out= is missing; set out= to the folder for the data set")
     if options.images is None and not (options.write_board and options.target != "colmap"):
         raise NerfroError(
             "images= is missing; set images= to the folder of the photographs, or write_board=true to print a board"
         )
-    return user_path(options.out)
+    out = user_path(options.out)
+    with lock_folder(out, "out"):
+        _calibrate(options, out)
+    return Capture(out)
 
 
 def _make_board(options: CalibrateConfig) -> TagBoard:
@@ -76,14 +66,13 @@ def _calibrate(options: CalibrateConfig, out: Path) -> None:
         _write_board(board, out, options.overwrite)
     if options.images is None:
         return
-    lens = cast(LensModel, options.lens)
     images, size = list_photographs(user_path(options.images))
     # Masks lie where the loader of the data set will look for them.
     masks = [find_mask(out, out / relative_path(image, out)) for image in images]
     require_used(out, [out / relative_path(image, out) for image in images], masks)
     refuse_existing([out / name for name in FILES], options.overwrite)
     if board is None:
-        settings = SfmSettings(lens, cast(Pairs, options.pairs), options.threads, options.mask_labels)
+        settings = SfmSettings(options.lens, options.pairs, options.threads, options.mask_labels)
         model = find_model(options.reconstruction, images, masks, out / "sparse", settings, options.overwrite)
         calibration, points = import_model(model, images, size)
         quads, seen = [], points
@@ -92,11 +81,11 @@ def _calibrate(options: CalibrateConfig, out: Path) -> None:
             image.name: outside_mask(board.detect(luminance(image)), mask, options.mask_labels)
             for image, mask in zip(track("detecting tags", images), masks, strict=True)
         }
-        calibration = calibrate_by_tags(detections, size, lens)
-        quads, points = [sheet.corners for sheet in board.sheets()], np.empty((0, 3))
+        calibration = calibrate_by_tags(detections, size, options.lens)
+        quads, points = [board.face_corners(face) for face in board.faces], np.empty((0, 3))
         seen = np.concatenate(quads)
     # With an existing model, the option has no effect.
-    may_distort = lens == "pinhole" and (board is not None or model.is_relative_to(out / "sparse"))
+    may_distort = options.lens == "pinhole" and (board is not None or model.is_relative_to(out / "sparse"))
     _report(calibration, "points" if board is None else "tags", may_distort, out)
     splits = split_views([image.name for image in images if image.name in calibration.poses], options.test_every)
     reach = ray_range(calibration, seen)

@@ -15,6 +15,7 @@ from nerfro.core.cameras import up_direction
 from nerfro.core.paths import relative_path
 from nerfro.files.atomic import write_atomically
 from nerfro.geometry.lines import nearest_point
+from nerfro.geometry.normals import axes_along
 from nerfro.poses.calibration import Calibration
 
 SPLITS = ("train", "val", "test")
@@ -131,7 +132,7 @@ def _plot_cameras(
     if len(points):
         low, high = np.quantile(points, (0.02, 0.98), axis=0)
         points = points[((points >= low) & (points <= high)).all(1)][:: -(-len(points) // 4000)]
-    axes_shown = np.eye(3) if quads else _upright(up_direction(torch.from_numpy(-poses[:, :, 1])).numpy())
+    axes_shown = np.eye(3) if quads else axes_along(up_direction(torch.from_numpy(-poses[:, :, 1])).numpy())
     cameras, points = np.einsum("ij,vjk->vik", axes_shown, poses), points @ axes_shown.T
     focus = nearest_point(cameras[:, :, 3], cameras[:, :, 2])
     figure = Figure(figsize=(13, 6.5), layout="constrained", dpi=110)
@@ -150,10 +151,3 @@ def _plot_cameras(
     content = io.BytesIO()
     FigureCanvasAgg(figure).print_png(content)
     return content.getvalue()
-
-
-def _upright(up: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Return axes whose last one is a unit vector."""
-    across = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
-    across /= np.linalg.norm(across)
-    return np.stack([across, np.cross(up, across), up])

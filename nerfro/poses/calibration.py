@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -12,8 +11,7 @@ from nerfro.core.errors import NerfroError
 from nerfro.core.provenance import AlgorithmSettings
 from nerfro.poses.boards import TagDetections
 from nerfro.poses.opencv import opencv
-
-LensModel = Literal["pinhole", "radial", "opencv"]
+from nerfro.poses.options import LensModel
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,8 @@ from annotated_types import Ge, Le
 from nerfro.data.frames import Every
 from nerfro.registry.allowed import Count, Natural, Positive
 
+LensModel = Literal["pinhole", "radial", "opencv"]
+Pairs = Literal["sequential", "all"]
 Squares = Annotated[int, Ge(1), Le(100)]  # along a side of a board
 
 
@@ -49,9 +51,9 @@ class CalibrateConfig:
     size: Positive = 0.05
     write_board: bool = False
     reconstruction: str | None = None
-    pairs: Literal["sequential", "all"] | None = None
+    pairs: Pairs | None = None
     threads: Count | None = None
-    lens: Literal["pinhole", "radial", "opencv"] = "pinhole"
+    lens: LensModel = "pinhole"
     mask_labels: list[Natural] | None = None
     test_every: Every = 8
     overwrite: bool = False

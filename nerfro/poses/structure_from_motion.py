@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -23,15 +23,14 @@ from scipy.sparse.csgraph import connected_components
 from nerfro.core.errors import NerfroError
 from nerfro.core.optional import optional
 from nerfro.core.paths import user_path
-from nerfro.core.progress import progress_bar, track
+from nerfro.core.progress import counting_bar, track
 from nerfro.core.provenance import AlgorithmSettings
 from nerfro.data.formats.colmap_model import MODEL_FOLDERS, find_model_folder, lens_of, read_colmap
 from nerfro.data.image_files import read_mask, to_unit
 from nerfro.data.lenses import Lens, check_lenses
 from nerfro.files.atomic import refuse_existing, require_room, write_atomically
-from nerfro.poses.calibration import Calibration, Intrinsics, LensModel, Pose
-
-Pairs = Literal["sequential", "all"]
+from nerfro.poses.calibration import Calibration, Intrinsics, Pose
+from nerfro.poses.options import LensModel, Pairs
 
 _MODELS = "models"  # temporary folder of new models
 # COLMAP's camera model for each of nerfro's lens models.
@@ -226,12 +225,8 @@ def _map(pycolmap: Any, database: Path, images: Sequence[Path], threads: int) ->
     mapping.random_seed, mapping.num_threads = 0, threads
     folder = database.with_name(_MODELS)
     folder.mkdir(exist_ok=True)
-    with progress_bar("registering images", len(images)) as progress:
-
-        def advance(count: int = 1) -> None:
-            # Registrations in a model that COLMAP discards are counted again in the next one.
-            progress.update(min(count, len(images) - progress.n))
-
+    # Registrations in a model that COLMAP discards are counted again in the next one.
+    with counting_bar("registering images", len(images)) as advance:
         return pycolmap.incremental_mapping(
             database,
             images[0].parent,
@@ -244,8 +239,7 @@ def _map(pycolmap: Any, database: Path, images: Sequence[Path], threads: int) ->
 
 def _chunks(items: Sequence[Any], size: int, description: str) -> Iterator[Sequence[Any]]:
     """Divide work into chunks with a progress bar, because COLMAP reports no progress."""
-    starts = range(0, len(items), size)
-    return (items[start : start + size] for start in track(description, starts))
+    return (items[start : start + size] for start in track(description, range(0, len(items), size)))
 
 
 def _linked(models: dict[int, Any], settings: SfmSettings) -> set[str]:

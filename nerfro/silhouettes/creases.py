@@ -52,7 +52,7 @@ def sharpened(
     mesh: MovingMesh,
     rims_of: Callable[[Float[np.ndarray, "vertices 3"]], Rims],
     sides: Sides,
-    step: Callable[[], None] = lambda: None,
+    step: Callable[[], object] = lambda: None,
     settings: CreaseSettings = CreaseSettings(),
 ) -> Float[np.ndarray, "vertices 3"]:
     """Move vertices in all directions until sides are smooth, edges are sharp, and contours meet the masks.

@@ -11,6 +11,7 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from nerfro.geometry.normals import unit
+from nerfro.geometry.orientation import area_vectors
 
 # Cosine of the smallest angle between the triangles at a crease, and between the normals on both sides beyond them.
 _CREASE = np.cos(np.radians(30))
@@ -51,8 +52,7 @@ class MovingMesh:
 
     def face_normals(self, vertices: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "F 3"]:
         """Compute triangle normals whose length is twice the area."""
-        a, b, c = vertices[self.faces].swapaxes(0, 1)
-        return np.cross(b - a, c - a)
+        return area_vectors(vertices[self.faces])
 
     def normals(self, vertices: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "vertices 3"]:
         """Compute unit vertex normals as area-weighted means over the adjacent triangles."""

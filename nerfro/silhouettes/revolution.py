@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -15,6 +14,7 @@ from torch.func import jacfwd
 from torch.nn import functional
 from torch.nn.functional import normalize
 
+from nerfro.core.progress import track
 from nerfro.core.provenance import AlgorithmSettings
 from nerfro.core.robust import geman_mcclure_weight
 from nerfro.geometry.mesh import TriangleMesh
@@ -97,15 +97,11 @@ class Profile:
     radii: Float[Tensor, " profile"]
     edge: float = 0.0
 
-    def in_plane(self, points: Float[Tensor, "*points 3"]) -> tuple[Float[Tensor, "*points"], Float[Tensor, "*points"]]:
-        """Return the distance of points from the axis, and their height above the foot."""
-        offset = points - self.foot
-        along = offset @ self.axis
-        return (offset - along[..., None] * self.axis).square().sum(-1).clamp(min=1e-20).sqrt(), along
-
     def distance(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
         """Compute an approximate signed distance, negative inside; exactly zero on the surface except at its edges."""
-        radius, along = self.in_plane(points)
+        offset = points - self.foot
+        along = offset @ self.axis
+        radius = (offset - along[..., None] * self.axis).square().sum(-1).clamp(min=1e-20).sqrt()
         step = self.height / (len(self.radii) - 1)
         knot = (along / step).clamp(0, len(self.radii) - 1.001)
         low = knot.floor().long()
@@ -126,7 +122,6 @@ class Profile:
 def fit_revolution(
     mesh: TriangleMesh,
     silhouettes: Silhouettes,
-    progress: Callable[[float], None] = lambda done: None,
     axis: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]] | None = None,
     settings: RevolutionSettings = RevolutionSettings(),
 ) -> TriangleMesh | None:
@@ -139,7 +134,6 @@ def fit_revolution(
     Args:
         mesh: initial surface.
         silhouettes: silhouettes of the object.
-        progress: called with the completed fraction.
         axis: a point on the initial axis and the unit direction of the axis; None takes the axis around which the
             initial surface is most circular. With a given axis, the initial radii are those of the largest body of
             revolution inside the initial surface, because the visual hull of few views is much wider than the object.
@@ -180,7 +174,7 @@ def fit_revolution(
     bends[:end] *= settings.end_bending
     bends[-end:] *= settings.end_bending
     first_scale, last_scale = settings.robust_scale
-    for iteration in range(settings.iterations):
+    for iteration in track("finding the axis", range(settings.iterations)):
         done = min(1.0, iteration / (settings.iterations - 6))
         scale = first_scale * (last_scale / first_scale) ** done
         lengths = _nearest_lengths(body(numbers), origins, directions, settings)
@@ -195,7 +189,6 @@ def fit_revolution(
         damping = 1e-3 * system.diagonal().mean() * torch.eye(len(numbers)).double()
         step = torch.linalg.solve(system + damping, right)
         numbers = numbers - (step * (settings.max_step / step.abs().max()).clamp(max=1)).float()
-        progress((iteration + 1) / settings.iterations)
     return _without_hidden_cone(body(numbers), least_sine, settings).mesh()
 
 

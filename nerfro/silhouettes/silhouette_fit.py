@@ -2,23 +2,30 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy import sparse
 from scipy.spatial import cKDTree
 
+from nerfro.core.progress import progress_bar
 from nerfro.core.provenance import AlgorithmSettings
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.silhouettes.creases import CreaseSettings, Sides, has_creases, sharpened
-from nerfro.silhouettes.moving_mesh import MovingMesh, solve_symmetric
-from nerfro.silhouettes.pixel_sides import PixelSideSettings, by_pixel_sides
-from nerfro.silhouettes.rims import Outlines, Rims, RimSettings, find_rims, outlines_of
+from nerfro.silhouettes.moving_mesh import MeshGeometry, MovingMesh, solve_symmetric
+from nerfro.silhouettes.rims import (
+    Outlines,
+    PixelSideSettings,
+    Rims,
+    RimSettings,
+    by_pixel_sides,
+    find_rims,
+    outlines_of,
+)
 from nerfro.silhouettes.silhouettes import VALIDATION_EVERY, is_antialiased
 from nerfro.silhouettes.visual_hull import Silhouettes
 
@@ -96,11 +103,7 @@ class FitSettings(AlgorithmSettings):
 
 
 def fit_surface(
-    mesh: TriangleMesh,
-    silhouettes: Silhouettes,
-    smoothing: float = 1.0,
-    progress: Callable[[float], None] = lambda done: None,
-    settings: FitSettings = FitSettings(),
+    mesh: TriangleMesh, silhouettes: Silhouettes, smoothing: float = 1.0, settings: FitSettings = FitSettings()
 ) -> TriangleMesh:
     """Fit a smooth surface whose contours meet the outlines of the masks.
 
@@ -135,30 +138,25 @@ def fit_surface(
         mesh: closed mesh with triangles of similar size, as marching cubes produces.
         silhouettes: silhouettes of the object.
         smoothing: factor of the selected strength; larger values suit masks drawn by hand.
-        progress: called with the completed fraction.
         settings: priors, numbers of steps and limits.
     """
     settings.use()
-    fit = _Fit(mesh, silhouettes, settings)
-    count, total = itertools.count(1), 2 * settings.steps + 3 * settings.last_steps
-
-    def step() -> None:
-        progress(next(count) / total)
-
-    starts = [fit.search(prior, step) for prior in (settings.round_prior, settings.flat_prior)]
-    probit = fit.has_accurate_binary_masks(starts)
-    num_last_steps = settings.probit_steps if probit else settings.last_steps
-    total = 2 * settings.steps + 3 * num_last_steps
-    candidates = [fit.tried(start, probit, step) for start in starts]
-    flat, creases = starts[-1], settings.creases
-    if has_creases(fit.mesh.geometry(flat.vertices)):
-        total += 2 * creases.steps
-        facets, curved = (fit.with_creases(flat, sides, probit, step) for sides in (creases.facets, creases.curved))
-        candidates.append(facets if facets.error <= settings.tolerance * curved.error else curved)
-    best = min(candidates, key=lambda candidate: candidate.error)
-    if best.sides is not None:
-        total += creases.steps - num_last_steps
-    return TriangleMesh(fit.finished(best, fit.outlines, probit, step, smoothing), mesh.faces)
+    fit, creases = _Fit(mesh, silhouettes, settings), settings.creases
+    with progress_bar("fitting", 2 * settings.steps + 3 * settings.last_steps) as bar:
+        starts = [fit.search(prior, bar.update) for prior in (settings.round_prior, settings.flat_prior)]
+        probit = fit.has_accurate_binary_masks(starts)
+        num_last_steps = settings.probit_steps if probit else settings.last_steps
+        bar.total = 2 * settings.steps + 3 * num_last_steps
+        candidates = [fit.tried(start, probit, bar.update) for start in starts]
+        if has_creases(fit.mesh.geometry(starts[-1].vertices)):
+            bar.total += 2 * creases.steps
+            sharp = (starts[-1]._replace(sides=sides) for sides in (creases.facets, creases.curved))
+            facets, curved = (fit.tried(candidate, probit, bar.update) for candidate in sharp)
+            candidates.append(facets if facets.error <= settings.tolerance * curved.error else curved)
+        best = min(candidates, key=lambda candidate: candidate.error)
+        if best.sides is not None:
+            bar.total += creases.steps - num_last_steps
+        return TriangleMesh(fit.finished(best, fit.outlines, probit, bar.update, smoothing), mesh.faces)
 
 
 class _Candidate(NamedTuple):
@@ -167,7 +165,7 @@ class _Candidate(NamedTuple):
     prior: Prior
     strength: float
     vertices: Float[np.ndarray, "vertices 3"]
-    error: float  # mean misfit to the validation views in world units, see `_Fit.search`, `tried` and `with_creases`
+    error: float  # mean misfit to the validation views in world units, see `_Fit.search` and `tried`
     sides: Sides | None = None  # prior of the sides, for a surface with sharp edges
 
 
@@ -178,7 +176,7 @@ class _Fit:
         self.settings = settings
         self.start, self.mesh, self.silhouettes = mesh.vertices, MovingMesh(mesh.faces), silhouettes
         self.size = float(np.ptp(mesh.vertices, axis=0).max())
-        self.edges = edges = self.mesh.edges
+        edges = self.mesh.edges
         self.degree = np.bincount(edges.ravel())
         # Sparse matrix that maps values at vertices to differences along edges.
         signs, number = np.repeat([1.0, -1.0], len(edges)), np.tile(np.arange(len(edges)), 2)
@@ -186,7 +184,7 @@ class _Fit:
         self.outlines = outlines_of(silhouettes)
         self.training, self.validation = _split_views(self.outlines)
 
-    def search(self, prior: Prior, step: Callable[[], None]) -> _Candidate:
+    def search(self, prior: Prior, step: Callable[[], object]) -> _Candidate:
         """Fit with decreasing strength of the prior, and select the strength by validation views."""
         vertices, candidates = self.start, []
         for strength in np.geomspace(prior.first, prior.last, self.settings.steps).tolist():
@@ -196,23 +194,21 @@ class _Fit:
         limit = self.settings.tolerance * min(candidate.error for candidate in candidates)
         return next(candidate for candidate in candidates if candidate.error <= limit)
 
-    def tried(self, candidate: _Candidate, probit: bool, step: Callable[[], None]) -> _Candidate:
-        """Compute the validation error after trial steps, which are the last steps with the training views."""
-        vertices = self.finished(candidate, self.training, probit, step)
-        return candidate._replace(error=self.validation_error(vertices, probit))
+    def tried(self, candidate: _Candidate, probit: bool, step: Callable[[], object]) -> _Candidate:
+        """Compute the validation error after trial steps, which are the last steps with the training views.
 
-    def with_creases(self, blunt: _Candidate, sides: Sides, probit: bool, step: Callable[[], None]) -> _Candidate:
-        """Sharpen the edges with the training views, and compute the validation error; last steps start there."""
-        candidate = blunt._replace(sides=sides)
+        The last steps of a surface with sharp edges start from the result.
+        """
         vertices = self.finished(candidate, self.training, probit, step)
-        return candidate._replace(vertices=vertices, error=self.validation_error(vertices, probit))
+        start = candidate.vertices if candidate.sides is None else vertices
+        return candidate._replace(vertices=start, error=self.validation_error(vertices, probit))
 
     def finished(
         self,
         candidate: _Candidate,
         outlines: Outlines,
         probit: bool,
-        step: Callable[[], None],
+        step: Callable[[], object],
         smoothing: float = 1.0,
     ) -> Float[np.ndarray, "vertices 3"]:
         """Make the last steps of a candidate and return its vertices.
@@ -298,11 +294,10 @@ class _Fit:
         normals, rims = surface.normals, find_rims(surface, self.silhouettes, outlines, settings.rims)
         if contour_error is not None:
             rims = by_pixel_sides(rims, self.silhouettes, contour_error, settings.pixel_sides)
-        curvature = _mean_curvature(vertices, normals, self.edges, self.mesh.mean)
+        curvature = _mean_curvature(surface, self.mesh.mean)
         typical = np.zeros_like(curvature.value)
         if prior.typical_curvature:
-            distance = settings.normal_distance * self.size
-            typical = _typical_curvature(curvature.value, vertices, normals, distance, settings)
+            typical = _typical_curvature(curvature.value, surface, settings.normal_distance * self.size, settings)
         excess = curvature.value - typical
         # While the prior is strong, large curvature may belong to the roofs of the visual hull instead of edges.
         stiffness = self._stiffness(excess, prior.edge * max(1.0, strength))
@@ -311,12 +306,12 @@ class _Fit:
         bending = per_observation * prior.bending * self.size**2 * (settings.reduced_bending if steady else 1)
         terms = [
             (1.0, _outline_term(rims, normals)),
-            (per_observation * prior.area, self._area_term(vertices, normals, stiffness, pressure)),
+            (per_observation * prior.area, self._area_term(surface, stiffness, pressure)),
             (bending, _bending_term(curvature, stiffness, excess)),
         ]
         if steady:
             changes = steady * len(rims.fraction) * self.size**2
-            terms.append((changes, self._change_term(vertices, normals, curvature)))
+            terms.append((changes, self._change_term(surface, curvature)))
         system = sum(weight * term.system for weight, term in terms)
         right = np.sum([weight * term.right for weight, term in terms], axis=0)
         longest = 2 * self.mesh.edge_length(vertices)
@@ -329,23 +324,17 @@ class _Fit:
         return 1 / np.hypot(1, 0.5 * (bent + self.mesh.mean @ bent) / edge)
 
     def _area_term(
-        self,
-        vertices: Float[np.ndarray, "vertices 3"],
-        normals: Float[np.ndarray, "vertices 3"],
-        stiffness: Float[np.ndarray, " vertices"],
-        pressure: Float[np.ndarray, " vertices"],
+        self, surface: MeshGeometry, stiffness: Float[np.ndarray, " vertices"], pressure: Float[np.ndarray, " vertices"]
     ) -> _Term:
         """Sum of squared edge lengths, balanced by a pressure along the normals."""
-        tension = self.across.T @ sparse.diags(stiffness[self.edges].prod(1)) @ self.across
-        system = sum(n @ tension @ n for n in map(sparse.diags, normals.T))
-        stretched = sum(normals[:, axis] * (tension @ vertices[:, axis]) for axis in range(3))
+        tension = self.across.T @ sparse.diags(stiffness[surface.edges].prod(1)) @ self.across
+        system = sum(n @ tension @ n for n in map(sparse.diags, surface.normals.T))
+        stretched = sum(n * (tension @ x) for n, x in zip(surface.normals.T, surface.vertices.T, strict=True))
         return _Term(system, pressure - stretched)
 
-    def _change_term(
-        self, vertices: Float[np.ndarray, "vertices 3"], normals: Float[np.ndarray, "vertices 3"], curvature: _Curvature
-    ) -> _Term:
+    def _change_term(self, surface: MeshGeometry, curvature: _Curvature) -> _Term:
         """Sum of squared changes of curvature along edges and flat sides."""
-        alike = sparse.diags(_along_edges(vertices, normals, self.edges, self.mesh.mean, self.settings))
+        alike = sparse.diags(_along_edges(surface, self.mesh.mean, self.settings))
         changes = curvature.change.T @ self.across.T @ alike @ self.across
         return _Term(changes @ curvature.change, -changes @ curvature.value)
 
@@ -395,18 +384,14 @@ def _split_views(outlines: Outlines) -> tuple[Outlines, Outlines]:
     return {view: outline for view, outline in outlines.items() if view not in validation}, validation
 
 
-def _mean_curvature(
-    vertices: Float[np.ndarray, "vertices 3"],
-    normals: Float[np.ndarray, "vertices 3"],
-    edges: Int[np.ndarray, "edges 2"],
-    mean: sparse.csr_matrix,
-) -> _Curvature:
+def _mean_curvature(surface: MeshGeometry, mean: sparse.csr_matrix) -> _Curvature:
     """Compute the curvature at vertices, see `_Curvature`.
 
     The mean of the neighbours of a vertex is displaced by r^2 H / 2 along the normal, with the mean curvature H and the
     mean squared edge length r^2.
     """
-    both = np.concatenate([edges, edges[:, ::-1]])
+    vertices, normals = surface.vertices, surface.normals
+    both = np.concatenate([surface.edges, surface.edges[:, ::-1]])
     square = ((vertices[both[:, 0]] - vertices[both[:, 1]]) ** 2).sum(1)
     around = np.bincount(both[:, 0], square) / np.bincount(both[:, 0])
     typical = around.mean()
@@ -417,19 +402,14 @@ def _mean_curvature(
     return _Curvature(change.tocsr(), scale @ (normals * (umbrella @ vertices)).sum(1), around)
 
 
-def _along_edges(
-    vertices: Float[np.ndarray, "vertices 3"],
-    normals: Float[np.ndarray, "vertices 3"],
-    edges: Int[np.ndarray, "edges 2"],
-    mean: sparse.csr_matrix,
-    settings: FitSettings,
-) -> Float[np.ndarray, " edges"]:
+def _along_edges(surface: MeshGeometry, mean: sparse.csr_matrix, settings: FitSettings) -> Float[np.ndarray, " edges"]:
     """Weight edges by their alignment with the direction of smallest curvature: 1 along, 0 across, 1 if undefined."""
-    along, turn = (values[edges[:, 1]] - values[edges[:, 0]] for values in (vertices, normals))
+    edges, num_vertices = surface.edges, len(surface.vertices)
+    along, turn = (values[edges[:, 1]] - values[edges[:, 0]] for values in (surface.vertices, surface.normals))
     square = (along**2).sum(1)
     turning = turn[:, :, None] * turn[:, None, :] * (square.mean() / square)[:, None, None]
-    sums = [np.bincount(edges.ravel(), np.repeat(products, 2), len(vertices)) for products in turning.reshape(-1, 9).T]
-    around = np.stack(sums, -1) / np.bincount(edges.ravel(), minlength=len(vertices))[:, None]
+    sums = [np.bincount(edges.ravel(), np.repeat(products, 2), num_vertices) for products in turning.reshape(-1, 9).T]
+    around = np.stack(sums, -1) / np.bincount(edges.ravel(), minlength=num_vertices)[:, None]
     for _ in range(settings.blurs):
         around = 0.5 * (around + mean @ around)
     size, direction = np.linalg.eigh(around.reshape(-1, 3, 3))
@@ -441,18 +421,14 @@ def _along_edges(
 
 
 def _typical_curvature(
-    curved: Float[np.ndarray, " vertices"],
-    vertices: Float[np.ndarray, "vertices 3"],
-    normals: Float[np.ndarray, "vertices 3"],
-    normal_distance: float,
-    settings: FitSettings,
+    curved: Float[np.ndarray, " vertices"], surface: MeshGeometry, normal_distance: float, settings: FitSettings
 ) -> Float[np.ndarray, " vertices"]:
     """Compute the curvature that most neighbours of each vertex exceed, with the sign of their median.
 
     Neighbours are nearest in position and normal, with `normal_distance` per radian, so that the opposite side of a
     thin wall is far away.
     """
-    points = np.concatenate([vertices, normal_distance * normals], 1)
+    points = np.concatenate([surface.vertices, normal_distance * surface.normals], 1)
     spread = np.linspace(0, len(points) - 1, min(len(points), settings.num_spread)).astype(np.int64)
     _, index = cKDTree(points[spread]).query(points, k=min(settings.num_neighbours, len(spread)))
     near = curved[spread][index]

@@ -73,6 +73,14 @@ def border_pixels(masks: Float[Tensor, "V H W"]) -> Bool[Tensor, "V Q"]:
     return torch.cat([inside[:, [0, -1]].flatten(1), inside[:, :, [0, -1]].flatten(1)], 1)
 
 
+def intersection_over_union(
+    ours: Bool[np.ndarray, "*V H W"], theirs: Bool[np.ndarray, "*V H W"]
+) -> Float[np.ndarray, "*V"]:
+    """Compute the intersection over union of masks; 1 where both are empty."""
+    both, either = (ours & theirs).sum((-2, -1)), (ours | theirs).sum((-2, -1))
+    return np.where(either > 0, both / np.maximum(either, 1), 1.0)
+
+
 def pixel_stride(cameras: Cameras, max_pixels: int) -> int:
     """Return the subsampling stride for which an image has at most `max_pixels` per side."""
     return -(-max(cameras.width, cameras.height) // max_pixels)

@@ -13,7 +13,7 @@ from nerfro.core.progress import fraction_bar
 from nerfro.core.provenance import AlgorithmSettings
 from nerfro.data.base import Views
 from nerfro.geometry.mesh import TriangleMesh, num_decimals
-from nerfro.silhouettes.pose_conventions import overlap
+from nerfro.silhouettes.agreement import overlap
 from nerfro.silhouettes.revolution import RevolutionSettings, Symmetry, fit_revolution
 from nerfro.silhouettes.silhouette_fit import FitSettings, fit_surface
 from nerfro.silhouettes.silhouettes import border_pixels
@@ -141,16 +141,14 @@ def make_mesh(
     num_parts, num_kept = remove_strays(distances, keep)
     mesh, revolution = extract_surface(distances, corner, spacing), None
     if symmetry is not None and is_revolution:
-        revolution = _revolution(mesh, silhouettes, settings)
+        revolution = fit_revolution(mesh, silhouettes, settings=settings.revolution)
     if revolution is None and smoothing > 0:
-        with fraction_bar("fitting") as progress:
-            mesh = fit_surface(mesh, silhouettes, smoothing, progress, settings.fit)
+        mesh = fit_surface(mesh, silhouettes, smoothing, settings.fit)
     if revolution is not None:
         mesh = revolution
     elif symmetry is not None:
-        revolution = _revolution(mesh, silhouettes, settings)
-        max_loss = {"axis": settings.max_loss_axis, "auto": settings.max_loss_auto}[symmetry]
-        mesh = _choose_symmetry(revolution, mesh, evidence or silhouettes, symmetry, max_loss)
+        revolution = fit_revolution(mesh, silhouettes, settings=settings.revolution)
+        mesh = _choose_symmetry(revolution, mesh, evidence or silhouettes, symmetry, settings)
     if num_kept < num_parts:
         print(f"kept the largest {num_kept} of {num_parts} separate components")
     if reaches_border(distances):
@@ -159,19 +157,14 @@ def make_mesh(
     return mesh
 
 
-def _revolution(mesh: TriangleMesh, silhouettes: Silhouettes, settings: SurfaceSettings) -> TriangleMesh | None:
-    with fraction_bar("finding the axis") as progress:
-        return fit_revolution(mesh, silhouettes, progress, settings=settings.revolution)
-
-
 def _choose_symmetry(
     revolution: TriangleMesh | None,
     free: TriangleMesh,
     silhouettes: Silhouettes,
     symmetry: Symmetry,
-    max_loss: float,
+    settings: SurfaceSettings,
 ) -> TriangleMesh:
-    """Choose the body of revolution unless its overlap with the masks is smaller by more than `max_loss`.
+    """Choose the body of revolution unless its overlap with the masks is smaller by more than the limit of `symmetry`.
 
     The medians are compared, because a foreground object may be cut out of some masks.
     """
@@ -179,6 +172,7 @@ def _choose_symmetry(
         if symmetry == "axis":
             raise NerfroError("symmetry=axis is not possible, because the visual hull has no axis; remove the option")
         return free
+    max_loss = {"axis": settings.max_loss_axis, "auto": settings.max_loss_auto}[symmetry]
     symmetric, unconstrained = (float(np.median(overlap(mesh, silhouettes))) for mesh in (revolution, free))
     result = f"median overlap with the masks: {symmetric:.4f} as a body of revolution, {unconstrained:.4f} otherwise"
     if symmetry == "axis" and symmetric < unconstrained - max_loss:

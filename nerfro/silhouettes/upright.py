@@ -10,6 +10,7 @@ from jaxtyping import Float
 from nerfro.core.cameras import Cameras
 from nerfro.core.provenance import AlgorithmSettings
 from nerfro.geometry.mesh import TriangleMesh
+from nerfro.geometry.orientation import area_vectors
 
 
 @dataclass(frozen=True)
@@ -87,9 +88,7 @@ def body_axis(
         near: initial direction of the axis.
         settings: settings of the slices.
     """
-    corners = mesh.triangles
-    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    middles, axis = corners.mean(1), near
+    area, middles, axis = 0.5 * np.linalg.norm(area_vectors(mesh.triangles), axis=1), mesh.triangles.mean(1), near
     margin, num_slices = settings.end_margin, settings.num_slices
     for _ in range(settings.rounds):
         height = middles @ axis

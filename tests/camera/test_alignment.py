@@ -10,7 +10,7 @@ from torch import Tensor
 
 from benchmarks.cameras import disturbed
 from nerfro.camera.refined import gauss_newton
-from nerfro.camera.refined.least_squares import PriorInformation
+from nerfro.camera.refined.gauss_newton import PriorInformation
 from nerfro.camera.refined.outlines import align_to_outlines
 from nerfro.camera.refined.panorama import align
 from nerfro.camera.refined.refined import RefinedCamera
@@ -85,12 +85,12 @@ def test_steps_are_zero_at_the_true_cameras_and_bounded() -> None:
 
     far = gauss_newton.Step(difference_pixels=0.5, scale=10.0, max_pixels=0.25)
     gauss_newton.gauss_newton_step(camera, TRUE, pixels_of_step(0), inverted, shown, far)
-    assert float(camera.motions.motion.norm(dim=-1).max()) == pytest.approx(0.25, rel=1e-4)
+    assert float(camera.motion.norm(dim=-1).max()) == pytest.approx(0.25, rel=1e-4)
     camera.begin(TRUE)
     gauss_newton.gauss_newton_step(
         camera, TRUE, pixels_of_step(0), photographed, shown, gauss_newton.Step(0.5, 0.3, 3.0)
     )
-    assert float(camera.motions.motion.abs().max()) < 1e-4
+    assert float(camera.motion.abs().max()) < 1e-4
 
 
 def test_informative_pixels_have_contrast() -> None:
@@ -116,7 +116,7 @@ def test_resumed_step_on_a_gpu_uses_the_prior_of_a_cpu_checkpoint() -> None:
         sky_alone = lambda rays, view: to_srgb(sky(rays.directions))  # noqa: E731
         step = gauss_newton.Step(difference_pixels=0.5, scale=10.0, max_pixels=0.25)
         gauss_newton.gauss_newton_step(camera, given, pixels, lambda chosen: pictures[chosen], sky_alone, step, [prior])
-        assert float(camera.motions.motion.abs().max()) < 1e-4
+        assert float(camera.motion.abs().max()) < 1e-4
 
 
 def panorama(
@@ -133,7 +133,7 @@ def panorama(
 
 def rotation_errors(camera: RefinedCamera) -> Tensor:
     """Rotation errors of the cameras in degrees, without the common rotation."""
-    axes, true = (poses[..., :3].double() for poses in (camera.motions.moved(), TRUE.camera_to_world))
+    axes, true = (poses[..., :3].double() for poses in (camera.moved(), TRUE.camera_to_world))
     u, _, vt = torch.linalg.svd((axes @ true.mT).mean(0))
     between = (u @ vt).T @ axes @ true.mT
     cosine = 0.5 * (between.diagonal(dim1=1, dim2=2).sum(-1) - 1)
@@ -146,7 +146,7 @@ def test_sky_alignment_recovers_rotations(brightness: float) -> None:
     gains = 0.6 * torch.exp(brightness * torch.randn(NUM_VIEWS, generator=torch.Generator().manual_seed(0)))
     camera = RefinedCamera(exposure=brightness > 0)
     assert panorama(camera, DISTURBED, gains=gains) is not None
-    assert not bool(camera.motions.motion[:, 3:].any())
+    assert not bool(camera.motion[:, 3:].any())
     assert float(rotation_errors(camera).median()) < (0.03 if brightness == 0 else 0.06)
 
 
@@ -160,7 +160,7 @@ def test_sky_alignment_recovers_the_shared_focal_length() -> None:
 def test_sky_alignment_has_no_result_without_sky_pixels() -> None:
     camera = RefinedCamera()
     assert panorama(camera, TRUE, box=10 * BOX) is None
-    assert not bool(camera.motions.motion.any())
+    assert not bool(camera.motion.any())
 
 
 def ellipsoid() -> TriangleMesh:
@@ -177,12 +177,12 @@ def aligned(
 ) -> PriorInformation:
     """Align cameras to outlines; a prior fixes some of the six motion parameters of each camera."""
     camera.begin(given)
-    precision = torch.zeros_like(camera.motions.motion)
+    precision = torch.zeros_like(camera.motion)
     precision[:, fixed or []] = 1e6
     mean = camera.parameter_vector()
     information = torch.nn.functional.pad(precision.flatten(), (0, len(mean) - precision.numel())).diag()
     prior = [PriorInformation(mean, information)]
-    posterior = align_to_outlines(camera, given, lambda cameras: cameras, seen, ellipsoid(), prior)
+    posterior = align_to_outlines(camera, given, seen, ellipsoid(), prior)
     assert posterior is not None
     return posterior
 
@@ -205,8 +205,8 @@ def test_outline_alignment_does_not_move_cameras_to_a_wrong_surface(capsys: pyte
     camera = RefinedCamera()
     camera.begin(TRUE)
     other = TriangleMesh(ellipsoid().vertices[:, [1, 0, 2]], ellipsoid().faces[:, ::-1])
-    assert align_to_outlines(camera, TRUE, lambda cameras: cameras, silhouettes(), other) is None
-    assert not bool(camera.motions.motion.any())
+    assert align_to_outlines(camera, TRUE, silhouettes(), other) is None
+    assert not bool(camera.motion.any())
     assert "pixels off its masks" in capsys.readouterr().out
 
 
@@ -214,7 +214,7 @@ def test_outline_alignment_refuses_empty_masks() -> None:
     camera = RefinedCamera()
     camera.begin(TRUE)
     nothing = Silhouettes.of(TRUE, torch.zeros(NUM_VIEWS, SIZE, SIZE))
-    refused("belong together", align_to_outlines, camera, TRUE, lambda cameras: cameras, nothing, ellipsoid())
+    refused("belong together", align_to_outlines, camera, TRUE, nothing, ellipsoid())
 
 
 def test_outline_alignment_recovers_the_principal_point_of_known_cameras() -> None:

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from nerfro.camera.refined import pixel_units, refined
+from nerfro.camera.refined import refined
 from nerfro.camera.similarity import Similarity, motion_between, similarity
 from nerfro.core.cameras import Cameras
 from nerfro.core.lens import coefficients
@@ -51,9 +51,9 @@ LENSES = [None, coefficients([0.05, -0.02], [0.002, -0.001])]
 def test_derivatives_match_central_differences(distortion: tuple[float, ...] | None) -> None:
     given = cameras(distortion)
     made, (view, row, column) = part(given), pixels(given)
-    made.motions.fix_gauge = False
-    made.motions.motion *= 0.01  # turns are composed to first order
-    made.motions.gauge_basis = made.motions.gauge_basis[:0]
+    made.fix_gauge = False
+    made.motion *= 0.01  # turns are composed to first order
+    made.gauge_basis = made.gauge_basis[:0]
     rays = given.rays(view, row, column)
     by_origin, by_direction = torch.randn(2, len(view), 2, 3, dtype=torch.float64)
     found = made.slopes(rays, view, by_origin, by_direction)
@@ -82,14 +82,14 @@ def test_common_motion_of_all_cameras_is_removed() -> None:
     shared = world.apply(poses)
     turns, shifts = poses[..., :3].mT @ shared[..., :3], poses[..., :3].mT @ (shared[..., 3:] - poses[..., 3:])
     vector = torch.stack([turns[:, 2, 1], turns[:, 0, 2], turns[:, 1, 0]], -1)
-    before = made.motions.moved()
+    before = made.moved()
     with torch.no_grad():
-        made.motions.motion += torch.cat([vector, shifts[..., 0]], -1) / made.motions.units
+        made.motion += torch.cat([vector, shifts[..., 0]], -1) / made.units
     free = refined.RefinedCamera(fix_gauge=False).double()
     free.begin(given)
-    free.motions.motion = torch.cat([vector, shifts[..., 0]], -1) / free.motions.units
+    free.motion = torch.cat([vector, shifts[..., 0]], -1) / free.units
     torch.testing.assert_close(free.aligned(given).camera_to_world, shared, rtol=0, atol=1e-6)  # to first order
-    turned, shifted = motion_between(before, made.motions.moved())
+    turned, shifted = motion_between(before, made.moved())
     moved = motion_between(poses, shared)
     assert turned.max().item() < 1e-3 * moved[0].max().item()
     assert float(shifted.max()) < 1e-3 * float(moved[1].max())
@@ -97,9 +97,9 @@ def test_common_motion_of_all_cameras_is_removed() -> None:
 
 def test_each_parameter_unit_moves_points_by_one_pixel() -> None:
     given = cameras()
-    distances, h = pixel_units.object_distances(given), 1e-5
+    distances, h = refined.object_distances(given), 1e-5
     axis = (torch.arange(90) + 0.5).double() * SIZE / 90
-    motions = pixel_units.pixel_motions(given, distances)
+    motions = refined.pixel_motions(given, distances)
     for view in range(len(given)):
         one = given.select([view])
         u, v = (place.flatten() for place in torch.meshgrid(axis, axis, indexing="xy"))
@@ -137,5 +137,5 @@ def test_gauge_freedom_has_seven_dimensions_in_any_world_unit(scale: float) -> N
     given = cameras()
     poses = torch.cat([given.camera_to_world[..., :3], scale * given.camera_to_world[..., 3:]], -1)
     given = replace(given, camera_to_world=poses, near=scale * given.near, far=scale * given.far)
-    weights = pixel_units.even_weights(pixel_units.pixel_motions(given, pixel_units.object_distances(given)))
-    assert len(pixel_units.gauge_basis(poses, weights)) == 7
+    weights = refined.even_weights(refined.pixel_motions(given, refined.object_distances(given)))
+    assert len(refined.gauge_basis(poses, weights)) == 7

@@ -107,7 +107,7 @@ def test_resumed_run_with_refined_cameras_equals_an_uninterrupted_run(train: Run
         states.append(weights_of(tmp_path / name))
     assert states[0].keys() == states[1].keys()
     assert all(torch.equal(states[0][name], states[1][name]) for name in states[0])
-    assert float(states[0]["renderer.scene.camera.motions.motion"].abs().max()) > 0
+    assert float(states[0]["renderer.scene.camera.motion"].abs().max()) > 0
     assert float(states[0]["renderer.scene.camera.lens"].abs().max()) > 0
     assert float(states[0]["renderer.scene.camera.exposure.log_gain"].abs().max()) > 0
 
@@ -130,9 +130,9 @@ def test_cameras_are_aligned_by_sky_and_masks_before_training_and_priors_are_sav
         cameras.append(load(folder, "cpu").renderer.scene.camera)
         kept.append(load_checkpoint(folder / "checkpoints" / "last.ckpt")[0]["callbacks"]["Schedule"])
     without, with_masks = cameras
-    assert bool((without.motions.motion[:, :3] != 0).all())
-    assert not bool(without.motions.motion[:, 3:].any())
-    assert bool((with_masks.motions.motion != 0).all())
+    assert bool((without.motion[:, :3] != 0).all())
+    assert not bool(without.motion[:, 3:].any())
+    assert bool((with_masks.motion != 0).all())
     kept = [state["cameras"]["state"] for state in kept]
     assert list(kept[0]) == ["panorama"]
     assert list(kept[1]) == ["panorama", "outlines"]

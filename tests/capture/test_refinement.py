@@ -15,8 +15,7 @@ from torch import Tensor
 from nerfro.backgrounds.base import Background
 from nerfro.capture import refinement
 from nerfro.capture.refinement import DescentStage, Refined, RefinementProblem, RefinementSettings, refine_surface
-from nerfro.capture.room_panorama import panorama_of
-from nerfro.capture.surroundings import Pixels, Room, Surroundings, divide_pixels, learn_surroundings
+from nerfro.capture.surroundings import Pixels, Room, Surroundings, divide_pixels, learn_surroundings, panorama_of
 from nerfro.core.draws import Draws
 from nerfro.core.errors import NerfroError
 from nerfro.core.types import Exits

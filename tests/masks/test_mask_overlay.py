@@ -11,7 +11,7 @@ from PIL import Image
 
 from nerfro.data.blender import BlenderData, OpenCVData
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.silhouettes.pose_conventions import overlap
+from nerfro.silhouettes.agreement import overlap
 from nerfro.silhouettes.visual_hull import Silhouettes
 from tests.exact_silhouettes import odd_shape
 from tests.sheet_photographs import look_at

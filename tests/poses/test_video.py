@@ -10,7 +10,7 @@ pytest.importorskip("cv2")
 
 import cv2
 
-from nerfro.poses.video import extract_frames
+from nerfro.poses.collection import extract_frames
 from tests.conftest import refused
 
 SHARP = (1, 7, 8, 13)  # one in each quarter of the video

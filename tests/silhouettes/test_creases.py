@@ -7,7 +7,7 @@ import trimesh
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.silhouettes.creases import has_creases
 from nerfro.silhouettes.moving_mesh import MovingMesh
-from nerfro.silhouettes.rims import RimFinder
+from nerfro.silhouettes.rims import find_rims, outlines_of
 from nerfro.silhouettes.silhouette_fit import fit_surface
 from tests.exact_silhouettes import cameras_around, hull, photographed_softly, volume
 
@@ -49,8 +49,8 @@ def test_round_side_of_a_cylinder_stays_round() -> None:
 def test_outlines_of_a_sharp_body_lie_at_its_edges() -> None:
     """Where normals that are smooth turn away is within the edge, by a tenth of a pixel here."""
     made = box().subdivide_to_size(0.05)
-    mesh = TriangleMesh(np.asarray(made.vertices), np.asarray(made.faces))
-    rims = RimFinder(mesh, photographed_softly(box(), cameras_around(12, 80))).find()
+    seen = photographed_softly(box(), cameras_around(12, 80))
+    rims = find_rims(MovingMesh(np.asarray(made.faces)).geometry(np.asarray(made.vertices)), seen, outlines_of(seen))
     off = rims.misfit / rims.width
     assert abs(np.median(off)) < 0.02
     assert np.median(np.abs(off)) < 0.04

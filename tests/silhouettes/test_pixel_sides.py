@@ -6,8 +6,7 @@ import torch
 import trimesh
 
 from nerfro.silhouettes.moving_mesh import MovingMesh
-from nerfro.silhouettes.pixel_sides import by_pixel_sides
-from nerfro.silhouettes.rims import Rims, find_rims, outlines_of
+from nerfro.silhouettes.rims import Rims, by_pixel_sides, find_rims, outlines_of
 from nerfro.silhouettes.silhouette_fit import fit_surface
 from nerfro.silhouettes.silhouettes import is_antialiased
 from nerfro.silhouettes.visual_hull import Silhouettes

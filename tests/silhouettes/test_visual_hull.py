@@ -12,7 +12,7 @@ from nerfro.core.errors import NerfroError
 from nerfro.core.paths import ASSETS_DIR
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.silhouettes import surface
-from nerfro.silhouettes.pose_conventions import overlap, require_consistent_poses
+from nerfro.silhouettes.agreement import overlap, require_consistent_poses
 from nerfro.silhouettes.silhouette_fit import fit_surface
 from nerfro.silhouettes.silhouettes import outline_distance
 from nerfro.silhouettes.surface import make_mesh

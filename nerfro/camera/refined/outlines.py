@@ -7,14 +7,14 @@ the distant surroundings do (`panorama`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerfro.camera.refined.least_squares import PriorInformation, normal_equations, with_priors
+from nerfro.camera.refined.gauss_newton import PriorInformation, normal_equations, shortened, with_priors
 from nerfro.camera.refined.refined import RefinedCamera
 from nerfro.core.cameras import Cameras
 from nerfro.core.progress import track
@@ -22,7 +22,8 @@ from nerfro.core.provenance import AlgorithmSettings
 from nerfro.data.base import Views
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.media.base import Medium
-from nerfro.silhouettes.rims import RimFinder
+from nerfro.silhouettes.moving_mesh import MovingMesh
+from nerfro.silhouettes.rims import Rims, find_rims, outlines_of
 from nerfro.silhouettes.silhouettes import PixelBlocks
 from nerfro.silhouettes.visual_hull import Silhouettes
 
@@ -78,14 +79,13 @@ def align_to_masks(
     masks = torch.stack([blocks.mean(mask) for mask in views.masks])
     silhouettes = Silhouettes.of(blocks.cameras(views.cameras), masks)
     priors = [] if panorama is None else [panorama]
-    return align_to_outlines(camera, views.cameras, blocks.cameras, silhouettes, outline, priors, settings)
+    return align_to_outlines(camera, views.cameras, silhouettes, outline, priors, settings)
 
 
 @torch.no_grad()
 def align_to_outlines(
     camera: RefinedCamera,
     cameras: Cameras,
-    downscaled: Callable[[Cameras], Cameras],
     silhouettes: Silhouettes,
     mesh: TriangleMesh,
     priors: Sequence[PriorInformation] = (),
@@ -98,8 +98,7 @@ def align_to_outlines(
     Args:
         camera: estimated cameras, changed in place.
         cameras: cameras of the data set.
-        downscaled: conversion of cameras to the size of the silhouettes.
-        silhouettes: silhouettes of all views.
+        silhouettes: silhouettes of all views, downscaled to `settings.max_pixels` (see `PixelBlocks`).
         mesh: the surface.
         priors: prior information about the cameras.
         settings: steps and limits.
@@ -111,18 +110,20 @@ def align_to_outlines(
     settings.use()
     initial = camera.parameter_vector()
     weak = PriorInformation(initial, torch.eye(len(initial)).to(initial) / settings.prior_deviation**2)
-    finder = RimFinder(mesh, silhouettes)
+    blocks, outlines = PixelBlocks(cameras, settings.max_pixels), outlines_of(silhouettes)
+    surface = MovingMesh(mesh.faces).geometry(mesh.vertices)
     for step in track("outlines", range(settings.steps + 1)):
-        slopes, error, weights, view = _observations(camera, cameras, downscaled, finder)
+        estimated = blocks.cameras(camera.estimated(cameras))
+        rims = find_rims(surface, replace(silhouettes, cameras=estimated), outlines)
+        slopes, error, weights, view = _observations(camera, cameras, estimated, rims)
         variance = float((weights * error[:, 0].square()).sum() / weights.sum()) + settings.accuracy**2
         if step < settings.steps:
             matrix, vector = normal_equations(slopes, error, weights, view, len(cameras))
             matrix, vector = _without_width(matrix, vector)
             parameters = camera.parameter_vector()
             matrix, vector = with_priors(matrix, vector, parameters, settings.correlated * variance, [*priors, weak])
-            motion, lens = camera.split(-torch.linalg.solve(matrix, vector).to(camera.motions.motion))
-            longest = settings.max_step
-            camera.move(motion * (longest / motion.norm(dim=-1, keepdim=True).clamp(min=longest)), lens)
+            motion, lens = camera.split(-torch.linalg.solve(matrix, vector).to(camera.motion))
+            camera.move(shortened(motion, settings.max_step), lens)
     distance = float((error - error.median()).abs().median())
     if distance > settings.max_distance:
         camera.restore(initial, torch.ones(len(cameras), dtype=torch.bool), lens=True)
@@ -137,18 +138,19 @@ def align_to_outlines(
 
 
 def _observations(
-    camera: RefinedCamera,
-    cameras: Cameras,
-    downscaled: Callable[[Cameras], Cameras],
-    finder: RimFinder,
+    camera: RefinedCamera, cameras: Cameras, estimated: Cameras, rims: Rims
 ) -> tuple[Float[Tensor, "R 1 M"], Float[Tensor, "R 1"], Float[Tensor, "R"], Int[Tensor, "R"]]:
     """Compute derivatives, errors, weights and views of the contour points, in pixels of the silhouettes.
 
     The last derivative is by the common width of the masks.
+
+    Args:
+        camera: estimated cameras.
+        cameras: cameras of the data set.
+        estimated: estimated cameras of the silhouettes.
+        rims: contour points that these cameras see.
     """
-    estimated = downscaled(camera.estimated(cameras))
-    rims = finder.find(estimated)
-    device, views = camera.motions.motion.device, torch.from_numpy(rims.view)
+    device, views = camera.motion.device, torch.from_numpy(rims.view)
     points, normals, misfits, weights, widths = (
         torch.from_numpy(values).float() for values in (rims.points, rims.normal, rims.misfit, rims.weight, rims.width)
     )

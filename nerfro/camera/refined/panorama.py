@@ -18,7 +18,7 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 from torch.nn import functional as F
 
-from nerfro.camera.refined.least_squares import TINY, PriorInformation, axes_across, robust_weights
+from nerfro.camera.refined.gauss_newton import TINY, PriorInformation, axes_across, robust_weights, shortened
 from nerfro.camera.refined.refined import RefinedCamera
 from nerfro.core.cameras import Cameras
 from nerfro.core.light import to_linear
@@ -108,14 +108,13 @@ def align(
         if overlap is None:
             continue  # if little sky is visible, strongly blurred pixels always contain other objects
         matrix, vector, variance = _equations(overlap, gains, camera.exposure is not None, settings)
-        num_rotations, num_lens = 3 * len(cameras), overlap.by_lens.shape[-1]
         step = _solve(matrix, vector, settings.damping).to(images)
-        rotations, lens, log_gains = step.split([num_rotations, num_lens, len(step) - num_rotations - num_lens])
+        num = 3 * len(cameras) + overlap.by_camera.shape[-1] - 3  # rotations and lens
+        rotations, lens, log_gains = step.tensor_split((3 * len(cameras), num))
         gains = gains * log_gains.exp().view(-1, 3) if len(log_gains) else gains
-        rotations, max_pixels = rotations.view(-1, 3), 2 * blur * cameras.width / images.shape[-1]
-        rotations = rotations * (max_pixels / rotations.norm(dim=-1, keepdim=True).clamp(min=TINY)).clamp(max=1)
+        rotations = shortened(rotations.view(-1, 3), 2 * blur * cameras.width / images.shape[-1])
         camera.move(F.pad(rotations, (0, 3)), lens)
-        information = _marginalized(matrix, num_rotations + num_lens, settings.damping)
+        information = _marginalized(matrix, num, settings.damping)
         information = information / max(variance, settings.min_deviation**2)
     return None if information is None else _prior(camera, information)
 
@@ -123,7 +122,7 @@ def align(
 def _prior(camera: RefinedCamera, information: Float[Tensor, "M M"]) -> PriorInformation:
     """Convert information about all rotations and the lens to a prior of all parameters."""
     # The photographs do not determine a common rotation of all cameras.
-    common = camera.motions.common_rotations().to(information)
+    common = camera.common_rotations().to(information)
     projection = torch.eye(len(information)).to(information)
     projection[: len(common), : len(common)] -= common @ common.mT
     mean = camera.parameter_vector()
@@ -174,20 +173,16 @@ class _Overlap:
     """O observations of K directions by V cameras; each direction is observed at least twice.
 
     Attributes:
-        num_views: number of cameras.
         view: index of the camera of each observation.
         direction: index of the direction of each observation.
         colour: blurred colours.
-        by_rotation: derivatives of the colours by the rotation of the camera.
-        by_lens: derivatives of the colours by the lens.
+        by_camera: derivatives of the colours by the rotation of the camera, followed by those by the lens.
     """
 
-    num_views: int
     view: Int[Tensor, "O"]
     direction: Int[Tensor, "O"]
     colour: Float[Tensor, "O 3"]
-    by_rotation: Float[Tensor, "O 3 3"]
-    by_lens: Float[Tensor, "O 3 L"]
+    by_camera: Float[Tensor, "O 3 3+L"]
 
 
 def _find_overlap(
@@ -235,7 +230,7 @@ def _find_overlap(
     pixel = position.floor()
     rays = cameras.rays(view, pixel[:, 1], pixel[:, 0], position - pixel)
     slopes = -camera.slopes(rays, view, torch.zeros_like(by_direction), by_direction)
-    return _Overlap(len(images), view, direction, sampled(directions), slopes[..., :3], slopes[..., 6:])
+    return _Overlap(view, direction, sampled(directions), torch.cat([slopes[..., :3], slopes[..., 6:]], -1))
 
 
 def _blurred_sky(
@@ -314,17 +309,16 @@ def _equations(
         weight = robust_weights(error, settings.scale)
     total = weight.new_zeros(num_directions).index_add(0, direction, weight).clamp(min=TINY)
 
-    of_view, num_lens = torch.arange(3, device=view.device) + 3 * view[:, None], overlap.by_lens.shape[-1]
-    of_lens = 3 * overlap.num_views + torch.arange(num_lens, device=view.device)
-    slopes, indices = [torch.cat([overlap.by_rotation, overlap.by_lens], -1) * gains[view][..., None]], [of_view]
-    indices.append(of_lens.expand(num, -1))
+    of_view, num_lens = torch.arange(3, device=view.device) + 3 * view[:, None], overlap.by_camera.shape[-1] - 3
+    of_lens = gains.numel() + torch.arange(num_lens, device=view.device).expand(num, -1)
+    slopes, indices = [overlap.by_camera * gains[view][..., None]], [of_view, of_lens]
     if learn_gains:
         slopes.append(torch.diag_embed(colour))
-        indices.append(3 * overlap.num_views + num_lens + of_view)
+        indices.append(gains.numel() + num_lens + of_view)
     values, columns = torch.cat(slopes, -1).double().cpu(), torch.cat(indices, -1).cpu()
     rows = torch.arange(3 * num).view(num, 3, 1).expand(values.shape)
     columns = columns[:, None].expand(values.shape)
-    size = 3 * num, 3 * overlap.num_views * (2 if learn_gains else 1) + num_lens
+    size = 3 * num, gains.numel() * (2 if learn_gains else 1) + num_lens
     jacobian = sparse.csr_matrix((values.flatten(), (rows.flatten(), columns.flatten())), size)
 
     weight, total, direction = (tensor.cpu() for tensor in (weight.double(), total.double(), direction))

@@ -1,7 +1,12 @@
-"""Camera model that refines poses and lens during training."""
+"""Camera model that refines poses and lens during training, with motions in units of pixels.
+
+A similarity transformation of all cameras and the scene changes no image (gauge freedom). Its motions are removed from
+the refinement of cameras.
+"""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import torch
@@ -11,33 +16,40 @@ from torch.nn.functional import normalize
 
 from nerfro.camera.base import CameraModel
 from nerfro.camera.exposure import PerView
-from nerfro.camera.refined.pixel_units import (
-    even_weights,
-    gauge_basis,
-    object_distances,
-    pixel_motions,
-    project_out_gauge,
-)
 from nerfro.camera.similarity import similarity
 from nerfro.core.cameras import Cameras
 from nerfro.core.lens import distort, undistort
 from nerfro.core.rays import Rays
+from nerfro.geometry.lines import nearest_point
 from nerfro.registry.registration import register
 
 
-class _Motions(PerView):
-    """Rotation and translation of each camera in its own axes, in units of pixels.
+@register("camera", "refined")
+class RefinedCamera(PerView, CameraModel):
+    """Refine the pose of each training camera, and optionally the common lens, during training.
+
+    The phase `cameras` moves the cameras. The motion that a similarity transformation of the world would cause (gauge
+    freedom) is removed to first order, so that the world and the surface keep their place.
+
+    Args:
+        lens: whether to refine the focal length and the principal point, which all views share.
+        exposure: whether to estimate a gain for each training view.
+        fix_gauge: whether to remove the gauge freedom. Disable this for cameras of a scene that is fixed.
 
     Attributes:
+        motion: rotation and translation of each camera in its own axes, in units of pixels.
+        lens: logarithmic focal length and principal point, in units of pixels; None if the lens is not refined.
         poses: camera-to-world matrices of the data set.
         focal, distortion: focal lengths and distortion coefficients of the data set.
         units: rotation or translation that moves the image by one pixel, for each parameter.
         weights: weights of the parameters for the gauge.
-        gauge_basis: basis of the gauge freedom (see `pixel_units.gauge_basis`); empty if the gauge is not fixed.
+        gauge_basis: basis of the gauge freedom (see `gauge_basis`); empty if the gauge is not fixed.
         focal_unit: change of the logarithmic focal length that moves the image by one pixel.
-        motion: parameters in pixels.
     """
 
+    moves = True
+    lens: Float[Tensor, "3"] | None
+    motion: Float[Tensor, "V 6"]
     poses: Float[Tensor, "V 3 4"]
     focal: Float[Tensor, "V 2"]
     distortion: Float[Tensor, "V 9"]
@@ -45,15 +57,16 @@ class _Motions(PerView):
     weights: Float[Tensor, "V 6"]
     gauge_basis: Float[Tensor, "gauge V 6"]
     focal_unit: Float[Tensor, "1"]
-    motion: Float[Tensor, "V 6"]
 
-    def __init__(self, fix_gauge: bool = True) -> None:
-        super().__init__()
+    def __init__(self, lens: bool = False, exposure: bool = False, fix_gauge: bool = True) -> None:
+        super().__init__(exposure)
         self.fix_gauge = fix_gauge
         for name in ("motion", "poses", "focal", "distortion", "units", "weights", "gauge_basis", "focal_unit"):
             self.register_buffer(name, torch.zeros(0))
+        self.register_buffer("lens", torch.zeros(3) if lens else None)
 
     def begin(self, cameras: Cameras) -> None:
+        super().begin(cameras)
         poses = cameras.camera_to_world.double().cpu()
         pixels = pixel_motions(cameras, object_distances(cameras))
         weights = even_weights(pixels)
@@ -71,60 +84,9 @@ class _Motions(PerView):
         for name, tensor in buffers.items():
             setattr(self, name, tensor.to(getattr(self, name)))
 
-    def forward(self) -> tuple[Float[Tensor, "V 3 3"], Float[Tensor, "V 3"]]:
-        """Return rotation and translation of each camera, in the given camera axes."""
-        motion = self.fixed()
-        return rotation_matrices(motion[:, :3]), motion[:, 3:]
-
-    def fixed(self) -> Float[Tensor, "V 6"]:
-        """Return rotations (radians) and translations (world units), without the gauge freedom."""
-        return project_out_gauge(self.motion * self.units, self.gauge_basis, self.weights)
-
-    def common_rotations(self) -> Float[Tensor, "M 3"]:
-        """Return an orthonormal basis of common rotations of all cameras, each about its centre; units of pixels."""
-        own = self.moved()[..., :3].mT / self.units[:, :3, None]
-        return torch.linalg.qr(own.flatten(0, 1))[0]
-
-    def moved(self) -> Float[Tensor, "V 3 4"]:
-        """Return the estimated poses."""
-        rotations, translations = self()
-        axes = self.poses[..., :3]
-        return torch.cat([axes @ rotations, self.poses[..., 3:] + axes @ translations[..., None]], -1)
-
-
-@register("camera", "refined")
-class RefinedCamera(CameraModel):
-    """Refine the pose of each training camera, and optionally the common lens, during training.
-
-    The phase `cameras` moves the cameras. The motion that a similarity transformation of the world would cause (gauge
-    freedom) is removed to first order, so that the world and the surface keep their place.
-
-    Args:
-        lens: whether to refine the focal length and the principal point, which all views share.
-        exposure: whether to estimate a gain for each training view and colour channel.
-        fix_gauge: whether to remove the gauge freedom. Disable this for cameras of a scene that is fixed.
-    """
-
-    moves = True
-    lens: Float[Tensor, "3"] | None
-
-    def __init__(
-        self,
-        lens: bool = False,
-        exposure: bool = False,
-        fix_gauge: bool = True,
-    ) -> None:
-        super().__init__(exposure)
-        self.motions = _Motions(fix_gauge)
-        self.register_buffer("lens", torch.zeros(3) if lens else None)  # focal length and principal point in pixels
-
-    def begin(self, cameras: Cameras) -> None:
-        super().begin(cameras)
-        self.motions.begin(cameras)
-
     def forward(self, rays: Rays, view: Int[Tensor, "R"]) -> Rays:
-        rotations, translations = self.motions()
-        axes = self.motions.poses[view, :, :3]
+        motion, axes = self.fixed_motion(), self.poses[view, :, :3]
+        rotations, translations = rotation_matrices(motion[:, :3]), motion[:, 3:]
         local = (rays.directions[:, None] @ axes)[:, 0]
         if self.lens is not None:
             local = self._through_lens(local, view)
@@ -150,9 +112,9 @@ class RefinedCamera(CameraModel):
         Returns:
             Derivatives by the six parameters of the camera, followed by three of the lens if it is refined.
         """
-        axes, moved = self.motions.poses[view, :, :3], self(rays, view)
+        axes, moved = self.poses[view, :, :3], self(rays, view)
         by_rotation = torch.linalg.cross(moved.directions[:, None].expand_as(by_direction), by_direction)
-        by_motion = torch.cat([by_rotation @ axes, by_origin @ axes], -1) * self.motions.units[view, None]
+        by_motion = torch.cat([by_rotation @ axes, by_origin @ axes], -1) * self.units[view, None]
         if self.lens is None:
             return by_motion
         lens, by_lens = self.lens.clone(), []
@@ -165,25 +127,40 @@ class RefinedCamera(CameraModel):
             by_lens.append((by_direction * (ends[0] - ends[1])[:, None]).sum(-1))
         return torch.cat([by_motion, torch.stack(by_lens, -1)], -1)
 
+    def fixed_motion(self) -> Float[Tensor, "V 6"]:
+        """Return rotations (radians) and translations (world units) in the given camera axes, without gauge freedom."""
+        return project_out_gauge(self.motion * self.units, self.gauge_basis, self.weights)
+
+    def common_rotations(self) -> Float[Tensor, "M 3"]:
+        """Return an orthonormal basis of common rotations of all cameras, each about its centre; units of pixels."""
+        own = self.moved()[..., :3].mT / self.units[:, :3, None]
+        return torch.linalg.qr(own.flatten(0, 1))[0]
+
+    def moved(self) -> Float[Tensor, "V 3 4"]:
+        """Return the estimated poses."""
+        motion, axes = self.fixed_motion(), self.poses[..., :3]
+        centres = self.poses[..., 3:] + axes @ motion[:, 3:, None]
+        return torch.cat([axes @ rotation_matrices(motion[:, :3]), centres], -1)
+
     def parameter_vector(self) -> Float[Tensor, " parameters"]:
         """Return a copy of the parameters of all cameras in pixels, followed by the lens if it is refined."""
-        return torch.cat([self.motions.motion.flatten(), *([] if self.lens is None else [self.lens])])
+        return torch.cat([self.motion.flatten(), *([] if self.lens is None else [self.lens])])
 
     def split(self, parameters: Shaped[Tensor, " parameters"]) -> tuple[Shaped[Tensor, "V 6"], Shaped[Tensor, "L"]]:
         """Split a vector of parameters (see `parameter_vector`) into motions of the cameras and lens."""
-        num = self.motions.motion.numel()
+        num = self.motion.numel()
         return parameters[:num].view(-1, 6), parameters[num:]
 
     def move(self, motion: Float[Tensor, "V 6"], lens: Float[Tensor, "L"]) -> None:
         """Add to the parameters of cameras and lens, in pixels."""
-        self.motions.motion.add_(motion)
+        self.motion.add_(motion)
         if self.lens is not None:
             self.lens += lens
 
     def restore(self, parameters: Float[Tensor, " parameters"], views: Bool[Tensor, "V"], lens: bool) -> None:
         """Restore earlier parameters (see `parameter_vector`) of some views, and of the lens if `lens` is true."""
         motion, old_lens = self.split(parameters)
-        self.motions.motion[views] = motion[views]
+        self.motion[views] = motion[views]
         if lens and self.lens is not None:
             self.lens.copy_(old_lens)
 
@@ -192,28 +169,28 @@ class RefinedCamera(CameraModel):
         growth, shift = self._lens()
         ideal = local[:, :2] / -local[:, 2:]
         flipped = ideal * ideal.new_tensor([1.0, -1.0])  # y down, as in the image
-        distorted = len(self.motions.distortion) > 0
+        distorted = len(self.distortion) > 0
         if distorted:
-            flipped, _ = distort(flipped, self.motions.distortion[view])
-        flipped = (flipped - shift / self.motions.focal[view]) / growth
+            flipped, _ = distort(flipped, self.distortion[view])
+        flipped = (flipped - shift / self.focal[view]) / growth
         if distorted:
-            flipped, _ = undistort(flipped, self.motions.distortion[view])
+            flipped, _ = undistort(flipped, self.distortion[view])
         return torch.cat([flipped * ideal.new_tensor([1.0, -1.0]), -torch.ones_like(local[:, 2:])], -1)
 
     def _lens(self) -> tuple[Float[Tensor, ""], Float[Tensor, "2"]]:
         """Return the factor of the focal length, and the shift of the principal point in pixels."""
         assert self.lens is not None
-        return torch.exp(self.lens[0] * self.motions.focal_unit[0]), self.lens[1:]
+        return torch.exp(self.lens[0] * self.focal_unit[0]), self.lens[1:]
 
     @torch.no_grad()
     def estimated(self, cameras: Cameras) -> Cameras:
-        poses = self.motions.moved().to(cameras.camera_to_world)
+        poses = self.moved().to(cameras.camera_to_world)
         return self._with_lens(replace(cameras, camera_to_world=poses))
 
     @torch.no_grad()
     def aligned(self, cameras: Cameras) -> Cameras:
         """Apply the similarity transformation of the training cameras, and the estimated lens, to other cameras."""
-        old, new, weights = (x.double() for x in (self.motions.poses, self.motions.moved(), self.motions.weights))
+        old, new, weights = (x.double() for x in (self.poses, self.moved(), self.weights))
         transformation = similarity(old, new, weights[:, 0], weights[:, 3])
         poses = transformation.apply(cameras.camera_to_world.to(transformation.shift)).to(cameras.camera_to_world)
         return self._with_lens(replace(cameras, camera_to_world=poses))
@@ -227,7 +204,7 @@ class RefinedCamera(CameraModel):
 
     @torch.no_grad()
     def measurements(self) -> dict[str, float]:
-        motion = (self.motions.fixed() / self.motions.units).square().sum(-1).mean().sqrt()
+        motion = (self.fixed_motion() / self.units).square().sum(-1).mean().sqrt()
         values = super().measurements() | {"cameras.motion_pixels": float(motion)}
         if self.lens is not None:
             growth, (x, y) = self._lens()
@@ -242,3 +219,80 @@ def rotation_matrices(vectors: Float[Tensor, "V 3"]) -> Float[Tensor, "V 3 3"]:
     zero = torch.zeros_like(x)
     cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1)
     return torch.linalg.matrix_exp(cross.view(-1, 3, 3))
+
+
+def object_distances(cameras: Cameras) -> Float[Tensor, "V"]:
+    """Return the distance of each camera from the point nearest to all optical axes, within near and far.
+
+    A distance is at least 0.1 % of the far bound.
+    """
+    poses = cameras.camera_to_world.double().cpu()
+    point = torch.from_numpy(nearest_point(poses[..., 3].numpy(), -poses[..., 2].numpy()))
+    distances = (poses[..., 3] - point).norm(dim=-1)
+    scale = cameras.far if math.isfinite(cameras.far) else float(distances.max()) or 1.0
+    return distances.clamp(min=max(cameras.near, 1e-3 * scale), max=cameras.far)
+
+
+def pixel_motions(cameras: Cameras, distances: Float[Tensor, "V"]) -> Float[Tensor, "V 7"]:
+    """Compute the image motion, in pixels, that a unit change of each camera parameter causes.
+
+    The parameters are rotations about the three camera axes (radians), translations along these (world units), and the
+    logarithm of the focal length. The result is the root mean square over the image for points at the given distance. A
+    point X = (x, y, -1) D moves by -w x X - t, and its image by f (dX + x dZ) / D.
+
+    Source:
+        Park et al., "CamP: camera preconditioning for neural radiance fields", 2023, section 4 (diagonal).
+    """
+    num_points = 9  # along each side of an image
+    ticks = (torch.arange(num_points, dtype=torch.float64) + 0.5) / num_points
+    position = torch.cartesian_prod(ticks, ticks)
+    fx, fy, cx, cy = (getattr(cameras, name).double().cpu()[:, None] for name in ("fx", "fy", "cx", "cy"))
+    x, y = (position[:, 0] * cameras.width - cx) / fx, (cy - position[:, 1] * cameras.height) / fy
+    points = torch.stack([x, y, -torch.ones_like(x)], -1) * distances[:, None, None]
+    axes = torch.eye(3, dtype=points.dtype)
+    rotated = -torch.linalg.cross(axes.expand(*x.shape, 3, 3), points[:, :, None].expand(*x.shape, 3, 3))
+    moved = torch.cat([rotated, (-axes).expand_as(rotated)], 2) / distances[:, None, None, None]
+    du = fx[..., None] * (moved[..., 0] + x[..., None] * moved[..., 2])
+    dv = fy[..., None] * (moved[..., 1] + y[..., None] * moved[..., 2])
+    squares = torch.cat([du.square() + dv.square(), ((fx * x).square() + (fy * y).square())[..., None]], -1)
+    return squares.mean(1).sqrt()
+
+
+def even_weights(motions: Float[Tensor, "V 7"]) -> Float[Tensor, "V 6"]:
+    """Average `pixel_motions` over axes, into one weight for rotations and one for translations of each camera.
+
+    With equal weights for all axes, the removal of the gauge freedom does not depend on the orientation of the cameras.
+    """
+    return torch.stack([motions[:, :2].mean(1), motions[:, 3:5].mean(1)], -1).repeat_interleave(3, -1)
+
+
+def gauge_basis(poses: Float[Tensor, "V 3 4"], weights: Float[Tensor, "V 6"]) -> Float[Tensor, "gauge V 6"]:
+    """Compute an orthonormal basis of the gauge freedom: camera motions by similarity transformations of the world.
+
+    Args:
+        poses: camera-to-world matrices, world units.
+        weights: weights of rotations and translations about and along the camera axes.
+
+    Returns:
+        Weighted motions; at most seven (three rotations, three translations and one scaling).
+    """
+    centres = poses[..., 3] - poses[..., 3].mean(0)
+    axes = torch.eye(3, dtype=poses.dtype)[:, None].expand(3, *centres.shape)
+    zeros = torch.zeros_like(axes)
+    rotations = torch.cat([axes, torch.linalg.cross(axes, centres.expand_as(axes))], -1)
+    # Translations by the typical distance of the scene have the size of the other motions in any world unit.
+    distance = weights[:, :3].mean() / weights[:, 3:].mean()
+    translations = torch.cat([zeros, distance * axes], -1)
+    motions = torch.cat([rotations, translations, torch.cat([zeros[:1], centres[None]], -1)])
+    own = motions.unflatten(-1, (2, 3)) @ poses[..., :3]  # in camera axes
+    u, values, _ = torch.linalg.svd((own.flatten(-2) * weights).flatten(1).T, full_matrices=False)
+    return u[:, values > 1e-6 * values.max()].T.unflatten(-1, (len(poses), 6))
+
+
+def project_out_gauge(
+    motion: Float[Tensor, "V 6"], basis: Float[Tensor, "gauge V 6"], weights: Float[Tensor, "V 6"]
+) -> Float[Tensor, "V 6"]:
+    """Remove the component in the space of `gauge_basis` from rotations and translations of cameras."""
+    weighted = motion * weights
+    common = torch.einsum("kvi,vi->k", basis, weighted)
+    return (weighted - torch.einsum("kvi,k->vi", basis, common)) / weights

@@ -9,8 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerfro.camera.refined.gauss_newton import Step, gauss_newton_step, informative_pixels
-from nerfro.camera.refined.least_squares import PriorInformation
+from nerfro.camera.refined.gauss_newton import PriorInformation, Step, gauss_newton_step, informative_pixels
 from nerfro.camera.refined.outlines import OutlineSettings, align_to_masks
 from nerfro.camera.refined.panorama import PanoramaSettings, align
 from nerfro.camera.refined.refined import RefinedCamera
