@@ -10,8 +10,9 @@ from typing import Any, Literal
 import numpy as np
 
 from nerfro.core.errors import NerfroError
+from nerfro.data.base import SPLITS
 from nerfro.data.formats.bounds import find_bounds, image_edges, usable_points
-from nerfro.data.frames import SPLITS, Every, FrameSet, PosedImages
+from nerfro.data.frames import Every, FrameSet, PosedImages
 from nerfro.data.image_files import read_size
 from nerfro.data.masks import find_mask
 from nerfro.data.transforms import Manifest, find_splits, parse_manifest, read_manifest
