@@ -112,7 +112,7 @@ class VoxelGrid(Medium):
         return medium
 
     def _set(self, occupancy: Tensor, box: Tensor, ior: float, size: int, sigma: float) -> None:
-        if any(float(face.abs().max()) > 0 for face in _faces(occupancy)):
+        if occupancy.count_nonzero() > occupancy[1:-1, 1:-1, 1:-1].count_nonzero():
             raise NerfroError("the object touches the grid's border; enlarge medium.box_min and medium.box_max")
         self.ior, self.smoothing_size, self.smoothing_sigma = float(ior), int(size), float(sigma)
         # Grids are rebuilt from the mesh at every start and do not belong in checkpoints.
@@ -192,7 +192,3 @@ def _clearance_of(
     distance = distance_to_set(varies.numpy(), cell) - np.linalg.norm(cell)
     diagonal = float(torch.linalg.vector_norm(box[1] - box[0]))
     return torch.from_numpy(distance.clip(0, diagonal)).to(table)
-
-
-def _faces(values: Tensor) -> list[Tensor]:
-    return [values.select(axis, end) for axis in range(3) for end in (0, -1)]
