@@ -33,7 +33,7 @@ class BlenderData(PosedImages):
 
 
 @register("data", "opencv")
-class OpenCVData(BlenderData):
+class OpenCVData(PosedImages):
     """Read the format of the paper's captured scenes: `transforms_{train,val,test}.json` with one 3x3 camera matrix.
 
     Poses have OpenCV camera axes. The centre of pixel (column, row) is at (column + 0.5, row + 0.5), as in the code of
@@ -56,6 +56,10 @@ class OpenCVData(BlenderData):
     ) -> None:
         super().__init__(root, near, far, **options)
         self.eval_crop = eval_crop
+
+    @property
+    def splits(self) -> list[str]:
+        return list(find_splits(self.root))
 
     def read(self, split: str) -> FrameSet:
         manifest = read_manifest(self.root, split)

@@ -180,8 +180,8 @@ def with_other_splits(views: Views, source: DataSource, split: str) -> Views:
     for other in source.splits:
         if other == split:
             continue
-        more, known = masked_views(source.load(other)), {frame.image for frame in views.frames}
-        fresh = [i for i, frame in enumerate(more.frames) if frame.image not in known]
+        more, images = masked_views(source.load(other)), {frame.image for frame in views.frames}
+        fresh = [i for i, frame in enumerate(more.frames) if frame.image not in images]
         joined = views.joined(more.select(fresh)) if fresh else None
         views = views if joined is None else joined
     masks = views.masks
