@@ -172,8 +172,7 @@ def room_panels(spacing: float) -> list[Panel]:
 
     def side(axis: int, corner: np.ndarray, right: np.ndarray, down: np.ndarray) -> Panel:
         def colour(points: np.ndarray) -> np.ndarray:
-            places = (points - ROOM_CENTRE) / ROOM_SCALE
-            return starlamp.room(places, np.full(points.shape[:-1], axis))
+            return starlamp.room((points - ROOM_CENTRE) / ROOM_SCALE, np.full(points.shape[:-1], axis))
 
         return painted_panel(corner, right, down, colour, spacing, glows=True)
 
