@@ -20,6 +20,8 @@ from nerfro.core.progress import track
 from nerfro.core.types import WORLD_ORIGIN
 from nerfro.data.lazy_images import LazyImages
 
+SPLITS = ["train", "val", "test"]
+
 
 @dataclass(frozen=True)
 class Frame:

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from nerfro.core.cameras import Cameras, central_window
 from nerfro.core.errors import NerfroError, first_of
 from nerfro.core.paths import refuse_root, resolve_path
-from nerfro.data.base import DataSource, Frame, Views
+from nerfro.data.base import SPLITS, DataSource, Frame, Views
 from nerfro.data.image_files import IMAGE_SUFFIXES, Alpha, read_rgb
 from nerfro.data.lazy_images import LazyImages
 from nerfro.data.lenses import Lens, check_lenses
@@ -25,7 +25,6 @@ from nerfro.data.masks import find_mask, find_masks, find_usable, require_used, 
 from nerfro.registry.allowed import Coordinate, Distance, Factor, check, validated
 
 Every = Annotated[int, Ge(2)]  # every n-th view is a test view
-SPLITS = ["train", "val", "test"]
 Item = TypeVar("Item")
 
 _ROTATION_TOLERANCE = 1e-3

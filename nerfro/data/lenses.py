@@ -17,7 +17,7 @@ from torch import Tensor
 from nerfro.core.errors import NerfroError, first_of, warn
 from nerfro.core.lens import coefficients, distort, opencv_coefficients, undistort
 from nerfro.files.reading import is_number, parse_matrix
-from nerfro.registry.allowed import check
+from nerfro.registry.allowed import Positive, check
 
 # Perspective lenses in the files of nerfstudio, COLMAP and Blender. They differ in the coefficients that are zero.
 _PERSPECTIVE = ("OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE", "PERSP")
@@ -30,20 +30,15 @@ _OTHER = re.compile(
     rf"{_PROJECTIONS.pattern}|rolling|skew|^sk[xy]$|fov|focal|intrinsic|principal|cameramat|cammatrix|cameraangle|"
     r"(?<!un)distort|distcoef|pixelaspect|^shift[xy]$|^[cf]l?[xy]?$|^[dkp]\d*$"
 )
-_NUMBER = float  # finite
-_PIXELS = Annotated[float, Ge(1), Le(10**6)]
-_POSITIVE = Annotated[float, Gt(0)]
-_RADIANS = Annotated[float, Gt(0), Lt(math.pi)]
-_DEGREES = Annotated[float, Gt(0), Lt(180)]
 # Arguments of `coefficients`: numerator, tangential and denominator.
 _COEFFICIENTS = (("k1", "k2", "k3", "k4"), ("p1", "p2"), ("q1", "q2", "q3"))
 _NAMES = (*_COEFFICIENTS[0], "k5", "k6", *_COEFFICIENTS[1])
 _NUMBERS = {
-    **dict.fromkeys(("w", "h"), _PIXELS),
-    **dict.fromkeys(("fl_x", "fl_y"), _POSITIVE),
-    **dict.fromkeys(("camera_angle_x", "camera_angle_y"), _RADIANS),
-    **dict.fromkeys(("x_fov", "y_fov"), _DEGREES),
-    **dict.fromkeys(("cx", "cy", *_NAMES), _NUMBER),
+    **dict.fromkeys(("w", "h"), Annotated[float, Ge(1), Le(10**6)]),  # pixels
+    **dict.fromkeys(("fl_x", "fl_y"), Positive),
+    **dict.fromkeys(("camera_angle_x", "camera_angle_y"), Annotated[float, Gt(0), Lt(math.pi)]),
+    **dict.fromkeys(("x_fov", "y_fov"), Annotated[float, Gt(0), Lt(180)]),
+    **dict.fromkeys(("cx", "cy", *_NAMES), float),
 }
 
 
@@ -79,7 +74,7 @@ class Lens:
         focal = np.abs(np.diag(matrix)[:2]).max()
         if max(abs(matrix[0, 1]), abs(matrix[1, 0])) > max_skew * focal or np.abs(matrix[2] - [0, 0, 1]).max() > 1e-6:
             raise NerfroError(f"{where} must have no skew and the last row 0, 0, 1; it is {matrix.tolist()}")
-        fx, fy, cx, cy = (float(matrix[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        fx, fy, cx, cy = (float(matrix[entry]) for entry in ((0, 0), (1, 1), (0, 2), (1, 2)))
         return cls(fx, fy, cx, cy)
 
     def resized(self, calibrated: tuple[float, float], size: tuple[int, int], where: str) -> Lens:

@@ -14,12 +14,11 @@ import numpy as np
 from PIL import Image
 
 from nerfro.core.errors import NerfroError, first_of, warn
-from nerfro.data.base import DataSource, Views
+from nerfro.data.base import SPLITS, DataSource, Views
 from nerfro.data.image_files import IMAGE_SUFFIXES, Levels, read_levels, read_mask, read_size
 from nerfro.data.lazy_images import LazyImages
 from nerfro.files.reading import open_image
 
-_SPLIT_FOLDERS = ("train", "val", "test")
 # Lossless format first. Cameras and networks write suffixes in lower or upper case.
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 
@@ -80,17 +79,12 @@ def find_mask(root: Path, image: Path, stated: str | None = None) -> Path | None
         if not os.path.isfile(mask):  # False for a name that is too long
             raise NerfroError(f"mask {mask} of {image} does not exist; restore it or remove its path from the data set")
         return mask
-    if (beside := mask_beside(image)) is not None:
+    if (beside := mask_beside(image)) is not None or not image.is_relative_to(root):
         return beside
-    candidates = []
-    if image.is_relative_to(root):
-        folder = image.relative_to(root).parent
-        folders = [folder]
-        if folder.parts and folder.parts[0] not in _SPLIT_FOLDERS:
-            folders.append(Path(*folder.parts[1:]))
-        for within in folders:
-            names = [*(f"{image.stem}{suffix}" for suffix in _SUFFIXES), f"{image.name}.png"]
-            candidates += [root / "masks" / within / name for name in names]
+    first, *rest = image.relative_to(root).parent.parts or ("",)
+    folders = [Path(first, *rest)] if first in SPLITS else [Path(first, *rest), Path(*rest)]
+    names = [*(f"{image.stem}{suffix}" for suffix in _SUFFIXES), f"{image.name}.png"]
+    candidates = (root / "masks" / folder / name for folder in folders for name in names)
     return next((path for path in candidates if path.is_file()), None)
 
 
@@ -186,8 +180,8 @@ def with_other_splits(views: Views, source: DataSource, split: str) -> Views:
     for other in source.splits:
         if other == split:
             continue
-        more, known = masked_views(source.load(other)), {frame.image for frame in views.frames}
-        fresh = [i for i, frame in enumerate(more.frames) if frame.image not in known]
+        more, images = masked_views(source.load(other)), {frame.image for frame in views.frames}
+        fresh = [i for i, frame in enumerate(more.frames) if frame.image not in images]
         joined = views.joined(more.select(fresh)) if fresh else None
         views = views if joined is None else joined
     masks = views.masks

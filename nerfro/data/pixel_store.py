@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import mmap
 
 import numpy as np
@@ -11,6 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from nerfro.data.lazy_images import LazyImages
+from nerfro.files.cache import content_hash, file_hash
 from nerfro.files.mapped import mapped_array
 
 # Images that need more bytes than this are memory-mapped from a cache file.
@@ -61,12 +61,7 @@ def _load(images: LazyImages) -> np.ndarray:
         for view, levels in enumerate(images.all_levels()):
             stack[view] = levels
     else:
-        stack = mapped_array(_cache_key(images), shape, images.dtype, images.all_levels)
+        recipe = f"{images.recipe} {images.dtype} {images.downscale} {images.window}"
+        key = content_hash(recipe, *map(file_hash, images.files))
+        stack = mapped_array(key, shape, images.dtype, images.all_levels)
     return stack.view(np.int16) if images.dtype == np.uint16 else stack
-
-
-def _cache_key(images: LazyImages) -> str:
-    digest = hashlib.sha256(f"{images.recipe} {images.dtype} {images.downscale} {images.window}".encode())
-    for path in images.files:
-        digest.update(hashlib.sha256(path.read_bytes()).digest())
-    return digest.hexdigest()[:32]

@@ -10,8 +10,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from nerfro.core.errors import NerfroError, first_of, warn
-from nerfro.data.base import Frame
-from nerfro.data.frames import SPLITS, check_pose, require_root
+from nerfro.data.base import SPLITS, Frame
+from nerfro.data.frames import check_pose, require_root
 from nerfro.data.image_files import IMAGE_SUFFIXES, read_size
 from nerfro.data.lenses import Lens, read_lens
 from nerfro.data.masks import find_mask, mask_beside

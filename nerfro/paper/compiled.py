@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import torch
-from jaxtyping import Bool
-from torch import Tensor
 
 from nerfro.core.types import Path, Rays
 from nerfro.kernels.operators import arrays
@@ -22,9 +20,7 @@ if TYPE_CHECKING:
 _CAPACITY = 18
 
 
-def eikonal_on_grid(
-    rays: Rays, medium: VoxelGrid | Bodies, step: float, tolerance: float, max_steps: int
-) -> tuple[Path, Bool[Tensor, "R"]]:
+def eikonal_on_grid(rays: Rays, medium: VoxelGrid | Bodies, step: float, tolerance: float, max_steps: int) -> Path:
     """Evaluate `eikonal.march_adaptive` by the compiled kernel, on the CPU for rays on any device."""
     from nerfro.paper.eikonal_cpu import march_adaptive
     from nerfro.paper.index_cpu import NO_SOLIDS, NO_VOXELS
@@ -32,7 +28,7 @@ def eikonal_on_grid(
     bodies = medium.bodies
     packed = (_voxels(cast(VoxelGrid, medium)), NO_SOLIDS) if bodies is None else (NO_VOXELS, bodies.packed())
     settings = step, tolerance, max_steps
-    *columns, counts, refracted, exceeded = march_adaptive(*_arrays(rays), *packed, settings, _CAPACITY)
+    *columns, counts, refracted = march_adaptive(*_arrays(rays), *packed, settings, _CAPACITY)
     width = max(int(counts.max(initial=2)), 2)
     if width > _CAPACITY:  # trace the rays with more vertices again
         rows = np.nonzero(counts > _CAPACITY)[0]
@@ -40,8 +36,7 @@ def eikonal_on_grid(
         for i, (short, long) in enumerate(zip(columns, again, strict=True)):
             columns[i] = np.concatenate([short, np.repeat(short[:, -1:], width - _CAPACITY, axis=1)], axis=1)
             columns[i][rows] = long
-    path = _path(rays, [column[:, :width] for column in columns], refracted)
-    return path, torch.from_numpy(exceeded).to(path.s.device)
+    return _path(rays, [column[:, :width] for column in columns], refracted)
 
 
 def uniform_on_grid(rays: Rays, medium: VoxelGrid, num_steps: int) -> Path:

@@ -62,11 +62,11 @@ class Eikonal(PathSampler):
             return march_uniform(rays, medium, euler, self.num_steps)
         tolerance = self.tolerance * float(torch.linalg.vector_norm(medium.box[1] - medium.box[0]))
         if isinstance(medium, VoxelGrid):
-            return eikonal_on_grid(rays, medium, 0.5 * float(medium.spacing.min()), tolerance, self.max_steps)[0]
+            return eikonal_on_grid(rays, medium, 0.5 * float(medium.spacing.min()), tolerance, self.max_steps)
         if _has_grids(medium):
             step = 2 * medium.bodies.shell / STEPS_PER_SHELL
-            return eikonal_on_grid(rays, medium.bodies, step, tolerance, self.max_steps)[0]
-        return march_adaptive(rays, medium, tolerance, self.max_steps)[0]
+            return eikonal_on_grid(rays, medium.bodies, step, tolerance, self.max_steps)
+        return march_adaptive(rays, medium, tolerance, self.max_steps)
 
     def replay(self, path: Path, rays: Rays, medium: Medium) -> Path:
         """Repeat the steps of a path with gradients with respect to rays and medium, and keep the states of all steps.
@@ -156,20 +156,18 @@ class _KnownVertices:
         self.next[rows] += 1
 
 
-def march_adaptive(rays: Rays, medium: Medium, tolerance: float, max_steps: int) -> tuple[Path, Bool[Tensor, "R"]]:
+def march_adaptive(rays: Rays, medium: Medium, tolerance: float, max_steps: int) -> Path:
     """Trace rays by leapfrog steps where the index varies and by straight jumps elsewhere.
 
     This is the reference implementation of the compiled kernel. A vertex is recorded when the path is more than
-    `tolerance` world units from the tangent of the last vertex, and at the start of jumps.
-
-    Returns:
-        The path, and whether each ray met the limit of steps, after which the path continues straight.
+    `tolerance` world units from the tangent of the last vertex, and at the start of jumps. After `max_steps` steps, the
+    path continues straight.
     """
     vertices = _NewVertices(rays, tolerance)
-    state, refracted, exceeded = _march(rays, medium, max_steps, vertices)
+    state, refracted = _march(rays, medium, max_steps, vertices)
     vertices.before_jump(torch.arange(len(rays), device=rays.near.device), *state)
     vertices.lines.append_ends(rays.far, medium.box, refracted, *state)
-    return vertices.lines.path(rays, refracted), exceeded
+    return vertices.lines.path(rays, refracted)
 
 
 def replay_adaptive(path: Path, rays: Rays, medium: Medium, max_steps: int) -> Path:
@@ -179,7 +177,7 @@ def replay_adaptive(path: Path, rays: Rays, medium: Medium, max_steps: int) -> P
     """
     precise = rays[path.ray].to(torch.float64)
     vertices = _KnownVertices(path)
-    state, _, _ = _march(precise, medium, max_steps, vertices)
+    state, _ = _march(precise, medium, max_steps, vertices)
     rows = torch.arange(len(precise), device=path.s.device)
     first = (rows, torch.zeros_like(rows), *_start(precise))
     return assembled(path, rays, medium, [first, *vertices.found], state)
@@ -191,13 +189,13 @@ def _start(rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
 
 def _march(
     rays: Rays, medium: Medium, max_steps: int, vertices: _NewVertices | _KnownVertices
-) -> tuple[tuple[Tensor, Tensor, Tensor], Bool[Tensor, "R"], Bool[Tensor, "R"]]:
+) -> tuple[tuple[Tensor, Tensor, Tensor], Bool[Tensor, "R"]]:
     """Trace rays until they leave the medium's box; outside the box, rays are straight.
 
     Inside the box, a ray jumps by the clearance of the medium if there is any, and otherwise takes a leapfrog step.
 
     Returns:
-        Last positions, directions and arc lengths; whether the index varied on the path; whether a ray met the limit.
+        Last positions, directions and arc lengths; whether the index varied on the path.
     """
     num_rays = len(rays)
     rows = torch.arange(num_rays, device=rays.near.device)
@@ -238,6 +236,4 @@ def _march(
         vertices.after_step(stepping, length, x, d, s)
         outside = ((x[active] < medium.box[0]) | (x[active] > medium.box[1])).any(-1)
         active = active[~outside]
-    exceeded = torch.zeros_like(refracted)
-    exceeded[active] = True
-    return (x, d, s), refracted, exceeded
+    return (x, d, s), refracted

@@ -156,14 +156,14 @@ def _step_length(solids, step, dx, dy, dz, gx, gy, gz):
 
 @compiled
 def _march_ray(voxels, solids, origin, direction, near, far, settings, row):
-    """Trace one ray and write its vertices; returns their number, whether the index varied, and the excess of steps."""
+    """Trace one ray and write its vertices; returns their number, and whether the index varied."""
     low, high = _box_of(voxels, solids)
     step, tolerance, max_steps = settings
     skip = REACHED * step
     dx, dy, dz = float(direction[0]), float(direction[1]), float(direction[2])
     s, end = float(near), float(far)
     x, y, z = origin[0] + s * dx, origin[1] + s * dy, origin[2] + s * dz
-    count, refracted, exceeded = _put_vertex(row, 0, x, y, z, dx, dy, dz, s), False, False
+    count, refracted = _put_vertex(row, 0, x, y, z, dx, dy, dz, s), False
     enter, leave = box_span(low, high, x, y, z, dx, dy, dz)
     if enter < leave and leave > 0.0 and enter < end - s:
         # Position, direction and arc length of the last recorded vertex.
@@ -172,7 +172,6 @@ def _march_ray(voxels, solids, origin, direction, near, far, settings, row):
         x, y, z, s = x + jump * dx, y + jump * dy, z + jump * dz, s + jump
         n, gx, gy, gz, free = _look_up(voxels, solids, x, y, z)
         vx, vy, vz = n * dx, n * dy, n * dz
-        exceeded = True
         for _ in range(max_steps):
             if free > skip:
                 if (dx - kdx) ** 2 + (dy - kdy) ** 2 + (dz - kdz) ** 2 > MIN_TURN:
@@ -198,9 +197,7 @@ def _march_ray(voxels, solids, origin, direction, near, far, settings, row):
                 if ex * ex + ey * ey + ez * ez > tolerance * tolerance:
                     count = _put_vertex(row, count, x, y, z, dx, dy, dz, s)
                     kx, ky, kz, kdx, kdy, kdz, ks = x, y, z, dx, dy, dz, s
-            outside = x < low[0] or x > high[0] or y < low[1] or y > high[1] or z < low[2] or z > high[2]
-            if outside:
-                exceeded = False
+            if x < low[0] or x > high[0] or y < low[1] or y > high[1] or z < low[2] or z > high[2]:
                 break
         if (dx - kdx) ** 2 + (dy - kdy) ** 2 + (dz - kdz) ** 2 > MIN_TURN:
             count = _put_vertex(row, count, x, y, z, dx, dy, dz, s)
@@ -209,14 +206,15 @@ def _march_ray(voxels, solids, origin, direction, near, far, settings, row):
         ahead = max(ahead, distance_out(low, high, x, y, z, dx, dy, dz))
     count = _put_vertex(row, count, x + ahead * dx, y + ahead * dy, z + ahead * dz, dx, dy, dz, s + ahead)
     _repeat_last(row, count)
-    return count, refracted, exceeded
+    return count, refracted
 
 
 @compiled_parallel
 def march_adaptive(origins, directions, near, far, voxels, solids, settings, capacity):
     """Trace rays by steps in regions of varying index, and straight jumps elsewhere.
 
-    A vertex is recorded when the path is more than the tolerance from its last tangent.
+    A vertex is recorded when the path is more than the tolerance from its last tangent. After the largest number of
+    steps, a path continues straight.
 
     Args:
         origins, directions, near, far: rays [R, ...].
@@ -228,7 +226,6 @@ def march_adaptive(origins, directions, near, far, voxels, solids, settings, cap
         positions [R, S, 3], directions [R, S, 3], s [R, S]: S is the capacity; in the precision of the rays.
         counts [R]: number of vertices of each path, which may be more than the capacity.
         refracted [R]: whether the index varied along the path.
-        exceeded [R]: whether a ray took the largest number of steps, after which the path continues straight.
     """
     num_rays = origins.shape[0]
     out_positions = np.empty((num_rays, capacity, 3), origins.dtype)
@@ -236,10 +233,9 @@ def march_adaptive(origins, directions, near, far, voxels, solids, settings, cap
     out_s = np.empty((num_rays, capacity), origins.dtype)
     counts = np.empty(num_rays, np.int64)
     refracted = np.empty(num_rays, np.bool_)
-    exceeded = np.empty(num_rays, np.bool_)
     for ray in prange(num_rays):
         row = (out_positions[ray], out_directions[ray], out_s[ray])
-        counts[ray], refracted[ray], exceeded[ray] = _march_ray(
+        counts[ray], refracted[ray] = _march_ray(
             voxels, solids, origins[ray], directions[ray], near[ray], far[ray], settings, row
         )
-    return out_positions, out_directions, out_s, counts, refracted, exceeded
+    return out_positions, out_directions, out_s, counts, refracted

@@ -6,17 +6,16 @@ frustums, and of `model=mip_nerf`.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.core.types import Batch, FieldValues, Path, Rendering, Samples
-from nerfro.geometry.space import Space
-from nerfro.paper.encoding import DIRECTION_DEGREE, integrated_positional_encoding, positional_encoding
-from nerfro.paper.mlp import RadianceMLP, in_blocks
+from nerfro.paper.encoding import integrated_positional_encoding
+from nerfro.paper.mlp import in_blocks
 from nerfro.paper.nerf import EncodedField
-from nerfro.registry.allowed import Depth, Positive, Width
+from nerfro.registry.allowed import Depth
 from nerfro.registry.registration import register
 from nerfro.rendering import Components, Renderer, composite
 
@@ -26,25 +25,12 @@ class MipNerfField(EncodedField):
     """8x256 MLP on the expected encoding of each sample's frustum (mip-NeRF, section 3); needs `cast=cones`.
 
     Args:
-        width, depth, skip, view_width: shape of the MLP, see `RadianceMLP`.
         position_degree: number of octaves of the integrated encoding, which damps octaves finer than the frustum.
-        unit, space: see `field=nerf`.
+        options: see `EncodedField`.
     """
 
-    def __init__(
-        self,
-        width: Width = 256,
-        depth: Depth = 8,
-        skip: int = 5,
-        view_width: Width = 128,
-        position_degree: Depth = 16,
-        unit: Positive | None = 1.0,
-        space: Space | None = None,
-    ) -> None:
-        super().__init__(unit, space)
-        self.position_degree = position_degree
-        num_position, num_direction = 6 * position_degree, 3 * (1 + 2 * DIRECTION_DEGREE)
-        self.mlp = RadianceMLP(num_position, num_direction, width, depth, skip, view_width)
+    def __init__(self, position_degree: Depth = 16, **options: Any) -> None:
+        super().__init__(position_degree=position_degree, **options)
 
     def forward(self, samples: Samples) -> FieldValues:
         density, radiance = in_blocks(self._decode_block, *frustum_gaussians(samples), samples.directions)
@@ -59,9 +45,7 @@ class MipNerfField(EncodedField):
         directions: Float[Tensor, "points 3"],
     ) -> tuple[Float[Tensor, " points"], Float[Tensor, "points 3"]]:
         position = integrated_positional_encoding(mean / self.unit, variance / self.unit**2, self.position_degree)
-        direction = positional_encoding(directions, DIRECTION_DEGREE)
-        density, radiance = self.mlp(position, direction)
-        return density / self.unit, radiance
+        return self.decode_encoded(position, directions)
 
 
 def frustum_gaussians(samples: Samples) -> tuple[Float[Tensor, "P N 3"], Float[Tensor, "P N 3"]]:

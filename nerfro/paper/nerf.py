@@ -23,18 +23,37 @@ _RANGE_OF_RAYS = 4.0
 
 
 class EncodedField(Field):
-    """A field that encodes positions in world coordinates.
+    """A field that evaluates an MLP on encodings of positions in world coordinates, and of directions.
 
     Args:
+        width, depth, skip, view_width: shape of the MLP, see `RadianceMLP`.
+        position_degree: number of octaves of the encoding of positions.
         unit: length of the encoded positions and of the density, world units. The authors use 1. In a configuration,
             None takes a quarter of the distance from near to far, so that the world unit is irrelevant.
         space: space that the field covers; None for all of space.
+
+    Attributes:
+        num_coordinates: number of coordinates that the encoding of positions includes.
     """
 
-    def __init__(self, unit: float | None = 1.0, space: Space | None = None) -> None:
+    num_coordinates = 0
+
+    def __init__(
+        self,
+        width: Width = 256,
+        depth: Depth = 8,
+        skip: int = 5,
+        view_width: Width = 128,
+        position_degree: int = 16,
+        unit: Positive | None = 1.0,
+        space: Space | None = None,
+    ) -> None:
         super().__init__()
+        self.position_degree = position_degree
         self.unit = 1.0 if unit is None else unit
         self.space = Unbounded() if space is None else space
+        num_position, num_direction = self.num_coordinates + 6 * position_degree, 3 * (1 + 2 * DIRECTION_DEGREE)
+        self.mlp = RadianceMLP(num_position, num_direction, width, depth, skip, view_width)
 
     @classmethod
     def derive(cls, settings: DictConfig, views: Views, space: Space) -> dict[str, Any]:
@@ -44,31 +63,27 @@ class EncodedField(Field):
     def bounds(self) -> Float[Tensor, "2 3"] | None:
         return self.space.bounds
 
+    def decode_encoded(
+        self, position: Float[Tensor, "points F"], directions: Float[Tensor, "points 3"]
+    ) -> tuple[Float[Tensor, " points"], Float[Tensor, "points 3"]]:
+        """Evaluate density and colour for encoded positions and unit directions."""
+        density, radiance = self.mlp(position, positional_encoding(directions, DIRECTION_DEGREE))
+        return density / self.unit, radiance
+
 
 @register("field", "nerf")
 class NerfField(EncodedField):
     """8x256 MLP on positional encodings of position and local direction (paper, section 2; NeRF, section 5).
 
     Args:
-        width, depth, skip, view_width: shape of the MLP, see `RadianceMLP`.
         position_degree: number of octaves of the encoding of positions.
-        unit, space: see `EncodedField`. The field is empty outside a box, and samples there are not evaluated.
+        options: see `EncodedField`. The field is empty outside a box, and samples there are not evaluated.
     """
 
-    def __init__(
-        self,
-        width: Width = 256,
-        depth: Depth = 8,
-        skip: int = 5,
-        view_width: Width = 128,
-        position_degree: Annotated[int, Ge(0), Le(64)] = 10,
-        unit: Positive | None = 1.0,
-        space: Space | None = None,
-    ) -> None:
-        super().__init__(unit, space)
-        self.position_degree = position_degree
-        num_position, num_direction = 3 * (1 + 2 * position_degree), 3 * (1 + 2 * DIRECTION_DEGREE)
-        self.mlp = RadianceMLP(num_position, num_direction, width, depth, skip, view_width)
+    num_coordinates = 3
+
+    def __init__(self, position_degree: Annotated[int, Ge(0), Le(64)] = 10, **options: Any) -> None:
+        super().__init__(position_degree=position_degree, **options)
 
     def forward(self, samples: Samples) -> FieldValues:
         return evaluate_selected(self.decode, samples, self.space.inside(samples.positions))
@@ -82,7 +97,4 @@ class NerfField(EncodedField):
     def _decode_block(
         self, positions: Float[Tensor, "points 3"], directions: Float[Tensor, "points 3"]
     ) -> tuple[Float[Tensor, " points"], Float[Tensor, "points 3"]]:
-        position = positional_encoding(positions / self.unit, self.position_degree)
-        direction = positional_encoding(directions, DIRECTION_DEGREE)
-        density, radiance = self.mlp(position, direction)
-        return density / self.unit, radiance
+        return self.decode_encoded(positional_encoding(positions / self.unit, self.position_degree), directions)

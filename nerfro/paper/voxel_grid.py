@@ -10,6 +10,7 @@ import torch
 from annotated_types import Ge, Le
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import max_pool3d
 
 from nerfro.core.errors import NerfroError
 from nerfro.files.cache import cached_arrays, content_hash
@@ -112,7 +113,7 @@ class VoxelGrid(Medium):
         return medium
 
     def _set(self, occupancy: Tensor, box: Tensor, ior: float, size: int, sigma: float) -> None:
-        if any(float(face.abs().max()) > 0 for face in _faces(occupancy)):
+        if occupancy.count_nonzero() > occupancy[1:-1, 1:-1, 1:-1].count_nonzero():
             raise NerfroError("the object touches the grid's border; enlarge medium.box_min and medium.box_max")
         self.ior, self.smoothing_size, self.smoothing_sigma = float(ior), int(size), float(sigma)
         # Grids are rebuilt from the mesh at every start and do not belong in checkpoints.
@@ -183,16 +184,9 @@ def _clearance_of(
     table: Float[Tensor, "X Y Z 4"], spacing: Float[Tensor, "3"], box: Float[Tensor, "2 3"]
 ) -> Float[Tensor, "x y z"]:
     """Compute `VoxelGrid.clearance_grid`."""
-    varies = (table[..., 1:] != 0).any(-1)
-    for axis in range(3):
-        length = varies.shape[axis] - 1
-        varies = varies.narrow(axis, 0, length) | varies.narrow(axis, 1, length)
+    varies = max_pool3d((table[..., 1:] != 0).any(-1)[None].float(), 2, stride=1)[0] > 0  # at any corner of a cell
     cell = spacing.double().numpy()
     # The distance between two cell centres exceeds that between any of their points by at most a cell diagonal.
     distance = distance_to_set(varies.numpy(), cell) - np.linalg.norm(cell)
     diagonal = float(torch.linalg.vector_norm(box[1] - box[0]))
     return torch.from_numpy(distance.clip(0, diagonal)).to(table)
-
-
-def _faces(values: Tensor) -> list[Tensor]:
-    return [values.select(axis, end) for axis in range(3) for end in (0, -1)]

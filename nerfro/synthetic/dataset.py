@@ -19,6 +19,7 @@ from PIL import Image
 from nerfro.cli.overrides import as_overrides, command_line
 from nerfro.core.errors import NerfroError
 from nerfro.core.light import to_srgb
+from nerfro.data.base import SPLITS
 from nerfro.files import lat_long
 from nerfro.files.atomic import write_atomically
 from nerfro.files.folder_lock import require_only
@@ -30,7 +31,6 @@ from nerfro.synthetic.viewpoints import directions_on_sphere, look_at_origin
 
 CAMERA_ANGLE_X = 0.6911112070083618  # field of view of the NeRF synthetic scenes and of the paper's scenes
 CAMERA_DISTANCE = 4.03
-SPLITS = ("train", "val", "test")
 
 
 @dataclass(frozen=True)
@@ -49,6 +49,11 @@ class PlannedImage:
     pose: np.ndarray
     spp: int
     seed: int
+
+    def frame(self, folder: str, pose: np.ndarray) -> dict[str, Any]:
+        """Return the entry of the image in a transforms file, from which `folder` is the path to the data set."""
+        paths = {"file_path": f"{folder}/{self.image_path}", "mask_path": f"{folder}/{self.mask_path}"}
+        return {**paths, "transform_matrix": pose.tolist()}
 
 
 @dataclass(frozen=True)
@@ -175,11 +180,7 @@ class ViewSplits(DataSet):
             lat_long.save_lat_long(self.folder / "sky.exr", torch.from_numpy(sky))
         for split in SPLITS:
             frames = [
-                {
-                    "file_path": "./" + view.image_path.removesuffix(".png"),
-                    "mask_path": "./" + view.mask_path,
-                    "transform_matrix": view.pose.tolist(),
-                }
+                view.frame(".", view.pose) | {"file_path": "./" + view.image_path.removesuffix(".png")}
                 for view in planned
                 if view.image_path.startswith(f"{split}/")
             ]

@@ -23,10 +23,7 @@ VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb", "scalar_rgb")
 SILHOUETTE_PLACES = [((k + 0.5) / 128, (int(f"{k:07b}"[::-1], 2) + 0.5) / 128) for k in range(128)]
 SAMPLES_PER_PASS = 6_000_000  # a wavefront of paths takes about 1 GB of memory per 10 million paths
 _TEXELS_PER_TASK = 1 << 17
-ROULETTE_DEPTH, MAX_DEPTH = (
-    32,
-    1024,
-)  # large, because cubes reflect light many times inside
+ROULETTE_DEPTH, MAX_DEPTH = 32, 1024  # large, because cubes reflect light many times inside
 
 
 @functools.cache

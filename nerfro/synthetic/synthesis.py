@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from types import ModuleType
 
 from nerfro.core.errors import NerfroError
@@ -28,17 +27,6 @@ def find_scene(name: str) -> ModuleType:
     return SCENES[name]
 
 
-def data_set_type(scene: ModuleType) -> type[DataSet]:
-    """Return the class of the data set of a scene; the module of the scene may define it as `DATA_SET`."""
-    return getattr(scene, "DATA_SET", ViewSplits)
-
-
-def build_scene(name: str, resolution: int) -> SyntheticScene:
-    """Model a scene. Colours have a resolution of half a pixel in images of `resolution` pixels."""
-    module = find_scene(name)
-    return module.build(spacing=max(0.5 * data_set_type(module).WIDTH / resolution, 0.0025))
-
-
 def synthesize(options: SynthesizeConfig) -> DataSet:
     """Render the missing images of a data set.
 
@@ -52,26 +40,24 @@ def synthesize(options: SynthesizeConfig) -> DataSet:
         raise NerfroError(f"absorption={list(options.absorption)} is not allowed; give red, green and blue")
     folder = user_path(options.out or f"outputs/scenes/{options.scene}")
     with lock_folder(folder, "out"):
-        return _synthesize(options, folder)
-
-
-def _synthesize(options: SynthesizeConfig, folder: Path) -> DataSet:
-    scene = build_scene(options.scene, options.resolution)
-    ior = scene.ior if options.ior is None else options.ior
-    scene = replace(scene, absorption=tuple(options.absorption), ior=ior)
-    mitsuba = load_mitsuba(options.variant)  # a missing Mitsuba is reported before files are removed
-    data = data_set_type(find_scene(options.scene))(options, scene, folder)
-    data.prepare(mitsuba)
-    planned = data.planned()
-    waiting = data.missing(planned)
-    print(f"{options.scene}: {len(planned)} {data.NOUN}, {len(planned) - len(waiting)} of them already in {folder}")
-    if waiting:
-        tracer = PathTracer(data.lit(), options.fresnel, data.camera, options.variant)
-        # The remaining time is estimated from samples, because test views have more samples.
-        with progress_bar("render", sum(image.spp for image in waiting)) as bar:
-            for image in waiting:
-                radiance = tracer.render(image.pose, image.spp, image.seed)
-                data.write(image, radiance, tracer.silhouette(image.pose))
-                bar.update(image.spp)
-    data.finish(planned)
+        module = find_scene(options.scene)
+        data_type: type[DataSet] = getattr(module, "DATA_SET", ViewSplits)
+        # Colours have a resolution of half a pixel of the images.
+        scene: SyntheticScene = module.build(spacing=max(0.5 * data_type.WIDTH / options.resolution, 0.0025))
+        ior = scene.ior if options.ior is None else options.ior
+        mitsuba = load_mitsuba(options.variant)  # a missing Mitsuba is reported before files are removed
+        data = data_type(options, replace(scene, absorption=tuple(options.absorption), ior=ior), folder)
+        data.prepare(mitsuba)
+        planned = data.planned()
+        waiting = data.missing(planned)
+        print(f"{options.scene}: {len(planned)} {data.NOUN}, {len(planned) - len(waiting)} of them already in {folder}")
+        if waiting:
+            tracer = PathTracer(data.lit(), options.fresnel, data.camera, options.variant)
+            # The remaining time is estimated from samples, because test views have more samples.
+            with progress_bar("render", sum(image.spp for image in waiting)) as bar:
+                for image in waiting:
+                    radiance = tracer.render(image.pose, image.spp, image.seed)
+                    data.write(image, radiance, tracer.silhouette(image.pose))
+                    bar.update(image.spp)
+        data.finish(planned)
     return data

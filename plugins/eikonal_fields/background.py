@@ -89,9 +89,7 @@ def _vertices(box: Float[Tensor, "2 3"], resolution: int) -> Float[Tensor, "poin
 def _mean_radiance(field: Field, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points 4"]:
     total = positions.new_zeros(len(positions), 4)
     axes = torch.cat([torch.eye(3), -torch.eye(3)]).to(positions.device)
-    s = positions.new_zeros(len(positions), 1)
     for axis in axes:
-        directions = axis.expand(len(positions), 1, 3)
-        values = field(Samples(positions[:, None], directions, s, torch.cat([s, s], 1), s[:, 0]))
-        total += torch.cat([values.radiance[:, 0], values.density], -1).float() / len(axes)
+        density, radiance = field.at_points(positions, axis.expand_as(positions))
+        total += torch.cat([radiance, density[:, None]], -1) / len(axes)
     return total

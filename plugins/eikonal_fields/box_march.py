@@ -42,13 +42,9 @@ class BoxMarch(PathSampler):
         bent = self._march(rays[rows], rays.near[rows] + enter[rows], medium)
         last = torch.ones(self.num_steps + 3, dtype=torch.long, device=rows.device)
         last[0] = 0
-        return Path.unbranched(
-            straight.positions[:, last].index_copy(0, rows, bent.positions),
-            straight.directions[:, last].index_copy(0, rows, bent.directions),
-            straight.s[:, last].index_copy(0, rows, bent.s),
-            straight.refracted.index_copy(0, rows, bent.refracted),
-            rays.radii,
-        )
+        names = ("positions", "directions", "s")
+        columns = [getattr(straight, name)[:, last].index_copy(0, rows, getattr(bent, name)) for name in names]
+        return Path.unbranched(*columns, straight.refracted.index_copy(0, rows, bent.refracted), rays.radii)
 
     def replay(self, path: Path, rays: Rays, medium: Medium) -> Path:
         """Trace the path again; `forward` has gradients."""

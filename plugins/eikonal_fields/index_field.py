@@ -9,8 +9,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from nerfro.core.errors import NerfroError
 from nerfro.core.paths import resolve_path
+from nerfro.geometry.box import corners_of_box
 from nerfro.geometry.mesh import load_mesh, local_origin
 from nerfro.geometry.space import inside_box
 from nerfro.media.base import Medium
@@ -65,16 +65,8 @@ class IndexField(Medium):
         if mesh is not None:
             surface = load_mesh(resolve_path(mesh), accept_open_mesh=True)
             self.origin = local_origin(surface.vertices)
-            bounds = torch.from_numpy(surface.bounds - self.origin).float()
-        elif len(box_min) == len(box_max) == 3:
-            bounds = torch.tensor([list(box_min), list(box_max)])
-        else:
-            bounds = torch.zeros(2, 3)
-        if not bool((bounds[0] < bounds[1]).all()):
-            raise NerfroError(
-                f"medium=index_field: no box from {list(box_min)} to {list(box_max)}; give three numbers each, "
-                "box_min below box_max"
-            )
+            box_min, box_max = (surface.bounds - self.origin).tolist()
+        bounds = torch.from_numpy(corners_of_box(box_min, box_max)).float()
         side = float((bounds[1] - bounds[0]).max())
         self.fade, self.scale, self.skip = margin * side, 0.5 * side, skip
         self.register_buffer("bounds", bounds, persistent=False)

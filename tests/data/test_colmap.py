@@ -91,16 +91,6 @@ def test_models_are_exchanged_with_pycolmap_in_both_directions(write, tmp_path):
         np.testing.assert_allclose(again.cameras.project(TORCH_POINTS)[0].numpy(), pixels, atol=1e-4)
 
 
-def test_bounds_default_to_the_sparse_points(write):
-    inside = np.array([[0, 0, 0.5], [0.2, 0, 0], [0, -0.1, -0.3]])
-    views = load(write(points=inside), near=None, far=None)
-    centres = np.stack([camera_to_world(i, "opencv")[:3, 3] for i in range(6)])
-    distance = np.linalg.norm(inside[:, None] - centres, axis=-1)
-    # The outermost thousandth is left out, so the ends are not quite reached.
-    assert views.cameras.near == pytest.approx(0.9 * distance.min(), rel=1e-3)
-    assert views.cameras.far == pytest.approx(1.1 * distance.max(), rel=1e-3)
-
-
 @pytest.mark.parametrize("lens", [(FX, 3 * FX, WIDTH / 2, HEIGHT / 2), (FX, FX, 0.1 * WIDTH, 0.8 * HEIGHT)])
 def test_bounds_are_those_of_the_points_within_the_images(write, lens):
     points = np.random.default_rng(0).uniform(-1, 1, (400, 3))

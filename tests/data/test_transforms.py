@@ -325,19 +325,6 @@ def test_bounds_enclose_the_sparse_points(tmp_path: Path) -> None:
     refused(r"sparse_pc\.ply has no readable points", lambda: NerfstudioData(str(root)).load("train"))
 
 
-def test_bounds_enclose_points_that_a_principal_point_in_the_corner_brings_into_view(tmp_path: Path) -> None:
-    focal, pixel, pose = 9 * FX, np.array([0.2 * WIDTH, 0.8 * HEIGHT]), camera_to_world(1, "opengl")
-    top = {"fl_x": focal, "cx": WIDTH, "cy": 0.0, "ply_file_path": "points.ply"}
-    root = write_nerfstudio(tmp_path, seeds=[1], top=top, name="transforms_train.json")
-    x, y = (pixel - [WIDTH, 0.0]) / focal
-    points = pose[:3, :3] @ [3 * x, -3 * y, -3.0] + np.random.default_rng(0).uniform(-0.01, 0.01, (50, 3))
-    trimesh.PointCloud(points + pose[:3, 3]).export(root / "points.ply")
-    cameras = NerfstudioData(str(root)).load("train").cameras
-    distance = np.linalg.norm(points, axis=1)
-    assert cameras.near == pytest.approx(0.9 * distance.min(), rel=1e-3)
-    assert cameras.far == pytest.approx(1.1 * distance.max(), rel=1e-3)
-
-
 def test_cameras_without_a_common_target_need_near_and_far(tmp_path: Path) -> None:
     def outwards(i: int) -> dict:
         pose = camera_to_world(i, "opengl")

@@ -95,9 +95,10 @@ def test_tolerance_bounds_the_distance_to_the_tangents() -> None:
 
 
 def test_rays_continue_straight_after_the_limit_of_steps() -> None:
-    path, exceeded = march_adaptive(make_rays([[-3, 0.5, 0]], [[1, 0, 0]], 0.5, 6), Luneburg().double(), 1e-4, 50)
-    assert exceeded.all()
-    assert path.far[0] == 6
+    rays, medium = make_rays([[-3, 0.5, 0]], [[1, 0, 0]], 0.5, 6), Luneburg().double()
+    limited, whole = (march_adaptive(rays, medium, 1e-4, max_steps) for max_steps in (50, 16384))
+    assert limited.far[0] == 6
+    assert angle(limited.exit_directions, whole.exit_directions) > 1
 
 
 # --- compiled kernels against plain torch ---
@@ -127,8 +128,7 @@ def test_compiled_adaptive_steps_match_the_reference(kind: str) -> None:
     medium: Medium = voxels if kind == "voxels" else solid
     rays = random_rays(200, 1.4, seed=1, far=7)
     compiled = Eikonal()(rays, medium)
-    plain, exceeded = march_adaptive(rays, medium.double(), 2e-4 * 3 * math.sqrt(3), 16384)
-    assert not exceeded.any()
+    plain = march_adaptive(rays, medium.double(), 2e-4 * 3 * math.sqrt(3), 16384)
     assert (compiled.refracted == plain.refracted).all()
     error = angle(compiled.exit_directions, plain.exit_directions)
     assert error.median() < 1e-5

@@ -43,7 +43,7 @@ class PlainEikonal(Eikonal):
 
     @torch.no_grad()
     def forward(self, rays: Rays, medium: Medium) -> Path:
-        return march_adaptive(rays, medium, 1e-3, self.max_steps)[0]
+        return march_adaptive(rays, medium, 1e-3, self.max_steps)
 
 
 def _nested_grid(inner_ior: float = 1.0, **glass: Any) -> Bodies:

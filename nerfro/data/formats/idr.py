@@ -63,10 +63,10 @@ class IdrData(PosedImages):
             raise NerfroError(
                 f"{file} has {num_matrices} matrices world_mat_<i> for {len(images)} images; the numbers must be equal"
             )
-        projections = (self._projection(arrays, i, file) for i in range(len(images)))
-        cameras = [decompose(projection, f"{file}: world_mat_{i}") for i, projection in enumerate(projections)]
+        numbers = range(len(images))
+        cameras = (decompose(self._projection(arrays, i, file), f"{file}: world_mat_{i}") for i in numbers)
         poses, lenses = zip(*cameras, strict=True)
-        indices = self.held_out(range(len(images)), self.test_every, split)
+        indices = self.held_out(numbers, self.test_every, split)
         frames = [Frame(images[i].name, images[i], masks[i], poses[i]) for i in indices]
         # All views are considered, so that all splits have the same bounds.
         distance = np.linalg.norm(np.stack(poses)[:, :, 3], axis=-1)

@@ -10,8 +10,9 @@ from typing import Any, Literal
 import numpy as np
 
 from nerfro.core.errors import NerfroError
+from nerfro.data.base import SPLITS
 from nerfro.data.formats.bounds import find_bounds, image_edges, usable_points
-from nerfro.data.frames import SPLITS, Every, FrameSet, PosedImages
+from nerfro.data.frames import Every, FrameSet, PosedImages
 from nerfro.data.image_files import read_size
 from nerfro.data.masks import find_mask
 from nerfro.data.transforms import Manifest, find_splits, parse_manifest, read_manifest
@@ -19,7 +20,7 @@ from nerfro.geometry.mesh import load_points
 from nerfro.registry.allowed import check
 from nerfro.registry.registration import register
 
-_SINGLE, _MASK_KEY = "transforms.json", "object_mask_path"
+_MASK_KEY = "object_mask_path"
 
 
 @register("data", "nerfstudio")
@@ -51,22 +52,20 @@ class NerfstudioData(PosedImages):
 
     @property
     def splits(self) -> list[str]:
-        return SPLITS if self._is_single else list(find_splits(self.root))
-
-    @property
-    def _is_single(self) -> bool:
-        return (self.root / _SINGLE).is_file()
-
-    def _manifest(self, split: str) -> Manifest:
-        return self._whole if self._is_single else read_manifest(self.root, split, _MASK_KEY, self.skip_missing)
+        return SPLITS if self._single else list(find_splits(self.root))
 
     @functools.cached_property
-    def _whole(self) -> Manifest:
-        return parse_manifest(self.root / _SINGLE, _MASK_KEY, self.skip_missing)
+    def _single(self) -> Manifest | None:
+        """Content of transforms.json; None if there is one file per split."""
+        file = self.root / "transforms.json"
+        return parse_manifest(file, _MASK_KEY, self.skip_missing) if file.is_file() else None
+
+    def _manifest(self, split: str) -> Manifest:
+        return self._single or read_manifest(self.root, split, _MASK_KEY, self.skip_missing)
 
     def read(self, split: str) -> FrameSet:
         manifest = self._manifest(split)
-        indices = self._choose(manifest, split) if self._is_single else list(range(len(manifest.frames)))
+        indices = self._choose(manifest, split) if self._single else list(range(len(manifest.frames)))
         entries: Any = manifest.document["frames"]
         frames, stated = [manifest.frames[i] for i in indices], [entries[i].get("mask_path") for i in indices]
         usable = [path and find_mask(self.root, frame.image, path) for path, frame in zip(stated, frames, strict=True)]

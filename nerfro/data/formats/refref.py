@@ -14,8 +14,8 @@ from jaxtyping import Float
 
 from nerfro.core.errors import NerfroError
 from nerfro.core.optional import optional
-from nerfro.data.base import Frame, Views
-from nerfro.data.frames import SPLITS, FrameSet, PosedImages, check_pose
+from nerfro.data.base import SPLITS, Frame, Views
+from nerfro.data.frames import FrameSet, PosedImages, check_pose
 from nerfro.data.image_files import read_size
 from nerfro.data.lenses import Lens
 from nerfro.files.reading import parse_matrix, reading
@@ -94,13 +94,12 @@ def _read_rows(files: list[Path], numbers: range, columns: list[str]) -> list[tu
     Returns:
         Number and content of each row.
     """
-    pyarrow = optional("pyarrow", "refref", "data=refref reads .parquet files with pyarrow")
-    optional("pyarrow.parquet", "refref", "data=refref reads .parquet files with pyarrow")
+    parquet = optional("pyarrow.parquet", "refref", "data=refref reads .parquet files with pyarrow")
     rows: list[tuple[int, dict[str, Any]]] = []
     offset = 0
     for path in files:
         with reading(path, advice="download it again"):
-            table = pyarrow.parquet.ParquetFile(path)
+            table = parquet.ParquetFile(path)
             num_rows = table.metadata.num_rows
             wanted = range(max(numbers.start, offset), min(numbers.stop, offset + num_rows))
             if len(wanted):

@@ -123,16 +123,12 @@ def globe(points: np.ndarray) -> np.ndarray:
     return distance.rounded(parts, GLOBE_ROUNDING)
 
 
-def board_to_world(points: np.ndarray) -> np.ndarray:
-    """Points [..., 3] of the board's frame, world units."""
-    return BOARD_SCALE * (points - [0.405, 0.405, 0.0]) + [0.0, 0.0, BOARD_HEIGHT]
-
-
 def board_panels(board: TagBoard) -> list[Panel]:
     """The board's printed sheets."""
     panels = []
     for face in board.faces:
-        corner, upper_right, _, lower_left = board_to_world(board.face_corners(face))
+        corners = BOARD_SCALE * (board.face_corners(face) - [0.405, 0.405, 0.0]) + [0.0, 0.0, BOARD_HEIGHT]
+        corner, upper_right, _, lower_left = corners
         # Paper is not quite white, and ink not quite black.
         print_ = 0.08 + 0.84 * board.draw(face, 12).astype(np.float32)[..., None].repeat(3, -1) / 255
         panels.append(Panel(corner, upper_right - corner, lower_left - corner, print_, smooth=False))
@@ -176,8 +172,7 @@ def room_panels(spacing: float) -> list[Panel]:
 
     def side(axis: int, corner: np.ndarray, right: np.ndarray, down: np.ndarray) -> Panel:
         def colour(points: np.ndarray) -> np.ndarray:
-            places = (points - ROOM_CENTRE) / ROOM_SCALE
-            return starlamp.room(places, np.full(points.shape[:-1], axis))
+            return starlamp.room((points - ROOM_CENTRE) / ROOM_SCALE, np.full(points.shape[:-1], axis))
 
         return painted_panel(corner, right, down, colour, spacing, glows=True)
 

@@ -62,14 +62,7 @@ class Photographs(DataSet):
         camera, truth = self.camera, self.folder / "truth"
         self.scene.glass.save(truth / "mesh.ply")
         self.scene.interior.save(truth / "interior.ply")
-        frames = [
-            {
-                "file_path": f"../{photograph.image_path}",
-                "mask_path": f"../{photograph.mask_path}",
-                "transform_matrix": (photograph.pose @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist(),
-            }
-            for photograph in planned
-        ]
+        frames = [image.frame("..", image.pose @ np.diag([1.0, -1.0, -1.0, 1.0])) for image in planned]
         matrix = [[camera.focal, 0.0, camera.cx], [0.0, camera.focal, camera.cy], [0.0, 0.0, 1.0]]
         content = {"cam_mat": matrix, "w": camera.width, "h": camera.height, "frames": frames}
         write_json(truth / "transforms_train.json", content)
