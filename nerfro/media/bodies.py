@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -198,7 +198,8 @@ class Bodies(Medium):
         low, high = self.box.double().cpu().numpy()
         indices = np.append(1.0, self.indices.double().cpu().numpy())
         absorbs = np.append(False, self.absorbs.cpu().numpy())
-        return Solids(*self.grids.packed, indices, absorbs, low, high, self.nested, self.shell)
+        scene: tuple[Any, ...] = *self.grids.packed, indices, absorbs, low, high, self.nested, self.shell
+        return Solids._make(scene)
 
     @property
     def bodies(self) -> Bodies:

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 
 from nerfro.core.types import Path, Rays
-from nerfro.kernels.operators import arrays
 from nerfro.media.bodies import Bodies
 from nerfro.paper.voxel_grid import VoxelGrid
+from nerfro.samplers.paths.compiled import ray_arrays
 
 if TYPE_CHECKING:
     from nerfro.paper.index_cpu import Voxels
@@ -47,8 +47,8 @@ def uniform_on_grid(rays: Rays, medium: VoxelGrid, num_steps: int) -> Path:
     return _path(rays, vertices, refracted)
 
 
-def _arrays(rays: Rays) -> list[np.ndarray]:
-    return arrays(rays.origins, rays.directions, rays.near, rays.far)
+def _arrays(rays: Rays) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    return ray_arrays(rays.origins, rays.directions, rays.near, rays.far)
 
 
 def _voxels(medium: VoxelGrid) -> Voxels:

@@ -74,9 +74,10 @@ def _trace(
         max_events: largest number of events of a polyline.
         max_split_events, least_weight, main_only: see `Branching`.
     """
-    rays = arrays(origins, directions, near, far)
-    packed = Solids(*(values.numpy() for values in solids), nested, shell)
-    settings = max_events, Branching(max_split_events, least_weight, main_only)
+    rays = ray_arrays(origins, directions, near, far)
+    of_bodies: dict[str, Any] = {name: values.numpy() for name, values in zip(Solids._fields, solids, strict=False)}
+    packed = Solids(**of_bodies, nested=nested, shell=shell)
+    settings = max_events, max_split_events, least_weight, main_only
     max_polylines = _MAX_POLYLINES if max_split_events and not main_only else 1
     rows, counts = trace_snell(*rays, packed, settings, _MAX_VERTICES, max_polylines)
     kept, needed = (counts <= (max_polylines, _MAX_VERTICES)).all(1), counts.max(0, initial=1)
@@ -84,7 +85,7 @@ def _trace(
     columns = _polylines(rows, np.where(kept, counts[:, 0], 0), width)
     if not kept.all():
         rest = (~kept).nonzero()[0]
-        few = [values[rest] for values in rays]
+        few = ray_arrays(origins[rest], directions[rest], near[rest], far[rest])
         rows, counts = trace_snell(*few, packed, settings, width, int(needed[0]))
         again = _polylines(rows, counts[:, 0], width)
         pairs = zip(columns, [rest[again[0]], *again[1:]], strict=True)
@@ -92,6 +93,14 @@ def _trace(
         order = np.argsort(joined[0], kind="stable")
         columns = [column[order] for column in joined]
     return (*map(torch.from_numpy, columns),)
+
+
+def ray_arrays(
+    origins: Tensor, directions: Tensor, near: Tensor, far: Tensor
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return rays as kernels take them; see `kernels.operators.arrays`."""
+    origins_, directions_, near_, far_ = arrays(origins, directions, near, far)
+    return origins_, directions_, near_, far_
 
 
 def _polylines(rows: TracedRows, counts: Int[np.ndarray, "R"], width: int) -> list[np.ndarray]:

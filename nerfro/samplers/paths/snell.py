@@ -94,6 +94,9 @@ class ReferenceTracer(Tracer):
 class StraightTracer(Tracer):
     """Leave rays straight in a vacuum."""
 
+    def __init__(self) -> None:
+        pass
+
     def trace(self, rays: Rays, max_events: int, branching: Branching) -> SnellTrace:
         return SnellTrace.without_events(straight_path(rays))
 
@@ -141,13 +144,13 @@ class Snell(PathSampler):
         """
         bodies = medium.bodies
         if medium.is_vacuum:
-            return [StraightTracer(medium)]  # type: ignore[arg-type]
+            return [StraightTracer()]
         if bodies is None:
             raise NerfroError(
                 "sampler/path=snell needs a medium with a surface; take medium=sdf_grid, or sampler/path=eikonal"
             )
         if self.interface == "sdf":
-            tracer = GridTracer if len(bodies.grids) else ReferenceTracer
+            tracer: type[Tracer] = GridTracer if len(bodies.grids) else ReferenceTracer
         elif bodies.meshes:
             tracer = TriangleTracer
             bodies.intersector  # noqa: B018 (created once, before the variants of all wavelengths share it)

@@ -17,6 +17,7 @@ from numba import prange
 
 from nerfro.kernels.compilation import compiled, compiled_parallel
 from nerfro.kernels.lookup import body_distance, box_span, distance_out, grid_of, spline_value_gradient
+from nerfro.samplers.paths.branching import Branching
 from nerfro.samplers.paths.surface_search_cpu import Line, advance, first_surface
 
 _BLOCK = 64  # number of rays for which a thread allocates scratch memory once
@@ -277,7 +278,7 @@ def _trace_ray(solids, line, near, far, settings, scratch, rows):
     Entries after the last vertex of a row are undefined. Polylines beyond the capacity are only counted.
     """
     inside, last_row = scratch.inside, len(rows.weight) - 1
-    max_events, branching = settings
+    max_events, branching = settings[0], Branching(settings[1], settings[2], settings[3])
     branch = Branch(advance(line, near), near, 1.0, 0, 0)
     x, y, z, dx, dy, dz = branch.line
     enter, leave = box_span(solids.box_low, solids.box_high, x, y, z, dx, dy, dz)
@@ -308,7 +309,7 @@ def trace_snell(origins, directions, near, far, solids, settings, max_vertices, 
     Args:
         origins, directions, near, far: rays [R, ...].
         solids: bodies, a `kernels.lookup.Solids`.
-        settings: largest number of events of a polyline, and the `Branching`.
+        settings: largest number of events of a polyline, and the fields of a `Branching`.
         max_vertices: largest number of vertices of a polyline, S.
         max_polylines: largest number of polylines of a ray, P.
 
@@ -318,7 +319,7 @@ def trace_snell(origins, directions, near, far, solids, settings, max_vertices, 
         counts [R, 2]: number of polylines of each ray, and largest number of vertices, which may exceed P and S.
     """
     num_rays, dtype = origins.shape[0], origins.dtype
-    num_bodies, num_pending, polylines = len(solids.low), settings[1].max_split_events, (num_rays, max_polylines)
+    num_bodies, num_pending, polylines = len(solids.low), settings[1], (num_rays, max_polylines)
     rows = TracedRows(
         np.empty((*polylines, max_vertices, 7), dtype), np.empty((*polylines, max_vertices, 3), np.int8),
         np.empty(polylines, dtype), np.empty((*polylines, 3), np.int64),

@@ -72,6 +72,6 @@ def invert_cdf(
     return left + fraction * (right - left)
 
 
-def midpoints(edges: Float[Tensor, "P E"]) -> Float[Tensor, "P E-1"]:
+def midpoints(edges: Float[Tensor, "*rows E"]) -> Float[Tensor, "*rows E-1"]:
     """Return the middle of each interval."""
     return 0.5 * (edges[..., 1:] + edges[..., :-1])
