@@ -85,14 +85,14 @@ def _trace(
     packed = Solids(**of_bodies, nested=nested, shell=shell)
     settings = Settings(max_events, max_split_events, least_weight, main_only)
     max_polylines = _MAX_POLYLINES if max_split_events and not main_only else 1
-    rows, counts = trace_snell(*rays, packed, settings, _MAX_VERTICES, max_polylines)
+    rows, counts = trace_snell(rays[0], rays[1], rays[2], rays[3], packed, settings, _MAX_VERTICES, max_polylines)
     kept, needed = (counts <= (max_polylines, _MAX_VERTICES)).all(1), counts.max(0, initial=1)
     width = max(int(needed[1]), 2)
     columns = _polylines(rows, np.where(kept, counts[:, 0], 0), width)
     if not kept.all():
         rest = (~kept).nonzero()[0]
         few = [values[rest] for values in rays]
-        rows, counts = trace_snell(*few, packed, settings, width, int(needed[0]))
+        rows, counts = trace_snell(few[0], few[1], few[2], few[3], packed, settings, width, int(needed[0]))
         again = _polylines(rows, counts[:, 0], width)
         pairs = zip(columns, [rest[again[0]], *again[1:]], strict=True)
         joined = [np.concatenate(pair) for pair in pairs]
