@@ -113,15 +113,12 @@ def test_validation_pixels_are_usable_and_constant(tiny_scene: Path) -> None:
 
 def bending() -> Any:
     """What is asked of a model that bends rays by a ball."""
-    ball, sampler = Ball(0.6, 1.5), Snell()
-    return Mock(
-        spec=Renderer,
-        scene=Mock(
-            Scene, device=torch.device("cpu"), medium=ball, colour_space=ColourSpace.LINEAR, camera=GivenCamera()
-        ),
-        path_sampler=sampler,
-        point_sampler=Stratified(),
+    model = Mock(spec=Renderer, path_sampler=Snell(), point_sampler=Stratified())
+    model.scene = Mock(
+        Scene, device=torch.device("cpu"), medium=Ball(0.6, 1.5), colour_space=ColourSpace.LINEAR, camera=GivenCamera()
     )
+    model.exit_directions = functools.partial(Renderer.exit_directions, model)
+    return model
 
 
 @pytest.mark.parametrize("contrast", [None, 0.015])
