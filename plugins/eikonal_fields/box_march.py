@@ -43,12 +43,10 @@ class BoxMarch(PathSampler):
         last = torch.ones(self.num_steps + 3, dtype=torch.long, device=rows.device)
         last[0] = 0
         names = ("positions", "directions", "s")
-        positions, directions, s = [
-            getattr(straight, name)[:, last].index_copy(0, rows, getattr(bent, name)) for name in names
-        ]
-        return Path.unbranched(
-            positions, directions, s, straight.refracted.index_copy(0, rows, bent.refracted), rays.radii
-        )
+        columns = (getattr(straight, name)[:, last].index_copy(0, rows, getattr(bent, name)) for name in names)
+        positions, directions, s = columns
+        refracted = straight.refracted.index_copy(0, rows, bent.refracted)
+        return Path.unbranched(positions, directions, s, refracted, rays.radii)
 
     def replay(self, path: Path, rays: Rays, medium: Medium) -> Path:
         """Trace the path again; `forward` has gradients."""
