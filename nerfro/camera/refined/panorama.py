@@ -182,7 +182,7 @@ class _Overlap:
     view: Int[Tensor, "O"]
     direction: Int[Tensor, "O"]
     colour: Float[Tensor, "O 3"]
-    by_camera: Float[Tensor, "O 3 3+L"]
+    by_camera: Float[Tensor, "O 3 columns"]
 
 
 def _find_overlap(
