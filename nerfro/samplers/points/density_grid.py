@@ -180,8 +180,9 @@ class DensityGridSampler(PointSampler):
         words = draws.words(torch.arange(math.ceil(num_cells * self.update_fraction), device=device), 4, "density grid")
         cells = words[:, 0] * num_cells >> 32
         cells = cells if inside is None else inside[cells]
-        corners = torch.stack(torch.unravel_index(cells, self.density.shape), -1)
-        unit = (corners + (words[:, 1:] >> 8) * 2.0**-24) / self.resolution
+        side = self.resolution  # torch.unravel_index would copy the shape to the device
+        corners = torch.stack([cells // side**2, cells // side % side, cells % side], -1)
+        unit = (corners + (words[:, 1:] >> 8) * 2.0**-24) / side
         low, high = self.space.box
         contracted = low + unit * (high - low)
         positions = self.space.expand(contracted)
