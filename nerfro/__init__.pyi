@@ -9,7 +9,7 @@ from .data.capture import Capture
 from .evaluation.collection import metrics
 from .fields.hash_grid import HashGridField
 from .geometry.space import Box, Contracted
-from .losses.photometric import Photometric
+from .losses.radiance import Photometric
 from .masks.segment import segment
 from .media.bodies import Bodies, Body, GridSettings
 from .media.body_settings import make_bodies
