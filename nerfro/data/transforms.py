@@ -94,7 +94,7 @@ def parse_manifest(path: Path, mask_key: str = "mask_path", skip_missing: bool =
     if not frames:
         raise NerfroError(f"{path} has an empty list 'frames'; a split needs at least one")
     names = [_frame_name(f"{path}: frame {i}", frame) for i, frame in enumerate(frames)]
-    image_of = {name: _existing_image(path.parent, name) for name in set(names)}
+    image_of = {name: existing_image(path.parent, name) for name in dict.fromkeys(names)}
     images = [image_of[name] for name in names]
     counts = Counter(image for image in images if image is not None)  # by file: `r_0` and `r_0.png` are one image
     repeated = {f"'{name}'": None for name, image in zip(names, images, strict=True) if image and counts[image] > 1}
@@ -150,6 +150,7 @@ def _candidates(root: Path, name: str) -> list[Path]:
     return [root / f"{name}{end}" for end in (*suffixes, *(end.upper() for end in suffixes))]
 
 
-def _existing_image(root: Path, name: str) -> Path | None:
+def existing_image(root: Path, name: str) -> Path | None:
+    """Find the image file of a `file_path`, whose extension may be missing; None if there is no such file."""
     # Unlike Path.is_file, this function returns False for a name that is too long.
     return next((path for path in _candidates(root, name) if os.path.isfile(path)), None)

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import functools
 import os
-from pathlib import PurePosixPath
+from collections.abc import Mapping, Sequence
+from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 import numpy as np
 
-from nerfro.core.errors import NerfroError
+from nerfro.core.cameras import Cameras
+from nerfro.core.errors import NerfroError, warn
 from nerfro.data.base import SPLITS
 from nerfro.data.formats.bounds import find_bounds, image_edges, usable_points
 from nerfro.data.frames import Every, FrameSet, PosedImages
 from nerfro.data.image_files import read_size
 from nerfro.data.masks import find_mask
 from nerfro.data.transforms import Manifest, find_splits, parse_manifest, read_manifest
+from nerfro.files.reading import same_content
 from nerfro.geometry.mesh import load_points
 from nerfro.registry.allowed import check
 from nerfro.registry.registration import register
@@ -50,9 +53,13 @@ class NerfstudioData(PosedImages):
         super().__init__(root, **options)
         self.skip_missing, self.test_every = missing == "skip", test_every
 
-    @property
-    def splits(self) -> list[str]:
-        return SPLITS if self._single else list(find_splits(self.root))
+    def split_files(self) -> Mapping[str, Path]:
+        return {} if self._single else find_splits(self.root)
+
+    def cameras_of(self, file: Path) -> Cameras | None:
+        if self._single is None or not same_content(self._single.path, file):
+            return super().cameras_of(file)
+        return self._views(self._frames(self._single, range(len(self._single.frames)))).cameras
 
     @functools.cached_property
     def _single(self) -> Manifest | None:
@@ -65,7 +72,10 @@ class NerfstudioData(PosedImages):
 
     def read(self, split: str) -> FrameSet:
         manifest = self._manifest(split)
-        indices = self._choose(manifest, split) if self._single else list(range(len(manifest.frames)))
+        indices = self._choose(manifest, split) if self._single else range(len(manifest.frames))
+        return self._frames(manifest, indices)
+
+    def _frames(self, manifest: Manifest, indices: Sequence[int]) -> FrameSet:
         entries: Any = manifest.document["frames"]
         frames, stated = [manifest.frames[i] for i in indices], [entries[i].get("mask_path") for i in indices]
         usable = [path and find_mask(self.root, frame.image, path) for path, frame in zip(stated, frames, strict=True)]
