@@ -85,7 +85,9 @@ def open_image(path: Path, upright: bool = True) -> Iterator[tuple[Image.Image, 
                 image = Image.open(file)
                 too_large = math.prod(image.size) > MAX_PIXELS
             except UnidentifiedImageError as error:
-                raise OSError("it is not an image") from error
+                raise OSError(
+                    "it is not an image of a readable type; convert EXR, HEIC and raw files to PNG or JPEG"
+                ) from error
             except Image.DecompressionBombError:
                 too_large = True
         if too_large:

@@ -79,17 +79,24 @@ class NerfstudioData(PosedImages):
         entries: Any = manifest.document["frames"]
         frames, stated = [manifest.frames[i] for i in indices], [entries[i].get("mask_path") for i in indices]
         usable = [path and find_mask(self.root, frame.image, path) for path, frame in zip(stated, frames, strict=True)]
-        return FrameSet(frames, manifest.lenses(indices), "opengl", *self._bounds(split), usable=usable)
+        return FrameSet(frames, manifest.lenses(indices), "opengl", *self._bounds, usable=usable)
 
-    def _bounds(self, split: str) -> tuple[float, float]:
+    @functools.cached_property
+    def _bounds(self) -> tuple[float, float]:
         """Return the bounds, which are estimated from the training cameras for all splits."""
         if self.near is not None and self.far is not None:
             return self.near, self.far
-        manifest = self._manifest("train" if "train" in self.splits else split)
+        manifest = self._manifest("train" if "train" in self.splits else self.splits[0])
         points, file = np.empty((0, 3)), manifest.document.get("ply_file_path")
         check(f"{manifest.path}: ", {"ply_file_path": str}, {"ply_file_path": file})
-        if isinstance(file, str) and os.path.isfile(self.root / file):  # False for a name that is too long
-            points = usable_points(load_points(self.root / file), self.root / file)
+        path = self.root / str(file or "").replace("\\", "/")
+        if os.path.isfile(path):  # False for a name that is too long
+            points = usable_points(load_points(path), path)
+        elif file:
+            warn(
+                f"the points {path} (ply_file_path) do not exist, so near and far are estimated from the cameras; "
+                "restore the file, set data.near and data.far, or remove the key"
+            )
         width, height, _ = read_size(manifest.frames[0].image)
         edges = np.stack([image_edges(lens, width, height) for lens in manifest.lenses()])
         return find_bounds(np.stack([frame.camera_to_world for frame in manifest.frames]), edges, points)
