@@ -25,6 +25,7 @@ from nerfro.training.config import (
     build_medium,
     build_model,
     check_run,
+    require_data,
     resolve_trainer_options,
 )
 from nerfro.training.data_module import RayDataModule
@@ -116,6 +117,7 @@ class Training:
         """
         seed_everything(config.seed, verbose=False)
         config = resolve_trainer_options(config)
+        require_data(config)
         source = build_data(config)
         views = source.load("train")
         return cls(source, views, *_build(config, source, views))

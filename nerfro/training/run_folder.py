@@ -18,10 +18,11 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor, nn
 
-from nerfro.core.cameras import Cameras
+from nerfro.cli.overrides import as_overrides, command_line
 from nerfro.core.errors import Interrupted, NerfroError, first_of, warn
 from nerfro.core.paths import PACKAGE_DIR, user_path
-from nerfro.core.provenance import AlgorithmSettings, command_line, versions
+from nerfro.core.provenance import AlgorithmSettings, command_of_process, versions
+from nerfro.data.base import Views
 from nerfro.files.atomic import require_room, write_atomically
 from nerfro.files.folder_lock import lock_folder, require_only
 from nerfro.files.foreign_config import foreign_config, read_foreign_config
@@ -77,7 +78,8 @@ def lock_run(folder: Path, config: DictConfig) -> Iterator[Path | None]:
 
 def resume_advice(folder: Path) -> str:
     """Return how to resume a run."""
-    return "to resume, repeat the command" + ("" if in_sweep() else f" with hydra.run.dir={folder} ckpt_path=last")
+    options = shlex.join(as_overrides({"hydra.run.dir": folder, "ckpt_path": "last"}))
+    return "to resume, repeat the command" + ("" if in_sweep() else f" with {options}")
 
 
 def in_sweep() -> bool:
@@ -100,14 +102,15 @@ def begin(folder: Path, config: DictConfig, renderer: Renderer, has_steps: bool)
 
 def next_steps(folder: Path, split: str | None) -> str:
     """Return the lines about results at the end of a run: an image, the page and the tables of scores."""
-    lines = [f"page: python -m nerfro.view {shlex.quote(f'checkpoint={folder}')}"]
+    checkpoint = as_overrides({"checkpoint": folder})
+    lines = [f"page: {command_line('view', checkpoint)}"]
     if split is None:
-        lines.append(f"scores: python -m nerfro.evaluate {shlex.quote(f'checkpoint={folder}')}")
+        lines.append(f"scores: {command_line('evaluate', checkpoint)}")
     else:
         lines.insert(0, f"image: {folder / 'images' / f'{split}_000.png'}")
         lines.append(f"tables: {folder}/metrics.md, .csv and .tex for each view, and metrics.json")
     if in_sweep():
-        lines.append(f"table of the sweep: python -m nerfro.summary {shlex.quote(f'runs={folder.parent}')}")
+        lines.append(f"table of the sweep: {command_line('summary', as_overrides({'runs': folder.parent}))}")
     return "\n".join(lines)
 
 
@@ -294,4 +297,4 @@ def _command() -> str:
     if in_sweep():
         # In a launcher's worker this process has another main module and other arguments.
         return shlex.join(["python", "-m", "nerfro.train", *HydraConfig.get().overrides.task])
-    return command_line()
+    return command_of_process()
