@@ -140,7 +140,7 @@ def _build(config: DictConfig, source: DataSource, training: Views) -> tuple[Dic
         Subdivision(**config.batches.subdivision),
     )  # fmt: skip
     schedule = Schedule(build_each("phase", config.phase), training)
-    return config, TrainingModule.of(renderer, config, [schedule], training.cameras), data
+    return config, TrainingModule.of(renderer, config, [schedule], training), data
 
 
 def check_before_training(renderer: Renderer, data: RayDataModule, trainer: Trainer) -> str:
