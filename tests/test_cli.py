@@ -2,6 +2,7 @@
 
 import io
 import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -21,7 +22,8 @@ from nerfro.cli.failures import errors_in_one_line, in_one_line
 from nerfro.cli.overrides import as_overrides, full_key
 from nerfro.core.errors import NerfroError, warn
 from nerfro.core.paths import resolve_path, user_path
-from nerfro.training.config import TrainConfig
+from nerfro.training.config import TrainConfig, require_data
+from nerfro.training.run_folder import next_steps, resume_advice
 from tests.conftest import composed, refused
 
 
@@ -148,3 +150,19 @@ def test_groups_of_parameters_are_added_to_those_of_the_experiment() -> None:
     choices = OverridesParser.create().parse_override(swept).sweep_string_iterator()
     starts = [composed(f"+optimizer.groups={choice}").optimizer.groups[pattern].start for choice in choices]
     assert starts == [7, 8]
+
+
+@pytest.mark.parametrize(
+    "name", ["My Drive (1)", "Übung", "a[1]=b,c", "it's", 'a"b', "a\\b", 'a\\"b', "end\\", "a;b&c", "a:b {c}"]
+)
+def test_printed_commands_run_with_any_folder(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / name / "run"
+    printed = [*next_steps(folder, None).splitlines(), f"resume: {resume_advice(folder)}"]
+    refused_data = refused(
+        "holds no data yet", require_data, composed(*as_overrides({"data.root": folder.with_name("ship")}))
+    )
+    commands = [line.partition("python -m ")[2] or line.partition(" with ")[2] for line in printed]
+    commands.append(refused_data.partition("python -m ")[2].removesuffix(" first"))
+    values = [values_of([word for word in shlex.split(command) if "=" in word]) for command in commands]
+    assert [value.get("checkpoint") for value in values[:2]] == [str(folder)] * 2
+    assert (values[2]["hydra"]["run"]["dir"], values[3]["out"]) == (str(folder), str(folder.with_name("ship")))

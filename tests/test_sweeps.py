@@ -17,8 +17,8 @@ from omegaconf import OmegaConf
 from nerfro.core.paths import CONF_DIR, scene_name
 from nerfro.registry.allowed import plain, validate
 from nerfro.training.config import TrainConfig
-from nerfro.training.sweeps import identity_of
-from tests.conftest import Runner, composed
+from nerfro.training.sweeps import _record, _require_same_cell, identity_of
+from tests.conftest import Runner, composed, refused, write_tiny_scene
 from tests.forked import Command
 from tests.processes import ONE_THREAD, python
 
@@ -177,6 +177,17 @@ def test_recalibrated_data_are_different_data(name: str, tmp_path: Path) -> None
     assert identity() == before, "pictures are known by name and size"
     (tmp_path / "sparse" / name).write_bytes(b"after!")
     assert identity() != before
+
+
+def test_cell_with_moved_data_is_the_same_cell(tmp_path: Path) -> None:
+    identities = []
+    for name, radius in (("data", 1.0), ("moved", 1.0), ("other", 1.1)):
+        write_tiny_scene(tmp_path / name, radius)
+        config = composed(f"data.root={tmp_path / name}", "medium.mesh=${data.root}/mesh.ply")
+        identities.append(identity_of(config))
+    _record(tmp_path, identities[0])
+    _require_same_cell(tmp_path, identities[1])
+    refused("with another content of the file medium.mesh", _require_same_cell, tmp_path, identities[2])
 
 
 def test_results_of_a_sweep_inside_the_data_folder_are_no_data(tmp_path: Path) -> None:

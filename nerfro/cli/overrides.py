@@ -65,4 +65,5 @@ def _quoted(value: object) -> str:
     text = "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
     if re.fullmatch(r"[\w./+@%-]+", text, re.ASCII):
         return text
-    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    # Hydra reads a backslash as it is, except before a quotation mark.
+    return '"' + re.sub(r'(\\*)("|$)', lambda end: 2 * end[1] + ("\\" + end[2] if end[2] else ""), text) + '"'

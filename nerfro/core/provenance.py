@@ -34,7 +34,7 @@ class AlgorithmSettings:
         AlgorithmSettings.used[type(self).__name__] = repr(self)
 
 
-def command_line() -> str:
+def command_of_process() -> str:
     """Return the command line of this process."""
     spec = getattr(sys.modules["__main__"], "__spec__", None)
     program = [sys.argv[0]] if spec is None else ["-m", spec.name]

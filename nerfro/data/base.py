@@ -141,7 +141,7 @@ class DataSource(ABC):
         origin: world coordinates of the origin of the positions in `Views`; see `Medium.origin`.
     """
 
-    root: Path
+    root: Path = Path()
     mask_labels: Sequence[int] | None = None
     origin: Float[np.ndarray, "3"] = WORLD_ORIGIN
 
@@ -150,6 +150,10 @@ class DataSource(ABC):
         moved = copy.copy(self)
         moved.origin = origin
         return moved
+
+    def cameras_of(self, file: Path) -> Cameras | None:
+        """Return the cameras that a file of the data set states, as `load` does; None for any other file."""
+        return None
 
     @property
     @abstractmethod

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Any
 
 from annotated_types import Gt, Le
@@ -23,9 +25,8 @@ class BlenderData(PosedImages):
     def __init__(self, root: str = "embedded:torus", near: Distance = 2.0, far: Distance = 6.0, **options: Any) -> None:
         super().__init__(root, near, far, **options)
 
-    @property
-    def splits(self) -> list[str]:
-        return list(find_splits(self.root))
+    def split_files(self) -> Mapping[str, Path]:
+        return find_splits(self.root)
 
     def read(self, split: str) -> FrameSet:
         manifest = read_manifest(self.root, split)
@@ -57,9 +58,8 @@ class OpenCVData(PosedImages):
         super().__init__(root, near, far, **options)
         self.eval_crop = eval_crop
 
-    @property
-    def splits(self) -> list[str]:
-        return list(find_splits(self.root))
+    def split_files(self) -> Mapping[str, Path]:
+        return find_splits(self.root)
 
     def read(self, split: str) -> FrameSet:
         manifest = read_manifest(self.root, split)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar
@@ -22,6 +22,7 @@ from nerfro.data.image_files import IMAGE_SUFFIXES, Alpha, read_rgb
 from nerfro.data.lazy_images import LazyImages
 from nerfro.data.lenses import Lens, check_lenses
 from nerfro.data.masks import find_mask, find_masks, find_usable, require_used, unused_masks
+from nerfro.files.reading import same_content
 from nerfro.registry.allowed import Coordinate, Distance, Factor, check, validated
 
 Every = Annotated[int, Ge(2)]  # every n-th view is a test view
@@ -84,9 +85,18 @@ class PosedImages(DataSource):
         self.near, self.far, self.downscale, self.alpha, self.mask_labels = near, far, downscale, alpha, mask_labels
         self._images_of_masks: dict[Path, Path] = {}
 
+    def split_files(self) -> Mapping[str, Path]:
+        """Return the file that states the cameras of each split; empty if one file states the cameras of all splits."""
+        return {}
+
     @property
     def splits(self) -> list[str]:
-        return SPLITS
+        return list(self.split_files()) or SPLITS
+
+    def cameras_of(self, file: Path) -> Cameras | None:
+        files = self.split_files() if self.root.is_dir() else {}
+        split = next((name for name, own in files.items() if same_content(own, file)), None)
+        return None if split is None else self.load(split).cameras
 
     @abstractmethod
     def read(self, split: str) -> FrameSet:

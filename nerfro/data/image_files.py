@@ -15,7 +15,7 @@ from nerfro.core.errors import NerfroError
 from nerfro.files.deep_images import read_16bit
 from nerfro.files.reading import open_image
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".jfif", ".webp", ".bmp", ".tif", ".tiff")
 Alpha = Literal["drop", "white", "black"]
 
 Levels = UInt8[np.ndarray, "H W *C"] | UInt16[np.ndarray, "H W *C"]

@@ -126,7 +126,7 @@ def _model(level: Mapping[str, Any], where: str) -> str | None:
     for key, value in level.items():
         plain = re.sub(r"[\W_]", "", key).lower()
         names_other = isinstance(value, str) and _STATES_PROJECTION.search(plain) and _PROJECTIONS.search(value)
-        if (names_other or _OTHER.search(plain)) and key not in _NUMBERS and value not in (None, False, 0, "", []):
+        if (names_other or _OTHER.search(plain)) and key not in _NUMBERS and not _says_nothing(value):
             raise NerfroError(
                 f"{where}: {key}={value!r} is not supported; undistort the images, state a perspective lens by fl_x, "
                 "fl_y, cx, cy, k1, k2, k3, p1 and p2, or remove the key if it says nothing about the lens"
@@ -139,6 +139,11 @@ def _model(level: Mapping[str, Any], where: str) -> str | None:
                 "for example with COLMAP's image_undistorter"
             )
     return str(stated[0][1]).upper() if stated else None
+
+
+def _says_nothing(value: Any) -> bool:
+    """Test whether the value of a key is empty or zero, as `rolling_shutter` of a global shutter: [0, 0, 0, 0]."""
+    return all(map(_says_nothing, value)) if isinstance(value, list) else value in (None, False, 0, "")
 
 
 def _numbers(level: Mapping[str, Any], rational: bool, where: str) -> dict[str, float]:

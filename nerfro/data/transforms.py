@@ -18,6 +18,12 @@ from nerfro.data.masks import find_mask, mask_beside
 from nerfro.files.reading import parse_matrix, read_json
 from nerfro.registry.allowed import check
 
+_OTHER_TYPES = (".exr", ".hdr", ".heic", ".heif", ".avif", ".dng", ".npy")  # of photographs that are not read
+# Files and folders of other data formats, for a message.
+_OTHER_FORMATS = {
+    "transforms.json": "nerfstudio", "sparse": "colmap", "colmap": "colmap", "poses_bounds.npy": "llff",
+    "cameras_sphere.npz": "idr",
+}  # fmt: skip
 _PATHS = dict.fromkeys(("file_path", "mask_path", "mask_file_path", "object_mask_path"), str)
 
 
@@ -62,10 +68,9 @@ def find_splits(root: Path) -> dict[str, Path]:
     files = {path.stem.removesuffix("_transforms"): path for path in root.glob("*_transforms.json")}
     files |= {path.stem.removeprefix("transforms_"): path for path in root.glob("transforms_*.json")}
     if not files:
-        raise NerfroError(
-            f"data.root={root} holds no transforms_<split>.json; give the folder of a data set, see "
-            "docs/guides/data_formats.md"
-        )
+        names = [f"{name}, which data={form} reads" for name, form in _OTHER_FORMATS.items() if (root / name).exists()]
+        advice = f"it holds {names[0]}" if names else "give the folder of a data set, see docs/guides/data_formats.md"
+        raise NerfroError(f"data.root={root} holds no transforms_<split>.json; {advice}")
     rank = {name: i for i, name in enumerate(SPLITS)}
     return {name: files[name] for name in sorted(files, key=lambda name: (rank.get(name, len(rank)), name))}
 
@@ -94,8 +99,11 @@ def parse_manifest(path: Path, mask_key: str = "mask_path", skip_missing: bool =
     if not frames:
         raise NerfroError(f"{path} has an empty list 'frames'; a split needs at least one")
     names = [_frame_name(f"{path}: frame {i}", frame) for i, frame in enumerate(frames)]
-    image_of = {name: _existing_image(path.parent, name) for name in set(names)}
+    image_of = {name: existing_image(path.parent, name) for name in dict.fromkeys(names)}
     images = [image_of[name] for name in names]
+    for name, image in image_of.items():
+        if image is None:
+            _refuse_other_type(path, name)
     counts = Counter(image for image in images if image is not None)  # by file: `r_0` and `r_0.png` are one image
     repeated = {f"'{name}'": None for name, image in zip(names, images, strict=True) if image and counts[image] > 1}
     if repeated:
@@ -129,9 +137,8 @@ def _read_frame(
 ) -> Frame:
     pose = check_pose(parse_matrix(entry["transform_matrix"], ((4, 4), (3, 4)), f"{where}: transform_matrix"), where)
     if image is None:
-        raise NerfroError(
-            f"{where}: image {_candidates(root, name)[0]} does not exist; restore it or take the frame out"
-        )
+        file = root / name if PurePosixPath(name).suffix else _candidates(root, name)[0]
+        raise NerfroError(f"{where}: image {file} does not exist; restore it or take the frame out")
     # `mask_file_path` is RefRef's key for the silhouette.
     stated = entry.get(mask_key, entry.get("mask_file_path"))
     if mask_key == "mask_path" or stated is not None:
@@ -139,6 +146,18 @@ def _read_frame(
     beside, ignored = mask_beside(image), root / (entry.get("mask_path") or "").replace("\\", "/")
     is_ignored = beside is not None and os.path.abspath(beside) == os.path.abspath(ignored)
     return Frame(name, image, None if is_ignored else beside, pose)
+
+
+def _refuse_other_type(path: Path, name: str) -> None:
+    """Refuse an image that a transforms file names and that exists in a format that is not read."""
+    suffixes = ("", *_OTHER_TYPES, *(suffix.upper() for suffix in _OTHER_TYPES))
+    file = next((file for end in suffixes if os.path.isfile(file := path.parent / f"{name}{end}")), None)
+    if file is not None:
+        raise NerfroError(
+            f"{path} names {file}, and images with the ending {file.suffix or '(none)'} are not read; convert the "
+            "images to PNG (8 or 16 bits, sRGB) or JPEG, and correct the names in the file. Allowed are "
+            f"{', '.join(IMAGE_SUFFIXES)}"
+        )
 
 
 def _candidates(root: Path, name: str) -> list[Path]:
@@ -150,6 +169,7 @@ def _candidates(root: Path, name: str) -> list[Path]:
     return [root / f"{name}{end}" for end in (*suffixes, *(end.upper() for end in suffixes))]
 
 
-def _existing_image(root: Path, name: str) -> Path | None:
+def existing_image(root: Path, name: str) -> Path | None:
+    """Find the image file of a `file_path`, whose extension may be missing; None if there is no such file."""
     # Unlike Path.is_file, this function returns False for a name that is too long.
     return next((path for path in _candidates(root, name) if os.path.isfile(path)), None)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from jaxtyping import Float
 
+from nerfro.core.cameras import Cameras
 from nerfro.core.errors import NerfroError
 from nerfro.data.base import DataSource, Views
 
@@ -20,6 +23,9 @@ class WithValidationViews(DataSource):
     def __init__(self, source: DataSource, number: int) -> None:
         self._source, self._number = source, number
         self.root, self.origin = source.root, source.origin
+
+    def cameras_of(self, file: Path) -> Cameras | None:
+        return self._source.cameras_of(file)
 
     @property
     def splits(self) -> list[str]:

@@ -55,7 +55,7 @@ def write_mitsuba(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
     glass, inside = glass_meshes(scene), inside_mesh(scene, options.resolution, options.half_depth)
     if len(glass) > 1:
         _require_apart(scene, glass)
-    split = page_split(scene.source)
+    split = page_split(scene)
     cameras, absorption = scene.cameras(split).to("cpu"), absorption_of(scene.renderer.scene)
     glass_file, inside_file, sky_file = (out.with_name(out.stem + ending) for ending in MITSUBA_FILES)
     objects: dict[str, Any] = {

@@ -37,7 +37,11 @@ def content_hash(*parts: np.ndarray | str | float | int | bool) -> str:
 
 def file_hash(path: Path | str) -> str:
     """Compute a hexadecimal hash of the content of a file."""
-    return hashlib.sha256(user_path(path).read_bytes()).hexdigest()[:32]
+    digest = hashlib.sha256()
+    with user_path(path).open("rb") as file:
+        while block := file.read(2**20):
+            digest.update(block)
+    return digest.hexdigest()[:32]
 
 
 def save_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:

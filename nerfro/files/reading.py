@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import os
 import stat
 import struct
 import threading
@@ -84,7 +85,9 @@ def open_image(path: Path, upright: bool = True) -> Iterator[tuple[Image.Image, 
                 image = Image.open(file)
                 too_large = math.prod(image.size) > MAX_PIXELS
             except UnidentifiedImageError as error:
-                raise OSError("it is not an image") from error
+                raise OSError(
+                    "it is not an image of a readable type; convert EXR, HEIC and raw files to PNG or JPEG"
+                ) from error
             except Image.DecompressionBombError:
                 too_large = True
         if too_large:
@@ -217,3 +220,11 @@ def load_array(path: Path) -> np.ndarray:
         if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
             raise NerfroError(f"{path} is not a .npy of numbers; {_AGAIN}")
         return array.astype(np.float64)
+
+
+def same_content(one: Path, other: Path) -> bool:
+    """Test whether two paths name files with the same bytes."""
+    files = one, other
+    if not all(os.path.isfile(file) for file in files):  # False for a name that is too long
+        return False
+    return one.stat().st_size == other.stat().st_size and one.read_bytes() == other.read_bytes()

@@ -21,10 +21,10 @@ from nerfro.files.foreign_config import read_foreign_config
 from nerfro.files.images import load_png
 from nerfro.training.callbacks import Throughput, steps_by_phase
 from nerfro.training.config import build_data, check_trained
+from nerfro.training.inputs import relocated
 from nerfro.training.load import checkpoint_of, scene_of
 from nerfro.training.run import Run
-from nerfro.training.run_folder import CONFIG_FILE, load_checkpoint
-from nerfro.training.settings import with_values
+from nerfro.training.run_folder import CONFIG_FILE, load_run
 
 
 def evaluate(
@@ -48,9 +48,7 @@ def evaluate(
 
 
 def _evaluate_checkpoint(options: EvaluateConfig, path: Path) -> RunMetrics:
-    checkpoint, trained = load_checkpoint(path)
-    if options.root is not None:
-        trained.data.root = options.root
+    checkpoint, trained = load_run(path, options.root)
     if options.chunk_size is not None:
         trained.evaluation.chunk_size = options.chunk_size
     trained.evaluation.subdivision.update(changed_settings(options.subdivision))
@@ -100,8 +98,7 @@ def _names_in_run(file: Path, root: str | None) -> dict[str, str]:
     """Return the names of the images of a run by their names in the data set; empty for images of other programs."""
     if not file.is_file():
         return {}
-    config = check_trained(read_foreign_config(file), file)
-    config = config if root is None else with_values(config, {"data.root": root})
+    config = relocated(check_trained(read_foreign_config(file), file), file.parent, root)
     split = config.evaluation.split
     names = build_data(config).load(split).names
     return {Path(name).stem: f"{split}_{number:03d}" for number, name in enumerate(names)}

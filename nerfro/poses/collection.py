@@ -20,12 +20,14 @@ from nerfro.core.progress import track
 from nerfro.data.frames import list_images
 from nerfro.data.image_files import IMAGE_SUFFIXES, to_unit
 from nerfro.files.atomic import atomic_file, write_atomically
+from nerfro.files.cache import file_hash
 from nerfro.files.deep_images import read_16bit
 from nerfro.files.reading import open_image, orientation_of
 from nerfro.poses.calibrated_data import REPORT
 from nerfro.poses.opencv import opencv
 from nerfro.poses.photographs import HEIF_SUFFIXES, PHOTOGRAPH_SUFFIXES, one_of_each_pair, require_one_of_each_name
 
+_VIDEO_RECORD = "video.sha256"  # hash of the video in the folder of its frames
 # EXIF data of 16-bit files that are kept; others describe the file.
 _KEPT_TAGS = (ExifTags.Base.Orientation, ExifTags.Base.Make, ExifTags.Base.Model)
 
@@ -44,8 +46,13 @@ def collect_photographs(config: DictConfig, out: Path) -> list[Path]:
         photographs = user_path(config.images)
     else:
         photographs = out / "frames"
+        video = user_path(config.video)
         if not (out / REPORT).is_file():
-            extract_frames(user_path(config.video), photographs, config.frames)
+            extract_frames(video, photographs, config.frames)
+        elif video.is_file() and _is_of_other_video(photographs, video):
+            raise NerfroError(
+                f"out={out} has poses of the frames of another video than video={video}; choose another out=FOLDER"
+            )
     link_photographs(photographs, None if config.masks is None else user_path(config.masks), out)
     return list_images(out / "images")
 
@@ -163,7 +170,8 @@ def extract_frames(video: Path, folder: Path, count: int) -> list[Path]:
     """Write the sharpest frame of each of `count` equal parts of a video as `frame_NNNNN.jpg`.
 
     The number in the name is the number of the frame in the video. Frames that exist are kept, so that an interrupted
-    extraction resumes. Frames of another video or of another `count` are deleted.
+    extraction resumes. Frames of another video or of another `count` are deleted; the folder records a hash of
+    the video.
 
     Args:
         video: file in any format that OpenCV's FFmpeg reads; its rotation is applied.
@@ -186,9 +194,12 @@ def extract_frames(video: Path, folder: Path, count: int) -> list[Path]:
     sharpest = {int(first + sharpness[first:last].argmax()) for first, last in itertools.pairwise(edges)}
     files = {number: folder / f"frame_{number:05d}.jpg" for number in sorted(sharpest)}
     folder.mkdir(parents=True, exist_ok=True)
+    record = folder / _VIDEO_RECORD
+    is_same = record.is_file() and not _is_of_other_video(folder, video)
     for file in folder.glob("frame_*.jpg"):
-        if file not in files.values() or file.stat().st_mtime_ns < video.stat().st_mtime_ns:
+        if file not in files.values() or not is_same:
             file.unlink()
+    write_atomically(record, f"{file_hash(video)}\n")
     waiting = {number for number, file in files.items() if not file.is_file()}
     for number, frame in enumerate(_frames(video) if waiting else ()):
         if number in waiting:
@@ -198,6 +209,12 @@ def extract_frames(video: Path, folder: Path, count: int) -> list[Path]:
         if not waiting:
             break
     return list(files.values())
+
+
+def _is_of_other_video(folder: Path, video: Path) -> bool:
+    """Test whether a folder of frames records the hash of another video; False without a record."""
+    record = folder / _VIDEO_RECORD
+    return record.is_file() and record.read_text("utf-8", errors="replace").strip() != file_hash(video)
 
 
 def _sharpness(video: Path) -> Float[np.ndarray, "F"]:

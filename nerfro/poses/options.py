@@ -30,7 +30,7 @@ class CalibrateConfig:
             metres for printing.
         write_board: write the board for printing, board.pdf and board_*.png, to `out`. Without `images` the command
             ends there.
-        reconstruction: folder of a COLMAP model; by default a model in sparse/0, sparse or colmap/sparse/0 beside
+        reconstruction: folder of a COLMAP model; by default the largest model in sparse/ or colmap/sparse/ beside
             `images`, in the folder of `images`, or within `images`, else a new model.
         pairs: image pairs that COLMAP matches: `sequential` (each image with the ten next ones, and with fewer distant
             ones) or `all`; by default sequential if the file names are numbered.

@@ -14,7 +14,7 @@ from typing import Any, Literal
 from nerfro.cli.overrides import as_overrides, is_given, is_scene_file
 from nerfro.core.errors import NerfroError, warn
 from nerfro.core.paths import EMBEDDED_PREFIX, user_path
-from nerfro.core.provenance import AlgorithmSettings, command_line, versions
+from nerfro.core.provenance import AlgorithmSettings, command_of_process, versions
 from nerfro.files.atomic import write_atomically
 from nerfro.files.reading import read_json
 from nerfro.media.body_settings import BodySettings, expanded
@@ -121,7 +121,7 @@ class SceneFile:
         scene = self._with_paths(lambda path: Path(os.path.relpath(os.path.realpath(user_path(path)), folder)))
         installed = {name: version for name, version in versions().items() if version is not None}
         algorithms = list(AlgorithmSettings.used.values())
-        origin = replace(self.provenance, command=command_line(), versions=installed, algorithms=algorithms)
+        origin = replace(self.provenance, command=command_of_process(), versions=installed, algorithms=algorithms)
         document = {name: value for name, value in vars(scene).items() if value not in (None, {}, [])}
         text = json.dumps(document | {"provenance": origin}, default=_given, indent=1)
         # Lists of numbers are on one line.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import glob
 import os
 import re
-import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
@@ -15,6 +14,7 @@ from typing import Any
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from nerfro.cli.overrides import as_overrides, command_line
 from nerfro.core.errors import NerfroError, first_of
 from nerfro.core.paths import EMBEDDED_PREFIX, refuse_root, scene_name, user_path
 from nerfro.evaluation.results import RunMetrics, read_metrics_json
@@ -178,7 +178,7 @@ def _why_unfinished(folder: Path) -> str:
         reason = ""
     if reason:
         return f"it failed: {reason}"
-    command = f"; run python -m nerfro.evaluate {shlex.quote(f'checkpoint={shown(folder)}')}"
+    command = f"; run {command_line('evaluate', as_overrides({'checkpoint': shown(folder)}))}"
     return f"it has not been evaluated{command if (folder / LAST_CHECKPOINT).is_file() else ''}"
 
 

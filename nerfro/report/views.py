@@ -21,6 +21,7 @@ from nerfro.files.images import data_uri, load_png, to_8bit
 from nerfro.report.comparison import Comparison
 from nerfro.report.runs import EvaluatedRun, EvaluationSet
 from nerfro.training.config import build_data
+from nerfro.training.inputs import relocated
 
 PNG_SIDE = 256  # pixels; larger images are embedded as JPEG to limit the size of the page
 
@@ -96,7 +97,7 @@ def scene_images(comparison: Comparison, test_set: EvaluationSet, selection: Sel
     runs = {number: cell[0] for number, cell in enumerate(cells) if cell}
     titles = {number: comparison.methods[number] for number in runs}
     first = next(iter(runs.values()))
-    references: Views = build_data(OmegaConf.create(dict(first.config))).load(test_set.split)
+    references: Views = build_data(relocated(OmegaConf.create(dict(first.config)), first.folder)).load(test_set.split)
     if test_set.num_views == first.config["trainer"].get("limit_test_batches"):
         references = references.select(range(min(len(references), test_set.num_views)))
     cameras = references.cameras

@@ -25,6 +25,7 @@ from nerfro.training.config import (
     build_medium,
     build_model,
     check_run,
+    require_data,
     resolve_trainer_options,
 )
 from nerfro.training.data_module import RayDataModule
@@ -116,6 +117,7 @@ class Training:
         """
         seed_everything(config.seed, verbose=False)
         config = resolve_trainer_options(config)
+        require_data(config)
         source = build_data(config)
         views = source.load("train")
         return cls(source, views, *_build(config, source, views))
@@ -138,7 +140,7 @@ def _build(config: DictConfig, source: DataSource, training: Views) -> tuple[Dic
         Subdivision(**config.batches.subdivision),
     )  # fmt: skip
     schedule = Schedule(build_each("phase", config.phase), training)
-    return config, TrainingModule.of(renderer, config, [schedule], training.cameras), data
+    return config, TrainingModule.of(renderer, config, [schedule], training), data
 
 
 def check_before_training(renderer: Renderer, data: RayDataModule, trainer: Trainer) -> str:

@@ -15,6 +15,7 @@ from annotated_types import Ge, Gt, Le
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from nerfro.cli.overrides import as_overrides, command_line
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import CONF_DIR, resolve_path, scene_name
 from nerfro.data.base import DataSource
@@ -361,20 +362,20 @@ def training_device(config: DictConfig) -> str:
     return "cuda" if config.trainer.accelerator in ("gpu", "cuda") and torch.cuda.is_available() else "cpu"
 
 
+def require_data(config: DictConfig) -> None:
+    """Refuse the missing data of a synthetic scene; the message names the command that renders the scene."""
+    scene, root = scene_name(config.data.root), resolve_path(config.data.root)
+    if not root.exists() and (CONF_DIR / "scene" / f"{scene}.yaml").is_file():
+        small = ["resolution=128", "spp=256", "test_spp=1024", "views.val=10", "views.test=20"]
+        command = command_line("synthesize", [*as_overrides({"scene": scene, "out": root}), *small])
+        raise NerfroError(f"{root} holds no data yet; run {command} first")
+
+
 def build_data(config: DictConfig) -> DataSource:
     """Build the data set of a run, with the origin of its medium.
 
     A `val` split is made of training views if `num_validation_views` is set.
-
-    Raises:
-        NerfroError: there is no data; for a synthetic scene the message names the command that renders the scene.
     """
-    scene, root = scene_name(config.data.root), resolve_path(config.data.root)
-    if not root.exists() and (CONF_DIR / "scene" / f"{scene}.yaml").is_file():
-        small = "resolution=128 spp=256 test_spp=1024 views.val=10 views.test=20"
-        raise NerfroError(
-            f"{root} holds no data yet; run python -m nerfro.synthesize scene={scene} out={root} {small} first"
-        )
     source, number = build(config.data), config.batches.num_validation_views
     source = source.with_origin(origin_of(OmegaConf.select(config, "medium")))
     return WithValidationViews(source, number) if number else source

@@ -1,10 +1,12 @@
-"""Inputs of a training that a checkpoint does not contain: surfaces of the medium and cameras of the photographs."""
+"""Inputs of a training: surfaces of the medium, and photographs with their cameras; a run opens without its data."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+import shutil
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import suppress
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 import torch
@@ -12,27 +14,128 @@ from omegaconf import DictConfig
 
 from nerfro.core.cameras import Cameras
 from nerfro.core.errors import NerfroError
-from nerfro.core.paths import resolve_path
-from nerfro.files.cache import file_hash
+from nerfro.core.paths import EMBEDDED_PREFIX, resolve_path
+from nerfro.data.base import Views
+from nerfro.files.atomic import atomic_file
+from nerfro.files.cache import content_hash, file_hash
+from nerfro.files.reading import same_content
 from nerfro.registry.registration import plugin_of
-from nerfro.training.settings import first_difference, flat
+from nerfro.training.settings import first_difference, flat, with_values
 
 # Entry of a checkpoint.
 INPUTS = "nerfro_inputs"
+# Folder of a run with copies of the files that its settings name.
+INPUTS_FOLDER = "inputs"
+_GROUPS = ("camera", "medium", "sampler", "field", "background", "model")  # whose settings may name files
+_NUM_HASHED = 8  # photographs whose content is compared; of the others, name and size
 _OF_CAMERAS = ("camera_to_world", "fx", "fy", "cx", "cy")
 # Differences below this fraction of the largest number are rounding errors of another machine.
 _TOLERANCE = 1e-5
 
 
-def inputs_of(config: DictConfig, cameras: Cameras | None) -> dict[str, Any]:
+def inputs_of(config: DictConfig, views: Views | None) -> dict[str, Any]:
     """Return a description of the inputs of a training, for its checkpoints.
 
     Args:
         config: configuration of the run, see `TrainConfig`.
-        cameras: cameras of the training views; None if they are unknown.
+        views: training views; None if they are unknown.
     """
     described: dict[str, Any] = {"files": file_hashes(config)}
-    return described if cameras is None else described | {"cameras": _tensors(cameras)}
+    if views is None:
+        return described
+    cameras = views.cameras
+    image = {"width": cameras.width, "height": cameras.height, "near": float(cameras.near), "far": float(cameras.far)}
+    return described | {"cameras": _tensors(cameras), "image": image, "photographs": _hash_of_photographs(views)}
+
+
+def recorded_cameras(checkpoint: Mapping[str, Any]) -> Cameras | None:
+    """Return the cameras of the training views in a checkpoint; None if it has none or they are damaged."""
+    inputs = checkpoint.get(INPUTS)
+    tensors, image = (inputs.get(name) if isinstance(inputs, Mapping) else None for name in ("cameras", "image"))
+    try:
+        values = {name: torch.as_tensor(tensors[name], dtype=torch.float32) for name in (*_OF_CAMERAS, "distortion")}
+        num_views = len(values["fx"])
+        shapes = {"camera_to_world": (num_views, 3, 4), "distortion": (num_views, 9)}
+        sides = int(image["width"]), int(image["height"])
+        near, far = float(image["near"]), float(image["far"])
+    except (TypeError, KeyError, ValueError, OverflowError, RuntimeError):
+        return None
+    right = all(
+        value.shape == shapes.get(name, (num_views,)) and value.isfinite().all() for name, value in values.items()
+    )
+    if not right or num_views == 0 or min(sides) < 1 or not 0 <= near < far < math.inf:
+        return None
+    distortion = values.pop("distortion")
+    return Cameras(**values, width=sides[0], height=sides[1], near=near, far=far,
+                   distortion=distortion if distortion.any() else None)  # fmt: skip
+
+
+def copy_files(folder: Path, config: DictConfig) -> None:
+    """Copy the files that settings of a run name, such as the mesh, into its folder, so that it opens without its data.
+
+    Embedded files, and `.gltf` files, which consist of several files, are left out.
+    """
+    for name, location in _texts(config, _GROUPS):
+        copied = folder / INPUTS_FOLDER / f"{name}{PurePath(location).suffix}"
+        if _is_own_file(location) and not same_content(resolve_path(location), copied):
+            with resolve_path(location).open("rb") as source, atomic_file(copied) as target:
+                shutil.copyfileobj(source, target)
+
+
+def relocated(config: DictConfig, folder: Path, root: str | Path | None = None) -> DictConfig:
+    """Return the configuration of a run with the present places of its files.
+
+    Files of the object are those that the run has copied (`copy_files`), otherwise those below the folder of the data.
+    Without `root`, a relative `data.root` that does not exist here is searched from the folders around the run.
+
+    Args:
+        config: configuration as trained.
+        folder: folder of the run.
+        root: folder of the data, if it has moved since training.
+    """
+    trained = str(config.data.root)
+    if root is None and not PurePath(trained).is_absolute() and not trained.startswith((EMBEDDED_PREFIX, "~")):
+        candidates = (parent / trained for parent in (Path(), *folder.resolve().parents))
+        root = next((candidate for candidate in candidates if candidate.is_dir()), None)
+    values = {} if root is None else {"data.root": str(root)}
+    copies = {file.stem: str(file) for file in (folder / INPUTS_FOLDER).glob("*") if not file.name.startswith(".")}
+    for name, location in _texts(config, _GROUPS):
+        if name in copies:
+            values[name] = copies[name]
+        elif (
+            root is not None and PurePath(location).is_relative_to(trained) and not trained.startswith(EMBEDDED_PREFIX)
+        ):
+            values[name] = str(Path(root) / PurePath(location).relative_to(trained))
+    return with_values(config, values)
+
+
+def require_files(checkpoint: Mapping[str, Any], config: DictConfig) -> None:
+    """Refuse a run whose surface files are missing."""
+    locations = dict(_texts(config, ("medium",)))
+    for name in _recorded_files(checkpoint).keys() & locations.keys():
+        location = locations[name]
+        if not resolve_path(location).is_file():
+            raise NerfroError(
+                f"{name}={location} of the run does not exist, and the run folder has no copy of it; give root=FOLDER, "
+                "the folder of the data, or restore the file"
+            )
+
+
+def _texts(config: DictConfig, groups: Collection[str]) -> Iterator[tuple[str, str]]:
+    """Yield name and value of each text among the settings of some groups."""
+    for group in groups:
+        for name, value in flat(config.get(group), group).items():
+            items = {f"{name}[{i}]": item for i, item in enumerate(value)} if isinstance(value, list) else {name: value}
+            yield from ((item, text) for item, text in items.items() if isinstance(text, str))
+
+
+def _is_own_file(location: str) -> bool:
+    """Test whether a text names an existing file that nerfro does not include."""
+    with suppress(OSError, NerfroError):  # other texts than paths
+        suffix = PurePath(location).suffix.lower()
+        own = not location.startswith(EMBEDDED_PREFIX) and suffix not in ("", ".gltf")
+        return own and resolve_path(location).is_file()
+    return False
 
 
 def file_hashes(config: DictConfig) -> dict[str, str]:
@@ -43,32 +146,43 @@ def file_hashes(config: DictConfig) -> dict[str, str]:
     if not plugin_of(config.sampler.path).cls.needs_medium:  # type: ignore[attr-defined]
         return {}
     hashes = {}
-    for name, value in flat(config.medium, "medium").items():
-        places = value if isinstance(value, list) else [value]
-        for number, place in enumerate(places):
-            with suppress(OSError, NerfroError):  # other texts than paths
-                if isinstance(place, str) and resolve_path(place).is_file():
-                    hashes[f"{name}[{number}]" if isinstance(value, list) else name] = file_hash(resolve_path(place))
+    for name, location in _texts(config, ("medium",)):
+        with suppress(OSError, NerfroError):  # other texts than paths
+            if resolve_path(location).is_file():
+                hashes[name] = file_hash(resolve_path(location))
     return hashes
 
 
 def changed_file(checkpoint: Mapping[str, Any], config: DictConfig) -> str | None:
     """Return the setting of the medium whose file has changed since a checkpoint was written; None if none has."""
     inputs = checkpoint.get(INPUTS)
-    recorded = inputs.get("files") if isinstance(inputs, Mapping) else None
-    if not isinstance(recorded, Mapping):
+    if not isinstance(inputs, Mapping) or not isinstance(inputs.get("files"), Mapping):
         return None
-    return first_difference({str(name): str(value) for name, value in recorded.items()}, file_hashes(config))
+    return first_difference(_recorded_files(checkpoint), file_hashes(config))
 
 
-def require_same_inputs(checkpoint: Mapping[str, Any], path: Path, config: DictConfig, cameras: Cameras) -> None:
-    """Refuse to resume a training whose surface files or cameras have changed.
+def compared_by_content(checkpoint: Mapping[str, Any]) -> set[str]:
+    """Return the settings that name files and folders of which a checkpoint records the content."""
+    inputs = checkpoint.get(INPUTS)
+    photographs = inputs.get("photographs") if isinstance(inputs, Mapping) else None
+    files = {name.partition("[")[0] for name in _recorded_files(checkpoint)}
+    return files | ({"data.root"} if isinstance(photographs, str) else set())
+
+
+def _recorded_files(checkpoint: Mapping[str, Any]) -> dict[str, str]:
+    inputs = checkpoint.get(INPUTS)
+    recorded = inputs.get("files") if isinstance(inputs, Mapping) else None
+    return {str(name): str(value) for name, value in recorded.items()} if isinstance(recorded, Mapping) else {}
+
+
+def require_same_inputs(checkpoint: Mapping[str, Any], path: Path, config: DictConfig, views: Views) -> None:
+    """Refuse to resume a training whose surface files, photographs or cameras have changed.
 
     Args:
         checkpoint: content of the checkpoint.
         path: file of the checkpoint.
         config: configuration of the run.
-        cameras: cameras of the training views.
+        views: training views.
 
     Raises:
         NerfroError: an input has changed.
@@ -78,9 +192,21 @@ def require_same_inputs(checkpoint: Mapping[str, Any], path: Path, config: DictC
     if name is not None:
         raise NerfroError(f"{path} was trained with another content of the file {name}; {advice}")
     inputs = checkpoint.get(INPUTS)
-    recorded = inputs.get("cameras") if isinstance(inputs, Mapping) else None
-    if isinstance(recorded, Mapping) and not _equal(recorded, _tensors(cameras)):
+    recorded, photographs = (
+        inputs.get(entry) if isinstance(inputs, Mapping) else None for entry in ("cameras", "photographs")
+    )
+    other_cameras = isinstance(recorded, Mapping) and not _equal(recorded, _tensors(views.cameras))
+    if other_cameras or (isinstance(photographs, str) and photographs != _hash_of_photographs(views)):
         raise NerfroError(f"{path} was trained on other photographs or cameras than {config.data.root} has; {advice}")
+
+
+def _hash_of_photographs(views: Views) -> str | None:
+    """Hash names and sizes of the photographs and the content of some; None if the data format has no image files."""
+    if not views.frames:
+        return None
+    files = [frame.image for frame in views.frames]
+    contents = [file_hash(files[view]) for view in views.spread(_NUM_HASHED)]
+    return content_hash(*views.names, *(file.stat().st_size for file in files), *contents)
 
 
 def _tensors(cameras: Cameras) -> dict[str, torch.Tensor]:

@@ -13,13 +13,16 @@ from nerfro.evaluation.request import find_device
 from nerfro.registry.registration import discover
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.training.config import build_data
-from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint, restore
-from nerfro.training.settings import with_values
+from nerfro.training.inputs import recorded_cameras
+from nerfro.training.run_folder import LAST_CHECKPOINT, load_run, restore
 from nerfro.viewing.trained_scene import TrainedScene
 
 
 def load(run: str | Path, device: str = "auto", root: str | Path | None = None) -> TrainedScene:
     """Load the trained scene of a run.
+
+    The run folder contains the surface of the object and the training cameras, so the scene can be rendered along a
+    path and exported without the data.
 
     Args:
         run: folder of the run, or one of its checkpoints.
@@ -30,8 +33,7 @@ def load(run: str | Path, device: str = "auto", root: str | Path | None = None) 
         NerfroError: the checkpoint cannot be read, or files of the run are missing.
     """
     discover()
-    checkpoint, config = load_checkpoint(checkpoint_of(run))
-    config = config if root is None else with_values(config, {"data.root": str(root)})
+    checkpoint, config = load_run(checkpoint_of(run), root)
     return scene_of(checkpoint, config, find_device(device))
 
 
@@ -43,5 +45,6 @@ def checkpoint_of(run: str | Path) -> Path:
 
 def scene_of(checkpoint: dict[str, Any], config: DictConfig, device: torch.device) -> TrainedScene:
     """Build the scene of a checkpoint from a configuration, whose data and evaluation may differ from training."""
-    renderer = restore(checkpoint, config).to(device)
-    return TrainedScene(renderer, build_data(config), Subdivision(**config.evaluation.subdivision), config.name)
+    renderer, cameras = restore(checkpoint, config).to(device), recorded_cameras(checkpoint)
+    subdivision = Subdivision(**config.evaluation.subdivision)
+    return TrainedScene(renderer, build_data(config), subdivision, config.name, cameras)

@@ -14,10 +14,10 @@ from lightning.pytorch.callbacks import Timer
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor, nn
 
-from nerfro.core.cameras import Cameras
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import user_path
 from nerfro.core.types import Batch
+from nerfro.data.base import Views
 from nerfro.losses.base import Loss, Objective, ObjectiveValue
 from nerfro.registry.allowed import plain, validate
 from nerfro.registry.registration import discover
@@ -25,7 +25,7 @@ from nerfro.rendering import Renderer, Scene
 from nerfro.training.config import build_each
 from nerfro.training.inputs import INPUTS, inputs_of
 from nerfro.training.optimizer import OptimizerConfig
-from nerfro.training.run_folder import load_checkpoint, restore
+from nerfro.training.run_folder import load_run, restore
 
 
 class TrainingModule(LightningModule):
@@ -62,12 +62,12 @@ class TrainingModule(LightningModule):
         renderer: Renderer,
         config: DictConfig,
         callbacks: Sequence[Callback] = (),
-        cameras: Cameras | None = None,
+        views: Views | None = None,
     ) -> TrainingModule:
-        """Create the module from a configuration, and the cameras of the training views if they are known."""
+        """Create the module from a configuration, and the training views if they are known."""
         configuration = OmegaConf.to_yaml(config, resolve=True)
         optimizer = validate(OptimizerConfig, plain(config.optimizer), "optimizer.")
-        inputs = inputs_of(config, cameras)
+        inputs = inputs_of(config, views)
         return cls(renderer, build_each("loss", config.loss), optimizer, callbacks, configuration, inputs)
 
     @classmethod
@@ -86,7 +86,7 @@ class TrainingModule(LightningModule):
             NerfroError: the checkpoint cannot be read.
         """
         discover()
-        checkpoint, config = load_checkpoint(user_path(checkpoint_path))
+        checkpoint, config = load_run(user_path(checkpoint_path))
         return cls.of(restore(checkpoint, config), config).to(map_location)
 
     def configure_callbacks(self) -> list[Callback]:

@@ -7,7 +7,7 @@ import pickle
 import platform
 import shlex
 import subprocess
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -18,10 +18,11 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor, nn
 
-from nerfro.core.cameras import Cameras
+from nerfro.cli.overrides import as_overrides, command_line
 from nerfro.core.errors import Interrupted, NerfroError, first_of, warn
 from nerfro.core.paths import PACKAGE_DIR, user_path
-from nerfro.core.provenance import AlgorithmSettings, command_line, versions
+from nerfro.core.provenance import AlgorithmSettings, command_of_process, versions
+from nerfro.data.base import Views
 from nerfro.files.atomic import require_room, write_atomically
 from nerfro.files.folder_lock import lock_folder, require_only
 from nerfro.files.foreign_config import foreign_config, read_foreign_config
@@ -31,7 +32,14 @@ from nerfro.rendering import Renderer
 from nerfro.training.config import build_model, check_trained, training_device
 from nerfro.training.content import describe
 from nerfro.training.derivation import describe_backdrop
-from nerfro.training.inputs import changed_file, require_same_inputs
+from nerfro.training.inputs import (
+    changed_file,
+    compared_by_content,
+    copy_files,
+    relocated,
+    require_files,
+    require_same_inputs,
+)
 from nerfro.training.settings import RESUMING, first_difference, settings
 
 LAST_CHECKPOINT = Path("checkpoints", "last.ckpt")
@@ -77,7 +85,8 @@ def lock_run(folder: Path, config: DictConfig) -> Iterator[Path | None]:
 
 def resume_advice(folder: Path) -> str:
     """Return how to resume a run."""
-    return "to resume, repeat the command" + ("" if in_sweep() else f" with hydra.run.dir={folder} ckpt_path=last")
+    options = shlex.join(as_overrides({"hydra.run.dir": folder, "ckpt_path": "last"}))
+    return "to resume, repeat the command" + ("" if in_sweep() else f" with {options}")
 
 
 def in_sweep() -> bool:
@@ -94,20 +103,22 @@ def begin(folder: Path, config: DictConfig, renderer: Renderer, has_steps: bool)
     for scores in (*folder.glob("metrics.*"), *folder.glob("evaluate_*/metrics.*")) if has_steps else ():
         scores.unlink()
     record(folder, config)
+    copy_files(folder, config)
     from_data = f"{describe(config)}{describe_backdrop(config)}"
     print(f"nerfro: {config.name} on {config.data.root} -> {folder}\n{from_data}", end="", flush=True)
 
 
 def next_steps(folder: Path, split: str | None) -> str:
     """Return the lines about results at the end of a run: an image, the page and the tables of scores."""
-    lines = [f"page: python -m nerfro.view {shlex.quote(f'checkpoint={folder}')}"]
+    checkpoint = as_overrides({"checkpoint": folder})
+    lines = [f"page: {command_line('view', checkpoint)}"]
     if split is None:
-        lines.append(f"scores: python -m nerfro.evaluate {shlex.quote(f'checkpoint={folder}')}")
+        lines.append(f"scores: {command_line('evaluate', checkpoint)}")
     else:
         lines.insert(0, f"image: {folder / 'images' / f'{split}_000.png'}")
         lines.append(f"tables: {folder}/metrics.md, .csv and .tex for each view, and metrics.json")
     if in_sweep():
-        lines.append(f"table of the sweep: python -m nerfro.summary {shlex.quote(f'runs={folder.parent}')}")
+        lines.append(f"table of the sweep: {command_line('summary', as_overrides({'runs': folder.parent}))}")
     return "\n".join(lines)
 
 
@@ -182,6 +193,17 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Any], DictConfig]:
         return checkpoint, check_trained(foreign_config(checkpoint["nerfro_config"], path), path)
 
 
+def load_run(checkpoint: Path, root: str | Path | None = None) -> tuple[dict[str, Any], DictConfig]:
+    """Read a checkpoint of a run, and its configuration with the present places of its files.
+
+    Args:
+        checkpoint: file of the checkpoint, RUN/checkpoints/NAME.
+        root: folder of the data, if it has moved since training.
+    """
+    content, config = load_checkpoint(checkpoint)
+    return content, relocated(config, checkpoint.parent.parent, root)
+
+
 def require_finite(weights: Mapping[str, Any], path: Path) -> None:
     """Refuse weights that are not tensors, or not finite."""
     for name, weight in weights.items():
@@ -217,6 +239,7 @@ def restore(checkpoint: dict, config: DictConfig) -> Renderer:
     """Build the trained model of a checkpoint."""
     prefix = "renderer."
     weights = {n.removeprefix(prefix): w for n, w in checkpoint["state_dict"].items() if n.startswith(prefix)}
+    require_files(checkpoint, config)
     renderer = build_model(config)
     changed = changed_file(checkpoint, config)
     if changed is not None:
@@ -236,7 +259,7 @@ def require_same_run(
     checkpoint: Path | None,
     config: DictConfig,
     groups: Mapping[str, list[nn.Parameter]],
-    cameras: Cameras,
+    views: Views,
 ) -> int:
     """Refuse to resume from an unsuitable checkpoint, or in the folder of another run.
 
@@ -245,7 +268,7 @@ def require_same_run(
         checkpoint: checkpoint to resume from, if there is one.
         config: configuration of the run.
         groups: parameters by optimizer group.
-        cameras: cameras of the training views.
+        views: training views.
 
     Returns:
         Number of steps of the checkpoint; 0 for a run that starts from the beginning.
@@ -253,8 +276,8 @@ def require_same_run(
     begun = folder / CONFIG_FILE
     if checkpoint is not None:
         content, trained = load_checkpoint(checkpoint)
-        require_same_configuration(checkpoint, trained, config)
-        require_same_inputs(content, checkpoint, config, cameras)
+        require_same_configuration(checkpoint, trained, config, compared_by_content(content))
+        require_same_inputs(content, checkpoint, config, views)
         require_optimizer_fits(content, groups, checkpoint)
         done, most = content["global_step"], config.trainer.max_steps
         if 0 <= most < done:
@@ -265,9 +288,14 @@ def require_same_run(
     return 0
 
 
-def require_same_configuration(path: Path, trained: DictConfig, wanted: DictConfig) -> None:
-    """Raise an error if two configurations differ in settings with influence on the result."""
-    old, new = settings(trained, RESUMING), settings(wanted, RESUMING)
+def require_same_configuration(
+    path: Path, trained: DictConfig, wanted: DictConfig, others: Collection[str] = ()
+) -> None:
+    """Raise an error if two configurations differ in settings with influence on the result, except for `others`."""
+    old, new = (
+        {name: value for name, value in settings(config, RESUMING).items() if name not in others}
+        for config in (trained, wanted)
+    )
     key = first_difference(old, new)
     if key is not None:
         raise NerfroError(
@@ -294,4 +322,4 @@ def _command() -> str:
     if in_sweep():
         # In a launcher's worker this process has another main module and other arguments.
         return shlex.join(["python", "-m", "nerfro.train", *HydraConfig.get().overrides.task])
-    return command_line()
+    return command_of_process()

@@ -89,7 +89,11 @@ def _require_same_cell(folder: Path, identity: Mapping[str, Any]) -> None:
         raise NerfroError(f"{folder} holds a run that is no cell of a sweep; {advice}")
     try:
         record = read_json(folder / CELL_FILE, advice)
-        old, new = settings(record["settings"], RESULT), identity["settings"]
+        by_content = {"data.root", *(name.partition("[")[0] for name in record["files"])}
+        old, new = (
+            {name: value for name, value in values.items() if name not in by_content}
+            for values in (settings(record["settings"], RESULT), identity["settings"])
+        )
         same_data = record["data"] == identity["data"]
         changed = first_difference(record["files"], identity["files"])
     except (NerfroError, ValueError, KeyError, TypeError, AttributeError) as error:

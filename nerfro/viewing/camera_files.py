@@ -16,12 +16,14 @@ from jaxtyping import Float
 from nerfro.camera.base import CameraModel
 from nerfro.camera.similarity import motion_between
 from nerfro.core.cameras import Cameras
-from nerfro.core.errors import NerfroError
+from nerfro.core.errors import NerfroError, warn
 from nerfro.core.paths import relative_path
 from nerfro.core.types import WORLD_ORIGIN
-from nerfro.data.base import Views
+from nerfro.data.base import DataSource, Views
 from nerfro.data.frames import check_pose
+from nerfro.data.image_files import read_size
 from nerfro.data.lenses import Lens, check_lenses, read_lens
+from nerfro.data.transforms import existing_image
 from nerfro.files.atomic import write_atomically
 from nerfro.files.reading import is_number, parse_matrix, read_json
 from nerfro.viewing.camera_paths import CaptureGeometry
@@ -30,17 +32,39 @@ from nerfro.viewing.camera_paths import CaptureGeometry
 # r^8.
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 _RATIONAL = ("k1", "k2", "k3", "", "p1", "p2", "k4", "k5", "k6")
+# Keys of a lens in pixels, which need the size of the images.
+_IN_PIXELS = ("fl_x", "fl_y", "cx", "cy", "cam_mat")
+
+
+def cameras_of_file(file: Path, geometry: CaptureGeometry, source: DataSource) -> Cameras:
+    """Read the cameras of a file, and print their size and the convention of their poses.
+
+    A file of the data set, or a copy of it, has the cameras that training uses, with the camera axes of the data format
+    and in the resolution of the photographs. See `read_cameras` for other files.
+    """
+    own = source.cameras_of(file)
+    cameras = read_cameras(file, geometry, source.origin) if own is None else own
+    poses = "of the data set" if own is not None else "with OpenGL axes (x right, y up, view along -z), in world units"
+    print(f"{file}: {len(cameras)} cameras of {cameras.width}x{cameras.height} pixels, {poses}")
+    offset = geometry.centre - cameras.camera_to_world[:, :, 3].cpu()
+    if own is None and bool(((offset * -cameras.camera_to_world[:, :, 2].cpu()).sum(-1) < 0).all()):
+        warn(f"all cameras of {file} look away from the object; give poses with OpenGL axes: view along -z, y up")
+    return cameras
 
 
 def read_cameras(file: Path, geometry: CaptureGeometry, origin: Float[np.ndarray, "3"] = WORLD_ORIGIN) -> Cameras:
     """Read the cameras of a file, with poses in the world of the training data.
 
     The file is a camera path of nerfstudio (`camera_path`: poses and vertical fields of view) or a `transforms.json`
-    (`frames`: poses and intrinsics; the images are not needed).
+    (`frames`: poses and intrinsics). Poses are camera-to-world matrices with OpenGL axes, in world units.
+
+    The size in pixels is stated by `render_width` and `render_height`, or by `w` and `h`. Without `w` and `h`, it is
+    the size of the image of the first frame. Without an image, it is the size of the photographs, and lengths in pixels
+    (`fl_x`, `cx`) are refused.
 
     Args:
         file: JSON file.
-        geometry: geometry of the training data; its resolution is the default.
+        geometry: geometry of the training data.
         origin: world coordinates of the origin of the result.
 
     Raises:
@@ -60,8 +84,10 @@ def read_cameras(file: Path, geometry: CaptureGeometry, origin: Float[np.ndarray
     if not entries:
         raise NerfroError(f"{file} has no cameras; give one or more")
     sizes = {**entries[0], **document} if isinstance(entries[0], dict) else document
-    width, height = (_pixels(sizes, key, default, file) for key, default in
-                     zip(size, (geometry.camera.width, geometry.camera.height), strict=True))  # fmt: skip
+    defaults = geometry.camera.width, geometry.camera.height
+    if size == ("w", "h") and any(sizes.get(key) is None for key in size):
+        defaults = _size_of_image(file, document, defaults)
+    width, height = (_pixels(sizes, key, default, file) for key, default in zip(size, defaults, strict=True))
     poses, lenses = [], []
     for number, entry in enumerate(entries):
         where = f"{file}: camera {number}"
@@ -125,8 +151,24 @@ def _lens_of_path(document: Mapping[str, Any], entry: Mapping[str, Any], size: t
     return replace(Lens.of_angle(math.radians(angle), size[1], size[1]), cx=0.5 * size[0])
 
 
+def _size_of_image(file: Path, document: Mapping[str, Any], default: tuple[int, int]) -> tuple[int, int]:
+    """Return width and height of the image of the first frame, or the default for lenses without lengths in pixels."""
+    levels = [document, *(entry for entry in document["frames"] if isinstance(entry, dict))]
+    name = levels[1].get("file_path") if len(levels) > 1 else None
+    image = existing_image(file.parent, name.replace("\\", "/")) if isinstance(name, str) else None
+    if image is not None:
+        return read_size(image)[:2]
+    key = next((key for key in _IN_PIXELS if any(level.get(key) is not None for level in levels)), None)
+    if key is not None:
+        raise NerfroError(
+            f"{file} has {key} in pixels, but neither w and h nor the image of its first frame; add w and h, the size "
+            "of the images that the lens was calibrated for"
+        )
+    return default
+
+
 def _pixels(document: Mapping[str, Any], key: str, default: int, file: Path) -> int:
-    value = document.get(key, default)
+    value = default if document.get(key) is None else document[key]
     if not is_number(value) or value < 1:
         raise NerfroError(f"{file}: {key}={value!r} is not a number of pixels; give 1 or more")
     return int(value)

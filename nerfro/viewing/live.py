@@ -28,7 +28,7 @@ class LivePage:
     def __init__(self, server: PageServer, scene: TrainedScene, views: Views, split: str, resolution: int = 48) -> None:
         self._server, self._scene, self._cameras = server, scene, views.cameras
         self._resolution = resolution
-        static = {**static_parts(scene, views, split), "version": 0}
+        static = {**static_parts(scene, views.cameras, views.images, split), "version": 0}
         server.open(assemble_page(scene.name, static, self._bake(surface=True), live=True))
         self._next = time.monotonic()
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from nerfro.core.cameras import Cameras, up_direction
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import ASSETS_DIR
-from nerfro.data.base import DataSource, Views
+from nerfro.data.lazy_images import LazyImages
 from nerfro.files.atomic import write_atomically
 from nerfro.files.images import data_uri, to_8bit
 from nerfro.files.templates import fill_template
@@ -39,14 +39,18 @@ def make_page(scene: TrainedScene, resolution: int) -> str:
     Raises:
         NerfroError: the medium has no surface, or the position of the scene is unknown.
     """
-    split = page_split(scene.source)
-    views = scene.views(split)
-    parts = bake_parts(scene, views.cameras, resolution, progress=True)
-    return assemble_page(scene.name, static_parts(scene, views, split), parts)
+    split = page_split(scene)
+    views = scene.views(split) if scene.has_data else None
+    cameras = scene.cameras(split) if views is None else views.cameras
+    parts = bake_parts(scene, cameras, resolution, progress=True)
+    return assemble_page(scene.name, static_parts(scene, cameras, views and views.images, split), parts)
 
 
-def page_split(source: DataSource) -> str:
-    """Return the split whose cameras are on the page."""
+def page_split(scene: TrainedScene) -> str:
+    """Return the split whose cameras are on the page; without data, only the training cameras are known."""
+    if not scene.has_data:
+        return "train"
+    source = scene.source
     return next((name for name in _SPLITS if name in source.splits), source.splits[0])
 
 
@@ -75,17 +79,26 @@ def assemble_page(title: str, static: dict[str, Any], parts: dict[str, Baked], l
     return fill_template(_TEMPLATES / "page.html.jinja", title=title, scene=scene, arrays=arrays, asset=asset)
 
 
-def static_parts(scene: TrainedScene, views: Views, split: str) -> dict[str, Any]:
-    """Collect the data that is constant during training: cameras, photographs, and the position of the scene."""
-    renderer, cameras = scene.renderer, views.cameras
+def static_parts(
+    scene: TrainedScene, cameras: Cameras, images: LazyImages | Float[Tensor, "V H W 3"] | None, split: str
+) -> dict[str, Any]:
+    """Collect the data that is constant during training: cameras, photographs, and the position of the scene.
+
+    Args:
+        scene: the scene.
+        cameras: cameras on the page.
+        images: their photographs, sRGB in [0, 1]; None without data.
+        split: name of the split of the cameras.
+    """
+    renderer = scene.renderer
     space, box = renderer.scene.space, renderer.scene.medium.content_box.float().cpu()
     if not (box[1] > box[0]).all():
         box = scene.bounds if space.has_box else volume_space(scene, cameras).box
     # Arc length at which the integration along a ray begins.
     near = float(cameras.near if space.near is None else space.near)
-    with_photograph = set(range(len(views)))
-    if len(views) > _MAX_PHOTOGRAPHS:
-        with_photograph = {i * len(views) // _MAX_PHOTOGRAPHS for i in range(_MAX_PHOTOGRAPHS)}
+    with_photograph = set(range(len(cameras)))
+    if len(cameras) > _MAX_PHOTOGRAPHS:
+        with_photograph = {i * len(cameras) // _MAX_PHOTOGRAPHS for i in range(_MAX_PHOTOGRAPHS)}
     return {
         "linear": renderer.scene.colour_space is ColourSpace.LINEAR,
         "reflection": renderer.path_sampler.branching.max_split_events > 0,
@@ -105,9 +118,9 @@ def static_parts(scene: TrainedScene, views: Views, split: str) -> dict[str, Any
                 "principal": [float(cameras.cx[view]), float(cameras.cy[view])],
                 "size": [cameras.width, cameras.height],
                 "near": near,
-                "photograph": _thumbnail(views.images[view]) if view in with_photograph else None,
+                "photograph": _thumbnail(images[view]) if images is not None and view in with_photograph else None,
             }
-            for view in range(len(views))
+            for view in range(len(cameras))
         ],
     }
 

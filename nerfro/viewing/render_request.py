@@ -23,7 +23,7 @@ from nerfro.core.variants import variant
 from nerfro.data.lenses import Lens, check_lenses
 from nerfro.registry.allowed import Count, Positive, refuse_unused
 from nerfro.samplers.subdivision import SubdivisionChanges
-from nerfro.viewing.camera_files import read_cameras
+from nerfro.viewing.camera_files import cameras_of_file
 from nerfro.viewing.camera_paths import PATHS, CaptureGeometry, OrbitPosition, path_cameras
 from nerfro.viewing.trained_scene import TrainedScene
 
@@ -157,7 +157,7 @@ def _free_cameras(options: RenderConfig, scene: TrainedScene) -> Shots:
         start = OrbitPosition(options.azimuth, options.elevation, options.distance or geometry.distance)
         cameras = path_cameras(geometry, options.path, start, options.frames)
     else:
-        cameras = read_cameras(user_path(str(options.path)), geometry, scene.source.origin)
+        cameras = cameras_of_file(user_path(str(options.path)), geometry, scene.source)
     return Shots(cameras, _numbered("frame", len(cameras), 4), len(cameras) > 1)
 
 

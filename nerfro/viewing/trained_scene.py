@@ -67,23 +67,40 @@ class TrainedScene:
         source: data set.
         subdivision: rays per pixel; the default is the subdivision of the run's evaluation.
         name: name of the experiment.
+        training_cameras: cameras of the training views as trained; None to take those of the data set.
     """
 
     renderer: Renderer
     source: DataSource
     subdivision: Subdivision = field(default_factory=Subdivision)
     name: str = ""
+    training_cameras: Cameras | None = None
 
     def __repr__(self) -> str:
         return f"TrainedScene({self.name}, {self.renderer.scene})"
 
     def views(self, split: str = "test") -> Views:
-        """Load the cameras, photographs and masks of a split of the data."""
+        """Load the cameras, photographs and masks of a split of the data.
+
+        Raises:
+            NerfroError: the data do not exist, or lack the split.
+        """
+        if not self.has_data:
+            raise NerfroError(
+                f"the data of the run, {self.source.root}, do not exist here; give root=FOLDER. A path around the "
+                "object (path=orbit) and exports need no data"
+            )
         return self.source.load(split)
 
+    @property
+    def has_data(self) -> bool:
+        """Whether the folder of the data exists."""
+        return self.source.root.is_dir()
+
     def cameras(self, split: str = "test") -> Cameras:
-        """Load the cameras of a split of the data, on the device of the scene."""
-        return self.views(split).cameras.to(self.renderer.scene.device)
+        """Return the cameras of a split, on the device of the scene; only those of training are known without data."""
+        cameras = self.training_cameras if split == "train" else None
+        return (cameras or self.views(split).cameras).to(self.renderer.scene.device)
 
     def render(
         self,

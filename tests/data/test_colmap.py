@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -207,3 +208,22 @@ def test_model_without_its_images_is_read(write):
     assert [image.name for image in model.images] == [f"top/v{i}.png" for i in range(6)]
     np.testing.assert_allclose(model.points, POINTS)
     np.testing.assert_allclose(model.images[3].camera_to_world, camera_to_world(3, "opencv")[:3], atol=1e-12)
+
+
+def test_largest_of_several_models_is_used_and_named(write, tmp_path, capsys):
+    root = write("text")
+    (root / "sparse/0").rename(root / "sparse/1")
+    assert len(load(root)) == len(TRAIN)
+    assert "COLMAP" not in capsys.readouterr().out, "one model, whatever its number"
+    fragment = root / "sparse/0"
+    fragment.mkdir()
+    for name in ("cameras.txt", "points3D.txt"):
+        shutil.copy(root / "sparse/1" / name, fragment)
+    lines = [line for line in (root / "sparse/1/images.txt").read_text().splitlines() if not line.startswith("#")]
+    (fragment / "images.txt").write_text("\n".join(lines[:4]) + "\n")
+    source = FORMATS["colmap"].open(root)
+    assert len(source.load("train")) == len(TRAIN)
+    source.load("test")
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 1, "the line is printed once"
+    assert f"{root}/sparse/0 (2 images), {root}/sparse/1 (6 images); {root}/sparse/1 is used" in lines[0]

@@ -1,5 +1,6 @@
 """Formats with transforms files (Blender, OpenCV, nerfstudio), and the messages about wrong files."""
 
+import json
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -19,6 +20,7 @@ from tests.conftest import refused
 
 from .formats import (
     ANGLE,
+    FORMATS,
     IDEAL,
     SHARED,
     K,
@@ -334,3 +336,59 @@ def test_cameras_without_a_common_target_need_near_and_far(tmp_path: Path) -> No
     root = write_nerfstudio(tmp_path, seeds=range(12), frame=outwards)
     refused(r"data\.near and data\.far cannot be found", lambda: NerfstudioData(str(root)).load("train"))
     assert load(root).cameras.near == 0.5
+
+
+@pytest.mark.parametrize("form", ["nerfstudio", "blender"])
+@pytest.mark.parametrize(("suffix", "stated"), [(".exr", True), (".HEIC", True), (".exr", False)])
+def test_images_of_other_types_are_refused_by_their_type(form: str, suffix: str, stated: bool, tmp_path: Path) -> None:
+    root = FORMATS[form].write(tmp_path)
+    file = root / ("transforms.json" if form == "nerfstudio" else "transforms_train.json")
+    first = json.loads(file.read_text())["frames"][1]["file_path"].removesuffix(".png")
+    (root / f"{first}.png").rename(root / f"{first}{suffix}")
+    change_json(file, lambda d: d["frames"][1].update(file_path=f"{first}{suffix if stated else ''}"))
+    message = rf"{suffix} are not read; convert the images to PNG .* or JPEG, and correct the names in the file"
+    refused(message, FORMATS[form].load, root)
+
+
+def test_jfif_files_are_read_as_jpeg(tmp_path: Path) -> None:
+    root = write_nerfstudio(tmp_path)
+    Image.open(root / "images/f_1.png").convert("RGB").save(root / "images/f_1.jfif", "JPEG")
+    (root / "images/f_1.png").unlink()
+    change_json(root / "transforms.json", lambda d: d["frames"][4].update(file_path="images/f_1.jfif"))
+    assert "images/f_1.jfif" in load(root, test_every=3).names
+
+
+def test_sparse_points_are_read_from_windows_paths_and_reported_if_missing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "points").mkdir()
+    trimesh.PointCloud(np.random.default_rng(0).uniform(-0.1, 0.1, (100, 3))).export(tmp_path / "points/sparse.ply")
+    bounds = {}
+    for path in ("points/sparse.ply", "points\\sparse.ply", "points/none.ply"):
+        source = NerfstudioData(str(write_nerfstudio(tmp_path, top=SHARED | {"ply_file_path": path})), test_every=3)
+        for split in ("train", "test"):
+            cameras = source.load(split).cameras
+        bounds[path] = cameras.near, cameras.far
+        assert capsys.readouterr().out.count("(ply_file_path) do not exist, so near and far are") == ("none" in path)
+    assert bounds["points\\sparse.ply"] == bounds["points/sparse.ply"] != bounds["points/none.ply"]
+
+
+def test_rolling_shutter_of_zeros_is_a_global_shutter(tmp_path: Path) -> None:
+    for shutter, right in (([0.0] * 4, True), ([[0, 0], [0, 0]], True), ([0.0, 0.0, 0.0, 0.01], False)):
+        root = write_nerfstudio(tmp_path, top=SHARED | {"rolling_shutter": shutter})
+        if right:
+            assert len(load(root, test_every=3)) == 4
+        else:
+            refused("rolling_shutter=.* is not supported", load, root, test_every=3)
+
+
+@pytest.mark.parametrize(
+    ("form", "name"), [("nerfstudio", "transforms.json"), ("colmap", "sparse"), ("idr", "cameras_")]
+)
+def test_default_format_names_the_format_of_a_folder(form: str, name: str, tmp_path: Path) -> None:
+    root = FORMATS[form].write(tmp_path)
+    refused(
+        rf"holds no transforms_<split>.json; it holds {name}.*, which data={form} reads",
+        BlenderData(str(root)).load,
+        "train",
+    )

@@ -1,6 +1,7 @@
 """Extraction of sharp frames from a video."""
 
 import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,10 @@ import pytest
 pytest.importorskip("cv2")
 
 import cv2
+from omegaconf import OmegaConf
 
-from nerfro.poses.collection import extract_frames
+from nerfro.poses.calibrated_data import REPORT
+from nerfro.poses.collection import collect_photographs, extract_frames
 from tests.conftest import refused
 
 SHARP = (1, 7, 8, 13)  # one in each quarter of the video
@@ -47,11 +50,23 @@ def test_frames_of_another_extraction_are_deleted(video: Path, tmp_path: Path) -
     files = extract_frames(video, tmp_path, 4)
     assert sorted(tmp_path.glob("*.jpg")) == files
     assert (tmp_path / "notes.txt").is_file()
-    for file in files:  # of an earlier video
-        file.write_bytes(b"earlier")
-        os.utime(file, ns=(0, 0))
-    assert extract_frames(video, tmp_path, 4) == files
+
+
+def test_frames_of_another_video_are_replaced_whatever_its_time(video: Path, tmp_path: Path) -> None:
+    again = Path(shutil.copy(video, tmp_path / "again.mp4"))
+    files = extract_frames(again, tmp_path / "frames", 4)
+    for file in files:
+        file.write_bytes(b"of the first video")
+    touched = again.read_bytes() + b"\0" * 8  # the same frames in another file, which looks older than the frames
+    again.write_bytes(touched)
+    os.utime(again, ns=(0, 0))
+    assert extract_frames(again, tmp_path / "frames", 4) == files
     assert all(cv2.imread(str(file)).shape == (64, 96, 3) for file in files)
+    (tmp_path / REPORT).write_text("{}")
+    config = OmegaConf.create({"video": str(again), "images": None, "masks": None, "frames": 4})
+    assert len(collect_photographs(config, tmp_path)) == 4
+    again.write_bytes(touched + b"\0")
+    refused("has poses of the frames of another video than", collect_photographs, config, tmp_path)
 
 
 def test_files_without_a_video_are_refused(video: Path, tmp_path: Path) -> None:

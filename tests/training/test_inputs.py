@@ -3,16 +3,33 @@
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 import trimesh
+from omegaconf import OmegaConf
 
 from nerfro.core.cameras import Cameras
-from nerfro.training.inputs import INPUTS, changed_file, inputs_of, require_same_inputs
+from nerfro.data.base import Views
+from nerfro.data.blender import BlenderData
+from nerfro.training.inputs import (
+    INPUTS,
+    changed_file,
+    compared_by_content,
+    copy_files,
+    inputs_of,
+    recorded_cameras,
+    relocated,
+    require_files,
+    require_same_inputs,
+)
 from nerfro.training.load import load
-from tests.conftest import Runner, composed, refused
+from nerfro.training.run_folder import require_same_configuration
+from nerfro.viewing.page import page_split
+from nerfro.viewing.trained_scene import TrainedScene
+from tests.conftest import Runner, composed, refused, write_tiny_scene
 
 STEPS = ["trainer.max_steps=2", "evaluation.every=0", "evaluation.split=null"]
 
@@ -31,14 +48,15 @@ def test_files_of_the_medium_and_cameras_are_compared_with_a_checkpoint(tmp_path
     bodies = f"{{glass: {{ior: 1.5}}, water: {{mesh: {tmp_path / 'inner.ply'}, ior: 1.3}}}}"
     config = composed(f"medium.mesh={tmp_path / 'mesh.ply'}", f"medium.bodies={bodies}")
     cameras = Cameras(torch.rand(3, 3, 4), *torch.rand(4, 3), 8, 8, 1.0, 2.0)
-    checkpoint = {INPUTS: inputs_of(config, cameras)}
+    views = Views(cameras, torch.zeros(3, 8, 8, 3), None, ["a", "b", "c"])
+    checkpoint = {INPUTS: inputs_of(config, views)}
     path = tmp_path / "last.ckpt"
-    require_same_inputs(checkpoint, path, config, cameras)
-    fewer = cameras.select([0, 1])
+    require_same_inputs(checkpoint, path, config, views)
+    fewer = views.select([0, 1])
     refused("was trained on other photographs or cameras", require_same_inputs, checkpoint, path, config, fewer)
     dent(tmp_path / "inner.ply")
     assert changed_file(checkpoint, config) == "medium.bodies.water.mesh"
-    refused(r"content of the file medium\.bodies\.water\.mesh", require_same_inputs, checkpoint, path, config, cameras)
+    refused(r"content of the file medium\.bodies\.water\.mesh", require_same_inputs, checkpoint, path, config, views)
 
 
 def test_changed_surface_is_reported_in_loading_and_refused_in_resuming(
@@ -49,6 +67,9 @@ def test_changed_surface_is_reported_in_loading_and_refused_in_resuming(
     load(tmp_path / "run")
     assert "changed" not in capsys.readouterr().out
     dent(surface)
+    load(tmp_path / "run")
+    assert "changed" not in capsys.readouterr().out, "the run has a copy of the surface"
+    shutil.rmtree(tmp_path / "run/inputs")
     load(tmp_path / "run")
     assert "the content of the file medium.mesh has changed since the training" in "".join(capsys.readouterr())
     resumed = train(*STEPS, f"medium.mesh={surface}", "trainer.max_steps=3", "ckpt_path=last", code=1)
@@ -65,3 +86,105 @@ def test_changed_photographs_are_refused_in_resuming(train: Runner, tiny_scene: 
     file.write_text(json.dumps(cameras | {"frames": cameras["frames"][1:]}))
     resumed = train(*options, "trainer.max_steps=4", "ckpt_path=last", code=1)
     assert "was trained on other photographs or cameras than" in resumed.error
+
+
+def test_run_opens_anywhere_and_resumes_with_moved_data(
+    train: Runner, command: Runner, tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(tiny_scene, "data")
+    options = [*STEPS, "medium.mesh=${data.root}/mesh.ply"]
+    train(*options, "data.root=data")
+    trained = load("run")
+    data, run = (Path(shutil.move(name, tmp_path / "elsewhere" / name)) for name in ("data", "run"))
+    assert load(run).source.root == data, "a relative folder is searched around the run"
+    data.rename(tmp_path / "moved")
+    scene = load(run)
+    torch.testing.assert_close(scene.cameras("train").camera_to_world, trained.cameras("train").camera_to_world)
+    assert (scene.bounds == trained.bounds).all()
+    refused("the data of the run, data, do not exist here; give root=FOLDER", scene.views)
+    small = ["resolution=4", "subdivision.side=1", "device=cpu"]
+    assert "2 frames" in command("render", f"checkpoint={run}", "path=orbit", "frames=2", "film=[]", "out=O", *small)
+    for what, file in (("page", "page.html"), ("volume", "volume.npz")):
+        arguments = ["resolution=8", "device=cpu", f"what={what}", f"out={file}"]
+        assert "wrote" in command("export", f"checkpoint={run}", *arguments)
+    assert len(load(run, root="moved").views("test")) == 2
+    shutil.rmtree(run / "inputs")
+    refused(r"medium\.mesh=data/mesh\.ply of the run does not exist, .* give root=FOLDER", load, run)
+    assert (load(run, root="moved").bounds == trained.bounds).all()
+    resumed = [*options, "data.root=moved", "trainer.max_steps=3", f"hydra.run.dir={run}", "ckpt_path=last"]
+    train(*resumed)
+    photograph = tmp_path / "moved/train/r_1.png"
+    shutil.copy(tmp_path / "moved/train/r_0.png", photograph)
+    assert "was trained on other photographs" in train(*resumed, "trainer.max_steps=4", code=1).error
+
+
+def test_files_of_a_run_are_found_in_its_folder_or_below_the_given_root(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("mesh.ply", "inner.ply"):
+        (tmp_path / "data").mkdir(exist_ok=True)
+        trimesh.creation.icosphere(1).export(tmp_path / "data" / name)
+    bodies = "{glass: {ior: 1.5}, water: {mesh: data/inner.ply, ior: 1.3}}"
+    config = composed("data.root=data", "medium.mesh=${data.root}/mesh.ply", f"medium.bodies={bodies}")
+    config = OmegaConf.create(OmegaConf.to_yaml(config, resolve=True))
+    checkpoint, run = {INPUTS: inputs_of(config, None)}, tmp_path / "runs/first"
+    copy_files(run, config)
+    assert sorted(file.name for file in (run / "inputs").iterdir()) == [
+        "medium.bodies.water.mesh.ply",
+        "medium.mesh.ply",
+    ]
+    shutil.move("data", "elsewhere")
+    moved = relocated(config, run)
+    assert moved.medium.mesh == str(run / "inputs/medium.mesh.ply")
+    assert moved.medium.bodies.water.mesh == str(run / "inputs/medium.bodies.water.mesh.ply")
+    assert moved.data.root == "data", "unknown"
+    assert changed_file(checkpoint, moved) is None
+    require_files(checkpoint, moved)
+    shutil.rmtree(run / "inputs")
+    refused("of the run does not exist, and .* give root=FOLDER", require_files, checkpoint, relocated(config, run))
+    moved = relocated(config, run, "elsewhere")
+    assert (moved.data.root, moved.medium.bodies.water.mesh) == ("elsewhere", "elsewhere/inner.ply")
+    assert changed_file(checkpoint, moved) is None
+    shutil.move("elsewhere", "runs/data")
+    assert relocated(config, run).medium.mesh == str(tmp_path / "runs/data/mesh.ply"), "searched around the run"
+
+
+def test_resuming_compares_photographs_and_surfaces_by_their_content(tmp_path: Path) -> None:
+    configs, views = [], []
+    for name in ("data", "moved"):
+        write_tiny_scene(tmp_path / name)
+        config = composed(f"data.root={tmp_path / name}", "medium.mesh=${data.root}/mesh.ply")
+        configs.append(OmegaConf.create(OmegaConf.to_yaml(config, resolve=True)))
+        views.append(BlenderData(str(tmp_path / name)).load("train"))
+    checkpoint, path = {INPUTS: inputs_of(configs[0], views[0])}, tmp_path / "last.ckpt"
+    names = compared_by_content(checkpoint)
+    assert names == {"data.root", "medium.mesh"}
+    require_same_configuration(path, *configs, names)
+    require_same_inputs(checkpoint, path, configs[1], views[1])
+    refused("was trained with data.root=", require_same_configuration, path, *configs)
+    shutil.copy(tmp_path / "data/train/r_0.png", tmp_path / "moved/train/r_1.png")
+    message = "was trained on other photographs or cameras"
+    refused(message, require_same_inputs, checkpoint, path, configs[1], views[1])
+
+
+def test_scene_without_data_has_the_training_cameras(unchecked: None, tmp_path: Path) -> None:
+    cameras = Cameras(torch.rand(3, 3, 4), *torch.rand(4, 3), 8, 6, 1.0, 2.0)
+    renderer = SimpleNamespace(scene=SimpleNamespace(device=torch.device("cpu")))
+    scene = TrainedScene(renderer, BlenderData(str(tmp_path / "gone")), training_cameras=cameras)  # type: ignore[arg-type]
+    assert (scene.cameras("train").camera_to_world == cameras.camera_to_world).all()
+    assert page_split(scene) == "train"
+    refused("the data of the run, .*/gone, do not exist here; give root=FOLDER", scene.cameras, "test")
+
+
+def test_damaged_records_of_cameras_are_ignored() -> None:
+    cameras = Cameras(torch.rand(3, 3, 4), *torch.rand(4, 3), 8, 6, 1.0, 2.0)
+    inputs = inputs_of(
+        composed("sampler/path=straight"), Views(cameras, torch.zeros(3, 6, 8, 3), None, ["a", "b", "c"])
+    )
+    read = recorded_cameras({INPUTS: inputs})
+    assert read is not None
+    assert (read.width, read.height, read.near, read.far, read.distortion) == (8, 6, 1.0, 2.0, None)
+    damages = ({"image": None}, {"image": {"width": 8}}, {"cameras": 3}, {"cameras": inputs["cameras"] | {"fx": [1.0]}})
+    assert all(recorded_cameras({INPUTS: inputs | damage}) is None for damage in damages)

@@ -2,16 +2,20 @@
 
 import json
 import math
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 
-from nerfro.viewing.camera_files import read_cameras
+from nerfro.viewing.camera_files import cameras_of_file, read_cameras
 from nerfro.viewing.camera_paths import PATHS, CaptureGeometry, OrbitPosition, path_cameras
 from nerfro.viewing.trained_scene import TrainedScene
 from tests.conftest import refused
+from tests.data.formats import FORMATS
+from tests.data.photographs import HEIGHT, WIDTH
 
 CENTRE = torch.tensor([0.5, -0.2, 0.1])
 
@@ -121,6 +125,53 @@ def test_transforms_are_read_without_their_images(around: CaptureGeometry, tmp_p
         torch.testing.assert_close(cameras.camera_to_world[0], pose[:3])
 
 
+def test_size_without_keys_is_that_of_the_images_or_refused_for_lengths_in_pixels(
+    around: CaptureGeometry, tmp_path: Path
+) -> None:
+    file, pose = tmp_path / "transforms.json", torch.eye(4).tolist()
+    document = {"fl_x": 80.0, "frames": [{"file_path": "r_0", "transform_matrix": pose}]}
+    file.write_text(json.dumps(document))
+    refused(
+        "has fl_x in pixels, but neither w and h nor the image of its first frame; add w", read_cameras, file, around
+    )
+    Image.new("RGB", (64, 36)).save(tmp_path / "r_0.png")
+    cameras = read_cameras(file, around)
+    assert (cameras.width, cameras.height, float(cameras.fx), float(cameras.cx)) == (64, 36, 80, 32)
+    file.write_text(json.dumps({"camera_angle_x": 0.5, "frames": [{"transform_matrix": pose}]}))
+    assert read_cameras(file, around).width == around.camera.width
+
+
+@pytest.mark.parametrize("form", ["blender", "opencv", "nerfstudio"])
+def test_file_of_the_data_set_gives_its_views(
+    form: str, around: CaptureGeometry, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    FORMATS[form].write(root := tmp_path / "data")
+    source = FORMATS[form].open(root, downscale=2)
+    own = next(file for file in sorted(root.glob("transforms*.json")) if file.stem in ("transforms", "transforms_test"))
+    copied = Path(shutil.copy(own, tmp_path / "copy.json"))
+    views = [source.load(split).cameras for split in (("train", "test") if own.stem == "transforms" else ("test",))]
+    for file in (own, copied):
+        cameras = cameras_of_file(file, around, source)
+        assert f"cameras of {WIDTH // 2}x{HEIGHT // 2} pixels, of the data set" in capsys.readouterr().out
+        for name in ("camera_to_world", "fx", "cy"):
+            values, expected = getattr(cameras, name), torch.cat([getattr(split, name) for split in views])
+            torch.testing.assert_close(values.sort(0).values, expected.sort(0).values)
+        assert (cameras.width, cameras.near) == (views[0].width, views[0].near)
+
+
+def test_cameras_with_other_axes_are_reported(
+    around: CaptureGeometry, scene: TrainedScene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    poses = torch.cat([scene.cameras("test").camera_to_world, torch.tensor([0, 0, 0, 1.0]).expand(3, 1, 4)], 1)
+    for axes, reported in (([1, 1, 1, 1], False), ([1, -1, -1, 1], True)):
+        frames = [{"transform_matrix": (pose * torch.tensor(axes)).tolist()} for pose in poses]
+        (tmp_path / "other.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": frames}))
+        cameras_of_file(tmp_path / "other.json", around, scene.source)
+        lines = capsys.readouterr().out
+        assert "3 cameras of 32x32 pixels, with OpenGL axes" in lines
+        assert ("look away from the object" in lines) == reported
+
+
 @pytest.mark.parametrize(
     ("document", "message"),
     [
@@ -129,7 +180,10 @@ def test_transforms_are_read_without_their_images(around: CaptureGeometry, tmp_p
         ({"camera_path": [{"fov": 40}]}, "camera 0 has no 'camera_to_world'"),
         ({"camera_path": [{"fov": 400, "camera_to_world": torch.eye(4).flatten().tolist()}]}, "fov=400 must be"),
         ({"camera_path": [{"fov": 40, "camera_to_world": [1, 2]}]}, "camera 0 has shape 2"),
-        ({"frames": [{"transform_matrix": (2 * torch.eye(4)).tolist()}], "fl_x": 3}, "is not a rotation"),
+        (
+            {"frames": [{"transform_matrix": (2 * torch.eye(4)).tolist()}], "fl_x": 3, "w": 4, "h": 4},
+            "is not a rotation",
+        ),
         ({"frames": [{"transform_matrix": torch.eye(4).tolist()}]}, "has no focal length"),
     ],
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 from typing import Any
 
@@ -37,8 +38,8 @@ class ColmapData(PosedImages):
             cameras, see `find_bounds`.
         options: see `PosedImages`.
         images: folder of the images within the root.
-        model: folder of the model within the root. By default, the first model in sparse/0, sparse, colmap/sparse/0 and
-            the root is used.
+        model: folder of the model within the root. By default, the model with the most images in the first of the
+            folders sparse, colmap/sparse and the root that has one, itself or in numbered folders, as sparse/0.
         test_every: every n-th image by name, from the first, belongs to val and test.
     """
 
@@ -54,7 +55,7 @@ class ColmapData(PosedImages):
         self.images, self.model, self.test_every = images, model, test_every
 
     def read(self, split: str) -> FrameSet:
-        folder = self._model_folder()
+        folder = self._model_folder
         model = read_colmap(folder)
         near, far = self.near, self.far
         if near is None or far is None:
@@ -79,6 +80,7 @@ class ColmapData(PosedImages):
         camera = model.cameras[image.camera]
         return image_edges(lens_of(camera, f"{folder}: camera {image.camera}"), camera.width, camera.height)
 
+    @functools.cached_property
     def _model_folder(self) -> Path:
         folders = [self.root / name for name in ((self.model,) if self.model is not None else MODEL_FOLDERS)]
         folder = find_model_folder(folders)

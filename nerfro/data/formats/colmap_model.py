@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from nerfro.core.errors import NerfroError
+from nerfro.core.errors import NerfroError, warn
 from nerfro.core.lens import coefficients, opencv_coefficients
 from nerfro.data.lenses import Lens
 from nerfro.files.reading import MAX_ARRAY_BYTES, read_text
@@ -38,8 +38,9 @@ CAMERA_MODELS = (
     ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
 )
 _NUM_PARAMS = dict(CAMERA_MODELS)
-# Usual places of a model below the folder of a data set, in the order of the search.
-MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "")
+# Usual places of models below the folder of a data set, in the order of the search. COLMAP numbers the models of
+# photographs that it cannot connect: sparse/0, sparse/1.
+MODEL_FOLDERS = ("sparse", "colmap/sparse", "")
 
 
 @dataclass(frozen=True)
@@ -71,11 +72,35 @@ class ColmapModel:
 
 
 def find_model_folder(folders: Iterable[Path]) -> Path | None:
-    """Return the first folder with a model, that is, with the file cameras.bin or cameras.txt."""
-    return next(
-        (folder for folder in folders if any((folder / name).is_file() for name in ("cameras.bin", "cameras.txt"))),
-        None,
-    )
+    """Return the folder of the model in the first of some folders that contains one, itself or in numbered folders.
+
+    Of several models, the one with the most images is used, and a line says so.
+    """
+    for folder in folders:
+        numbered = sorted((path for path in folder.glob("[0-9]*") if path.name.isdecimal()), key=lambda p: int(p.name))
+        models = [path for path in (*numbered, folder) if _holds_model(path)]
+        if len(models) > 1:
+            counts = {path: _num_images(path) for path in models}
+            largest = max(models, key=lambda path: counts[path])
+            sizes = ", ".join(f"{path} ({count} images)" for path, count in counts.items())
+            warn(f"there are {len(models)} COLMAP models: {sizes}; {largest} is used, which has the most images")
+            return largest
+        if models:
+            return models[0]
+    return None
+
+
+def _holds_model(folder: Path) -> bool:
+    """Test whether a folder contains the file cameras.bin or cameras.txt."""
+    return any((folder / name).is_file() for name in ("cameras.bin", "cameras.txt"))
+
+
+def _num_images(folder: Path) -> int:
+    """Count the registered images of a model; 0 if it cannot be read."""
+    try:
+        return len(read_colmap(folder).images)
+    except NerfroError:
+        return 0
 
 
 def read_colmap(folder: Path) -> ColmapModel:

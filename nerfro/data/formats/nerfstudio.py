@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import functools
 import os
-from pathlib import PurePosixPath
+from collections.abc import Mapping, Sequence
+from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 import numpy as np
 
-from nerfro.core.errors import NerfroError
+from nerfro.core.cameras import Cameras
+from nerfro.core.errors import NerfroError, warn
 from nerfro.data.base import SPLITS
 from nerfro.data.formats.bounds import find_bounds, image_edges, usable_points
 from nerfro.data.frames import Every, FrameSet, PosedImages
 from nerfro.data.image_files import read_size
 from nerfro.data.masks import find_mask
 from nerfro.data.transforms import Manifest, find_splits, parse_manifest, read_manifest
+from nerfro.files.reading import same_content
 from nerfro.geometry.mesh import load_points
 from nerfro.registry.allowed import check
 from nerfro.registry.registration import register
@@ -50,9 +53,13 @@ class NerfstudioData(PosedImages):
         super().__init__(root, **options)
         self.skip_missing, self.test_every = missing == "skip", test_every
 
-    @property
-    def splits(self) -> list[str]:
-        return SPLITS if self._single else list(find_splits(self.root))
+    def split_files(self) -> Mapping[str, Path]:
+        return {} if self._single else find_splits(self.root)
+
+    def cameras_of(self, file: Path) -> Cameras | None:
+        if self._single is None or not same_content(self._single.path, file):
+            return super().cameras_of(file)
+        return self._views(self._frames(self._single, range(len(self._single.frames)))).cameras
 
     @functools.cached_property
     def _single(self) -> Manifest | None:
@@ -65,21 +72,31 @@ class NerfstudioData(PosedImages):
 
     def read(self, split: str) -> FrameSet:
         manifest = self._manifest(split)
-        indices = self._choose(manifest, split) if self._single else list(range(len(manifest.frames)))
+        indices = self._choose(manifest, split) if self._single else range(len(manifest.frames))
+        return self._frames(manifest, indices)
+
+    def _frames(self, manifest: Manifest, indices: Sequence[int]) -> FrameSet:
         entries: Any = manifest.document["frames"]
         frames, stated = [manifest.frames[i] for i in indices], [entries[i].get("mask_path") for i in indices]
         usable = [path and find_mask(self.root, frame.image, path) for path, frame in zip(stated, frames, strict=True)]
-        return FrameSet(frames, manifest.lenses(indices), "opengl", *self._bounds(split), usable=usable)
+        return FrameSet(frames, manifest.lenses(indices), "opengl", *self._bounds, usable=usable)
 
-    def _bounds(self, split: str) -> tuple[float, float]:
+    @functools.cached_property
+    def _bounds(self) -> tuple[float, float]:
         """Return the bounds, which are estimated from the training cameras for all splits."""
         if self.near is not None and self.far is not None:
             return self.near, self.far
-        manifest = self._manifest("train" if "train" in self.splits else split)
+        manifest = self._manifest("train" if "train" in self.splits else self.splits[0])
         points, file = np.empty((0, 3)), manifest.document.get("ply_file_path")
         check(f"{manifest.path}: ", {"ply_file_path": str}, {"ply_file_path": file})
-        if isinstance(file, str) and os.path.isfile(self.root / file):  # False for a name that is too long
-            points = usable_points(load_points(self.root / file), self.root / file)
+        path = self.root / str(file or "").replace("\\", "/")
+        if os.path.isfile(path):  # False for a name that is too long
+            points = usable_points(load_points(path), path)
+        elif file:
+            warn(
+                f"the points {path} (ply_file_path) do not exist, so near and far are estimated from the cameras; "
+                "restore the file, set data.near and data.far, or remove the key"
+            )
         width, height, _ = read_size(manifest.frames[0].image)
         edges = np.stack([image_edges(lens, width, height) for lens in manifest.lenses()])
         return find_bounds(np.stack([frame.camera_to_world for frame in manifest.frames]), edges, points)
