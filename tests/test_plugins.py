@@ -347,6 +347,7 @@ def train_template(
 def test_template_trains(template: str, train_template: Runner) -> None:
     finished = train_template(TEMPLATES[template.removesuffix(".py")])
     assert "20 steps in" in finished.out
+    assert "initial values" not in finished.out, "all parameters learn"
 
 
 def writer(*names: str, text: str | None = "a file") -> Callable[..., str | None]:

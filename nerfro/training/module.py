@@ -26,6 +26,7 @@ from nerfro.training.config import build_each
 from nerfro.training.inputs import INPUTS, inputs_of
 from nerfro.training.optimizer import OptimizerConfig
 from nerfro.training.run_folder import load_checkpoint, restore
+from nerfro.training.updates import Updates
 
 
 class TrainingModule(LightningModule):
@@ -55,6 +56,7 @@ class TrainingModule(LightningModule):
         self.objective = Objective(losses)
         self.optimizer_config = optimizer
         self._is_logged_step = True
+        self._updates: Updates | None = None
 
     @classmethod
     def of(
@@ -106,6 +108,21 @@ class TrainingModule(LightningModule):
     def setup(self, stage: str) -> None:
         if self.trainer.world_size > 1 and not self.renderer.trains_in_parallel:
             raise NerfroError(f"{type(self.renderer).__name__} trains in one process; set trainer.devices=1")
+
+    def on_fit_start(self) -> None:
+        self._updates = Updates(self.renderer.parameters_by_name())
+
+    def on_train_start(self) -> None:  # after the phases before training
+        if self.global_step > 0:
+            self._updates = None  # only a whole run tells which parameters never learn
+        elif self._updates is not None:
+            starts = {parameter: self.optimizer_config.group(group).start or 0
+                      for group, parameters in self.parameter_groups().items() for parameter in parameters}
+            self._updates.warn_of_late_starts(self.trainer.max_steps, starts)
+
+    def on_train_end(self) -> None:
+        if self._updates is not None and self.global_step > 0:
+            self._updates.warn_of_unchanged()
 
     def training_step(self, batch: Batch, batch_index: int) -> dict[str, Tensor]:
         """Compute the loss of a batch, and the mean squared error of its pixels (sRGB)."""
@@ -164,7 +181,7 @@ class TrainingModule(LightningModule):
         for name, parameters in self.parameter_groups().items():
             settings = self.optimizer_config.group(name)
             rate = settings.learning_rate or self.optimizer_config.learning_rate
-            group = {"params": parameters, "lr": rate, "initial_lr": rate, "name": name, "start": settings.start}
+            group = {"params": parameters, "lr": rate, "initial_lr": rate, "name": name, "start": settings.start or 0}
             groups.append(group)
         # Lightning cannot clip the gradients of a fused optimizer under mixed precision.
         fused = self._trainer is None or not self._trainer.gradient_clip_val

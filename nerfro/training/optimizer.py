@@ -28,11 +28,12 @@ class GroupConfig:
 
     Attributes:
         learning_rate: initial learning rate; None for the common rate.
-        start: step at which the parameters begin to learn.
+        start: step at which the parameters begin to learn; None for the step that the component of a run needs
+            (`Component.learns_from`), which is 0 except for a background that a phase fits first.
     """
 
     learning_rate: Positive | None = None
-    start: Natural = 0
+    start: Natural | None = None
 
 
 @validated("optimizer")
