@@ -46,8 +46,8 @@ def _with_starts(config: DictConfig) -> DictConfig:
     config = copy.deepcopy(config)
     for name, component in components(config):
         for pattern, group in config.optimizer.groups.items():
-            if group.start is None and pattern.startswith(f"{name}."):
-                group.start = component.learns_from(config)
+            if group.get("start") is None and pattern.startswith(f"{name}."):
+                OmegaConf.update(group, "start", component.learns_from(config), force_add=True)
     return config
 
 
