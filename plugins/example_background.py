@@ -22,7 +22,8 @@ class GradientSky(Background):
         if up not in (0, 1, 2):
             raise NerfroError(f"gradient_sky: up={up} is no axis; choose 0, 1 or 2")
         self.up = up
-        self.raw = nn.Parameter(torch.zeros(2, 3))  # ground and zenith, before the exponential
+        # Ground and zenith, before the exponential. Radiance above 1 is clipped and has no gradient.
+        self.raw = nn.Parameter(torch.full((2, 3), -1.5))
 
     def forward(self, exits: Exits) -> Float[Tensor, "*batch 3"]:
         height = 0.5 * (1 + exits.directions[..., self.up, None])

@@ -24,7 +24,7 @@ from nerfro.core.errors import NerfroError, warn
 from nerfro.core.paths import resolve_path, user_path
 from nerfro.training.config import TrainConfig, require_data
 from nerfro.training.run_folder import next_steps, resume_advice
-from tests.conftest import composed, refused
+from tests.conftest import Runner, composed, refused
 
 
 @pytest.mark.parametrize("num_lines", [1, 10_000])  # less and more than a pipe's buffer
@@ -71,6 +71,13 @@ def test_unparsable_overrides_explain_quoting(override: str, hint: str) -> None:
     if "'" in hint:
         (parsed,) = parser.parse_overrides([hint.strip("'")])
         assert parsed.value() == override.partition("=")[2]
+
+
+def test_group_without_a_name_is_refused_with_its_options(run_here: Runner) -> None:
+    for group, option in (("experiment", "glass"), ("field", "hash_grid")):
+        error = run_here("train", f"{group}=", code=1).error
+        assert error.startswith(f"nerfro: error: {group}= names no option; leave it out, or choose from ")
+        assert f" {option}," in error
 
 
 def test_flags_may_stand_anywhere() -> None:

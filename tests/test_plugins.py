@@ -16,6 +16,7 @@ from omegaconf import DictConfig
 from PIL import Image
 from torch import nn
 
+from nerfro.cli.options import Described
 from nerfro.core import types
 from nerfro.core.paths import PLUGINS_DIR
 from nerfro.data.base import DataSource, Views
@@ -302,7 +303,7 @@ TEMPLATES = {
     "example_path_sampler": ["sampler/path=mirror_floor"],
     "example_phase": ["+phase.extra_steps.every=1"],
     "example_sampler": ["sampler/points=logarithmic", "sampler.points.num_samples=8"],
-    "opt_in/example_callback": ["+callbacks=gradient_norm", "callbacks.gradient_norm.every=1"],
+    "opt_in/example_callback": ["+callbacks=gradient_norm"],
     "opt_in/example_export": [],
     "opt_in/example_metric": ["optimized_metric=mean_absolute_error"],
 }
@@ -347,6 +348,7 @@ def train_template(
 def test_template_trains(template: str, train_template: Runner) -> None:
     finished = train_template(TEMPLATES[template.removesuffix(".py")])
     assert "20 steps in" in finished.out
+    assert "initial values" not in finished.out, "all parameters learn"
 
 
 def writer(*names: str, text: str | None = "a file") -> Callable[..., str | None]:
@@ -437,6 +439,11 @@ def test_list_shows_every_plugin_with_its_fields_defaults_and_summary(run_here: 
 )
 def test_list_of_unknown_plugins_is_refused(argument: str, message: str, run_here: Runner) -> None:
     assert message in run_here("plugins", argument, code=1).error
+
+
+def test_list_shows_a_single_metric(run_here: Runner) -> None:
+    Described("", {}, {}).require_known(["metric=psnr", "surface=ball"])  # before the imports
+    assert run_here("plugins", "metric=psnr").out.startswith("metric=psnr  Peak signal-to-noise ratio")
 
 
 # Installed packages.

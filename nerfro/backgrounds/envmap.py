@@ -38,6 +38,9 @@ _MIN_RESOLUTION, _MAX_RESOLUTION = 64, 1024
 # Bounds of the finest level of gradient descent, whose optimizer visits all texels in each step: with and without finer
 # levels that `phase=background` fits.
 _MAX_BESIDE_FITS, _MAX_ALONE = 256, 512
+# Training steps after the first fit without gradient descent. While the field is empty, the map would learn the colours
+# of objects inside the glass.
+_FIRST_STEP = 100
 
 
 @dataclass(frozen=True)
@@ -64,6 +67,11 @@ class Observed:
     @classmethod
     def joined(cls, parts: Sequence[Observed]) -> Observed:
         return cls(*(torch.cat(values) for values in zip(*(vars(part).values() for part in parts), strict=True)))
+
+
+def _is_fitted(settings: DictConfig) -> bool:
+    """Return whether `phase=background` takes steps, which need a field with a box."""
+    return ((settings.phase.get("background") or {}).get("steps") or 0) > 0
 
 
 @register("background", "envmap")
@@ -115,13 +123,17 @@ class EnvironmentMap(Background):
     def derive(cls, settings: DictConfig, views: Views, space: Space) -> dict[str, Any]:
         if space.infinite or settings.background.resolutions is not None:
             return {}
-        fits = settings.phase.get("background", {}).get("steps", 0) > 0
+        fits = _is_fitted(settings)
         pixels = 0.5 * math.pi * float(views.cameras.fx.double().median())
         limit = _MAX_RESOLUTION if fits else _MAX_ALONE
         finest = min(max(2 ** round(math.log2(pixels)), _MIN_RESOLUTION), limit)
         levels = [2**level for level in range(int(math.log2(_RESOLUTIONS[0])), int(math.log2(finest)) + 1)]
         descent = [n for n in levels if n <= _MAX_BESIDE_FITS or not fits]
         return {"resolutions": descent, "fitted_resolutions": levels[len(descent) :]}
+
+    @classmethod
+    def learns_from(cls, settings: DictConfig) -> int:
+        return _FIRST_STEP if _is_fitted(settings) and settings.content.space == "box" else 0
 
     @classmethod
     def of_texels(cls, radiance: Float[Tensor, "T 3"]) -> EnvironmentMap:

@@ -132,6 +132,9 @@ def _messages(error: BaseException) -> list[str]:
     lines = [line.strip() for line in str(error).partition("Config search path")[0].splitlines() if line.strip()]
     if (present := re.search(r"Could not append to config\. An item is already at '([^']+)'", str(error))) is not None:
         return [f"{present[1]} has a value already; write {present[1]}=..., without a plus sign"]
+    if (empty := re.search(r"Could not find '([\w/]+)/'", str(error))) is not None:
+        options = ", ".join(" ".join(lines).rpartition("': ")[2].split())
+        return [f"{empty[1]}= names no option; leave it out, or choose from {options}"]
     cause = error.__cause__ or error.__context__ or error
     if not isinstance(cause, OmegaConfBaseException):
         return lines

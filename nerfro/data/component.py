@@ -34,3 +34,15 @@ class Component:
             Values by the names of constructor parameters.
         """
         return {}
+
+    @classmethod
+    def learns_from(cls, settings: DictConfig) -> int:
+        """Return the training step at which gradient descent begins to change the parameters of this component.
+
+        A component that a phase fits before the first training step may return a later step. The result replaces a
+        `start` in `optimizer.groups` that is None.
+
+        Args:
+            settings: all settings of the run, see `TrainConfig`.
+        """
+        return 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
@@ -15,6 +15,7 @@ import rich.box
 import rich.console
 import rich.table
 import rich.text
+from rich.cells import cell_len
 
 from nerfro.evaluation.image_metrics import image_metrics
 from nerfro.evaluation.results import (
@@ -201,18 +202,56 @@ def write_table(table: Table, stem: Path) -> None:
         write_atomically(f"{stem}{suffix}", form(table))
 
 
-def to_rich(table: Table) -> rich.console.Group:
+def to_rich(table: Table) -> rich.console.RenderableType:
     """Format a table for the console: `rich.print(to_rich(table))`.
 
-    Groups of columns are separate tables, one below the other, so that a comparison of many scenes fits the console.
+    Groups of columns are separate tables, one below the other, so that a comparison of many scenes fits the console. A
+    group that is wider than the console is divided, too.
     """
-    # A title or caption of a rich table would be wrapped to the width of the table.
-    drawn: list[rich.console.RenderableType] = [rich.text.Text(table.title, style="italic")]
-    start = 0
-    for group, num_columns in table.groups():
-        drawn.append(_rich_group(table, group, slice(start, start + num_columns)))
-        start += num_columns
-    return rich.console.Group(*drawn, *(rich.text.Text(note, style="dim") for note in table.notes))
+    return _OnConsole(table)
+
+
+@dataclass(frozen=True)
+class _OnConsole:
+    """A table that is divided for the width of a console."""
+
+    table: Table
+
+    def __rich_console__(
+        self, console: rich.console.Console, options: rich.console.ConsoleOptions
+    ) -> Iterator[rich.console.RenderableType]:
+        table = self.table
+        # A title or caption of a rich table would be wrapped to the width of the table.
+        yield rich.text.Text(table.title, style="italic")
+        start = 0
+        for group, num_columns in table.groups():
+            for columns in _fitting(table, slice(start, start + num_columns), options.max_width):
+                yield _rich_group(table, group, columns)
+            start += num_columns
+        yield from (rich.text.Text(note, style="dim") for note in table.notes)
+
+
+def _fitting(table: Table, columns: slice, width: int) -> Iterator[slice]:
+    """Divide columns into parts that fit a console beside the labels of the rows.
+
+    Args:
+        table: the table.
+        columns: columns of a group.
+        width: characters in a line. A table has one at its left edge, and three more than its content in each column.
+    """
+    rows = [table.cells_with_medals(i, _CONSOLE if table.medals else _MARKDOWN) for i in range(len(table.rows))]
+    rows += [table.cells(row) for row in table.summary]
+    widths = [max(map(cell_len, cells)) for cells in zip((c.heading for c in table.columns), *rows, strict=True)]
+    labels = (table.label_title, *(row.label for row in (*table.rows, *table.summary)))
+    widest = max(widths[columns], default=0)
+    left = 4 + min(max(map(cell_len, labels)), max(width - 7 - widest, 1))
+    first, used = columns.start, left
+    for j in range(columns.start, columns.stop):
+        if j > first and used + widths[j] + 3 > width:
+            yield slice(first, j)
+            first, used = j, left
+        used += widths[j] + 3
+    yield slice(first, columns.stop)
 
 
 def _rich_group(table: Table, group: str, columns: slice) -> rich.table.Table:

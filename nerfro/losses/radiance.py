@@ -58,9 +58,9 @@ class BackgroundRegularizer(Loss):
         refracted_only: whether to count only rays that meet the medium.
     """
 
-    weight, start = 0.025, 2500
+    weight, start, ramp = 0.003, 100, 100
 
-    def __init__(self, refracted_only: bool = False) -> None:
+    def __init__(self, refracted_only: bool = True) -> None:
         super().__init__()
         self.refracted_only = refracted_only
 
@@ -90,7 +90,7 @@ class TotalVariation(Loss):
             that gradient descent learns.
     """
 
-    weight = 1e-3
+    weight = 3e-3
 
     def __init__(self, angle: Annotated[float, Gt(0), Lt(90)] | None = None) -> None:
         super().__init__()

@@ -395,5 +395,14 @@ def untyped(settings: Any) -> Any:
     """Copy a dataclass to one with the same names and values, whose types OmegaConf does not check."""
     values = {field.name: getattr(settings, field.name) for field in dataclasses.fields(settings)}
     values = {name: untyped(value) if dataclasses.is_dataclass(value) else value for name, value in values.items()}
+    values = {name: _without_classes(value) if isinstance(value, dict) else value for name, value in values.items()}
     kinds = {name: type(value) if dataclasses.is_dataclass(value) else Any for name, value in values.items()}
     return dataclasses.make_dataclass(type(settings).__name__, kinds.items())(**values)
+
+
+def _without_classes(values: dict[str, Any]) -> dict[str, Any]:
+    """Replace dataclasses in a dictionary by their fields."""
+    return {
+        name: dataclasses.asdict(value) if dataclasses.is_dataclass(value) else value  # type: ignore[arg-type]
+        for name, value in values.items()
+    }

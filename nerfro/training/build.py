@@ -31,6 +31,7 @@ from nerfro.training.config import (
 from nerfro.training.data_module import RayDataModule
 from nerfro.training.derivation import derived
 from nerfro.training.effects import settings_without_effect
+from nerfro.training.init_from import initialize_from
 from nerfro.training.memory import require_memory
 from nerfro.training.module import TrainingModule
 from nerfro.training.pixel_batches import PixelBatches
@@ -130,6 +131,8 @@ def _build(config: DictConfig, source: DataSource, training: Views) -> tuple[Dic
     config = derived(config, medium, training)
     renderer = build_model(config, medium)
     renderer.scene.begin(training.cameras)
+    if config.init_from is not None:
+        print(initialize_from(renderer, config.init_from, config.init_include), flush=True)
     if renderer.path_sampler.needs_medium and (medium.origin != source.origin).any():
         raise NerfroError(
             f"{type(medium).__name__} has its origin at {medium.origin.tolist()}, and the data set at "
@@ -137,7 +140,7 @@ def _build(config: DictConfig, source: DataSource, training: Views) -> tuple[Dic
         )
     data = RayDataModule(
         PixelBatches.of(training, config), validation, config.evaluation.every, config.trainer.overfit_batches,
-        Subdivision(**config.batches.subdivision),
+        Subdivision(**config.batches.subdivision), lambda: source.load(config.evaluation.split or "test").checked(),
     )  # fmt: skip
     schedule = Schedule(build_each("phase", config.phase), training)
     return config, TrainingModule.of(renderer, config, [schedule], training), data

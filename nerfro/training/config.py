@@ -73,7 +73,7 @@ class SamplerConfig:
 
 @dataclass
 class BatchesConfig:
-    """Selection of the training pixels; defaults as in the paper, which conf/train.yaml changes.
+    """Selection of the training pixels.
 
     Attributes:
         size: number of pixels in a step.
@@ -87,13 +87,13 @@ class BatchesConfig:
         subdivision: which pixels get several rays, in training and in validation.
     """
 
-    size: NumRays = 1024
-    batching: Literal["single_image", "all_images"] = "single_image"
+    size: NumRays = 2048
+    batching: Literal["single_image", "all_images"] = "all_images"
     object_fraction: Annotated[float, Ge(0), Le(1)] = 0.0
     num_validation_views: Natural = 0
     precrop_steps: Natural = 0
     precrop_fraction: Annotated[float, Gt(0), Le(1), OnlyWith("precrop_steps")] = 0.5
-    subdivision: Subdivision = dataclasses.field(default_factory=lambda: Subdivision(divergence=8.0))
+    subdivision: Subdivision = dataclasses.field(default_factory=lambda: Subdivision(2, 8.0, 0.1, 400))
 
 
 @dataclass
@@ -111,7 +111,7 @@ class EvaluationConfig:
     split: str | None = "test"
     chunk_size: NumRays = 8192
     every: Natural = 500
-    subdivision: Subdivision = dataclasses.field(default_factory=Subdivision)
+    subdivision: Subdivision = dataclasses.field(default_factory=lambda: Subdivision(4, 1.5, 0.1))
 
 
 @dataclass
@@ -233,6 +233,8 @@ class TrainConfig:
             such as mask.psnr.
         debug: a run of ten steps that scores one view.
         ckpt_path: checkpoint to resume from, or `last` for the newest checkpoint of this experiment.
+        init_from: folder of another run, or one of its checkpoints, whose parameters are the initial values.
+        init_include: patterns of the names of these parameters, such as background.*.
         viewer: serve an interactive page of the model during training, to browsers on this machine.
         viewer_port: port of the page; 0 selects a free port.
         compile: backend of torch.compile for the networks, such as inductor or cudagraphs on a GPU; None does
@@ -262,6 +264,8 @@ class TrainConfig:
     optimized_metric: MetricName = "psnr"
     debug: bool = False
     ckpt_path: str | None = None
+    init_from: str | None = None
+    init_include: Annotated[list[str], OnlyWith("init_from")] = dataclasses.field(default_factory=lambda: ["*"])
     viewer: bool = False
     viewer_port: Annotated[int, Ge(0), Le(65535)] = 8008
     compile: str | None = None
@@ -279,6 +283,8 @@ def check_trained(config: DictConfig, origin: Path) -> DictConfig:
     """
     try:
         typed = cast(DictConfig, OmegaConf.merge(OmegaConf.structured(untyped(TrainConfig())), config))
+        if OmegaConf.select(config, "optimizer.groups") is not None:
+            typed.optimizer.groups = config.optimizer.groups  # the run may lack groups of the defaults
         validate(TrainConfig, plain(typed), complete=False)
         content = typed.content
         if content.box_min is not None or content.box_max is not None:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Generic, TypeVar, cast
+from typing import Any, Generic, TypeVar, cast
 
 import torch
 from lightning.pytorch import LightningDataModule, Trainer
 from torch import nn
 
+from nerfro.core.errors import NerfroError
 from nerfro.core.types import Batch
 from nerfro.data.base import Views
 from nerfro.kernels.compilation import HELPERS
@@ -23,6 +25,8 @@ from nerfro.training.validation import ValidationPixels
 
 # Number of validations for each validation image, so that the curve has more points; each costs a few steps.
 _VALIDATIONS_PER_IMAGE = 5
+# Steps of an epoch without validation.
+_STEPS_OF_EPOCH = 100
 # Weights of linear layers; the default field has 9,000, the networks of the paper 1.2 million.
 _LARGE = 100_000
 # Threads of PyTorch beside the tracing thread, for networks without large layers. A step on 16 threads took 1.6 times
@@ -49,6 +53,7 @@ class RayDataModule(LightningDataModule):
         every: number of steps between two validation images; 0 for never.
         overfit_batches: number of batches that are repeated; 0 for new batches in all steps.
         subdivision: criteria for several rays through a pixel; None for one ray.
+        load_test: reads the views of `trainer.test` and `trainer.predict`; None for no such views.
 
     Attributes:
         tracer: traces the rays of the batches, once training begins.
@@ -63,14 +68,16 @@ class RayDataModule(LightningDataModule):
         every: int = 0,
         overfit_batches: int = 0,
         subdivision: Subdivision | None = None,
+        load_test: Callable[[], Views] | None = None,
     ) -> None:
         super().__init__()
+        self._load_test = load_test
         self._overfit_batches, self.subdivision = overfit_batches, subdivision
         self.batches, self.validation, self.every = batches, validation, every
         self.validation_pixels = None if validation is None else ValidationPixels.of(validation)
         self._ahead: Prefetcher | None = None
 
-    def train_dataloader(self) -> Iterator[int]:
+    def train_dataloader(self) -> Iterable[int]:
         assert self.trainer is not None  # attached by Lightning
         device, module = self.trainer.strategy.root_device, cast(TrainingModule, self.trainer.lightning_module)
         self.batches = self.batches_of(self.trainer).to(device, cast(torch.dtype, module.dtype))
@@ -79,6 +86,9 @@ class RayDataModule(LightningDataModule):
         if can_prefetch(module.renderer):
             self._ahead = Prefetcher(self._batch, spare_core=not multiplies_large_matrices(module.renderer))
         # Lightning calls this method after restoring a checkpoint, so a resumed run continues with the next batch.
+        trainer: Any = self.trainer
+        if trainer.check_val_every_n_epoch is not None and isinstance(trainer.val_check_interval, float):
+            return Epoch(self.trainer, validation_interval(self.every) or _STEPS_OF_EPOCH)
         return itertools.count(self.trainer.global_step)
 
     def batches_of(self, trainer: Trainer) -> PixelBatches:
@@ -87,6 +97,23 @@ class RayDataModule(LightningDataModule):
 
     def val_dataloader(self) -> list[int]:
         return [] if self.validation is None else [0]  # `validation_step` chooses the view
+
+    def test_dataloader(self) -> range:
+        return range(len(self.test))
+
+    def predict_dataloader(self) -> range:
+        return range(len(self.test))
+
+    @functools.cached_property
+    def test(self) -> Views:
+        """Views of `trainer.test` and `trainer.predict`, which are read once.
+
+        Raises:
+            NerfroError: the data module has no such views.
+        """
+        if self._load_test is None:
+            raise NerfroError("the data have no test views; give RayDataModule(..., load_test=lambda: views)")
+        return self._load_test()
 
     def due_view(self, step: int) -> int | None:
         """Return the view of the next validation image if one is due in a step; the views take turns."""
@@ -119,6 +146,25 @@ class RayDataModule(LightningDataModule):
         if self._ahead is not None:
             self._ahead.close()
             self._ahead = None
+
+
+class Epoch:
+    """Numbers of the training steps until the next validation, for a Trainer that validates after each epoch.
+
+    Args:
+        trainer: Trainer of the run.
+        num_steps: number of steps of an epoch.
+    """
+
+    def __init__(self, trainer: Trainer, num_steps: int) -> None:
+        self._trainer, self._num_steps = trainer, num_steps
+
+    def __len__(self) -> int:
+        return self._num_steps
+
+    def __iter__(self) -> Iterator[int]:
+        first = self._trainer.global_step * self._trainer.accumulate_grad_batches
+        return iter(range(first, first + self._num_steps))
 
 
 Made = TypeVar("Made")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import torch
@@ -37,7 +38,17 @@ def derived(config: DictConfig, medium: Medium, training: Views) -> DictConfig:
             settings = component.derive(config, training, space)
             values |= {f"{name}.{setting}": value for setting, value in settings.items()}
     missing = {name: value for name, value in values.items() if OmegaConf.select(config, name) is None}
-    return _with_backdrop(with_values(config, missing))
+    return _with_starts(_with_backdrop(with_values(config, missing)))
+
+
+def _with_starts(config: DictConfig) -> DictConfig:
+    """Take the first step of an optimizer group without one from the component that its pattern begins with."""
+    config = copy.deepcopy(config)
+    for name, component in components(config):
+        for pattern, group in config.optimizer.groups.items():
+            if group.get("start") is None and pattern.startswith(f"{name}."):
+                OmegaConf.update(group, "start", component.learns_from(config), force_add=True)
+    return config
 
 
 def describe_backdrop(config: DictConfig) -> str:

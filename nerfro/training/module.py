@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import Timer
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor, nn
 
-from nerfro.core.errors import NerfroError
+from nerfro.core.errors import NerfroError, first_of, warn
 from nerfro.core.paths import user_path
 from nerfro.core.types import Batch
 from nerfro.data.base import Views
@@ -26,6 +27,7 @@ from nerfro.training.config import build_each
 from nerfro.training.inputs import INPUTS, inputs_of
 from nerfro.training.optimizer import OptimizerConfig
 from nerfro.training.run_folder import load_run, restore
+from nerfro.training.updates import Updates
 
 
 class TrainingModule(LightningModule):
@@ -34,10 +36,14 @@ class TrainingModule(LightningModule):
     Args:
         renderer: the model that `model=` chooses.
         losses: training losses by name.
-        optimizer: settings of Adam and of the learning rate schedule.
+        optimizer: settings of the optimizer and of the learning rate schedule.
         callbacks: callbacks that are a part of the method; every Trainer adds them to its own.
         configuration: resolved configuration of the run (YAML), which every checkpoint contains.
         inputs: description of the inputs of the run, which every checkpoint contains, see `training.inputs`.
+
+    Attributes:
+        is_logged_step: whether the current training step has an entry in the log: the first step, and the last of every
+            `log_every_n_steps` steps, as in Lightning. Values that are logged in other steps are dropped.
     """
 
     def __init__(
@@ -54,7 +60,11 @@ class TrainingModule(LightningModule):
         self.renderer = renderer
         self.objective = Objective(losses)
         self.optimizer_config = optimizer
-        self._is_logged_step = True
+        optimizer.freeze_parameters(renderer.parameters_by_name())
+        self.is_logged_step = True
+        self._logged: set[str] = set()
+        self._dropped: set[str] = set()
+        self._updates: Updates | None = None
 
     @classmethod
     def of(
@@ -92,6 +102,10 @@ class TrainingModule(LightningModule):
     def configure_callbacks(self) -> list[Callback]:
         return self._callbacks
 
+    def __getstate__(self) -> dict[str, Any]:
+        # Averages of weights copy the module; the callbacks hold the photographs.
+        return {**super().__getstate__(), "_callbacks": []}
+
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         if self._configuration is not None:
             checkpoint["nerfro_config"] = self._configuration
@@ -104,8 +118,36 @@ class TrainingModule(LightningModule):
         return self.renderer.scene
 
     def setup(self, stage: str) -> None:
+        if self.trainer.datamodule is None:  # type: ignore[attr-defined]
+            raise NerfroError(
+                f"trainer.{stage} needs pixels and views; add datamodule=data, as nerfro.build returns it"
+            )
         if self.trainer.world_size > 1 and not self.renderer.trains_in_parallel:
             raise NerfroError(f"{type(self.renderer).__name__} trains in one process; set trainer.devices=1")
+
+    def on_fit_start(self) -> None:
+        require_monitored(self.trainer)
+        self._updates = Updates(self.renderer.parameters_by_name())
+
+    def on_train_start(self) -> None:  # after the phases before training
+        every: int = self.trainer.log_every_n_steps  # type: ignore[attr-defined]
+        self.is_logged_step = self.global_step == 0 or (self.global_step + 1) % every == 0
+        if self.global_step > 0:
+            self._updates = None  # only a whole run tells which parameters never learn
+        elif self._updates is not None:
+            starts = {
+                parameter: self.optimizer_config.group(group).start or 0
+                for group, parameters in self.parameter_groups().items()
+                for parameter in parameters
+            }
+            self._updates.warn_of_late_starts(self.trainer.max_steps, starts)
+
+    def on_train_end(self) -> None:
+        if self._updates is None or self.global_step == 0:
+            return
+        self._updates.warn_of_unchanged()
+        if names := sorted(self._dropped - self._logged):
+            warn(f"{first_of(names)} has no entry in the log: log in steps in which module.is_logged_step is true")
 
     def training_step(self, batch: Batch, batch_index: int) -> dict[str, Tensor]:
         """Compute the loss of a batch, and the mean squared error of its pixels (sRGB)."""
@@ -125,7 +167,7 @@ class TrainingModule(LightningModule):
 
     def _log_step(self, value: ObjectiveValue) -> None:
         """Log a step, but only in steps with output, because logging takes a tenth of the time of a step."""
-        if not self._is_logged_step:
+        if not self.is_logged_step:
             return
         self.log_dict({f"weight/{name}": weight for name, weight in value.weights.items()})
         self.log_dict({f"loss/{name}": loss for name, loss in value.losses.items()})
@@ -133,14 +175,15 @@ class TrainingModule(LightningModule):
         self.log("loss/total", value.total)
         self.log_dict({f"scene/{name}": measurement for name, measurement in self.scene.measurements().items()})
 
-    def log(self, *args: Any, **kwargs: Any) -> None:
-        """Log a value, but only in training steps with output; see `_log_step`."""
-        if self._is_logged_step or not self.trainer.training:
-            super().log(*args, **kwargs)
+    def log(self, name: str, *args: Any, **kwargs: Any) -> None:
+        """Log a value, but only in training steps with output, see `is_logged_step`."""
+        if self.is_logged_step or not self.trainer.training:
+            self._logged.add(name)
+            super().log(name, *args, **kwargs)
+        else:
+            self._dropped.add(name)
 
     def on_train_batch_start(self, batch: Batch, batch_index: int) -> None:
-        every: int = self.trainer.log_every_n_steps  # type: ignore[attr-defined]
-        self._is_logged_step = self.global_step == 0 or (self.global_step + 1) % every == 0
         progress = self.renderer.begin_step(training_progress(self.trainer))
         factor = learning_rate_factor(self.global_step, progress, self.optimizer_config)
         for group in self.trainer.optimizers[0].param_groups:
@@ -151,6 +194,10 @@ class TrainingModule(LightningModule):
             self.renderer.point_sampler.update(list(self.renderer.scene.fields), draws)  # type: ignore[arg-type]
         self.trainer.datamodule.prefetch()  # type: ignore[attr-defined]
 
+    def on_train_batch_end(self, outputs: object, batch: Batch, batch_index: int) -> None:  # after the callbacks
+        every: int = self.trainer.log_every_n_steps  # type: ignore[attr-defined]
+        self.is_logged_step = (self.global_step + 1) % every == 0
+
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """Return all learned parameters by optimizer group.
 
@@ -160,15 +207,9 @@ class TrainingModule(LightningModule):
         return self.optimizer_config.grouped(self.renderer.parameters_by_name())
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
-        groups = []
-        for name, parameters in self.parameter_groups().items():
-            settings = self.optimizer_config.group(name)
-            rate = settings.learning_rate or self.optimizer_config.learning_rate
-            group = {"params": parameters, "lr": rate, "initial_lr": rate, "name": name, "start": settings.start}
-            groups.append(group)
         # Lightning cannot clip the gradients of a fused optimizer under mixed precision.
         fused = self._trainer is None or not self._trainer.gradient_clip_val
-        return torch.optim.Adam(groups, eps=self.optimizer_config.adam_epsilon, fused=fused)
+        return self.optimizer_config.optimizer_of(self.parameter_groups(), fused)
 
     def validation_step(self, batch: int, batch_index: int) -> dict[str, Any] | None:
         if not self.trainer.is_global_zero:
@@ -187,6 +228,35 @@ class TrainingModule(LightningModule):
         prediction = self.scene.colour_space.to_display(rendered.radiance).reshape(target.shape)
         depth, opacity = (m.reshape(target.shape[:2]) for m in (rendered.depth / views.cameras.far, rendered.opacity))
         return {"view": view, "prediction": prediction, "target": target, "depth": depth, "opacity": opacity}
+
+    def test_step(self, batch: int, batch_index: int) -> None:
+        views = self.trainer.datamodule.test  # type: ignore[attr-defined]
+        error = (self.predict_step(batch, batch_index) - views.images[batch].to(self.device)).square().mean()
+        self.log("test/psnr", -10 * torch.log10(error), batch_size=1)
+
+    def predict_step(self, batch: int, batch_index: int) -> Float[Tensor, "H W 3"]:
+        """Render a test view; sRGB in [0, 1]."""
+        cameras = self.trainer.datamodule.test.cameras.to(self.device)  # type: ignore[attr-defined]
+        with torch.autocast(self.device.type, enabled=False):  # rounded directions would miss their pixels
+            radiance = self.renderer.render(cameras.image_rays(batch)).radiance
+        return self.scene.colour_space.to_display(radiance).reshape(cameras.height, cameras.width, 3)
+
+
+def require_monitored(trainer: Trainer) -> None:
+    """Refuse callbacks that monitor a score of validation if the run has no validation.
+
+    Raises:
+        NerfroError: a callback waits for a score that is never computed.
+    """
+    data = trainer.datamodule  # type: ignore[attr-defined]
+    validates = data.validation is not None and data.every > 0 and trainer.limit_val_batches != 0  # type: ignore[attr-defined]
+    for callback in trainer.callbacks:  # type: ignore[attr-defined]
+        monitor = str(getattr(callback, "monitor", None))
+        if monitor.startswith("val/") and not validates:
+            raise NerfroError(
+                f"{type(callback).__name__} monitors {monitor}, but the run has no validation; give validation views "
+                "(a split `val`, or batches.num_validation_views=2), and evaluation.every > 0"
+            )
 
 
 def training_progress(trainer: Trainer) -> float:

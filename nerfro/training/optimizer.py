@@ -1,13 +1,14 @@
-"""Settings of Adam and of the learning rate, and groups of parameters by name."""
+"""Settings of the optimizer and of the learning rate, and groups of parameters by name."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
+import torch
 from torch import nn
 
 from nerfro.core.errors import NerfroError
@@ -21,6 +22,14 @@ OPTIONAL_PATTERNS = (
 COMMON = "common"
 
 
+OptimizerName = Literal["adam", "adamw", "sgd", "radam"]
+_CLASSES: dict[str, type[torch.optim.Optimizer]] = {
+    "adam": torch.optim.Adam, "adamw": torch.optim.AdamW, "sgd": torch.optim.SGD, "radam": torch.optim.RAdam,
+}  # fmt: skip
+# Entries of the state of an optimizer with one number for each parameter.
+MOMENTS = {kind: () if kind == "sgd" else ("exp_avg", "exp_avg_sq") for kind in _CLASSES}
+
+
 @validated("optimizer.groups")
 @dataclass
 class GroupConfig:
@@ -28,21 +37,29 @@ class GroupConfig:
 
     Attributes:
         learning_rate: initial learning rate; None for the common rate.
-        start: step at which the parameters begin to learn.
+        start: step at which the parameters begin to learn; None for the step that the component of a run needs
+            (`Component.learns_from`), which is 0 except for a background that a phase fits first.
+        name: optimizer of PyTorch; None for the common one.
     """
 
     learning_rate: Positive | None = None
-    start: Natural = 0
+    start: Natural | None = None
+    name: OptimizerName | None = None
+
+
+def _default_groups() -> dict[str, GroupConfig]:
+    return {"background.*": GroupConfig(learning_rate=2e-3)}
 
 
 @validated("optimizer")
 @dataclass
 class OptimizerConfig:
-    """Adam with a log-linear learning rate and a sine warm-up (authors' code; mip-NeRF, section 4).
+    """Optimizer of PyTorch with a log-linear learning rate and a sine warm-up (authors' code; mip-NeRF, section 4).
 
-    The defaults are those of the paper; conf/train.yaml changes them.
+    The defaults are those of the default experiment. The experiments `paper_*` have the values of the paper.
 
     Attributes:
+        name: optimizer of PyTorch, whose other settings have PyTorch's defaults.
         learning_rate: initial learning rate.
         final_learning_rate: learning rate at the end of the run.
         groups: learning rate and start of parameters by the pattern of their names
@@ -51,15 +68,18 @@ class OptimizerConfig:
             last one decides.
         warmup_steps: length of the warm-up; 0 for none.
         warmup_factor: factor of the learning rate at its first step.
-        adam_epsilon: epsilon of Adam.
+        adam_epsilon: epsilon of adam, adamw and radam.
+        freeze: patterns of the names of parameters that do not learn.
     """
 
-    learning_rate: Positive = 5e-4
-    final_learning_rate: Positive = 5e-6
-    groups: dict[str, GroupConfig] = dataclasses.field(default_factory=dict)
-    warmup_steps: Natural = 2500
+    name: OptimizerName = "adam"
+    learning_rate: Positive = 1e-2
+    final_learning_rate: Positive = 5e-4
+    groups: dict[str, GroupConfig] = dataclasses.field(default_factory=_default_groups)
+    warmup_steps: Natural = 20
     warmup_factor: Annotated[NotNegative, OnlyWith("warmup_steps")] = 0.01
-    adam_epsilon: Positive = 1e-8
+    adam_epsilon: Positive = 1e-15
+    freeze: list[str] = dataclasses.field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.groups = {
@@ -71,8 +91,46 @@ class OptimizerConfig:
         """Return the settings of a group of `grouped`."""
         return self.groups.get(name, GroupConfig())
 
+    def freeze_parameters(self, parameters: Mapping[str, nn.Parameter]) -> None:
+        """Turn off the gradients of the parameters whose names match a pattern of `freeze`.
+
+        Args:
+            parameters: parameters by name.
+
+        Raises:
+            NerfroError: a pattern matches no parameter, or no parameter is left.
+        """
+        require_matches("optimizer.freeze", self.freeze, parameters)
+        for name, parameter in parameters.items():
+            if any(fnmatchcase(name, pattern) for pattern in self.freeze):
+                parameter.requires_grad_(False)
+        if self.freeze and not any(parameter.requires_grad for parameter in parameters.values()):
+            raise NerfroError(f"optimizer.freeze={self.freeze} leaves no parameter to learn; remove a pattern")
+
+    def optimizer_of(self, groups: Mapping[str, list[nn.Parameter]], fused: bool) -> torch.optim.Optimizer:
+        """Create the optimizer of grouped parameters; several kinds become one `JointOptimizer`.
+
+        Args:
+            groups: result of `grouped`.
+            fused: whether to fuse the operations of Adam.
+        """
+        described: list[dict[str, Any]] = []
+        for name, parameters in groups.items():
+            own = self.group(name)
+            rate, start = own.learning_rate or self.learning_rate, own.start or 0
+            described.append({
+                "params": parameters, "lr": rate, "initial_lr": rate, "name": name, "start": start,
+                "kind": own.name or self.name,
+            })  # fmt: skip
+        optimizers = {}
+        for kind in dict.fromkeys(group["kind"] for group in described):
+            options: dict[str, Any] = {} if kind == "sgd" else {"eps": self.adam_epsilon}
+            options |= {"fused": fused} if kind in ("adam", "adamw") else {}
+            optimizers[kind] = _CLASSES[kind]([group for group in described if group["kind"] == kind], **options)
+        return next(iter(optimizers.values())) if len(optimizers) == 1 else JointOptimizer(optimizers, described)
+
     def grouped(self, parameters: Mapping[str, nn.Parameter]) -> dict[str, list[nn.Parameter]]:
-        """Group parameters by the last pattern that matches their names; the others are in the group `COMMON`.
+        """Group the parameters that learn by the last pattern that matches; the others are in the group `COMMON`.
 
         Args:
             parameters: parameters by name.
@@ -83,9 +141,43 @@ class OptimizerConfig:
         require_matches("optimizer.groups", self.groups, parameters)
         groups: dict[str, list[nn.Parameter]] = {}
         for name, parameter in parameters.items():
+            if not parameter.requires_grad:
+                continue
             matching = (pattern for pattern in reversed(self.groups) if fnmatchcase(name, pattern))
             groups.setdefault(next(matching, COMMON), []).append(parameter)
         return groups
+
+
+class JointOptimizer(torch.optim.Optimizer):
+    """Several optimizers of PyTorch as one, each of which steps its own groups.
+
+    Args:
+        optimizers: optimizers by kind.
+        groups: groups of all optimizers, whose `kind` names their optimizer.
+    """
+
+    def __init__(self, optimizers: Mapping[str, torch.optim.Optimizer], groups: list[dict[str, Any]]) -> None:
+        self._optimizers = dict(optimizers)
+        super().__init__(groups, {})
+        self._share()
+
+    def __setstate__(self, state: dict[str, Any]) -> None:  # also called by `load_state_dict`
+        super().__setstate__(state)
+        self._share()
+
+    def _share(self) -> None:
+        for kind, optimizer in self._optimizers.items():
+            optimizer.state = self.state
+            optimizer.param_groups = [group for group in self.param_groups if group["kind"] == kind]
+
+    def step(self, closure: Callable[[], float] | None = None) -> float | None:  # type: ignore[override]
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        for optimizer in self._optimizers.values():
+            optimizer.step()
+        return loss
 
 
 def require_matches(where: str, patterns: Iterable[str], names: Iterable[str]) -> None:

@@ -40,7 +40,7 @@ class PixelBatches:
         self,
         views: Views,
         batch_size: Count,
-        batching: Batching = "single_image",
+        batching: Batching = "all_images",
         seed: Natural = 0,
         precrop_steps: Natural = 0,
         precrop_fraction: float = 0.5,

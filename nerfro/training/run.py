@@ -85,8 +85,8 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetr
     test = training.views if split is None else training.source.load(split).checked()
     test = test.select(range(len(test))[: config.trainer.limit_test_batches])
     metrics, renderer = ImageMetrics(), training.module.renderer
-    groups = training.module.parameter_groups()
-    num_steps = require_same_run(folder, checkpoint, config, groups, training.views)
+    optimizer = training.module.configure_optimizers()
+    num_steps = require_same_run(folder, checkpoint, config, optimizer, training.views)
     throughput, interruption = Throughput(), StopOnSignal()
     callbacks = [interruption, *([Viewer(config, training.source, test)] if config.viewer else [])]
     trainer = make_trainer(config, folder, throughput, callbacks, num_steps)

@@ -16,7 +16,7 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
-from torch import Tensor, nn
+from torch import Tensor
 
 from nerfro.cli.overrides import as_overrides, command_line
 from nerfro.core.errors import Interrupted, NerfroError, first_of, warn
@@ -40,6 +40,7 @@ from nerfro.training.inputs import (
     require_files,
     require_same_inputs,
 )
+from nerfro.training.optimizer import MOMENTS
 from nerfro.training.settings import RESUMING, first_difference, settings
 
 LAST_CHECKPOINT = Path("checkpoints", "last.ckpt")
@@ -213,21 +214,23 @@ def require_finite(weights: Mapping[str, Any], path: Path) -> None:
             raise NerfroError(f"{path} holds infinite numbers or NaN in {name}; train the run again, with another seed")
 
 
-def require_optimizer_fits(checkpoint: Mapping[str, Any], groups: Mapping[str, list[nn.Parameter]], path: Path) -> None:
-    """Refuse an optimizer state that is not of Adam, or has moments of wrong shape or infinite values."""
-    shapes = [parameter.shape for parameters in groups.values() for parameter in parameters]
-    defaults = torch.optim.Adam([torch.empty(0)]).defaults
+def require_optimizer_fits(checkpoint: Mapping[str, Any], optimizer: torch.optim.Optimizer, path: Path) -> None:
+    """Refuse the state of another optimizer, or with moments of wrong shape or infinite values."""
+    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+    kinds = [group["kind"] for group in optimizer.param_groups for _ in group["params"]]
+    free = ("params", "lr", "initial_lr", "start", "eps", "fused")
     try:
-        (optimizer,) = checkpoint["optimizer_states"]
+        (saved,) = checkpoint["optimizer_states"]
         fits = all(
-            optimizer["state"][number][moment].shape == shapes[number]
-            and optimizer["state"][number][moment].isfinite().all()
-            for number in optimizer["state"]
-            for moment in ("exp_avg", "exp_avg_sq")
+            saved["state"][number][moment].shape == parameters[number].shape
+            and saved["state"][number][moment].isfinite().all()
+            for number in saved["state"]
+            for moment in MOMENTS[kinds[number]]
         ) and all(
-            group[name] == default or (name in ("lr", "eps", "fused") and isinstance(group[name], float | bool))
-            for group in optimizer["param_groups"]
-            for name, default in defaults.items()
+            group[name] == value or (name in free and isinstance(group[name], list | float | int))
+            for group, own in zip(saved["param_groups"], optimizer.param_groups, strict=True)
+            for name, value in own.items()
+            if name != "params"
         )
     except (AttributeError, IndexError, KeyError, TypeError, ValueError):
         fits = False
@@ -258,7 +261,7 @@ def require_same_run(
     folder: Path,
     checkpoint: Path | None,
     config: DictConfig,
-    groups: Mapping[str, list[nn.Parameter]],
+    optimizer: torch.optim.Optimizer,
     views: Views,
 ) -> int:
     """Refuse to resume from an unsuitable checkpoint, or in the folder of another run.
@@ -267,7 +270,7 @@ def require_same_run(
         folder: folder of the run.
         checkpoint: checkpoint to resume from, if there is one.
         config: configuration of the run.
-        groups: parameters by optimizer group.
+        optimizer: optimizer of the run.
         views: training views.
 
     Returns:
@@ -278,7 +281,7 @@ def require_same_run(
         content, trained = load_checkpoint(checkpoint)
         require_same_configuration(checkpoint, trained, config, compared_by_content(content))
         require_same_inputs(content, checkpoint, config, views)
-        require_optimizer_fits(content, groups, checkpoint)
+        require_optimizer_fits(content, optimizer, checkpoint)
         done, most = content["global_step"], config.trainer.max_steps
         if 0 <= most < done:
             raise NerfroError(f"{checkpoint} has {done} steps, and trainer.max_steps={most}; give at least {done}")

@@ -14,7 +14,7 @@ from typing import Any
 import lightning.pytorch as pl
 import torch
 from lightning.fabric.plugins import TorchCheckpointIO
-from lightning.pytorch.callbacks import Callback, Timer
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint, Timer
 from lightning.pytorch.loggers import CSVLogger, WandbLogger
 from lightning.pytorch.profilers import AdvancedProfiler, PyTorchProfiler, SimpleProfiler
 from lightning.pytorch.strategies import DDPStrategy
@@ -61,6 +61,9 @@ def make_trainer(
         save_on_train_epoch_end=False,
     )
     callbacks = [create(find("callbacks", str(name)), node or {}) for name, node in config.callbacks.items()]
+    for callback in callbacks:
+        if isinstance(callback, ModelCheckpoint) and callback.dirpath is None:
+            callback.dirpath = str(folder / LAST_CHECKPOINT.parent)
     ours: dict[str, Any] = {
         "default_root_dir": str(folder),
         "profiler": None if profiler is None else _PROFILERS[profiler](dirpath=folder / "profile", filename=profiler),

@@ -10,22 +10,15 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from torch.optim import Optimizer
 
-from nerfro.parts import Count, register
+from nerfro.parts import register
 
 
 @register("callbacks", "gradient_norm")
 class GradientNorm(Callback):
-    """Log the norm of the gradients of all parameters.
-
-    Args:
-        every: number of steps between two entries of the log.
-    """
-
-    def __init__(self, every: Count = 100) -> None:
-        self.every = every
+    """Log the norm of the gradients of all parameters, every `trainer.log_every_n_steps` steps."""
 
     def on_before_optimizer_step(self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer) -> None:
-        if trainer.global_step % self.every == 0:
+        if pl_module.is_logged_step:  # other steps have no entry in the log
             gradients = [p.grad for p in pl_module.parameters() if p.grad is not None]
             norm = torch.nn.utils.get_total_norm(gradients)
             pl_module.log("train/gradient_norm", norm)

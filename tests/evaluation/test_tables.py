@@ -4,7 +4,9 @@ import csv
 import io
 import re
 
+import pytest
 import rich.console
+from rich.cells import cell_len
 
 from nerfro.evaluation.image_metrics import image_metrics
 from nerfro.evaluation.results import EvaluationResult, ViewScores
@@ -126,3 +128,22 @@ def test_regions_table_has_their_means_and_each_reason_once() -> None:
     table = regions_table(REGIONS, "means")
     assert table.rows == (line("full", 20.5), line("mask", 10.0), line("crop", 15.5))
     assert table.notes == ("SSIM n/a: crops too small", "LPIPS n/a: no network")
+
+
+@pytest.mark.parametrize("width", [40, 80])
+def test_wide_table_keeps_names_and_numbers_on_a_narrow_console(width: int) -> None:
+    label = "mip-NeRF on straight rays with an environment map (paper)"
+    columns = tuple(Column(f"{name} of masks", "higher", 4) for name in ("PSNR", "SSIM", "LPIPS", "FLIP", "MAE"))
+    numbers = tuple(12345.6789 + i for i in range(5))
+    table = Table("t", "method", columns, (Row(label, numbers, numbers), Row("NeRF", numbers)), medals=True)
+    console = rich.console.Console(width=width, file=io.StringIO())
+    console.print(to_rich(table))
+    lines = console.file.getvalue().splitlines()
+    assert max(map(cell_len, lines)) <= width
+    text = " ".join(lines)
+    assert "…" not in text
+    for number in numbers:
+        assert text.count(f"{number:.4f}") == 3, "two numbers and a standard deviation"
+    assert "NeRF " in text
+    if width == 80:
+        assert "mip-NeRF on straight rays" in text

@@ -61,7 +61,7 @@ def test_background_regularizer_matches_a_manual_computation(model: Renderer) ->
             count += 1
             passed = transmittance[ray] * rendering.background_radiance[ray]
             total += sum(abs(float(passed[c] - batch.rgb[ray, c])) for c in range(3))
-    value = BackgroundRegularizer()([rendering, rendering], batch, model.scene)
+    value = BackgroundRegularizer(refracted_only=False)([rendering, rendering], batch, model.scene)
     assert value.item() == pytest.approx(total / (count + 1), rel=1e-5)
 
 
@@ -82,7 +82,7 @@ def test_background_regularizer_has_gradients_only_for_the_fine_density(model: R
     batch = example_batch()
     renderings = model(batch.rays)
     assert (renderings[-1].transmittance > 0.5).any()
-    norms = gradient_norms(model, BackgroundRegularizer()(renderings, batch, model.scene))
+    norms = gradient_norms(model, BackgroundRegularizer(refracted_only=False)(renderings, batch, model.scene))
     assert norms["coarse"] == norms["background"] == 0
     assert norms["fine"] > 0
     colour = model.scene.fields[1].mlp.rgb
@@ -182,14 +182,14 @@ def test_background_regularizer_uses_the_background_of_pixels() -> None:
     rendered = rendering(torch.rand(8, 3), torch.rand(8, 3), passed)
     background = to_srgb(given.per_pixel(passed[:, None] * rendered.background_radiance))
     expected = (background - given.rgb).abs().sum(-1)[:2].sum() / (2 + 1)
-    torch.testing.assert_close(BackgroundRegularizer()([rendered], given, MODEL.scene), expected)
+    torch.testing.assert_close(BackgroundRegularizer(refracted_only=False)([rendered], given, MODEL.scene), expected)
 
 
 def test_background_regularizer_adds_no_density_in_front_of_overexposed_pixels() -> None:
     passed = torch.full((8,), 0.9, requires_grad=True)
     rendered = replace(rendering(torch.rand(8, 3), torch.full((8, 3), 2.0), passed), transmittance=passed)
     given = replace(batch(), rgb=torch.ones(3, 3))
-    value = BackgroundRegularizer()([rendered], given, MODEL.scene)
+    value = BackgroundRegularizer(refracted_only=False)([rendered], given, MODEL.scene)
     assert value.item() == 0
     assert not torch.autograd.grad(value, passed)[0].any()
 

@@ -1,5 +1,6 @@
 """The schedule of the learning rate, the progress of a run, and groups of parameters."""
 
+import copy
 import itertools
 import math
 from datetime import timedelta
@@ -11,9 +12,12 @@ import torch
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Timer
 
+from nerfro.losses.radiance import BackgroundRegularizer
+from nerfro.registry.allowed import plain, validate
+from nerfro.training.config import BatchesConfig, EvaluationConfig, TrainConfig
 from nerfro.training.module import learning_rate_factor, training_progress
 from nerfro.training.optimizer import GroupConfig, OptimizerConfig
-from tests.conftest import refused
+from tests.conftest import composed, refused
 
 PAPER = OptimizerConfig(learning_rate=5e-4, final_learning_rate=5e-6, warmup_steps=2500, warmup_factor=0.01)
 
@@ -87,3 +91,61 @@ def test_last_matching_pattern_decides_and_unmatched_pattern_is_refused() -> Non
     assert grouped(water, index) == {"common": names[:2], index: names[2:]}
     assert grouped("bodies.*.material.absorption") == {"common": names}, "a group of an experiment may be absent"
     refused(r"bodies\.glas\.\* matches no .*choose from .*bodies\.glass\.material\.ior", grouped, "bodies.glas.*")
+
+
+def test_groups_with_several_kinds_of_optimizers_step_like_each_alone_and_resume() -> None:
+    config = OptimizerConfig(
+        learning_rate=0.1, groups={"b": GroupConfig(0.5, name="sgd"), "c": GroupConfig(name="radam")}
+    )
+    kinds = {"a": torch.optim.Adam, "b": torch.optim.SGD, "c": torch.optim.RAdam}
+
+    def start() -> tuple[dict[str, torch.nn.Parameter], torch.optim.Optimizer]:
+        parameters = {name: torch.nn.Parameter(torch.ones(2)) for name in kinds}
+        return parameters, config.optimizer_of(config.grouped(parameters), fused=False)
+
+    def step(parameters: dict[str, torch.nn.Parameter], *optimizers: torch.optim.Optimizer) -> None:
+        for parameter in parameters.values():
+            parameter.grad = parameter.detach() ** 2
+        for optimizer in optimizers:
+            optimizer.step()
+
+    (joint, optimizer), (alone, _) = start(), start()
+    separate = [
+        kind([alone[name]], lr=0.5 if name == "b" else 0.1, **({} if name == "b" else {"eps": config.adam_epsilon}))
+        for name, kind in kinds.items()
+    ]
+    for _ in range(3):
+        step(joint, optimizer)
+        step(alone, *separate)
+    resumed, again = start()
+    again.load_state_dict(copy.deepcopy(optimizer.state_dict()))
+    with torch.no_grad():
+        for name, parameter in resumed.items():
+            parameter.copy_(joint[name])
+    step(resumed, again)
+    step(alone, *separate)
+    for name, parameter in resumed.items():
+        assert torch.equal(parameter, alone[name]), name
+
+
+def test_frozen_parameters_have_no_gradient_and_no_group() -> None:
+    parameters = {name: torch.nn.Parameter(torch.ones(2)) for name in ("fields.0.table", "background.texels")}
+    config = OptimizerConfig(freeze=["fields.*"])
+    config.freeze_parameters(parameters)
+    assert [parameter.requires_grad for parameter in parameters.values()] == [False, True]
+    assert list(config.grouped(parameters)) == ["background.*"]
+    refused(
+        r"optimizer\.freeze: feilds\.\* matches no", OptimizerConfig(freeze=["feilds.*"]).freeze_parameters, parameters
+    )
+    refused("leaves no parameter to learn", OptimizerConfig(freeze=["*"]).freeze_parameters, parameters)
+
+
+def test_defaults_of_python_and_of_the_command_are_the_same() -> None:
+    config = validate(TrainConfig, plain(composed()), complete=False)
+    assert config.optimizer == OptimizerConfig()
+    assert (config.batches, config.evaluation) == (BatchesConfig(), EvaluationConfig())
+    assert OptimizerConfig().warmup_steps == 20
+    regularizer = composed().loss.background
+    assert {name: getattr(BackgroundRegularizer(), name) for name in regularizer if name != "_target_"} == {
+        name: value for name, value in regularizer.items() if name != "_target_"
+    }

@@ -1,0 +1,65 @@
+"""Modules of `nerfro.build` with any Trainer of Lightning: validation, checkpoints, tests, predictions and logs."""
+
+import csv
+import importlib.util
+from pathlib import Path
+
+import lightning
+import pytest
+import torch
+from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint
+from lightning.pytorch.loggers import CSVLogger
+
+import nerfro
+from nerfro.core.paths import PLUGINS_DIR
+from nerfro.training.data_module import RayDataModule
+from nerfro.training.module import TrainingModule
+from tests.conftest import refused
+
+QUIET = {"accelerator": "cpu", "enable_progress_bar": False, "enable_model_summary": False}
+
+
+@pytest.fixture
+def built(unchecked: None, tiny_default_run: list[str]) -> tuple[TrainingModule, RayDataModule]:
+    return nerfro.build(None, [*tiny_default_run, "trainer.max_steps=4", "evaluation.every=10"])
+
+
+def test_any_trainer_validates_saves_tests_predicts_and_logs(
+    built: tuple[TrainingModule, RayDataModule], tmp_path: Path, restored_registry: None
+) -> None:
+    module, data = built
+    spec = importlib.util.spec_from_file_location("template", PLUGINS_DIR / "opt_in" / "example_callback.py")
+    assert spec is not None
+    assert spec.loader is not None
+    template = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(template)
+    best = ModelCheckpoint(tmp_path, monitor="val/psnr", mode="max", save_top_k=1)
+    callbacks = [best, EarlyStopping("val/psnr", mode="max", patience=9), template.GradientNorm()]
+    logger = CSVLogger(tmp_path, name="log", version="")
+    trainer = lightning.Trainer(max_steps=7, log_every_n_steps=3, logger=logger, callbacks=callbacks, **QUIET)
+    trainer.fit(module, datamodule=data)
+    assert trainer.global_step == 7
+    assert len(best.best_k_models) == 1, "validation every two steps"
+    (scores,) = trainer.test(module, datamodule=data, verbose=False)
+    predictions = torch.stack(trainer.predict(module, datamodule=data))
+    errors = (predictions - data.test.images).square().flatten(1).mean(-1)
+    assert scores["test/psnr"] == pytest.approx(float((-10 * errors.log10()).mean()), abs=1e-3)
+    assert nerfro.load(best.best_model_path).cameras("test").height == 16
+    with (tmp_path / "log" / "metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row["step"]) for row in rows if row["train/gradient_norm"]] == [2, 5]
+    assert [int(row["step"]) for row in rows if row["val/psnr"]] == [1, 3, 5]
+
+
+def test_score_that_is_never_computed_and_data_that_are_missing_are_refused(
+    built: tuple[TrainingModule, RayDataModule],
+) -> None:
+    module, data = built
+    trainer = lightning.Trainer(max_steps=2, logger=False, callbacks=[EarlyStopping("val/psnr")], **QUIET)
+    refused("needs pixels and views; add datamodule=data", trainer.fit, module, [0])
+    data.validation = None
+    refused(
+        r"EarlyStopping monitors val/psnr, but the run has no validation; give", trainer.fit, module, datamodule=data
+    )
+    data._load_test = None
+    refused("the data have no test views", trainer.test, module, datamodule=data, verbose=False)
