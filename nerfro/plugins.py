@@ -16,6 +16,7 @@ import nerfro.capture.refinement
 import nerfro.capture.vessel_fit
 import nerfro.cli.startup
 import nerfro.masks.masking
+import nerfro.pipeline.trials
 import nerfro.poses.structure_from_motion
 import nerfro.silhouettes.surface
 import nerfro.training.lightning_callbacks  # noqa: F401 - registers callbacks, as the others register settings

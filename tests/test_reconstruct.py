@@ -24,21 +24,26 @@ from nerfro.cli.calls import changed_settings
 from nerfro.cli.overrides import as_overrides
 from nerfro.core.errors import NerfroError
 from nerfro.data import image_files
+from nerfro.data.base import Views
 from nerfro.data.capture import Capture
 from nerfro.data.masks import find_mask
-from nerfro.evaluation.results import read_metrics_json
-from nerfro.files.images import save_png
+from nerfro.evaluation.metrics import ImageMetrics
+from nerfro.evaluation.results import EvaluationResult, RunMetrics, ViewScores, read_metrics_json
+from nerfro.files.images import load_png, save_png
 from nerfro.files.reading import open_image
 from nerfro.pipeline import reconstruct as chain
-from nerfro.pipeline.hypotheses import Hypothesis
+from nerfro.pipeline.hypotheses import Hypothesis, hypotheses, worth_a_trial
 from nerfro.pipeline.stage import terminated_in_one_line
+from nerfro.pipeline.trial_picture import draw_trials
+from nerfro.pipeline.trials import Trial, decide
 from nerfro.poses import collection
 from nerfro.poses.options import CalibrateConfig
-from nerfro.rendering.scene_file import SceneFile, read_scene_file
+from nerfro.rendering.scene_file import Provenance, SceneFile, read_scene_file
 from nerfro.report.summary import SummaryConfig
 from nerfro.training.run import Run
 from nerfro.viewing.exports import ExportConfig
 from tests.ball_photographs import RECONSTRUCTION, RECONSTRUCTION_TRAINING, save_with_masks
+from tests.cameras_at import cameras_at, random_poses
 from tests.conftest import Runner, refused, weights_of
 
 
@@ -180,7 +185,9 @@ class Pretended:
         self.out = out
         self.surroundings: str | None = "far"
         self.doubts, self.unsupported, self.medium = list[str](), list[str](), {"type": "object"}
+        self.vessel = {"wall": 0.01}
         self.psnr = {"straight": 20.0, "unknown": 22.0, "glass": 21.0, "glass_room": 21.0}  # by experiment
+        self.lpips = dict[str, float]()  # of the crop; without an experiment, its crop is too small
         self.ran: list[tuple[str, list[str]]] = []
         self.ends: dict[str, BaseException | None] = {}
         self._now = time.time() - 1000
@@ -220,7 +227,7 @@ class Pretended:
             self.write("surface/mesh.ply")
             self.write("surface/scene.json", {
                 "data": {"type": "opencv", "root": ".."}, "medium": self.medium, "bodies": bodies,
-                "vessel": {"wall": 0.01}, "surroundings": self.surroundings, "photograph": [512, 384],
+                "vessel": self.vessel, "surroundings": self.surroundings, "photograph": [512, 384],
                 "provenance": {"doubts": self.doubts, "unsupported": self.unsupported},
             })  # fmt: skip
         file = self.out / "surface" / "scene.json"
@@ -230,12 +237,26 @@ class Pretended:
         folder = options[-1 - (options[-1] == "ckpt_path=last")].removeprefix(f"hydra.run.dir={self.out}/")
         self.write(f"{folder}/config.yaml")
         if self.begin("train", options):
-            psnr = next(self.psnr[text.split("=")[1]] for text in options if text.startswith("+experiment="))
-            view = {"name": "val_000", "psnr": psnr, "regions": {"mask": {"psnr": psnr - 2}}}
+            experiment = next(text.split("=")[1] for text in options if text.startswith("+experiment="))
+            psnr, crop = self.psnr[experiment], {"lpips": self.lpips.get(experiment)}
+            view = {"name": "val_000", "psnr": psnr, "regions": {"mask": {"psnr": psnr - 2}, "crop": crop}}
+            self.images(f"{folder}/images", experiment)
             self.write(
                 f"{folder}/metrics.json", {"views": [view], "steps": 1, "train_seconds": 1, "rays_per_second": 1}
             )
         return Run(self.out / folder, read_metrics_json(self.out / folder / "metrics.json"))
+
+    def images(self, folder: str, experiment: str) -> None:
+        """Write the rendered image: the level of grey tells the experiment."""
+        level = list(self.psnr).index(experiment) / 4
+        save_png(self.out / folder / "val_000.png", torch.full((40, 60, 3), level))
+
+    def validation_views(self, folder: Path) -> Views:
+        """A white photograph, of which the object covers one pixel."""
+        masks = torch.zeros(1, 40, 60)
+        masks[0, 8, 50] = 1
+        cameras = cameras_at(random_poses(1), 60, 40, 50.0)
+        return Views(cameras, torch.ones(1, 40, 60, 3), masks, ["IMG_0.png"])
 
     def summarize(self, options: SummaryConfig) -> None:
         if self.begin("summary", as_overrides(changed_settings(options))):
@@ -249,7 +270,7 @@ class Pretended:
 @pytest.fixture
 def pretended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pretended:
     made = Pretended(tmp_path / "out")
-    for name in ("calibrate", "segment", "preprocess", "train_scene", "summarize", "export"):
+    for name in ("calibrate", "segment", "preprocess", "train_scene", "validation_views", "summarize", "export"):
         monkeypatch.setattr(chain, name, getattr(made, name))
     return made
 
@@ -338,17 +359,193 @@ def test_training_continues_with_the_hypothesis_that_the_validation_photographs_
 
 
 @pytest.mark.parametrize(
-    ("unsupported", "trials", "chosen"),
-    [(["solid body", "vessel"], 0, "straight"), (["solid body"], 2, "glass"), (["vessel"], 2, "unknown")],
-)
-def test_bodies_that_the_pixels_do_not_support_are_not_tried(
-    reconstruct: Runner, pretended: Pretended, unsupported: list[str], trials: int, chosen: str
+    ("doubts", "unsupported", "tried"),
+    [
+        ([], ["vessel", "solid body"], ["straight_rays", "vessel", "solid_body"]),
+        ([], ["vessel"], ["straight_rays", "solid_body", "vessel"]),
+        (["shallow"], ["solid body, water", "vessel"], ["straight_rays", "solid_body_glass", "vessel"]),
+        (["shallow"], ["solid body, glass", "vessel", "solid body, water"],
+         ["straight_rays", "solid_body_glass", "vessel"]),
+        (["shallow"], [], ["straight_rays", "solid_body_water", "solid_body_glass", "vessel"]),
+    ],
+)  # fmt: skip
+def test_pixels_of_the_object_order_the_trials_and_never_remove_the_last_body_or_vessel(
+    doubts: list[str], unsupported: list[str], tried: list[str]
 ) -> None:
-    pretended.unsupported = unsupported
-    reconstruct()
-    *tried, train = [options for name, options in pretended.ran if name == "train"]
-    assert len(tried) == trials
-    assert f"+experiment={chosen}" in train
+    scene = SceneFile(vessel={"wall": 0.01}, surroundings="far", provenance=Provenance(doubts=doubts))
+    assert [trial.folder for trial in worth_a_trial(hypotheses(scene), unsupported)] == tried
+
+
+@pytest.mark.parametrize(
+    ("choice", "experiment"), [("straight", "straight"), ("solid", "unknown"), ("vessel", "glass")]
+)
+def test_given_hypothesis_is_trained_without_trials(
+    pretended: Pretended, photos: Path, choice: str, experiment: str
+) -> None:
+    masks = photos.parent / "silhouettes"
+    nerfro.reconstruct(images=photos, masks=masks, out=pretended.out, hypothesis=choice)
+    assert pretended.names == ["calibrate", "preprocess", "train", "summary", "export"]
+    train = pretended.ran[2][1]
+    assert train[0] == f"+experiment={experiment}"
+    assert ("medium=vessel" in train) == (choice == "vessel")
+
+
+def test_run_of_an_unknown_hypothesis_is_kept_under_another_name(reconstruct: Runner, pretended: Pretended) -> None:
+    reconstruct("train=+experiment=glass_room")
+    assert "kept as" not in reconstruct("train=+experiment=glass_room logger=none").out
+    (pretended.out / "hypothesis.json").unlink()
+    assert f"kept as {pretended.out / 'run_1'}" in reconstruct("hypothesis=vessel").out
+    assert pretended.ran[-3][1][:2] == ["+experiment=glass", "medium=vessel"]
+
+
+def test_given_solid_body_of_unknown_index_is_tried_with_common_indices(
+    reconstruct: Runner, pretended: Pretended
+) -> None:
+    pretended.doubts = ["shallow"]
+    reconstruct("hypothesis=solid")
+    trials = [Path(options[-1]).name for name, options in pretended.ran if name == "train"]
+    assert trials == ["solid_body_water", "solid_body_glass", "run"]
+
+
+def test_impossible_hypothesis_is_refused(reconstruct: Runner, pretended: Pretended) -> None:
+    assert "both determine the training" in reconstruct(
+        "hypothesis=solid", "train=+experiment=glass", code=1
+    ).error  # fmt: skip
+    assert pretended.names == []
+    pretended.vessel = {}
+    refused = reconstruct("hypothesis=vessel", code=1).error
+    assert "which allow hypothesis=straight or hypothesis=solid; for a vessel without fitted lengths" in refused
+    assert "straight" in reconstruct("hypothesis=opaque", code=1).error
+
+
+def trial_with_scores(name: str, psnr: float, lpips: float | None) -> Trial:
+    scores = ViewScores("val_000", {"psnr": psnr}, {"mask": {"psnr": psnr - 2}, "crop": {"lpips": lpips}})
+    return Trial(Hypothesis(name, []), Run(Path(name), RunMetrics(EvaluationResult((scores,)))))
+
+
+@pytest.mark.parametrize(
+    ("psnr", "lpips", "best", "other"),
+    [
+        ({"straight": 27.1, "glass": 26.2}, {"glass": 0.240}, "vessel", "straight rays"),
+        ({"straight": 27.1, "glass": 26.2}, {"glass": 0.244}, "straight rays", None),
+        ({"straight": 27.1, "glass": 26.0}, {"glass": 0.240}, "straight rays", "vessel"),
+        ({"straight": 27.1, "unknown": 27.0, "glass": 27.2}, {"unknown": 0.2, "glass": 0.1}, "vessel", "straight rays"),
+        ({"straight": 26.0, "glass": 27.1}, {"glass": 0.240}, "vessel", None),
+        ({"straight": 26.0, "glass": 27.1}, {"glass": 0.250}, "vessel", "straight rays"),
+        ({"straight": 22.0, "unknown": 25.0, "glass": 23.0}, {"glass": 0.2}, "solid body", "vessel"),
+    ],
+)  # fmt: skip
+def test_decision_weighs_psnr_and_lpips(
+    capsys: pytest.CaptureFixture[str], psnr: dict, lpips: dict, best: str, other: str | None
+) -> None:
+    names = {"straight rays": "straight", "solid body": "unknown", "vessel": "glass"}
+    psnr, lpips = {"unknown": 22.0, "glass": 21.0} | psnr, {"straight": 0.244, "unknown": 0.3} | lpips
+    trials = [trial_with_scores(name, psnr[key], lpips[key]) for name, key in names.items()]
+    assert decide(trials, ["images=PHOTOS", "hypothesis=null"]).hypothesis.name == best
+    printed = capsys.readouterr().out
+    assert f"training continues with: {best}\n" in printed
+    assert ("PSNR and LPIPS disagree" in printed) == (other is not None)
+    if other is not None:
+        line, command = printed.splitlines()[-2:]
+        for name in (best, other):
+            psnr_of, lpips_of = psnr[names[name]], lpips[names[name]]
+            assert f"{name} {psnr_of:.2f} dB (object {psnr_of - 2:.2f} dB), LPIPS of the crop {lpips_of:.3f}" in line
+        assert line.endswith(f"to continue with {other}:")
+        assert command == f"  python -m nerfro.reconstruct images=PHOTOS hypothesis={other.split()[0]}"
+
+
+def test_without_lpips_of_every_hypothesis_psnr_alone_decides(capsys: pytest.CaptureFixture[str]) -> None:
+    trials = [trial_with_scores("straight rays", 27.1, 0.244), trial_with_scores("vessel", 26.2, None)]
+    assert decide(trials, []) is trials[0]
+    printed = capsys.readouterr().out
+    assert "PSNR alone decides, because LPIPS of the crop is not available: a crop is smaller than 31 pixels" in printed
+    assert "disagree" not in printed
+
+
+def test_printed_command_continues_with_the_other_hypothesis(
+    run_here: Runner, reconstruct: Runner, pretended: Pretended
+) -> None:
+    """All bodies are unsupported by the pixels of the object; the picture is in the reports of both runs."""
+    pretended.unsupported = ["vessel", "solid body"]
+    pretended.psnr |= {"straight": 27.1, "unknown": 22.0, "glass": 26.2}
+    pretended.lpips = {"straight": 0.244, "unknown": 0.3, "glass": 0.24}
+    printed = reconstruct().out
+    trials = [Path(options[-1]).name for name, options in pretended.ran if name == "train"]
+    assert trials == ["straight_rays", "vessel", "solid_body", "run"]
+    picture = pretended.out / "trials" / "hypotheses.png"
+    assert f"each hypothesis beside photographs: {picture}\n" in printed
+    shown = load_png(picture)
+    for column, level in enumerate((1.0, 0.0, 0.5, 0.25)):  # photograph, straight rays, vessel, solid body
+        assert shown[100, 276 * column + 100].tolist() == pytest.approx([level] * 3, abs=0.003)
+    command = next(line for line in printed.splitlines() if line.endswith("hypothesis=straight"))
+    other = run_here(*shlex.split(command.replace("python -m nerfro.", ""))).out
+    assert f"kept as {pretended.out / 'run_1'}" in other
+    *_, vessel, summary, _, straight, summary_of_other, _ = (options for _, options in pretended.ran)
+    assert (vessel[0], straight[0]) == ("+experiment=glass", "+experiment=straight")
+    assert "ckpt_path=last" not in straight
+    assert f"pictures=[{picture}]" in summary
+    assert f"pictures=[{picture}]" in summary_of_other
+
+
+def scored_trial(name: str, folder: Path, images: torch.Tensor, views: Views) -> Trial:
+    """A trial that rendered the images, scored by all metrics."""
+    metrics, scores = ImageMetrics(), []
+    for view, image in enumerate(images):
+        save_png(folder / "images" / f"val_{view:03d}.png", image)
+        scores.append(metrics.score(f"val_{view:03d}", image, views.images[view], views.masks[view]))
+    return Trial(Hypothesis(name, []), Run(folder, RunMetrics(metrics.result(scores))))
+
+
+@pytest.mark.parametrize(("size", "best"), [(48, "vessel"), (30, "straight rays")])
+def test_sharp_details_in_a_slightly_wrong_position_are_preferred_if_the_crop_is_large_enough(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], size: int, best: str
+) -> None:
+    pattern = (torch.arange(size) // 4 % 2)[:, None] == (torch.arange(size) // 4 % 2)
+    sharp = pattern.float()[None, ..., None].expand(1, size, size, 3) * 0.2 + 0.4
+    masks = torch.ones(1, size, size)
+    views = Views(cameras_at(random_poses(1), size, size, 50.0), sharp, masks, ["IMG_0.png"])
+    blurred = scored_trial("straight rays", tmp_path / "straight", torch.full_like(sharp, 0.5), views)
+    shifted = scored_trial("vessel", tmp_path / "vessel", sharp.roll(1, 2), views)
+    assert decide([blurred, shifted], ["out=DIR"]).hypothesis.name == best
+    printed = capsys.readouterr().out
+    assert ("PSNR alone decides" in printed) == (size < 31)
+    assert ("python -m nerfro.reconstruct out=DIR hypothesis=straight\n" in printed) == (size > 31)
+
+
+def test_picture_shows_every_hypothesis_beside_three_photographs(tmp_path: Path) -> None:
+    size, num_views = 64, 5
+    masks = torch.zeros(num_views, size, size)
+    masks[1:, 30:34, 40:60] = 1
+    masks[4, 30:34, 20:60] = 1  # crops of 38 x 41 and of 38 x 61 pixels
+    cameras, names = cameras_at(random_poses(num_views), size, size, 50.0), [f"IMG_{view}" for view in range(num_views)]
+    levels = (0.1 * torch.arange(num_views))[:, None, None, None].expand(-1, size, size, 3)
+    views = Views(cameras, levels, masks, names)
+    trials = [scored_trial(name, tmp_path / name, levels + 0.1 * number, views)
+              for number, name in enumerate(("straight rays", "solid body", "vessel"), start=1)]  # fmt: skip
+    picture = torch.from_numpy(np.array(draw_trials(trials, views))).float() / 255
+    width, height, gap, line = 305, 190, 6, 22  # crops are enlarged five times
+    assert picture.shape[:2] == (line + 3 * (height + line + gap) + 2 * line - gap, 4 * (width + gap) - gap)
+    for row, view in enumerate((1, 3, 4)):  # view 0 does not show the object
+        top = line + row * (height + line + gap)
+        for column in range(4):
+            cell = picture[top : top + height, column * (width + gap) :][:, :width]
+            torch.testing.assert_close(cell, torch.full_like(cell, 0.1 * (view + column)), atol=0.003, rtol=0)
+    below = picture[-3 * line :]
+    assert all((below[:, column * (width + gap) :][:, :width] < 0.3).any() for column in range(4))
+    (tmp_path / "vessel" / "images" / "val_003.png").unlink()
+    refused("val_003.png", draw_trials, trials, views)
+
+
+def test_missing_picture_of_the_hypotheses_is_a_warning(
+    reconstruct: Runner, pretended: Pretended, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(folder: Path) -> Views:
+        raise NerfroError("the photographs have moved")
+
+    monkeypatch.setattr(chain, "validation_views", fail)
+    done = reconstruct()
+    assert "the hypotheses were not drawn: the photographs have moved" in done.out
+    assert not any(option.startswith("pictures=") for option in dict(pretended.ran)["summary"])
 
 
 def test_interrupted_training_is_resumed(reconstruct: Runner, pretended: Pretended) -> None:
@@ -461,8 +658,9 @@ def test_posed_photographs_of_a_ball_become_a_scene(
     assert (out / "report" / "report.html").is_file()
     assert "training continues with: " in done.out
     assert (out / "page.html").is_file()
-    # Surface, two trials, training, report and page.
-    assert run_here("reconstruct", *asked).out.count(" is kept (delete the file to repeat the stage)") == 6
+    assert f"each hypothesis beside photographs: {out / 'trials' / 'hypotheses.png'}" in done.out
+    # Surface, three trials, training, report and page.
+    assert run_here("reconstruct", *asked).out.count(" is kept (delete the file to repeat the stage)") == 7
     assert (torch.initial_seed(), signal.getsignal(signal.SIGTERM)) == before
     command = next(line for line in done.out.splitlines() if line.endswith(f"hydra.run.dir={out}/run"))
     run_here("train", *shlex.split(command)[4:], f"hydra.run.dir={tmp_path / 'alone'}")

@@ -89,6 +89,17 @@ def test_page_is_self_contained_with_valid_internal_links(runs: Path) -> None:
     assert "max_time: 00:00:00:20" in html
 
 
+def test_page_shows_further_pictures(runs: Path, tmp_path: Path) -> None:
+    save_png(tmp_path / "crops <1>.png", torch.rand(8, 9, 3))
+    comparisons = compare(find_runs([str(runs)])[0], {}, {})
+    compared = [(comparison, to_table(comparison, PSNR, "full")) for comparison in comparisons]
+    html = report_page(compared, (), Selection(), [tmp_path / "crops <1>.png"])
+    assert embed_image(load_png(tmp_path / "crops <1>.png")) in html
+    assert "crops &lt;1&gt;.png</figcaption>" in html
+    assert 'href="#pictures"' in html
+    assert 'id="pictures"' not in page(runs)
+
+
 def test_page_without_the_data_set_shows_the_other_parts(runs: Path, tmp_path: Path) -> None:
     moved = tmp_path / "runs"
     shutil.copytree(runs, moved)

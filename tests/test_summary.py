@@ -239,6 +239,7 @@ def test_command_prints_writes_all_forms_and_refuses_to_overwrite(tmp_path: Path
         ("metrics=[]", "metrics: the list is empty; choose from psnr"),
         ("metrics=[psnr,foo]", "'foo' is not a metric; choose from psnr"),
         ("region=x", "choose 'full', 'mask', 'crop'"),
+        ("pictures=[a.png]", "are shown in the report; add report=true"),
     ],
 )
 def test_mistakes_give_a_one_line_error(tmp_path: Path, summarize: Runner, override: str, said: str) -> None:

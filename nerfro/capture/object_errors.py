@@ -178,7 +178,7 @@ def unsupported_bodies(
     vessel: Bodies | None,
     settings: ObjectErrorSettings = ObjectErrorSettings(),
 ) -> list[str]:
-    """Print the errors of bodies, and return the names of those that are not worth a training.
+    """Print the errors of bodies, and return the names of those without support, the smallest error first.
 
     A body is supported if its error is significantly smaller than that of straight rays, and if it gains at least three
     quarters of the gain of the best body.
@@ -206,7 +206,7 @@ def unsupported_bodies(
         and gains[name] > settings.min_gain * max(gains.values())
     ]
     print(f"bodies that these pixels support: {', '.join(supported) or 'none'}")
-    return [name for name in bodies if name not in supported]
+    return sorted((name for name in bodies if name not in supported), key=gains.__getitem__, reverse=True)
 
 
 def _with_index(solid: Bodies, ior: float) -> Bodies:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,17 +25,22 @@ PAPER, INK, EMPTY = (255, 255, 255), (25, 25, 25), (225, 225, 225)  # EMPTY: gre
 def sheet(
     images: Sequence[Float[Tensor, "_ _ 3"]], captions: Sequence[str], width: int, columns: int, title: str = ""
 ) -> Image.Image:
-    """Draw sRGB images `width` pixels wide in rows of at most `columns`, with captions below and a title on top."""
+    """Draw sRGB images `width` pixels wide in rows of at most `columns`, with captions below and a title on top.
+
+    Images have the aspect ratio of the first. Captions may have several lines.
+    """
     columns, height = min(columns, len(images)), round(width * images[0].shape[0] / images[0].shape[1])
-    pitch, start = height + LINE_HEIGHT + GAP, LINE_HEIGHT if title else 0
-    num_rows = -(-len(images) // columns)
+    rows = [captions[first : first + columns] for first in range(0, len(images), columns)]
+    heights = [height + LINE_HEIGHT * (1 + max(text.count("\n") for text in row)) + GAP for row in rows]
+    tops = list(itertools.accumulate(heights, initial=LINE_HEIGHT if title else 0))
     length = max(columns * (width + GAP) - GAP, math.ceil(_font().getlength(title)))
-    whole = Image.new("RGB", (length, start + num_rows * pitch - GAP), PAPER)
+    whole = Image.new("RGB", (length, tops[-1] - GAP), PAPER)
     _write(whole, title, whole.width // 2, LINE_HEIGHT // 2, length)
     for number, (image, caption) in enumerate(zip(images, captions, strict=True)):
-        left, top = number % columns * (width + GAP), start + number // columns * pitch
+        left, top = number % columns * (width + GAP), tops[number // columns]
         whole.paste(_resized(image, width, height), (left, top))
-        _write(whole, caption, left + width // 2, top + height + LINE_HEIGHT // 2, width)
+        for line, text in enumerate(caption.split("\n")):
+            _write(whole, text, left + width // 2, top + height + LINE_HEIGHT * line + LINE_HEIGHT // 2, width)
     return whole
 
 

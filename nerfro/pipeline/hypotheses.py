@@ -1,7 +1,8 @@
-"""Assumptions about a photographed object, and their comparison on validation photographs."""
+"""Assumptions about a photographed object, and the trainings that try them."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from nerfro.capture.object_errors import COMMON_INDICES, SOLID, STRAIGHT, VESSEL
@@ -28,6 +29,11 @@ class Hypothesis:
     def folder(self) -> str:
         """Name of the folder of the trial."""
         return self.name.replace(" ", "_").replace(",", "")
+
+    @property
+    def choice(self) -> str:
+        """Value of the option `hypothesis` that selects this hypothesis."""
+        return {STRAIGHT: "straight", VESSEL: "vessel"}.get(self.name, "solid")
 
     def trial_options(self, steps: int) -> list[str]:
         """Return the options of a short training that is scored on validation photographs.
@@ -76,3 +82,22 @@ def hypotheses(scene: SceneFile) -> list[Hypothesis]:
         ]
     vessel = [Hypothesis(VESSEL, [known_materials, "medium=vessel"])] if scene.vessel else []
     return [straight, *bodies, *vessel]
+
+
+def worth_a_trial(candidates: Sequence[Hypothesis], unsupported: Sequence[str]) -> list[Hypothesis]:
+    """Order hypotheses by the errors at pixels of the object, and omit solid bodies with an unlikely index.
+
+    These errors compare colours with the surroundings in the exit directions, so inaccurate surroundings or a thin wall
+    hide the effect of a body. Therefore at least one hypothesis of every choice remains.
+
+    Args:
+        candidates: the hypotheses.
+        unsupported: names of bodies that these pixels do not support, the smallest error first.
+
+    Returns:
+        Straight rays, then the supported bodies, then the others by their error.
+    """
+    rank = {name: number for number, name in enumerate(unsupported, start=1)}
+    ordered = sorted(candidates, key=lambda body: (body.name != STRAIGHT, rank.get(body.name, 0)))
+    first = {hypothesis.choice: hypothesis for hypothesis in reversed(ordered)}
+    return [body for body in ordered if body.name not in rank or first[body.choice] is body]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from annotated_types import Ge, Le
 from omegaconf import MISSING, DictConfig
@@ -28,6 +28,9 @@ class ReconstructConfig:
         masks: folder of the masks, PNG or JPEG files named `<photograph>` or `mask_<photograph>`.
         outlines: boxes or polygons around the object in some photographs, as for `python -m nerfro.mask`.
         out: output folder.
+        hypothesis: assumption about the object: `straight` rays, a `solid` body (or the bodies that the medium
+            describes) or a `vessel`; by default, trials decide. If the photographs do not determine the index of a
+            solid body, trials decide between water and glass. An earlier run with another hypothesis is renamed.
         trial_steps: number of steps of the training that tries each hypothesis about the object on validation
             photographs (straight rays, solid body, vessel); 0 skips the comparison and trains with bent rays: of
             the vessel or the bodies that the medium of the scene file describes, otherwise of a solid body (of water,
@@ -49,6 +52,7 @@ class ReconstructConfig:
     masks: str | None = None
     outlines: Any = None
     out: str | None = None
+    hypothesis: Literal["straight", "solid", "vessel"] | None = None
     trial_steps: Natural = 600
     pixels: Count = 256
     calibrate: str = ""
@@ -70,6 +74,11 @@ def have_poses(config: DictConfig, overrides: list[str]) -> bool:
                     f"{stage}={config[stage]!r}: {option} is a flag; give options of the form key=value, which "
                     f"`nerfro {stage} --help` explains"
                 )
+    if config.hypothesis is not None and is_given("experiment", shlex.split(config.train)):
+        raise NerfroError(
+            f"hypothesis={config.hypothesis} and the experiment in train={config.train!r} both determine the training; "
+            "give one of the two"
+        )
     if config.images is not None and config.video is not None:
         raise NerfroError("images= and video= are both given; give one of the two")
     posed = config.images is None and config.video is None

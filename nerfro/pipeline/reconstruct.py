@@ -5,6 +5,7 @@ Stages exchange values. Each leaves files, from which a repeated reconstruction 
 
 from __future__ import annotations
 
+import json
 import shlex
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,13 +21,17 @@ from nerfro.core.errors import NerfroError, warn
 from nerfro.core.paths import resolve_path, user_path
 from nerfro.data.capture import Capture
 from nerfro.data.lazy_images import decoded_once
-from nerfro.evaluation.results import EXPOSED, FULL, read_metrics_json
+from nerfro.evaluation.results import read_metrics_json
+from nerfro.files.atomic import write_atomically
 from nerfro.files.folder_lock import lock_folder
+from nerfro.files.images import save_image
 from nerfro.masks.segment import segment
 from nerfro.pipeline.export import export
-from nerfro.pipeline.hypotheses import Hypothesis, hypotheses
+from nerfro.pipeline.hypotheses import Hypothesis, hypotheses, worth_a_trial
 from nerfro.pipeline.options import ReconstructConfig, common_options, have_poses
 from nerfro.pipeline.stage import Stage, is_older, move_aside
+from nerfro.pipeline.trial_picture import PICTURE, draw_trials, validation_views
+from nerfro.pipeline.trials import Trial, decide
 from nerfro.poses.calibrate import calibrate
 from nerfro.poses.calibrated_data import PLOT, REPORT
 from nerfro.poses.collection import collect_photographs
@@ -39,9 +44,6 @@ from nerfro.training.run import Run, run_training
 from nerfro.training.run_folder import CONFIG_FILE
 from nerfro.viewing.exports import ExportConfig
 
-# Smallest gain of bent rays over straight rays in short trainings, in dB. On a simulated empty glass, a gain of 0.33 dB
-# in the trial became a gain of 0.75 dB after four minutes (docs/lab/simulated_glassware.md).
-_MIN_GAIN = 0.25
 _MIN_PHOTOGRAPHS = 3
 
 
@@ -123,77 +125,81 @@ def _preprocess(composition: Composition, capture: Capture, folder: Path) -> Sce
 
 
 def _train(composition: Composition, scene: SceneFile, out: Path) -> Run:
-    """Train with the hypothesis that predicts the validation photographs best."""
-    config, file = composition.config, out / "surface" / SCENE
+    """Train with the hypothesis that `hypothesis=` names or that the trials prefer, or with a given experiment."""
+    file = out / "surface" / SCENE
     inputs = [file, file.with_name(MESH)]
-    common = common_options(config, composition.overrides, scene.photograph)
-    candidates = hypotheses(scene)
+    common = common_options(composition.config, composition.overrides, scene.photograph)
     if is_given("experiment", common):
-        options = []
-    elif scene.surroundings is None:
+        options, experiment = [], [option for option in common if is_given("experiment", [option])]
+        _set_aside_other_hypothesis(experiment, out)
+    else:
+        hypothesis, trials = _find_hypothesis(composition, scene, common, out)
+        options = hypothesis.options
+        inputs += [trial.run.folder / "metrics.json" for trial in trials]
+        _set_aside_other_hypothesis(options, out)
+    return _run_training(scene, [*options, *common], inputs, out / "run")
+
+
+def _find_hypothesis(
+    composition: Composition, scene: SceneFile, common: Sequence[str], out: Path
+) -> tuple[Hypothesis, list[Trial]]:
+    """Return the hypothesis of the final training, and the trials that decided."""
+    config, file = composition.config, out / "surface" / SCENE
+    if scene.surroundings is None:
         raise NerfroError(
             f"{file} does not tell whether the surroundings are near, because no stage needed them; write "
             '"surroundings": "near" (an object in a room) or "far" into the file, and repeat this command'
         )
-    elif config.trial_steps == 0:
-        options = candidates[1].options
-    else:
-        unsupported = scene.provenance.unsupported
-        candidates = [hypothesis for hypothesis in candidates if hypothesis.name not in unsupported]
-        trials = []
-        for hypothesis in candidates if len(candidates) > 1 else []:
-            print(f"\nhypothesis: {hypothesis.name}")
-            short = hypothesis.trial_options(config.trial_steps)
-            options = [*hypothesis.options, *not_given(common, short), *short]
-            trials.append(_run_training(scene, options, inputs, out / "trials" / hypothesis.folder))
-        options = _best_hypothesis(candidates, trials, _advice(scene)).options
-        inputs += [trial.folder / "metrics.json" for trial in trials]
-    return _run_training(scene, [*options, *common], inputs, out / "run")
+    candidates = hypotheses(scene)
+    if config.hypothesis is None and config.trial_steps == 0:
+        return candidates[1], []
+    candidates = worth_a_trial(_selected(candidates, config.hypothesis, file), scene.provenance.unsupported)
+    if len(candidates) == 1 or config.trial_steps == 0:
+        return candidates[0], []
+    trials, inputs = [], [file, file.with_name(MESH)]
+    for hypothesis in candidates:
+        print(f"\nhypothesis: {hypothesis.name}")
+        short = hypothesis.trial_options(config.trial_steps)
+        options = [*hypothesis.options, *not_given(common, short), *short]
+        run = _run_training(scene, options, inputs, out / "trials" / hypothesis.folder)
+        trials.append(Trial(hypothesis, run))
+    best = decide(trials, composition.overrides)
+    _draw(trials, out / "trials" / PICTURE)
+    return best.hypothesis, trials
 
 
-def _advice(scene: SceneFile) -> str:
-    """Say how to train with bent rays although straight rays were chosen."""
-    solid = "to use bent rays nevertheless, add trial_steps=0"
-    if not scene.vessel:
-        return solid
-    experiment = "glass_room" if scene.surroundings == "near" else "glass"
-    return f"{solid} for a solid body, or train='+experiment={experiment} medium=vessel' for the fitted vessel"
+def _draw(trials: Sequence[Trial], picture: Path) -> None:
+    """Draw the trials beside photographs, and print where; a picture that cannot be drawn is a warning."""
+    if not picture.is_file() or is_older(picture, [trial.run.folder / "metrics.json" for trial in trials]):
+        try:
+            save_image(picture, draw_trials(trials, validation_views(trials[0].run.folder)))
+        except NerfroError as error:
+            warn(f"the hypotheses were not drawn: {error}")
+            picture.unlink(missing_ok=True)  # of earlier trials
+            return
+    print(f"each hypothesis beside photographs: {picture}")
 
 
-def _best_hypothesis(tried: Sequence[Hypothesis], runs: Sequence[Run], advice: str) -> Hypothesis:
-    """Print the scores of the trials, and return the hypothesis with the best mean of image and object.
+def _selected(candidates: Sequence[Hypothesis], choice: str | None, file: Path) -> list[Hypothesis]:
+    """Return the hypotheses that `hypothesis=` names, or all without it."""
+    selected = [hypothesis for hypothesis in candidates if choice in (None, hypothesis.choice)]
+    if not selected:
+        possible = " or ".join(dict.fromkeys(f"hypothesis={hypothesis.choice}" for hypothesis in candidates))
+        raise NerfroError(
+            f"hypothesis={choice} does not fit the bodies and the medium of {file}, which allow {possible}; for a "
+            "vessel without fitted lengths, delete this file and add medium=vessel medium.wall=LENGTH "
+            "(docs/guides/vessels.md)"
+        )
+    return selected
 
-    Bent rays have to be better than straight rays by `_MIN_GAIN`, because scores of five views vary.
 
-    Args:
-        tried: the hypotheses, straight rays first.
-        runs: trial of each hypothesis; empty if there are only straight rays.
-        advice: how to train with bent rays if straight rays are chosen, for the message.
-    """
-    if not runs:
-        print(f"\ntraining continues with: {tried[0].name}")
-        print(f"no body explains the pixels of the object better; {advice}")
-        return tried[0]
-    scores = []
-    print("\nPSNR of short trainings on validation photographs, in dB:")
-    print(f"  {'hypothesis':<20}{'image':>9}{'object':>9}{'mean':>9}")
-    for hypothesis, run in zip(tried, runs, strict=True):
-        assert run.scores is not None  # of validation photographs
-        # The exposures of validation photographs are unknown. Their right halves may lack the object.
-        result = run.scores.treatments.get(EXPOSED, run.scores.result)
-        result = run.scores.result if result.mean("psnr", "mask") is None else result
-        image, inside = result.mean("psnr", FULL) or 0.0, result.mean("psnr", "mask")
-        scores.append(image if inside is None else 0.5 * (image + inside))
-        shown = "n/a" if inside is None else f"{inside:.2f}"
-        print(f"  {hypothesis.name:<20}{image:>9.2f}{shown:>9}{scores[-1]:>9.2f}")
-    bent = max(range(1, len(tried)), key=scores.__getitem__)
-    best = tried[bent if scores[bent] >= scores[0] + _MIN_GAIN else 0]
-    print(f"training continues with: {best.name}")
-    if best is tried[0]:
-        doubts = [hypothesis.doubt for hypothesis in tried if hypothesis.doubt]
-        reason = doubts[0] if doubts else "the surface or the index is not accurate enough, or the object is opaque"
-        print(f"the mean of bent rays is not higher by {_MIN_GAIN} dB: {reason}; {advice}")
-    return best
+def _set_aside_other_hypothesis(options: Sequence[str], out: Path) -> None:
+    """Record the options that state the hypothesis, and rename a run that was trained with others."""
+    record, run, text = out / "hypothesis.json", out / "run", json.dumps(list(options))
+    recorded = record.read_text(encoding="utf-8") if record.is_file() else None
+    if run.exists() and text != recorded:
+        print(f"\ntrain: the hypothesis of {run} is another one or unknown; it is kept as {move_aside(run)}")
+    write_atomically(record, text)
 
 
 def _run_training(scene: SceneFile, options: Sequence[str], inputs: Sequence[Path], folder: Path) -> Run:
@@ -219,7 +225,10 @@ def train_scene(scene: SceneFile, overrides: Sequence[str]) -> Run:
 def _report(run: Run, out: Path) -> None:
     """Write the report and the interactive page, and print where they are; a page that cannot be made is a warning."""
     report, page, inputs = out / "report" / "report.html", out / "page.html", [run.folder / "metrics.json"]
-    options = SummaryConfig(runs=[str(run.folder)], out=str(report.parent), report=True, overwrite=True)
+    pictures = [path for path in [out / "trials" / PICTURE] if path.is_file()]
+    options = SummaryConfig(
+        runs=[str(run.folder)], out=str(report.parent), report=True, pictures=[*map(str, pictures)], overwrite=True
+    )
     summary = Stage("summary", as_overrides(changed_settings(options)), report, report, inputs)
     summary.run(lambda: summarize(options), lambda: None)
     exported = ExportConfig(checkpoint=str(run.folder), what="page", out=str(page), overwrite=True)

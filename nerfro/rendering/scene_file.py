@@ -34,7 +34,8 @@ class Provenance:
         algorithms: settings of the algorithms that the command has used (see `provenance.AlgorithmSettings`).
         standard_error: standard error of the estimated index of each body, null for few views; empty for given indices.
         doubts: reasons for doubt about the indices; empty for reliable indices.
-        unsupported: names of bodies that do not explain the pixels of the object better than straight rays.
+        unsupported: names of bodies that do not explain the pixels of the object better than straight rays, the
+            smallest error first.
     """
 
     command: str = ""

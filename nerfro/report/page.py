@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -14,6 +15,7 @@ from nerfro.core.paths import PACKAGE_DIR
 from nerfro.evaluation.error_maps import SQUARED_ERROR_LIMIT
 from nerfro.evaluation.tables import Table
 from nerfro.files.drawing import magma
+from nerfro.files.images import load_png
 from nerfro.files.templates import fill_template
 from nerfro.report.comparison import Comparison
 from nerfro.report.runs import EvaluatedRun, device, duration, shown
@@ -22,8 +24,20 @@ from nerfro.report.views import PNG_SIDE, Selection, embed_image, scene_images
 _TEMPLATES = PACKAGE_DIR / "report"
 
 
-def report_page(compared: Sequence[tuple[Comparison, Table]], unfinished: Sequence[str], selection: Selection) -> str:
-    """Create the page; `unfinished` contains one line about each run without scores."""
+def report_page(
+    compared: Sequence[tuple[Comparison, Table]],
+    unfinished: Sequence[str],
+    selection: Selection,
+    pictures: Sequence[Path] = (),
+) -> str:
+    """Create the page.
+
+    Args:
+        compared: comparisons with their tables.
+        unfinished: one line about each run without scores.
+        selection: images that the page shows.
+        pictures: further images, PNG files.
+    """
     sections = [
         {
             "id": f"b{number}",
@@ -39,6 +53,7 @@ def report_page(compared: Sequence[tuple[Comparison, Table]], unfinished: Sequen
         _TEMPLATES / "page.html.jinja",
         sections=sections,
         unfinished=unfinished,
+        pictures=[{"name": shown(file), "uri": embed_image(load_png(file))} for file in pictures],
         error_ramp=embed_image(ramp),
         error_limit=SQUARED_ERROR_LIMIT,
         png_side=PNG_SIDE,

@@ -8,11 +8,13 @@ from typing import Any, Literal, cast
 
 import rich
 
+from nerfro.core.errors import NerfroError
 from nerfro.core.paths import user_path
 from nerfro.evaluation.results import FULL, Region
 from nerfro.evaluation.tables import FORMATS, Table, to_rich, write_table
 from nerfro.files.atomic import refuse_existing, write_atomically
 from nerfro.files.folder_lock import lock_folder
+from nerfro.files.images import load_png
 from nerfro.registry.allowed import Natural
 from nerfro.report.comparison import compare, find_metrics, to_table
 from nerfro.report.page import report_page
@@ -64,6 +66,8 @@ class SummaryConfig:
         methods: titles of experiments, in the order of the rows, beside those of the experiments of nerfro.
         scenes: titles of scenes, by the last component of the data folder, beside those of known scenes.
         views: number of evenly spread views per scene in the report; 0 for all.
+        pictures: PNG files that the report shows after the scores, such as `trials/hypotheses.png` of
+            `nerfro.reconstruct`.
         overwrite: whether to replace files in `out`.
     """
 
@@ -75,12 +79,18 @@ class SummaryConfig:
     methods: dict[str, str] = field(default_factory=dict)
     scenes: dict[str, str] = field(default_factory=dict)
     views: Natural = 8
+    pictures: list[str] = field(default_factory=list)
     overwrite: bool = False
 
 
 def summarize(options: SummaryConfig) -> None:
     """Read and compare runs, and print and write the result."""
     metrics, region = find_metrics(options.metrics), cast(Region, options.region)
+    if options.pictures and not options.report:
+        raise NerfroError(f"pictures={options.pictures} are shown in the report; add report=true")
+    pictures = [user_path(file) for file in options.pictures]
+    for file in pictures:  # before the runs are read
+        load_png(file)
     patterns = options.runs if isinstance(options.runs, list) else [options.runs]
     runs, unfinished = find_runs([str(pattern) for pattern in patterns])
     comparisons = compare(runs, _METHODS | options.methods, _SCENES | options.scenes)
@@ -101,7 +111,7 @@ def summarize(options: SummaryConfig) -> None:
         print(f"tables: {out}")
         if options.report:
             selection = Selection(options.views, next(iter(metrics)), region)
-            page = report_page(list(zip(comparisons, tables.values(), strict=True)), unfinished, selection)
+            page = report_page(list(zip(comparisons, tables.values(), strict=True)), unfinished, selection, pictures)
             write_atomically(out / "report.html", page)
             print(f"report: {out / 'report.html'}, {len(page) / 2**20:.1f} MiB")
 
