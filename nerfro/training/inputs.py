@@ -50,9 +50,9 @@ def inputs_of(config: DictConfig, views: Views | None) -> dict[str, Any]:
 
 def recorded_cameras(checkpoint: Mapping[str, Any]) -> Cameras | None:
     """Return the cameras of the training views in a checkpoint; None if it has none or they are damaged."""
-    inputs = checkpoint.get(INPUTS)
-    tensors, image = (inputs.get(name) if isinstance(inputs, Mapping) else None for name in ("cameras", "image"))
+    inputs: Any = checkpoint.get(INPUTS)
     try:
+        tensors, image = inputs["cameras"], inputs["image"]
         values = {name: torch.as_tensor(tensors[name], dtype=torch.float32) for name in (*_OF_CAMERAS, "distortion")}
         num_views = len(values["fx"])
         shapes = {"camera_to_world": (num_views, 3, 4), "distortion": (num_views, 9)}

@@ -42,8 +42,9 @@ def make_page(scene: TrainedScene, resolution: int) -> str:
     split = page_split(scene)
     views = scene.views(split) if scene.has_data else None
     cameras = scene.cameras(split) if views is None else views.cameras
+    images = None if views is None else views.images
     parts = bake_parts(scene, cameras, resolution, progress=True)
-    return assemble_page(scene.name, static_parts(scene, cameras, views and views.images, split), parts)
+    return assemble_page(scene.name, static_parts(scene, cameras, images, split), parts)
 
 
 def page_split(scene: TrainedScene) -> str:
