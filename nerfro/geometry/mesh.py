@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from nerfro.core.errors import NerfroError
 from nerfro.files.atomic import write_atomically
 from nerfro.files.reading import reading
+from nerfro.geometry.facets import CREASE_DEGREES
 from nerfro.geometry.file_normals import informative_normals
 from nerfro.geometry.orientation import area_vectors, inward_faces
 from nerfro.registry.allowed import Coordinate, check
@@ -27,11 +28,16 @@ class TriangleMesh:
         faces: vertex indices of each triangle.
         normals: unit normals at the corners of the triangles, or zero, if the normals of the file are more accurate
             than the triangles; else None.
+        facets: number of the flat facet of each triangle, -1 for triangles of smooth surfaces; None if all are smooth.
+            Normals are not smooth across the edges of facets.
+        crease_degrees: edges with larger angles between their faces are sharp.
     """
 
     vertices: Float[np.ndarray, "vertices 3"]
     faces: Int[np.ndarray, "F 3"]
     normals: Float[np.ndarray, "F 3 3"] | None = None
+    facets: Int[np.ndarray, "F"] | None = None
+    crease_degrees: float = CREASE_DEGREES
 
     @property
     def triangles(self) -> Float[np.ndarray, "F 3 3"]:
