@@ -11,9 +11,9 @@ from nerfro.geometry.mesh import TriangleMesh
 def corner_normals(mesh: TriangleMesh) -> Float[np.ndarray, "F 3 3"]:
     """Compute the unit normal at each corner of each triangle, smooth up to creases.
 
-    Informative normals of the mesh file (see `informative_normals`) are used if they lie within the crease angle
-    of the mesh from the normal of the face. Otherwise the normal is the mean normal of the faces around the vertex whose normals are
-    within the crease angle of the corner's face and that belong to the same facet. The weights are
+    Informative normals of the mesh file (see `informative_normals`) are used if they lie within the crease angle of the
+    mesh from the normal of the face. Otherwise the normal is the mean normal of the faces around the vertex whose
+    normals are within the crease angle of the corner's face and that belong to the same facet. The weights are
     |e1 x e2| / (|e1|^2 |e2|^2) with the edges e1 and e2 at the vertex, which is exact for spheres. Where a large face
     meets much smaller faces, for example a flat side and a rounded edge, the weights are the areas, because the normal
     of the large face is the accurate one.
