@@ -40,7 +40,7 @@ class _Edges(NamedTuple):
     angle: Float[np.ndarray, " edges"]
     length: Float[np.ndarray, " edges"]
 
-    def chosen(self, rows: Bool[np.ndarray, " edges"]) -> _Edges:
+    def subset(self, rows: Bool[np.ndarray, " edges"]) -> _Edges:
         return _Edges(*(column[rows] for column in self))
 
 
@@ -67,15 +67,15 @@ def facets_of(
     face = _flat_faces(vertices, faces, edges)
     num_faces = int(face.max()) + 1
     area, num_triangles, corners = np.bincount(face, size), np.bincount(face), _num_corners(faces, face)
-    between = edges.chosen(face[edges.first] != face[edges.second])
+    between = edges.subset(face[edges.first] != face[edges.second])
     between = between._replace(first=face[between.first], second=face[between.second])
-    soft = between.chosen(between.angle < crease_degrees)
+    soft = between.subset(between.angle < crease_degrees)
     region = connected_component_labels(np.stack([soft.first, soft.second], 1), num_faces)
     region = np.unique(region, return_inverse=True)[1].reshape(-1)
     large = area >= _typical(region, area)[region] / _SMALL
-    sharp = between.chosen(between.angle >= crease_degrees)
+    sharp = between.subset(between.angle >= crease_degrees)
     rim = sum(np.bincount(region[side], sharp.length, region.max() + 1) for side in (sharp.first, sharp.second))
-    soft = soft.chosen(large[soft.first] & large[soft.second])
+    soft = soft.subset(large[soft.first] & large[soft.second])
     of_region, count = region[soft.first], region.max() + 1
     length = np.maximum(np.bincount(of_region, soft.length, count), np.finfo(float).tiny)
     several = np.bincount(region, area * large * (num_triangles > 1), count) / np.bincount(region, area * large, count)

@@ -17,7 +17,7 @@ from torch import Tensor
 from nerfro.core.errors import NerfroError, warn
 from nerfro.core.paths import resolve_path
 from nerfro.files.cache import cached_arrays, content_hash
-from nerfro.geometry.bodies import require_separate
+from nerfro.geometry.bodies import require_separate, require_simple
 from nerfro.geometry.facets import CREASE_DEGREES, facets_of
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.geometry.signed_distance import signed_distance_grid
@@ -132,6 +132,7 @@ class MeshSurface(Surface):
         self.mesh, self.bounds = mesh, mesh.bounds
         if mesh.is_closed:
             require_separate(mesh)
+            require_simple(mesh)
 
     def distances(self, grid: Grid) -> Float[np.ndarray, "X Y Z"]:
         return cached_distances(self.mesh, grid)
