@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +12,11 @@ from trimesh.exchange.gltf import export_glb
 from nerfro.core.errors import NerfroError
 from nerfro.exports.meshes import glass_meshes, inside_mesh
 from nerfro.files.atomic import write_atomically
+from nerfro.geometry.gltf import Z_UP_TO_Y_UP
 from nerfro.media.material import Dispersion
 from nerfro.viewing.changes import absorption_of
 from nerfro.viewing.exports import EXPORTS, Export, ExportConfig
 from nerfro.viewing.trained_scene import TrainedScene
-
-# The y axis is up in glTF, and the z axis in nerfro.
-_Z_UP_TO_Y_UP = trimesh.transformations.rotation_matrix(-math.pi / 2, [1, 0, 0])
 
 
 def write_mesh(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
@@ -64,9 +61,10 @@ def _encode_glb(scene: TrainedScene, glass: list[trimesh.Trimesh], inside: trime
                 document["bufferViews"][document["accessors"][accessor]["bufferView"]]["target"] = _VERTICES
             document["bufferViews"][document["accessors"][primitive["indices"]]["bufferView"]]["target"] = _INDICES
 
-    document = trimesh.Scene()
+    document, turn = trimesh.Scene(), np.eye(4)
+    turn[:3, :3] = Z_UP_TO_Y_UP
     for name, mesh in meshes.items():
-        document.add_geometry(mesh, geom_name=name, node_name=name, transform=_Z_UP_TO_Y_UP)
+        document.add_geometry(mesh, geom_name=name, node_name=name, transform=turn)
     return export_glb(document, include_normals=True, tree_postprocessor=add_materials)
 
 

@@ -1,17 +1,20 @@
-"""Connected closed surfaces of one mesh, and the check for crossing surfaces."""
+"""Connected closed surfaces of one mesh, and the checks for surfaces that cross each other or themselves."""
 
 from __future__ import annotations
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from nerfro.core.errors import NerfroError
 from nerfro.geometry.intersection import MeshIntersector
 from nerfro.geometry.mesh import TriangleMesh
+from nerfro.geometry.orientation import area_vectors
 
 _MARGIN = 1e-3  # fraction of an edge; surfaces that touch at the ends of an edge do not cross
+_NUM_POINTS = 4096  # on the surface, at which winding numbers are computed
+_MOST_BURIED = 0.002  # share of a surface inside itself that is accepted, such as folds of a scan
 _TOUCHING = 1e-5  # fraction of the mesh's extent; points closer to a surface along a line lie on the surface
 
 
@@ -46,6 +49,44 @@ def require_separate(mesh: TriangleMesh) -> None:
             )
 
 
+def require_simple(mesh: TriangleMesh) -> None:
+    """Raise an error if a part of a closed surface lies inside the same surface, where it would act as a cavity.
+
+    At such points the winding number is 2 or more. Without Embree, nothing is checked.
+
+    Args:
+        mesh: world units; the outer surface faces outwards, and the surface of a cavity faces the cavity.
+    """
+    points, inwards = points_below(mesh, _NUM_POINTS)
+    extent = np.ptp(mesh.bounds, axis=0).max()
+    try:
+        triangles = MeshIntersector((mesh.triangles - mesh.bounds.mean(0)) / extent)
+    except NerfroError:  # without Embree
+        return
+    points = (points - torch.from_numpy(mesh.bounds.mean(0))) / extent
+    # Where faces of two bodies coincide, Embree finds one of them; the line in the other direction avoids them.
+    windings = torch.stack([_crossings(triangles, points, sign * inwards)[1] for sign in (1, -1)])
+    buried = (windings.abs() >= 2).all(0).double().mean().item()
+    if buried > _MOST_BURIED:
+        raise NerfroError(
+            f"the surface of the mesh crosses itself: {buried:.1%} of the surface bounds a part that is inside twice, "
+            "which would act as a cavity; unite the parts (boolean union, or voxel remesh in Blender), or give the "
+            "parts as bodies={NAME: {mesh: FILE, ior: 1.5}, ...}"
+        )
+
+
+def points_below(mesh: TriangleMesh, count: int) -> tuple[Float[Tensor, "points 3"], Float[Tensor, "points 3"]]:
+    """Return random points just below a closed surface, uniform in area, and unit vectors inwards."""
+    triangles, normals = mesh.triangles, area_vectors(mesh.triangles)
+    size = np.linalg.norm(normals, axis=1)
+    generator = np.random.default_rng(0)
+    face = generator.choice(len(size), count, p=size / size.sum())
+    weights = generator.dirichlet(np.ones(3), count)
+    inwards = -normals[face] / size[face, None]
+    below = (weights[..., None] * triangles[face]).sum(1) + 3 * _TOUCHING * np.ptp(mesh.bounds, 0).max() * inwards
+    return torch.from_numpy(below), torch.from_numpy(inwards)
+
+
 def _are_crossed(others: MeshIntersector, own: Float[np.ndarray, "F 3 3"]) -> bool:
     """Return whether an edge of a surface crosses a triangle; the test finds crossings of any thickness."""
     start, end = (torch.from_numpy(own[:, corners].reshape(-1, 3)) for corners in ([0, 1, 2], [1, 2, 0]))
@@ -73,20 +114,22 @@ def _is_on_one_side(others: MeshIntersector, own: Float[np.ndarray, "F 3 3"]) ->
     points = torch.from_numpy(np.einsum("nfc,fcx->nfx", weights, some).reshape(-1, 3))
     lines = torch.nn.functional.normalize(torch.from_numpy(generator.normal(size=(3, 3))), dim=-1)
     # For points on a surface, the parities of the two directions differ.
-    odd = torch.stack([_are_met_oddly(others, points, sign * line) for line in lines for sign in (1, -1)])
+    met = [_crossings(others, points, (sign * line).expand_as(points))[0] for line in lines for sign in (1, -1)]
+    odd = torch.stack(met) % 2 == 1
     return bool(odd.all(0).any() != (~odd).all(0).any())
 
 
-def _are_met_oddly(
-    others: MeshIntersector, points: Float[Tensor, "points 3"], along: Float[Tensor, "3"]
-) -> Bool[Tensor, " points"]:
-    """Return whether the line from each point crosses an odd number of triangles."""
-    odd, left = torch.zeros(len(points), dtype=torch.bool), torch.arange(len(points))
-    origin = points + _TOUCHING * along
+def _crossings(
+    triangles: MeshIntersector, points: Float[Tensor, "points 3"], along: Float[Tensor, "points 3"]
+) -> tuple[Int[Tensor, " points"], Int[Tensor, " points"]]:
+    """Return how many triangles the line from each point crosses, and the winding number at the point."""
+    count, winding = torch.zeros(2, len(points), dtype=torch.long)
+    left, origin = torch.arange(len(points)), points + _TOUCHING * along
     while len(left):
-        hit = others.first_hits(origin, along.repeat(len(origin), 1))
+        hit = triangles.first_hits(origin, along[left])
         left, origin, hit = left[hit >= 0], origin[hit >= 0], hit[hit >= 0]
-        odd[left] ^= True
-        distance = others.distance(origin, along, hit)
-        origin = origin + (distance.clamp(min=0) + _TOUCHING)[:, None] * along
-    return odd
+        count[left] += 1
+        winding[left] += (triangles.areas(hit) * along[left]).sum(-1).sign().long()
+        distance = triangles.distance(origin, along[left], hit)
+        origin = origin + (distance.clamp(min=0) + _TOUCHING)[:, None] * along[left]
+    return count, winding

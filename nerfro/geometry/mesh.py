@@ -13,7 +13,9 @@ from jaxtyping import Float, Int
 from nerfro.core.errors import NerfroError
 from nerfro.files.atomic import write_atomically
 from nerfro.files.reading import reading
+from nerfro.geometry.facets import CREASE_DEGREES
 from nerfro.geometry.file_normals import informative_normals
+from nerfro.geometry.gltf import Z_UP_TO_Y_UP, is_gltf, require_readable
 from nerfro.geometry.orientation import area_vectors, inward_faces
 from nerfro.registry.allowed import Coordinate, check
 
@@ -27,11 +29,16 @@ class TriangleMesh:
         faces: vertex indices of each triangle.
         normals: unit normals at the corners of the triangles, or zero, if the normals of the file are more accurate
             than the triangles; else None.
+        facets: number of the flat facet of each triangle, -1 for triangles of smooth surfaces; None if all are smooth.
+            Normals are not smooth across the edges of facets.
+        crease_degrees: edges with larger angles between their faces are sharp.
     """
 
     vertices: Float[np.ndarray, "vertices 3"]
     faces: Int[np.ndarray, "F 3"]
     normals: Float[np.ndarray, "F 3 3"] | None = None
+    facets: Int[np.ndarray, "F"] | None = None
+    crease_degrees: float = CREASE_DEGREES
 
     @property
     def triangles(self) -> Float[np.ndarray, "F 3 3"]:
@@ -98,6 +105,8 @@ def origin_of_file(path: Path) -> Float[np.ndarray, "3"]:
 def load_mesh(path: Path, accept_open_mesh: bool = False) -> TriangleMesh:
     """Read a triangle mesh in any format of trimesh (ply, obj, stl, glb, ...) and merge duplicate vertices.
 
+    glTF files, whose y axis is up, are turned so that the z axis is up.
+
     Args:
         path: mesh file.
         accept_open_mesh: whether a mesh with holes is accepted.
@@ -105,6 +114,7 @@ def load_mesh(path: Path, accept_open_mesh: bool = False) -> TriangleMesh:
     Raises:
         NerfroError: the file is missing, unreadable, empty, not finite, or has unaccepted holes.
     """
+    turn = Z_UP_TO_Y_UP if is_gltf(path) else np.eye(3)
     missing = "set medium.mesh to a closed triangle mesh (ply, obj, stl, glb)"
     with reading(path, "mesh ", advice="export it as ply, obj, stl or glb", missing=missing):
         loaded = _parse(path)
@@ -114,6 +124,7 @@ def load_mesh(path: Path, accept_open_mesh: bool = False) -> TriangleMesh:
         raise NerfroError(f"mesh {path} has no triangles; export a surface instead of a point cloud or an empty scene")
     if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
         raise NerfroError(f"mesh {path} is not made of triangles of points with three coordinates; export it again")
+    vertices = vertices @ turn
     if not np.isfinite(vertices).all():
         raise NerfroError(f"mesh {path} has vertices that are not finite; export it again")
     if faces.min() < 0 or faces.max() >= len(vertices):
@@ -133,7 +144,8 @@ def load_mesh(path: Path, accept_open_mesh: bool = False) -> TriangleMesh:
         raise NerfroError(f"mesh {path} has normals of shape {list(read.shape)} for its vertices; export it again")
     if read is not None:
         length = np.linalg.norm(read, axis=-1, keepdims=True)
-        read = np.divide(read, length, out=np.zeros(read.shape), where=np.isfinite(length) & (length > 0))[faces]
+        read = np.divide(read, length, out=np.zeros(read.shape), where=np.isfinite(length) & (length > 0))
+        read = (read @ turn)[faces]
     mesh = _facing_outwards(merge_vertices(vertices, faces, read))
     if not accept_open_mesh and not mesh.is_closed:
         raise NerfroError(
@@ -165,13 +177,16 @@ def load_points(path: Path) -> Float[np.ndarray, "points 3"]:
         NerfroError: the file cannot be read.
     """
     with reading(path, trouble="has no readable points", advice="export it again, or remove it"):
-        return np.asarray(_parse(path).vertices, np.float64).reshape(-1, 3)
+        points = np.asarray(_parse(path).vertices, np.float64).reshape(-1, 3)
+    return points @ Z_UP_TO_Y_UP if is_gltf(path) else points
 
 
 def _parse(path: Path) -> Any:
     """Read a file with trimesh; scenes of several bodies become one mesh."""
     import trimesh
 
+    if is_gltf(path):
+        require_readable(path)
     loaded: Any = trimesh.load(path, process=False)
     return loaded.to_mesh() if isinstance(loaded, trimesh.Scene) else loaded
 

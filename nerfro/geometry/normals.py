@@ -7,18 +7,16 @@ from jaxtyping import Float
 
 from nerfro.geometry.mesh import TriangleMesh
 
-# Edges with larger angles between their faces stay sharp, in degrees; 30 is a common default of modelling programs.
-CREASE_DEGREES = 30.0
-
 
 def corner_normals(mesh: TriangleMesh) -> Float[np.ndarray, "F 3 3"]:
     """Compute the unit normal at each corner of each triangle, smooth up to creases.
 
-    Informative normals of the mesh file (see `informative_normals`) are used if they lie within the crease angle
-    `CREASE_DEGREES` of the face. Otherwise the normal is the mean normal of the faces around the vertex whose normals
-    are within the crease angle of the corner's face. The weights are |e1 x e2| / (|e1|^2 |e2|^2) with the edges e1 and
-    e2 at the vertex, which is exact for spheres. Where a large face meets much smaller faces, for example a flat side
-    and a rounded edge, the weights are the areas, because the normal of the large face is the accurate one.
+    Informative normals of the mesh file (see `informative_normals`) are used if they lie within the crease angle of the
+    mesh from the normal of the face. Otherwise the normal is the mean normal of the faces around the vertex whose
+    normals are within the crease angle of the corner's face and that belong to the same facet. The weights are
+    |e1 x e2| / (|e1|^2 |e2|^2) with the edges e1 and e2 at the vertex, which is exact for spheres. Where a large face
+    meets much smaller faces, for example a flat side and a rounded edge, the weights are the areas, because the normal
+    of the large face is the accurate one.
 
     Source:
         N. Max, "Weights for computing vertex normals from facet normals", Journal of Graphics Tools 4(2), 1999.
@@ -31,7 +29,7 @@ def corner_normals(mesh: TriangleMesh) -> Float[np.ndarray, "F 3 3"]:
     areas = np.linalg.norm(crosses, axis=-1).ravel()
     lengths = ((forward**2).sum(-1) * (backward**2).sum(-1)).ravel()
     weights = np.divide(areas, lengths, out=np.zeros(areas.shape), where=lengths > 0)
-    cosine = np.cos(np.radians(CREASE_DEGREES))
+    cosine = np.cos(np.radians(mesh.crease_degrees))
     # All pairs of corners that share a vertex: corners are sorted by vertex, and each is paired with all of its group.
     corner_vertex = mesh.faces.reshape(-1)
     order = np.argsort(corner_vertex, kind="stable")
@@ -42,6 +40,9 @@ def corner_normals(mesh: TriangleMesh) -> Float[np.ndarray, "F 3 3"]:
     within = np.arange(group_sizes.sum()) - np.repeat(group_starts, group_sizes)
     second = order[np.repeat(starts[corner_vertex], group_sizes) + within]
     smooth = (flat[first // 3] * flat[second // 3]).sum(1) >= cosine
+    if mesh.facets is not None:
+        facet, other = mesh.facets[first // 3], mesh.facets[second // 3]
+        smooth &= (facet == other) | (facet < 0) | (other < 0)
     group_areas = np.where(smooth, areas[second], areas[first])
     # If the triangles around a vertex differ in size by more than this factor, areas are the weights.
     uneven = np.maximum.reduceat(group_areas, group_starts) > 8.0 * np.minimum.reduceat(group_areas, group_starts)

@@ -33,7 +33,7 @@ def signed_distance_grid(
 
     which is exact to second order in the size of the triangle for any curvature. Facets of a finely tessellated curved
     surface are therefore invisible. Farther away, the value is a lower bound of the distance that is at most sqrt(3)
-    voxels too small. Edges with angles above `CREASE_DEGREES` stay sharp.
+    voxels too small. Creases and edges of facets stay sharp.
 
     Args:
         mesh: world units. The inside of an open mesh is decided as in `occupancy_fraction`.

@@ -16,11 +16,12 @@ from nerfro.core.paths import resolve_path
 from nerfro.geometry.mesh import local_origin, origin_of_file
 from nerfro.media.bodies import Bodies, Body, GridSettings
 from nerfro.media.material import Abbe, Learns, Material, find_material, learned_quantities
-from nerfro.media.surface import make_surface
+from nerfro.media.surface import CreaseAngle, Shading, make_surface
 from nerfro.registry.allowed import NotNegative, Positive, Resolution, validate
 from nerfro.registry.registration import register
 
 _LEARNED = ("ior", "absorption")
+SHADING = ("shading", "crease_degrees")  # settings of a mesh, of a body or of the medium
 
 
 @dataclass
@@ -37,6 +38,9 @@ class BodySettings:
         priority: where bodies overlap, the one with the highest priority decides; of equal ones the last.
         learn: quantities that are learned in training: `ior`, `absorption`; an empty list for none. By default those of
             `medium.learn_ior` and `medium.learn_absorption`.
+        shading: whether the triangles of the mesh are samples of a `smooth` surface or `flat`; by default
+            `medium.shading`.
+        crease_degrees: edges with larger angles between their triangles are sharp; by default `medium.crease_degrees`.
     """
 
     mesh: str | None = None
@@ -47,20 +51,23 @@ class BodySettings:
     absorption: list[NotNegative] = dataclasses.field(default_factory=list)
     priority: int = 0
     learn: list[str] | None = None
+    shading: Shading | None = None
+    crease_degrees: CreaseAngle | None = None
 
 
 def expanded(medium: Mapping[str, Any]) -> dict[str, BodySettings]:
     """Return the settings of each body of a medium, in ascending order of priority.
 
     `mesh` and `ior` of the medium are short for one body with the name `object`; with `bodies`, `mesh` is the surface
-    of bodies that have none.
+    of bodies that have none. `shading` and `crease_degrees` of the medium are those of meshes that have neither.
 
     Raises:
         NerfroError: a setting is unknown or not allowed.
     """
     bodies, mesh = medium.get("bodies"), medium.get("mesh")
     if bodies is None:
-        return {} if mesh is None else {"object": BodySettings(mesh=str(mesh), ior=medium.get("ior"))}
+        body = BodySettings(mesh=None if mesh is None else str(mesh), ior=medium.get("ior"))
+        return {} if mesh is None else {"object": _with_shading(body, medium)}
     if not isinstance(bodies, Mapping):
         raise NerfroError(f"bodies={bodies} is not a mapping; write bodies={{NAME: {{mesh: FILE, ior: 1.5}}}}")
     if not bodies:
@@ -69,7 +76,14 @@ def expanded(medium: Mapping[str, Any]) -> dict[str, BodySettings]:
     if mesh is not None:
         own = {name: body for name, body in settings.items() if body.mesh is not None or body.surface is not None}
         settings = {name: dataclasses.replace(body, mesh=str(mesh)) for name, body in settings.items()} | own
+    settings = {name: _with_shading(body, medium) for name, body in settings.items()}
     return dict(sorted(settings.items(), key=lambda item: item[1].priority))
+
+
+def _with_shading(body: BodySettings, medium: Mapping[str, Any]) -> BodySettings:
+    if body.mesh is None or body.shading is not None or body.crease_degrees is not None:
+        return body
+    return dataclasses.replace(body, **{name: medium.get(name) for name in SHADING})
 
 
 def surfaces_of(medium: Any) -> list[Mapping[str, Any]]:
@@ -101,6 +115,8 @@ def make_bodies(
     learn_absorption: Learns = False,
     cache: bool = True,
     bodies: dict[str, Any] | None = None,
+    shading: Shading = "auto",
+    crease_degrees: CreaseAngle | None = None,
 ) -> Bodies:
     """Make bodies of constant index with closed surfaces, which are sharp for `snell` and thin shells for `eikonal`.
 
@@ -117,10 +133,16 @@ def make_bodies(
         learn_ior: refine the refractive indices of all bodies without a setting `learn` in training.
         learn_absorption: learn the absorption of the same bodies; only for `sampler/path=snell`.
         cache: keep the distances in the cache folder.
-        bodies: bodies by name, with the settings mesh or surface, ior or material, abbe, absorption, priority and learn
-            of each (`media.body_settings.BodySettings`); replaces `ior`.
+        bodies: bodies by name, with the settings mesh or surface, ior or material, abbe, absorption, priority, learn,
+            shading and crease_degrees of each (`media.body_settings.BodySettings`); replaces `ior`.
+        shading: whether the triangles of meshes are samples of a `smooth` surface or `flat`; `auto` decides for each
+            face.
+        crease_degrees: edges with larger angles between their triangles are sharp. If it is given, `auto` looks for no
+            facets; by default 30.
     """
-    settings = expanded({"mesh": mesh, "ior": ior, "bodies": bodies})
+    settings = expanded(
+        {"mesh": mesh, "ior": ior, "bodies": bodies, "shading": shading, "crease_degrees": crease_degrees}
+    )
     if not settings:
         raise NerfroError("medium=sdf_grid needs mesh; add medium.mesh=..., or bodies={NAME: {mesh: FILE, ior: 1.5}}")
     learn = learned_quantities(learn_ior, learn_absorption)
@@ -151,9 +173,12 @@ def surface_settings(name: str, body: BodySettings) -> Mapping[str, Any]:
     if body.surface is None:
         if body.mesh is None:
             raise NerfroError(f"bodies.{name} needs a mesh; add bodies.{name}.mesh=FILE")
-        return {"name": "mesh", "file": body.mesh}
+        shading = {name: getattr(body, name) for name in SHADING if getattr(body, name) is not None}
+        return {"name": "mesh", "file": body.mesh} | shading
     if body.mesh is not None or not isinstance(body.surface, Mapping):
         raise NerfroError(f"bodies.{name} needs one of mesh and surface; write surface: {{name: ball, radius: 1}}")
+    if body.shading is not None or body.crease_degrees is not None:
+        raise NerfroError(f"shading and crease_degrees of bodies.{name} belong to its surface; write them in surface:")
     return body.surface
 
 

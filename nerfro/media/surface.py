@@ -5,24 +5,29 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import cache
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
+from annotated_types import Gt, Le
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerfro.core.errors import NerfroError
+from nerfro.core.errors import NerfroError, warn
 from nerfro.core.paths import resolve_path
 from nerfro.files.cache import cached_arrays, content_hash
-from nerfro.geometry.bodies import require_separate
+from nerfro.geometry.bodies import require_separate, require_simple
+from nerfro.geometry.facets import CREASE_DEGREES, facets_of
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.geometry.signed_distance import signed_distance_grid
 from nerfro.media.distance_grid import BAND, DistanceGrid
 from nerfro.registry.registration import create, discover, find, register
 
+Shading = Literal["auto", "smooth", "flat"]
+CreaseAngle = Annotated[float, Gt(0), Le(180)]
 # Part of the cache key. Increase it when the same mesh and settings give different distances.
-_VERSION = 3
+_VERSION = 4
 
 
 @dataclass(frozen=True)
@@ -106,20 +111,54 @@ class MeshSurface(Surface):
     Args:
         file: mesh in world units, any format trimesh reads.
         accept_open_mesh: accept a mesh with holes. Rays along three axes decide by majority whether a point is inside.
+        shading: whether the triangles are samples of a `smooth` surface or `flat`; `auto` decides for each face.
+        crease_degrees: edges with larger angles between their triangles are sharp. If it is given, `auto` looks for no
+            facets; by default 30.
     """
 
     mesh: TriangleMesh
 
-    def __init__(self, file: str, accept_open_mesh: bool = False) -> None:
-        self._set(load_mesh(resolve_path(file), accept_open_mesh))
+    def __init__(
+        self,
+        file: str,
+        accept_open_mesh: bool = False,
+        shading: Shading = "auto",
+        crease_degrees: CreaseAngle | None = None,
+    ) -> None:
+        mesh = load_mesh(resolve_path(file), accept_open_mesh)
+        self._set(_shaded(mesh, file, shading, crease_degrees))
 
     def _set(self, mesh: TriangleMesh) -> None:
         self.mesh, self.bounds = mesh, mesh.bounds
         if mesh.is_closed:
             require_separate(mesh)
+            require_simple(mesh)
 
     def distances(self, grid: Grid) -> Float[np.ndarray, "X Y Z"]:
         return cached_distances(self.mesh, grid)
+
+
+def _shaded(mesh: TriangleMesh, file: str, shading: Shading, crease_degrees: float | None) -> TriangleMesh:
+    """Mark the facets of a mesh; see `MeshSurface`."""
+    if shading == "flat":
+        if crease_degrees is not None:
+            raise NerfroError(
+                f"crease_degrees={crease_degrees:g} contradicts shading=flat of {file}, with which all edges are "
+                "sharp; remove one of them"
+            )
+        return replace(mesh, normals=None, facets=np.arange(len(mesh.faces)))
+    mesh = replace(mesh, crease_degrees=CREASE_DEGREES if crease_degrees is None else crease_degrees)
+    if shading == "smooth" or crease_degrees is not None:
+        return mesh
+    number, doubt = facets_of(mesh.vertices, mesh.faces)
+    if mesh.normals is not None:
+        number = np.where(mesh.normals.any((1, 2)), -1, number)
+    elif doubt:
+        _warn_once(f"{file}: {doubt}; set shading=smooth or shading=flat of the body (bodies.NAME.shading)")
+    return replace(mesh, facets=number) if (number >= 0).any() else mesh
+
+
+_warn_once = cache(warn)  # several stages of a command read the same mesh
 
 
 def cached_distances(
@@ -127,9 +166,12 @@ def cached_distances(
 ) -> Float[np.ndarray, "X Y Z"]:
     """Compute the signed distances to a mesh (`signed_distance_grid`), or load them from the cache folder."""
     normals = "none" if mesh.normals is None else mesh.normals
+    facets = "none" if mesh.facets is None else mesh.facets
     settings = grid.box, grid.resolution, grid.band
     left_out = () if lid is None else (lid,)
-    key = "distance_" + content_hash(_VERSION, mesh.vertices, mesh.faces, normals, *settings, *left_out)
+    key = "distance_" + content_hash(
+        _VERSION, mesh.vertices, mesh.faces, normals, facets, mesh.crease_degrees, *settings, *left_out
+    )
     arrays = cached_arrays(key, lambda: {"distance": signed_distance_grid(mesh, *settings, *left_out)}, grid.cache)
     return arrays["distance"]
 

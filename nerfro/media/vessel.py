@@ -16,10 +16,10 @@ from nerfro.geometry.bodies import bodies_of
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.geometry.orientation import area_vectors
 from nerfro.media.bodies import Bodies, Body, GridSettings
-from nerfro.media.body_settings import BodySettings, expanded, make_material
+from nerfro.media.body_settings import SHADING, BodySettings, expanded, make_material
 from nerfro.media.distance_grid import DistanceGrid
 from nerfro.media.material import Learns, Material, learned_quantities
-from nerfro.media.surface import Grid, MeshSurface, Surface, cached_distances, direction
+from nerfro.media.surface import CreaseAngle, Grid, MeshSurface, Shading, Surface, cached_distances, direction
 from nerfro.registry.allowed import Coordinate, NotNegative, Positive, Resolution
 from nerfro.registry.registration import register
 
@@ -252,6 +252,8 @@ def make_vessel(
     fillet: NotNegative = 0.0,
     glass: dict[str, Any] | None = None,
     liquid: dict[str, Any] | None = None,
+    shading: Shading = "auto",
+    crease_degrees: CreaseAngle | None = None,
 ) -> Bodies:
     """Make a drinking glass or a bottle from its outer surface and a few lengths; see `vessel`.
 
@@ -270,7 +272,8 @@ def make_vessel(
         liquid_ior: refractive index of the liquid; 1 for an empty vessel.
         up: direction from the bottom to the top, world axes; its length does not matter.
         height: outer height of the vessel, in the unit of the other lengths.
-        resolution, box_min, box_max, shell_voxels, accept_open_mesh, cache: see `medium=sdf_grid`.
+        resolution, box_min, box_max, shell_voxels, accept_open_mesh, cache, shading, crease_degrees: see
+            `medium=sdf_grid`.
         learn_absorption: learn the absorption.
         fillet: radius of the rounded edge between wall and foot inside the vessel.
         glass, liquid: settings of the materials in place of `ior` and `liquid_ior`: ior or material, abbe, absorption
@@ -281,12 +284,13 @@ def make_vessel(
     named = {name: values for name, values in (("wall", glass), ("liquid", liquid)) if values is not None}
     settings = {"wall": BodySettings(ior=ior), "liquid": BodySettings(ior=liquid_ior)}
     settings |= expanded({"bodies": named}) if named else {}
-    if any(body.mesh is not None or body.surface is not None for body in settings.values()):
-        raise NerfroError("medium.glass and medium.liquid describe materials; remove their mesh and surface")
+    of_surfaces = [getattr(body, name) for body in settings.values() for name in ("mesh", "surface", *SHADING)]
+    if any(value is not None for value in of_surfaces):
+        raise NerfroError("medium.glass and medium.liquid describe materials; remove their mesh, surface and shading")
     learn = learned_quantities(False, learn_absorption)
     materials = {name: make_material(name, body, learn) for name, body in settings.items()}
     is_empty = settings["liquid"].ior == 1 and not settings["liquid"].absorption
-    outer = MeshSurface(mesh, accept_open_mesh)
+    outer = MeshSurface(mesh, accept_open_mesh, shading, crease_degrees)
     low, high = extent(outer, direction("medium.up", up))
     unit = 1.0 if height is None else (high - low) / height
     lengths = VesselLengths(wall, wall if foot is None else foot, fillet, level, unit)

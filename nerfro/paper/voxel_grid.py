@@ -73,7 +73,7 @@ class VoxelGrid(Medium):
         super().__init__()
         require_bytes(BYTES_PER_VERTEX * resolution**3, f"medium.resolution={resolution}")
         box = corners_of_box(box_min, box_max)
-        loaded = MeshSurface(mesh, accept_open_mesh).mesh
+        loaded = MeshSurface(mesh, accept_open_mesh, "smooth").mesh
         # One voxel for the subsamples, one for the central difference, and the radius of the smoothing kernel.
         check_margin(loaded.bounds, box, resolution, 2 + smoothing_size // 2)
         self.origin = local_origin(loaded.vertices)

@@ -17,7 +17,7 @@ from nerfro.core.paths import EMBEDDED_PREFIX, user_path
 from nerfro.core.provenance import AlgorithmSettings, command_of_process, versions
 from nerfro.files.atomic import write_atomically
 from nerfro.files.reading import read_json
-from nerfro.media.body_settings import BodySettings, expanded
+from nerfro.media.body_settings import SHADING, BodySettings, expanded
 from nerfro.registry.allowed import Count, validate
 
 SCENE = "scene.json"
@@ -149,7 +149,7 @@ class SceneFile:
 
 def take_bodies(medium: dict[str, Any]) -> dict[str, BodySettings]:
     """Remove the bodies from the settings of a medium, and return them."""
-    return expanded({name: medium.pop(name, None) for name in ("mesh", "ior", "bodies")})
+    return expanded({name: medium.pop(name, None) for name in ("mesh", "ior", "bodies", *SHADING)})
 
 
 def read_scene_file(path: Path) -> SceneFile:

@@ -8,7 +8,7 @@ import pytest
 import torch
 import trimesh
 
-from nerfro.geometry.bodies import bodies_of, require_separate
+from nerfro.geometry.bodies import bodies_of, require_separate, require_simple
 from nerfro.geometry.mesh import TriangleMesh, load_mesh, merge_vertices
 from nerfro.media.base import Medium
 from nerfro.media.body_settings import make_bodies
@@ -72,6 +72,42 @@ def test_intersecting_surfaces_are_refused(parts: list[trimesh.Trimesh]) -> None
     mesh = mesh_of(*parts)
     assert bodies_of(mesh).max() == len(parts) - 1
     refused("closed surfaces of the mesh cross", require_separate, mesh)
+
+
+def _coil(turn: float, count: int = 48, sides: int = 12) -> trimesh.Trimesh:
+    """Return a closed tube around a flat helix; beyond 360 degrees its ends overlap."""
+    angle = np.linspace(0, np.radians(turn), count)[:, None]
+    around = np.arange(sides) * 2 * np.pi / sides
+    radius, height = 0.6 + 0.25 * np.cos(around), 0.25 * np.sin(around) + 0.04 * angle
+    rings = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], -1)
+    ends = np.stack([0.6 * np.cos(angle), 0.6 * np.sin(angle), 0.04 * angle], -1)[[0, -1], 0]
+    i, j = np.meshgrid(np.arange(count - 1), np.arange(sides), indexing="ij")
+    a, b = i * sides + j, i * sides + (j + 1) % sides
+    side = np.concatenate([np.stack([a, a + sides, b], -1), np.stack([b, a + sides, b + sides], -1)]).reshape(-1, 3)
+    rim, last = np.arange(sides), (count - 1) * sides
+    after = (rim + 1) % sides
+    first = np.stack([np.full(sides, count * sides), rim, after], -1)
+    end = np.stack([np.full(sides, count * sides + 1), last + after, last + rim], -1)
+    return trimesh.Trimesh(np.concatenate([rings.reshape(-1, 3), ends]), np.concatenate([side, first, end]))
+
+
+def test_surface_that_crosses_itself_is_refused(tmp_path: Path) -> None:
+    for turn in (300, 400):
+        _coil(turn).export(tmp_path / f"{turn}.ply")
+        assert load_mesh(tmp_path / f"{turn}.ply").is_closed
+    make_bodies(str(tmp_path / "300.ply"), resolution=16, cache=False)
+    for medium in (make_bodies, VoxelGrid):
+        refused("the surface of the mesh crosses itself", medium, str(tmp_path / "400.ply"), **BOX)
+
+
+def test_nested_and_touching_surfaces_do_not_cross_themselves(tmp_path: Path) -> None:
+    shapes = [
+        [ball(0.6), ball(0.3, -0.2), ball(0.1, 0.3)], [box(0.5), box(0.5, 0.5)], [box(0.5), box(0.5, 0.5, 0.5)],
+        [trimesh.creation.torus(1.0, 0.3), ball(0.6)],
+    ]  # fmt: skip
+    for number, parts in enumerate(shapes):
+        trimesh.util.concatenate(parts).export(tmp_path / f"{number}.ply")
+        require_simple(load_mesh(tmp_path / f"{number}.ply"))
 
 
 @pytest.mark.parametrize("medium", [make_bodies, VoxelGrid])

@@ -1,13 +1,15 @@
 """Reading meshes, and the messages about bad ones."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
+from trimesh.exchange.gltf import export_glb
 
 from nerfro.core.errors import NerfroError
-from nerfro.geometry.mesh import load_mesh
+from nerfro.geometry.mesh import load_mesh, load_points
 from tests.conftest import refused
 
 
@@ -20,6 +22,45 @@ def test_any_format_gives_the_same_closed_mesh(tmp_path: Path, extension: str) -
     assert mesh.vertices.shape == (162, 3)
     assert mesh.is_closed
     np.testing.assert_allclose(np.linalg.norm(mesh.vertices, axis=1), 0.7, rtol=1e-5)
+
+
+@pytest.mark.parametrize("suffix", ["glb", "gltf"])
+def test_gltf_files_are_turned_from_y_up_to_z_up(
+    suffix: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shape = trimesh.creation.icosphere(2).apply_transform(np.diag([1, 0.6, 0.4, 1])).apply_translation([0.1, 0.2, 0.3])
+    normals = np.array(shape.vertex_normals)
+    shape.export(tmp_path / "z_up.ply", vertex_normal=True)
+    vertices, faces = shape.vertices[:, [0, 2, 1]] * [1, 1, -1], shape.faces
+    y_up = trimesh.Trimesh(vertices, faces, vertex_normals=normals[:, [0, 2, 1]] * [1, 1, -1], process=False)
+    file = tmp_path / f"y_up.{suffix}"
+    trimesh.Scene(y_up).export(file, include_normals=True)
+    expected = load_mesh(tmp_path / "z_up.ply")
+    capsys.readouterr()
+    turned = load_mesh(file)
+    np.testing.assert_allclose(turned.vertices, expected.vertices, atol=1e-6)
+    np.testing.assert_array_equal(turned.faces, expected.faces)
+    assert (turned.normals is None) == (expected.normals is None)
+    np.testing.assert_array_equal(np.unique(load_points(file), axis=0), turned.vertices)
+    out = capsys.readouterr().out
+    assert out.count("(x, -z, y)") == 1
+    assert file.name in out
+
+
+@pytest.mark.parametrize(
+    ("extension", "name"),
+    [("KHR_draco_mesh_compression", "Draco"), ("EXT_meshopt_compression", "meshopt"),
+     ("KHR_mesh_quantization", "quantized positions")],
+)  # fmt: skip
+def test_compressed_gltf_is_refused(extension: str, name: str, tmp_path: Path) -> None:
+    def compressed(tree: dict[str, Any]) -> None:
+        tree["extensionsUsed"] = tree["extensionsRequired"] = [extension]
+
+    scene = trimesh.Scene(trimesh.creation.box())
+    (tmp_path / "a.glb").write_bytes(export_glb(scene, tree_postprocessor=compressed))
+    refused(
+        rf"a\.glb is compressed by {name} \({extension}\).*export it without compression", load_mesh, tmp_path / "a.glb"
+    )
 
 
 def test_files_without_triangles_or_with_nan_are_named(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from PIL import Image
 
 from nerfro.core.errors import NerfroError
 from nerfro.core.light import to_linear, to_srgb
+from nerfro.geometry.mesh import load_mesh
 from nerfro.geometry.space import Box
 from nerfro.media.body_settings import make_bodies
 from nerfro.samplers.subdivision import Subdivision
@@ -48,6 +49,10 @@ def test_glb_contains_glass_as_dielectric_and_the_content_as_emission(scene: Tra
         assert (cosine > 0).all(), "and so do normals"
     expected = colour(torch.from_numpy(np.asarray(inside.vertices)))
     np.testing.assert_allclose(inside.visual.vertex_attributes["color"], expected, atol=1e-4)
+    # The file is turned on import as on export.
+    again = load_mesh(tmp_path / "ball.glb", accept_open_mesh=True).vertices
+    written = np.unique(np.concatenate([glass.vertices, inside.vertices]), axis=0)
+    np.testing.assert_array_equal(np.unique(again, axis=0), written)
     content = (tmp_path / "ball.glb").read_bytes()
     document = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
     materials = {material["name"]: material for material in document["materials"]}

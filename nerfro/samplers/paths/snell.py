@@ -110,7 +110,8 @@ class Snell(PathSampler):
 
     Args:
         interface: `sdf` is the zero level of the signed distance, with smooth normals and tolerance of noisy hulls;
-            `mesh` is the triangles, with sharp edges, and vertex normals where the mesh is smooth.
+            `mesh` is the triangles, with sharp edges, and smooth normals where the triangles sample a smooth surface
+            (`shading` of the body).
         max_events: largest number of refractions and reflections of a ray.
         branches: `none` transmits all light that is not totally reflected, as the paper does; `first` adds the
             reflection at the first surface of a ray; `all` adds all reflections.

@@ -1,0 +1,159 @@
+"""Flat facets of a mesh, such as those of a cut stone, in contrast to triangles that sample a smooth surface."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from nerfro.geometry.orientation import area_vectors
+
+# Edges with larger angles between their faces stay sharp, in degrees; 30 is a common default of modelling programs.
+CREASE_DEGREES = 30.0
+_COPLANAR = 0.1  # degrees between triangles of one flat face
+_SMALL = 20  # times smaller than most of a region, a face belongs to a rounded edge
+_LEAST_SHARE = 0.05  # of the area of the mesh; smaller regions stay smooth
+_MIXED = 0.25  # share of the edges, by length, at which neither two triangles nor two quadrilaterals meet
+_RIM = 0.1  # length of sharp edges around a region relative to the edges within it
+# Angles between faces, in degrees: cylinders of modelling programs have 30 or more sides.
+_LEAST_TURN, _DOUBTFUL_TURN, _FACETED_TURN = 2.0, 8.0, 12.5
+
+
+class Facets(NamedTuple):
+    """Flat facets of a mesh.
+
+    Attributes:
+        number: number of the facet of each triangle; -1 for triangles of smooth surfaces.
+        doubt: description of faces that may be facets or samples of a smooth surface; empty if there are none.
+    """
+
+    number: Int[np.ndarray, "F"]
+    doubt: str
+
+
+class _Edges(NamedTuple):
+    """Edges between two triangles: both triangles, the angle between them in degrees, and the length."""
+
+    first: Int[np.ndarray, " edges"]
+    second: Int[np.ndarray, " edges"]
+    angle: Float[np.ndarray, " edges"]
+    length: Float[np.ndarray, " edges"]
+
+    def subset(self, rows: Bool[np.ndarray, " edges"]) -> _Edges:
+        return _Edges(*(column[rows] for column in self))
+
+
+def facets_of(
+    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "F 3"], crease_degrees: float = CREASE_DEGREES
+) -> Facets:
+    """Decide which faces of a mesh are facets with sharp edges, where the angles alone do not decide.
+
+    Coplanar triangles form flat faces. A region consists of faces that are connected by edges below the crease angle.
+    Samples of a smooth surface give triangles or a regular grid of quadrilaterals, whereas facets have different
+    numbers of corners. Faces of a region are therefore facets if most of the region consists of faces of several
+    triangles and many edges lie between faces of different numbers of corners. Rings and grids of large quadrilaterals
+    that end at sharp edges are ambiguous, for example a tumbler of 20 sides; they are facets if the faces meet at 12.5
+    degrees or more. Faces much smaller than the others belong to rounded edges.
+
+    Args:
+        vertices: world units; equal positions must be merged.
+        faces: vertex indices of each triangle, outward faces counter-clockwise.
+        crease_degrees: angle above which edges are sharp anyway.
+    """
+    from trimesh.graph import connected_component_labels
+
+    edges, size = _edges(vertices, faces), 0.5 * np.linalg.norm(area_vectors(vertices[faces]), axis=1)
+    face = _flat_faces(vertices, faces, edges)
+    num_faces = int(face.max()) + 1
+    area, num_triangles, corners = np.bincount(face, size), np.bincount(face), _num_corners(faces, face)
+    between = edges.subset(face[edges.first] != face[edges.second])
+    between = between._replace(first=face[between.first], second=face[between.second])
+    soft = between.subset(between.angle < crease_degrees)
+    region = connected_component_labels(np.stack([soft.first, soft.second], 1), num_faces)
+    region = np.unique(region, return_inverse=True)[1].reshape(-1)
+    large = area >= _typical(region, area)[region] / _SMALL
+    sharp = between.subset(between.angle >= crease_degrees)
+    rim = sum(np.bincount(region[side], sharp.length, region.max() + 1) for side in (sharp.first, sharp.second))
+    soft = soft.subset(large[soft.first] & large[soft.second])
+    of_region, count = region[soft.first], region.max() + 1
+    length = np.maximum(np.bincount(of_region, soft.length, count), np.finfo(float).tiny)
+    several = np.bincount(region, area * large * (num_triangles > 1), count) / np.bincount(region, area * large, count)
+    alike = (corners[soft.first] == corners[soft.second]) & (corners[soft.first] <= 4)
+    mixed = np.bincount(of_region, soft.length * ~alike, count) / length
+    turn, is_strip = _turn(soft, region, length)
+    decided = (np.bincount(region, area) >= _LEAST_SHARE * area.sum()) & (turn >= _LEAST_TURN)
+    is_polygonal, ends = is_strip | (several >= 0.5), rim >= _RIM * length
+    is_cut = decided & (several >= 0.5) & (mixed >= _MIXED)
+    ambiguous = decided & ~is_cut & (is_polygonal | ends) & (turn >= _DOUBTFUL_TURN)
+    is_faceted = is_cut | (ambiguous & is_polygonal & ends & (turn >= _FACETED_TURN))
+    if is_faceted.any():  # a body that has facets has facets on all sides
+        is_faceted |= (turn >= _LEAST_TURN) & is_polygonal & ends
+    number = np.where(is_faceted[region] & large, np.arange(num_faces), -1)[face]
+    if not ambiguous.any():
+        return Facets(number, "")
+    worst = np.where(ambiguous, np.bincount(region, area), 0).argmax()
+    return Facets(
+        number,
+        f"{(region == worst).sum()} flat faces that meet at about {turn[worst]:.0f} degrees may be facets or samples "
+        f"of a smooth surface, and are traced as {'flat' if is_faceted[worst] else 'smooth'}",
+    )
+
+
+def _edges(vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "F 3"]) -> _Edges:
+    start, end = faces.reshape(-1), np.roll(faces, -1, 1).reshape(-1)
+    key = np.minimum(start, end) * (faces.max() + 1) + np.maximum(start, end)
+    order = np.argsort(key, kind="stable")
+    first = np.flatnonzero(np.diff(key[order], prepend=-1))
+    first = first[np.diff(first, append=len(key)) == 2]
+    one, other = order[first] // 3, order[first + 1] // 3
+    normals = area_vectors(vertices[faces])
+    sine = np.linalg.norm(np.cross(normals[one], normals[other]), axis=1)
+    angle = np.degrees(np.arctan2(sine, (normals[one] * normals[other]).sum(1)))
+    return _Edges(one, other, angle, np.linalg.norm(vertices[end] - vertices[start], axis=1)[order[first]])
+
+
+def _flat_faces(
+    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "F 3"], edges: _Edges
+) -> Int[np.ndarray, "F"]:
+    """Number the sets of connected coplanar triangles."""
+    from trimesh.graph import connected_component_labels
+
+    flat = edges.angle < _COPLANAR
+    label = connected_component_labels(np.stack([edges.first[flat], edges.second[flat]], 1), len(faces))
+    normals = area_vectors(vertices[faces])
+    sums = np.stack([np.bincount(label, column) for column in normals.T], -1)[label]
+    tilt = np.degrees(np.arctan2(np.linalg.norm(np.cross(normals, sums), axis=1), (normals * sums).sum(1)))
+    # Triangles of a finely tessellated surface are coplanar with their neighbours, but not with one plane.
+    is_bent = np.bincount(label, tilt > 3 * _COPLANAR)[label] > 0
+    label = np.where(is_bent, label.max() + 1 + np.arange(len(label)), label)
+    return np.unique(label, return_inverse=True)[1].reshape(-1)
+
+
+def _num_corners(faces: Int[np.ndarray, "F 3"], face: Int[np.ndarray, "F"]) -> Int[np.ndarray, " flat"]:
+    """Count the corners of flat faces: vertices at which at least three flat faces meet."""
+    pairs = np.unique(faces.reshape(-1) * (face.max() + 1) + np.repeat(face, 3))
+    vertex, flat = np.divmod(pairs, face.max() + 1)
+    return np.bincount(flat, np.bincount(vertex)[vertex] >= 3).astype(np.int64)
+
+
+def _typical(region: Int[np.ndarray, " flat"], area: Float[np.ndarray, " flat"]) -> Float[np.ndarray, " regions"]:
+    """Return the area of the flat face at the middle of the area of each region."""
+    order = np.lexsort((area, region))
+    total = np.bincount(region, area)
+    middle = np.searchsorted(np.cumsum(area[order]), np.cumsum(total) - 0.5 * total)
+    return np.asarray(area[order[middle.clip(max=len(order) - 1)]])
+
+
+def _turn(
+    soft: _Edges, region: Int[np.ndarray, " flat"], length: Float[np.ndarray, " regions"]
+) -> tuple[Float[np.ndarray, " regions"], Bool[np.ndarray, " regions"]]:
+    """Return the mean angle between neighbouring faces in each region, and whether the faces form a strip or ring."""
+    turn = np.bincount(region[soft.first], soft.length * soft.angle, len(length)) / length
+    ends = np.sort(np.stack([soft.first, soft.second], 1), 1)
+    pairs = np.unique(ends, axis=0)
+    num_neighbours = np.bincount(pairs.reshape(-1), minlength=len(region))
+    num_pairs, num_faces = np.bincount(region[pairs[:, 0]], minlength=len(length)), np.bincount(region)
+    is_strip = (num_pairs > 0) & (np.bincount(region, num_neighbours > 2) == 0)
+    # On a cone, faces meet at smaller angles than the sides of its base.
+    return np.where(is_strip & (num_pairs == num_faces), 360 / num_faces, turn), is_strip
