@@ -83,7 +83,8 @@ def expanded(medium: Mapping[str, Any]) -> dict[str, BodySettings]:
 def _with_shading(body: BodySettings, medium: Mapping[str, Any]) -> BodySettings:
     if body.mesh is None or body.shading is not None or body.crease_degrees is not None:
         return body
-    return dataclasses.replace(body, **{name: medium.get(name) for name in SHADING})
+    settings: dict[str, Any] = {name: medium.get(name) for name in SHADING}
+    return dataclasses.replace(body, **settings)
 
 
 def surfaces_of(medium: Any) -> list[Mapping[str, Any]]:

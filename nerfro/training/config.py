@@ -284,7 +284,8 @@ def check_trained(config: DictConfig, origin: Path) -> DictConfig:
     try:
         typed = cast(DictConfig, OmegaConf.merge(OmegaConf.structured(untyped(TrainConfig())), config))
         if OmegaConf.select(config, "optimizer.groups") is not None:
-            typed.optimizer.groups = config.optimizer.groups  # the run may lack groups of the defaults
+            # The run may lack groups of the defaults.
+            OmegaConf.update(typed, "optimizer.groups", config.optimizer.groups, merge=False)
         validate(TrainConfig, plain(typed), complete=False)
         content = typed.content
         if content.box_min is not None or content.box_max is not None:

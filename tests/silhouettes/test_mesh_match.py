@@ -11,7 +11,7 @@ import trimesh
 from nerfro.core.errors import NerfroError
 from nerfro.data.base import Views
 from nerfro.media.body_settings import make_bodies
-from nerfro.training.mesh_match import require_match
+from nerfro.silhouettes.mesh_match import require_match
 from tests.exact_silhouettes import cameras_around, photographed
 
 OBJECT = trimesh.util.concatenate(
