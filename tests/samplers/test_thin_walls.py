@@ -10,6 +10,9 @@ import torch
 import trimesh
 
 import nerfro
+from nerfro.media.body_settings import make_bodies
+from nerfro.samplers.paths.snell import Snell
+from nerfro.samplers.paths.thin_walls import warn_of_thin_walls
 from tests.conftest import Runner
 
 
@@ -56,6 +59,20 @@ def test_solid_with_sharp_edges_has_no_thin_walls(tmp_path: Path, capsys: pytest
     trimesh.creation.cylinder(1.0, 1.5, sections=3).export(tmp_path / "prism.ply")
     _exits(tmp_path / "prism.ply", "sdf")
     assert "warning" not in capsys.readouterr().out
+
+
+def test_only_walls_that_bend_rays_in_wrong_directions_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bodies = {}
+    for name, wall in (("glass", 0.165), ("thin", 0.1)):
+        mesh = _hollow_ball(tmp_path / f"{name}.ply", wall)
+        bodies[name] = {name: {"mesh": str(mesh), "ior": 1.5}}
+    trimesh.creation.icosphere(4, 0.835).export(tmp_path / "water.ply")
+    bodies["glass"]["water"] = {"mesh": str(tmp_path / "water.ply"), "ior": 1.33}
+    for name, is_named in (("glass", False), ("thin", True)):
+        warn_of_thin_walls(Snell(), make_bodies(bodies=bodies[name], resolution=64, cache=False))
+        assert ("sampler/path=snell sampler.path.interface=mesh" in capsys.readouterr().out) == is_named
 
 
 def test_training_warns_of_thin_walls(tmp_path: Path, tiny_default_run: list[str], run_here: Runner) -> None:

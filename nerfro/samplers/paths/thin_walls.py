@@ -9,18 +9,23 @@ import torch
 from jaxtyping import Float
 
 from nerfro.core.errors import NerfroError, warn
+from nerfro.geometry.bodies import points_below
 from nerfro.geometry.intersection import MeshIntersector
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.geometry.orientation import area_vectors
 from nerfro.media.base import Medium
+from nerfro.media.bodies import Bodies
 from nerfro.samplers.base import PathSampler
+from nerfro.samplers.paths.snell import Snell
+from nerfro.samplers.paths.traced_file import make_rays
 
 # Thickness, in voxels, below which the spline of one side of a wall contains the fold of the distances in its middle.
 # Median error of exit directions behind a hollow ball of index 1.5: 0.01 degrees at 4.8 voxels, 0.6 at 3, and 2 at 1.8.
 _MIN_VOXELS = 5.0
 # Share of the surface that may belong to thinner parts, such as the surroundings of a sharp edge.
 _FEW = 0.2
-_NUM_POINTS = 4096
+_NUM_POINTS, _NUM_RAYS = 4096, 512
+# Median error of exit directions, in degrees, below which walls may be thin; a pixel of 400 covers about 0.1 degrees.
+_LEAST_ERROR = 0.1
 _MAX_VERTICES = 512  # largest resolution that the warning recommends
 
 
@@ -29,6 +34,7 @@ def warn_of_thin_walls(sampler: PathSampler, medium: Medium) -> None:
     bodies = medium.bodies
     if sampler.traces_triangles or not sampler.needs_medium or bodies is None:
         return
+    error = None
     for name, mesh, grid in zip(bodies.names, bodies.meshes, bodies.grids, strict=False):
         if not mesh.is_closed:
             continue
@@ -39,26 +45,39 @@ def warn_of_thin_walls(sampler: PathSampler, medium: Medium) -> None:
         thin = voxels < _MIN_VOXELS
         if thin.mean() <= _FEW:
             continue
+        if error is None:
+            error = _median_error(bodies)
+        if error < _LEAST_ERROR:
+            return
         factor = _MIN_VOXELS / float(np.quantile(voxels, _FEW))
         resolution = math.ceil((len(grid.distances) - 1) * factor) + 1
         finer = f"raise the resolution of the grid to {resolution}, " if resolution <= _MAX_VERTICES else ""
         warn(
             f"{thin.mean():.0%} of the surface of {name} bounds walls of about {np.median(voxels[thin]):.1f} voxels, "
             f"which bend rays in wrong directions below {_MIN_VOXELS:.0f} voxels; {finer}trace triangles "
-            "(sampler/path=snell with interface=mesh), or describe a cavity as a body of index 1"
+            "(sampler/path=snell sampler.path.interface=mesh), or describe a cavity as a body of index 1"
         )
+
+
+def _median_error(bodies: Bodies) -> float:
+    """Return the median angle between exit directions behind the grids and behind the triangles, degrees.
+
+    Rays start in all directions around the bodies and aim at random points of the first surface.
+    """
+    mesh, medium = bodies.meshes[0], bodies.achromatic()
+    target, _ = points_below(mesh, _NUM_RAYS)
+    start = torch.randn(_NUM_RAYS, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    size = torch.linalg.vector_norm(medium.box[1] - medium.box[0]).double().cpu()
+    start = target.mean(0) + 2 * size * torch.nn.functional.normalize(start, dim=-1)
+    towards = torch.nn.functional.normalize(target - start, dim=-1)
+    rays = make_rays(start + torch.from_numpy(medium.origin), towards, medium, 0.0, None)
+    by_grid, by_triangles = (Snell(interface)(rays, medium).exit_directions for interface in ("sdf", "mesh"))
+    return float(torch.rad2deg(2 * torch.asin((0.5 * (by_grid - by_triangles).norm(dim=-1)).clamp(max=1))).median())
 
 
 def thickness(mesh: TriangleMesh) -> Float[np.ndarray, " points"]:
     """Return the distance to the opposite side at random points of a closed surface, world units."""
-    triangles, normals = mesh.triangles, area_vectors(mesh.triangles)
-    size = np.linalg.norm(normals, axis=1)
-    generator = np.random.default_rng(0)
-    face = generator.choice(len(size), _NUM_POINTS, p=size / size.sum())
-    weights = generator.dirichlet(np.ones(3), _NUM_POINTS)
-    inwards = torch.from_numpy(-normals[face] / size[face, None])
-    below = 1e-5 * np.ptp(mesh.bounds, 0).max() * inwards
-    start = torch.from_numpy((weights[..., None] * triangles[face]).sum(1)) + below
-    intersector = MeshIntersector(triangles)
+    start, inwards = points_below(mesh, _NUM_POINTS)
+    intersector = MeshIntersector(mesh.triangles)
     hit = intersector.first_hits(start, inwards)
     return intersector.distance(start[hit >= 0], inwards[hit >= 0], hit[hit >= 0]).numpy()
