@@ -42,7 +42,8 @@ def test_any_trainer_validates_saves_tests_predicts_and_logs(
     assert len(best.best_k_models) == 1, "validation every two steps"
     (scores,) = trainer.test(module, datamodule=data, verbose=False)
     predictions = torch.stack(trainer.predict(module, datamodule=data))
-    errors = (predictions - data.test.images).square().flatten(1).mean(-1)
+    photographs = torch.stack([data.test.images[view] for view in range(len(predictions))])
+    errors = (predictions - photographs).square().flatten(1).mean(-1)
     assert scores["test/psnr"] == pytest.approx(float((-10 * errors.log10()).mean()), abs=1e-3)
     assert nerfro.load(best.best_model_path).cameras("test").height == 16
     with (tmp_path / "log" / "metrics.csv").open() as file:
