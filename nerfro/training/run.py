@@ -19,9 +19,9 @@ from nerfro.evaluation.tables import write_scores
 from nerfro.fields.networks import compile_networks
 from nerfro.rendering.scene_file import SceneFile
 from nerfro.samplers.subdivision import Subdivision
+from nerfro.silhouettes.mesh_match import require_match
 from nerfro.training.build import Training, check_before_training, composed_training, warn_without_effect
 from nerfro.training.callbacks import StopOnSignal, Throughput, steps_by_phase
-from nerfro.silhouettes.mesh_match import require_match
 from nerfro.training.run_folder import LAST_CHECKPOINT, begin, lock_run, next_steps, require_same_run
 from nerfro.training.trainer import finish_logs, fit, make_trainer, print_profile, quieten_lightning
 from nerfro.training.viewer import Viewer
