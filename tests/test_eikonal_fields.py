@@ -164,9 +164,9 @@ def test_content_of_the_first_stage_inside_the_box_is_discarded() -> None:
 
 def test_several_processes_are_refused_before_training() -> None:
     module = TrainingModule(make_model(), {}, OptimizerConfig())
-    module.trainer = SimpleNamespace(world_size=1)  # type: ignore[assignment]
+    module.trainer = SimpleNamespace(world_size=1, datamodule=object())  # type: ignore[assignment]
     module.setup("fit")
-    module.trainer = SimpleNamespace(world_size=2)  # type: ignore[assignment]
+    module.trainer = SimpleNamespace(world_size=2, datamodule=object())  # type: ignore[assignment]
     refused("trains in one process", module.setup, "fit")
 
 
