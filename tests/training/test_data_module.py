@@ -160,7 +160,10 @@ def test_batch_is_made_when_its_step_begins_if_paths_learn(
     renderer = Mock(spec=Renderer, path_sampler=Snell(), scene=scene, paths_learn=learns, modules=list)
     module = Mock(spec=TrainingModule, renderer=renderer, dtype=torch.float32)
     strategy = Mock(root_device=torch.device("cpu"))
-    data.trainer = Mock(spec=Trainer, strategy=strategy, lightning_module=module, global_step=5, training=True)  # type: ignore[assignment]
+    data.trainer = Mock(  # type: ignore[assignment]
+        spec=Trainer, strategy=strategy, lightning_module=module, global_step=5, training=True,
+        check_val_every_n_epoch=None, val_check_interval=10,
+    )  # fmt: skip
     steps = iter(data.train_dataloader())
     first, _second = next(steps), next(steps)
     assert not made

@@ -94,7 +94,7 @@ def test_rows_share_all_usable_pixels(kind, request):
 def test_masked_batch_of_one_image_is_different_usable_pixels_of_it(masked):
     seen = set()
     for step in range(200):
-        index = PixelBatches(masked, 1, seed=0).draw(step).number
+        index = PixelBatches(masked, 1, "single_image", seed=0).draw(step).number
         assert masked.usable.flatten()[index].all()
         seen.add(int(index) // (HEIGHT * WIDTH))
     assert seen == set(range(NUM_VIEWS))  # views are drawn alike, whatever their masks leave
@@ -102,7 +102,7 @@ def test_masked_batch_of_one_image_is_different_usable_pixels_of_it(masked):
     two.usable[2, 4:6] = True
     smallest = int(two.usable.sum((1, 2)).min())
     for step in range(20):
-        batch = PixelBatches(two, smallest, seed=0).draw(step)
+        batch = PixelBatches(two, smallest, "single_image", seed=0).draw(step)
         assert two.usable.flatten()[batch.number].all()
         assert len(batch.number.unique()) == smallest
         assert len((batch.number // (HEIGHT * WIDTH)).unique()) == 1
@@ -137,7 +137,7 @@ def test_object_fraction_is_ignored_without_masks(views, capsys):
 
 def test_pixels_of_an_object_need_all_images_and_an_object(views):
     masks = torch.zeros(NUM_VIEWS, HEIGHT, WIDTH)
-    refused("all_images", PixelBatches, replace(views, masks=masks + 1), 64, object_fraction=0.25)
+    refused("all_images", PixelBatches, replace(views, masks=masks + 1), 64, "single_image", object_fraction=0.25)
     refused("the masks have none", PixelBatches, replace(views, masks=masks), 64, "all_images", object_fraction=0.25)
 
 
@@ -173,12 +173,18 @@ def test_masks_apply_to_precropped_and_distributed_batches(masked, batching, siz
 
 
 def test_masks_that_leave_too_few_pixels_are_refused(masked):
-    refused("batch_size=2 exceeds the 1 pixels that the mask of r_2 leaves; take a smal", PixelBatches, masked, 2)
+    refused(
+        "batch_size=2 exceeds the 1 pixels that the mask of r_2 leaves; take a smal",
+        PixelBatches,
+        masked,
+        2,
+        "single_image",
+    )
     PixelBatches(masked, 500, "all_images")
     border = torch.ones(NUM_VIEWS, HEIGHT, WIDTH, dtype=torch.bool)
     border[:, 2:10, 2:14] = False
     cropped = functools.partial(PixelBatches, replace(masked, usable=border), 2, precrop_steps=1)
-    refused("exceeds the 0 pixels that the mask of r_0 leaves while precropped", cropped)
+    refused("exceeds the 0 pixels that the mask of r_0 leaves while precropped", cropped, batching="single_image")
     refused("the masks leave no pixel to train on while precropped", cropped, batching="all_images")
 
 
@@ -211,7 +217,7 @@ def test_pixels_have_the_cameras_of_the_window_from_which_they_are_drawn(views):
     ],
 )
 def test_option_out_of_range_is_refused(views, options, message):
-    refused(message, PixelBatches, views, **options)
+    refused(message, PixelBatches, views, batching="single_image", **options)
 
 
 def test_batches_hold_all_polylines_of_their_rays(views):
