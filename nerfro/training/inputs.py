@@ -50,9 +50,8 @@ def inputs_of(config: DictConfig, views: Views | None) -> dict[str, Any]:
 
 def recorded_cameras(checkpoint: Mapping[str, Any]) -> Cameras | None:
     """Return the cameras of the training views in a checkpoint; None if it has none or they are damaged."""
-    inputs: Any = checkpoint.get(INPUTS)
+    tensors, image = (_recorded(checkpoint, name) for name in ("cameras", "image"))
     try:
-        tensors, image = inputs["cameras"], inputs["image"]
         values = {name: torch.as_tensor(tensors[name], dtype=torch.float32) for name in (*_OF_CAMERAS, "distortion")}
         num_views = len(values["fx"])
         shapes = {"camera_to_world": (num_views, 3, 4), "distortion": (num_views, 9)}
@@ -155,24 +154,26 @@ def file_hashes(config: DictConfig) -> dict[str, str]:
 
 def changed_file(checkpoint: Mapping[str, Any], config: DictConfig) -> str | None:
     """Return the setting of the medium whose file has changed since a checkpoint was written; None if none has."""
-    inputs = checkpoint.get(INPUTS)
-    if not isinstance(inputs, Mapping) or not isinstance(inputs.get("files"), Mapping):
+    if not isinstance(_recorded(checkpoint, "files"), Mapping):
         return None
     return first_difference(_recorded_files(checkpoint), file_hashes(config))
 
 
 def compared_by_content(checkpoint: Mapping[str, Any]) -> set[str]:
     """Return the settings that name files and folders of which a checkpoint records the content."""
-    inputs = checkpoint.get(INPUTS)
-    photographs = inputs.get("photographs") if isinstance(inputs, Mapping) else None
     files = {name.partition("[")[0] for name in _recorded_files(checkpoint)}
-    return files | ({"data.root"} if isinstance(photographs, str) else set())
+    return files | ({"data.root"} if isinstance(_recorded(checkpoint, "photographs"), str) else set())
+
+
+def _recorded(checkpoint: Mapping[str, Any], name: str) -> Any:
+    """Return an entry of `inputs_of` in a checkpoint, which may be damaged; None if the checkpoint lacks the entry."""
+    inputs = checkpoint.get(INPUTS)
+    return inputs.get(name) if isinstance(inputs, Mapping) else None
 
 
 def _recorded_files(checkpoint: Mapping[str, Any]) -> dict[str, str]:
-    inputs = checkpoint.get(INPUTS)
-    recorded = inputs.get("files") if isinstance(inputs, Mapping) else None
-    return {str(name): str(value) for name, value in recorded.items()} if isinstance(recorded, Mapping) else {}
+    files = _recorded(checkpoint, "files")
+    return {str(name): str(value) for name, value in files.items()} if isinstance(files, Mapping) else {}
 
 
 def require_same_inputs(checkpoint: Mapping[str, Any], path: Path, config: DictConfig, views: Views) -> None:
@@ -191,11 +192,8 @@ def require_same_inputs(checkpoint: Mapping[str, Any], path: Path, config: DictC
     name = changed_file(checkpoint, config)
     if name is not None:
         raise NerfroError(f"{path} was trained with another content of the file {name}; {advice}")
-    inputs = checkpoint.get(INPUTS)
-    recorded, photographs = (
-        inputs.get(entry) if isinstance(inputs, Mapping) else None for entry in ("cameras", "photographs")
-    )
-    other_cameras = isinstance(recorded, Mapping) and not _equal(recorded, _tensors(views.cameras))
+    cameras, photographs = (_recorded(checkpoint, entry) for entry in ("cameras", "photographs"))
+    other_cameras = isinstance(cameras, Mapping) and not _equal(cameras, _tensors(views.cameras))
     if other_cameras or (isinstance(photographs, str) and photographs != _hash_of_photographs(views)):
         raise NerfroError(f"{path} was trained on other photographs or cameras than {config.data.root} has; {advice}")
 
