@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from fnmatch import fnmatchcase
 
 import torch
 from torch import Tensor
@@ -11,7 +10,7 @@ from torch import Tensor
 from nerfro.core.errors import NerfroError
 from nerfro.rendering import Renderer
 from nerfro.training.load import checkpoint_of
-from nerfro.training.optimizer import require_matches
+from nerfro.training.optimizer import matches, require_matches
 from nerfro.training.run_folder import load_run, restore
 
 
@@ -33,7 +32,7 @@ def initialize_from(renderer: Renderer, run: str, include: Sequence[str]) -> str
     require_matches("init_include", include, own)
     lines, num_loaded = [], 0
     for name, value in own.items():
-        if not any(fnmatchcase(name, pattern) for pattern in include):
+        if not matches(name, include):
             continue
         other = others.get(name)
         if other is None:

@@ -102,7 +102,7 @@ class OptimizerConfig:
         """
         require_matches("optimizer.freeze", self.freeze, parameters)
         for name, parameter in parameters.items():
-            if any(fnmatchcase(name, pattern) for pattern in self.freeze):
+            if matches(name, self.freeze):
                 parameter.requires_grad_(False)
         if self.freeze and not any(parameter.requires_grad for parameter in parameters.values()):
             raise NerfroError(f"optimizer.freeze={self.freeze} leaves no parameter to learn; remove a pattern")
@@ -143,7 +143,7 @@ class OptimizerConfig:
         for name, parameter in parameters.items():
             if not parameter.requires_grad:
                 continue
-            matching = (pattern for pattern in reversed(self.groups) if fnmatchcase(name, pattern))
+            matching = (pattern for pattern in reversed(self.groups) if matches(name, [pattern]))
             groups.setdefault(next(matching, COMMON), []).append(parameter)
         return groups
 
@@ -180,6 +180,11 @@ class JointOptimizer(torch.optim.Optimizer):
         return loss
 
 
+def matches(name: str, patterns: Iterable[str]) -> bool:
+    """Return whether the name of a parameter matches a pattern, in which an asterisk stands for any text."""
+    return any(fnmatchcase(name, pattern) for pattern in patterns)
+
+
 def require_matches(where: str, patterns: Iterable[str], names: Iterable[str]) -> None:
     """Refuse patterns that match no name of a parameter, unless they are in `OPTIONAL_PATTERNS`.
 
@@ -193,7 +198,7 @@ def require_matches(where: str, patterns: Iterable[str], names: Iterable[str]) -
     """
     learned = list(names)
     for pattern in patterns:
-        if pattern not in OPTIONAL_PATTERNS and not any(fnmatchcase(name, pattern) for name in learned):
+        if pattern not in OPTIONAL_PATTERNS and not any(matches(name, [pattern]) for name in learned):
             raise NerfroError(
                 f"{where}: {pattern} matches no learned parameter; choose from {', '.join(learned) or 'none'}, with * "
                 "for any text"
