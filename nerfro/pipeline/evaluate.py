@@ -17,14 +17,12 @@ from nerfro.evaluation.request import EvaluateConfig, find_device, own_folder, r
 from nerfro.evaluation.results import RunMetrics
 from nerfro.evaluation.scoring import score_folders, score_split
 from nerfro.evaluation.tables import write_scores
-from nerfro.files.foreign_config import read_foreign_config
 from nerfro.files.images import load_png
 from nerfro.training.callbacks import Throughput, steps_by_phase
-from nerfro.training.config import build_data, check_trained
-from nerfro.training.inputs import relocated
+from nerfro.training.config import build_data
 from nerfro.training.load import checkpoint_of, scene_of
 from nerfro.training.run import Run
-from nerfro.training.run_folder import CONFIG_FILE, load_run
+from nerfro.training.run_folder import CONFIG_FILE, load_run, run_config
 
 
 def evaluate(
@@ -98,7 +96,7 @@ def _names_in_run(file: Path, root: str | None) -> dict[str, str]:
     """Return the names of the images of a run by their names in the data set; empty for images of other programs."""
     if not file.is_file():
         return {}
-    config = relocated(check_trained(read_foreign_config(file), file), file.parent, root)
+    config = run_config(file.parent, root)
     split = config.evaluation.split
     names = build_data(config).load(split).names
     return {Path(name).stem: f"{split}_{number:03d}" for number, name in enumerate(names)}

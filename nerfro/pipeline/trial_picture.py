@@ -15,11 +15,10 @@ from nerfro.data.base import Views
 from nerfro.evaluation.regions import crop_rectangle, object_pixels
 from nerfro.evaluation.results import EXPOSED, FULL, Region
 from nerfro.files.drawing import sheet
-from nerfro.files.foreign_config import read_foreign_config
 from nerfro.files.images import load_png
 from nerfro.pipeline.trials import Trial
-from nerfro.training.config import build_data, check_trained
-from nerfro.training.run_folder import CONFIG_FILE
+from nerfro.training.config import build_data
+from nerfro.training.run_folder import run_config
 
 PICTURE = "hypotheses.png"
 _NUM_VIEWS, _MIN_WIDTH = 3, 256  # photographs, and the width in pixels that the captions need
@@ -28,7 +27,7 @@ _Window = tuple[slice, slice]
 
 def validation_views(folder: Path) -> Views:
     """Read the photographs on which a trial was scored, and their masks."""
-    config = check_trained(read_foreign_config(folder / CONFIG_FILE), folder / CONFIG_FILE)
+    config = run_config(folder)
     return build_data(config).load(str(config.evaluation.split))
 
 

@@ -205,6 +205,12 @@ def load_run(checkpoint: Path, root: str | Path | None = None) -> tuple[dict[str
     return content, relocated(config, checkpoint.parent.parent, root)
 
 
+def run_config(folder: Path, root: str | Path | None = None) -> DictConfig:
+    """Read the configuration of a run folder, with the present places of its files; see `load_run`."""
+    file = folder / CONFIG_FILE
+    return relocated(check_trained(read_foreign_config(file), file), folder, root)
+
+
 def require_finite(weights: Mapping[str, Any], path: Path) -> None:
     """Refuse weights that are not tensors, or not finite."""
     for name, weight in weights.items():
