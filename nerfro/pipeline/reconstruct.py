@@ -130,13 +130,12 @@ def _train(composition: Composition, scene: SceneFile, out: Path) -> Run:
     inputs = [file, file.with_name(MESH)]
     common = common_options(composition.config, composition.overrides, scene.photograph)
     if is_given("experiment", common):
-        options, experiment = [], [option for option in common if is_given("experiment", [option])]
-        _set_aside_other_hypothesis(experiment, out)
+        options, stated = [], [option for option in common if is_given("experiment", [option])]
     else:
         hypothesis, trials = _find_hypothesis(composition, scene, common, out)
-        options = hypothesis.options
+        options = stated = hypothesis.options
         inputs += [trial.run.folder / "metrics.json" for trial in trials]
-        _set_aside_other_hypothesis(options, out)
+    _set_aside_other_hypothesis(stated, out)
     return _run_training(scene, [*options, *common], inputs, out / "run")
 
 
@@ -225,9 +224,10 @@ def train_scene(scene: SceneFile, overrides: Sequence[str]) -> Run:
 def _report(run: Run, out: Path) -> None:
     """Write the report and the interactive page, and print where they are; a page that cannot be made is a warning."""
     report, page, inputs = out / "report" / "report.html", out / "page.html", [run.folder / "metrics.json"]
-    pictures = [path for path in [out / "trials" / PICTURE] if path.is_file()]
+    picture = out / "trials" / PICTURE
+    pictures = [str(picture)] if picture.is_file() else []
     options = SummaryConfig(
-        runs=[str(run.folder)], out=str(report.parent), report=True, pictures=[*map(str, pictures)], overwrite=True
+        runs=[str(run.folder)], out=str(report.parent), report=True, pictures=pictures, overwrite=True
     )
     summary = Stage("summary", as_overrides(changed_settings(options)), report, report, inputs)
     summary.run(lambda: summarize(options), lambda: None)
