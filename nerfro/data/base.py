@@ -141,7 +141,7 @@ class DataSource(ABC):
         origin: world coordinates of the origin of the positions in `Views`; see `Medium.origin`.
     """
 
-    root: Path = Path()
+    root: Path
     mask_labels: Sequence[int] | None = None
     origin: Float[np.ndarray, "3"] = WORLD_ORIGIN
 

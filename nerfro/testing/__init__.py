@@ -387,7 +387,7 @@ def _check_model(model: Renderer) -> None:
 
 
 def _check_data(source: DataSource) -> None:
-    _require(source.root != DataSource.root, "a data source has the attribute `root`, the folder of the data set")
+    _require(hasattr(source, "root"), "a data source has the attribute `root`, the folder of the data set")
     for split in source.splits:
         views = source.load(split)
         size = (views.cameras.height, views.cameras.width)

@@ -4,6 +4,7 @@ import functools
 import math
 from collections.abc import Iterator
 from importlib import import_module
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -50,6 +51,7 @@ class Photographs(DataSource):
     """Cameras around the origin, and black pictures."""
 
     splits = ("train", "test")  # type: ignore[assignment]
+    root = Path()
 
     def load(self, split: str) -> Views:
         places = [(4, 0, 1), (0, 4, 0.5), (-3, 2, -1)] if split == "test" else [(4, 0, 0), (0, -4, 0), (-2, 2, 2.8)]
