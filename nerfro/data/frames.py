@@ -20,7 +20,7 @@ from nerfro.core.paths import refuse_root, resolve_path
 from nerfro.data.base import SPLITS, DataSource, Frame, Views
 from nerfro.data.image_files import IMAGE_SUFFIXES, Alpha, read_rgb
 from nerfro.data.lazy_images import LazyImages
-from nerfro.data.lenses import Lens, check_lenses
+from nerfro.data.lenses import Lens, check_lenses, lens_tensors
 from nerfro.data.masks import find_mask, find_masks, find_usable, require_used, unused_masks
 from nerfro.files.reading import same_content
 from nerfro.registry.allowed import Coordinate, Distance, Factor, check, validated
@@ -143,11 +143,9 @@ class PosedImages(DataSource):
         self._require_precision(poses[:, :, 3])
         if read.axes == "opencv":
             poses = poses * np.array([1.0, -1.0, -1.0, 1.0])
-        intrinsics = torch.tensor([(lens.fx, lens.fy, lens.cx, lens.cy) for lens in read.lenses], dtype=torch.float64)
+        intrinsics, distortion = lens_tensors(read.lenses)
         scale = torch.tensor([width / stored[0], height / stored[1]], dtype=torch.float64).repeat(2)
         fx, fy, cx, cy = (intrinsics * scale).float().unbind(-1)
-        distorted = any(lens.distortion is not None for lens in read.lenses)
-        distortion = torch.tensor([lens.distortion or (0.0,) * 9 for lens in read.lenses]) if distorted else None
         cameras = Cameras(torch.from_numpy(poses).float(), fx, fy, cx, cy, width, height, near, far, distortion)
         usable = find_usable(files, read.usable, self.downscale, stored) if any(read.usable) else None
         if read.crop < 1:

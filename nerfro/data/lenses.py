@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -214,6 +214,14 @@ def _focal_lengths(
 def _focal_length(level: Mapping[str, float], axis: str, side: float) -> float | None:
     angle = level.get(f"camera_angle_{axis}")
     return level.get(f"fl_{axis}", None if angle is None else 0.5 * side / math.tan(0.5 * angle))
+
+
+def lens_tensors(lenses: Sequence[Lens]) -> tuple[Float[Tensor, "V 4"], Float[Tensor, "V 9"] | None]:
+    """Return fx, fy, cx and cy of lenses in double precision, and their distortion; None if no lens is distorted."""
+    intrinsics = torch.tensor([(lens.fx, lens.fy, lens.cx, lens.cy) for lens in lenses], dtype=torch.float64)
+    if all(lens.distortion is None for lens in lenses):
+        return intrinsics, None
+    return intrinsics, torch.tensor([lens.distortion or (0.0,) * 9 for lens in lenses])
 
 
 def check_lenses(lenses: Iterable[Lens], names: Iterable[str], size: tuple[int, int]) -> None:

@@ -22,7 +22,7 @@ from nerfro.core.types import WORLD_ORIGIN
 from nerfro.data.base import DataSource, Views
 from nerfro.data.frames import check_pose
 from nerfro.data.image_files import read_size
-from nerfro.data.lenses import Lens, check_lenses, read_lens
+from nerfro.data.lenses import Lens, check_lenses, lens_tensors, read_lens
 from nerfro.data.transforms import existing_image
 from nerfro.files.atomic import write_atomically
 from nerfro.files.reading import is_number, parse_matrix, read_json
@@ -98,9 +98,8 @@ def read_cameras(file: Path, geometry: CaptureGeometry, origin: Float[np.ndarray
         poses.append(check_pose(parse_matrix(matrix, ((3, 4), (4, 4)), where), where, pose_key))
         lenses.append(lens_of(document, entry, (width, height), where))
     check_lenses(lenses, [f"{file}: camera {number}" for number in range(len(lenses))], (width, height))
-    fx, fy, cx, cy = torch.tensor([(lens.fx, lens.fy, lens.cx, lens.cy) for lens in lenses]).unbind(-1)
-    distorted = any(lens.distortion is not None for lens in lenses)
-    distortion = torch.tensor([lens.distortion or (0.0,) * 9 for lens in lenses]) if distorted else None
+    intrinsics, distortion = lens_tensors(lenses)
+    fx, fy, cx, cy = intrinsics.float().unbind(-1)
     pose = np.stack(poses)
     pose[:, :, 3] -= origin
     near, far = geometry.camera.near, geometry.camera.far
