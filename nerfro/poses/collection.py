@@ -49,7 +49,7 @@ def collect_photographs(config: DictConfig, out: Path) -> list[Path]:
         video = user_path(config.video)
         if not (out / REPORT).is_file():
             extract_frames(video, photographs, config.frames)
-        elif video.is_file() and _is_of_other_video(photographs, video):
+        elif video.is_file() and _recorded_video(photographs) not in (None, file_hash(video)):
             raise NerfroError(
                 f"out={out} has poses of the frames of another video than video={video}; choose another out=FOLDER"
             )
@@ -194,12 +194,12 @@ def extract_frames(video: Path, folder: Path, count: int) -> list[Path]:
     sharpest = {int(first + sharpness[first:last].argmax()) for first, last in itertools.pairwise(edges)}
     files = {number: folder / f"frame_{number:05d}.jpg" for number in sorted(sharpest)}
     folder.mkdir(parents=True, exist_ok=True)
-    record = folder / _VIDEO_RECORD
-    is_same = record.is_file() and not _is_of_other_video(folder, video)
+    content = file_hash(video)
+    is_same = _recorded_video(folder) == content
     for file in folder.glob("frame_*.jpg"):
         if file not in files.values() or not is_same:
             file.unlink()
-    write_atomically(record, f"{file_hash(video)}\n")
+    write_atomically(folder / _VIDEO_RECORD, f"{content}\n")
     waiting = {number for number, file in files.items() if not file.is_file()}
     for number, frame in enumerate(_frames(video) if waiting else ()):
         if number in waiting:
@@ -211,10 +211,10 @@ def extract_frames(video: Path, folder: Path, count: int) -> list[Path]:
     return list(files.values())
 
 
-def _is_of_other_video(folder: Path, video: Path) -> bool:
-    """Test whether a folder of frames records the hash of another video; False without a record."""
+def _recorded_video(folder: Path) -> str | None:
+    """Return the hash of the video that a folder of frames records; None without a record."""
     record = folder / _VIDEO_RECORD
-    return record.is_file() and record.read_text("utf-8", errors="replace").strip() != file_hash(video)
+    return record.read_text("utf-8", errors="replace").strip() if record.is_file() else None
 
 
 def _sharpness(video: Path) -> Float[np.ndarray, "F"]:
