@@ -239,9 +239,8 @@ def _fitting(table: Table, columns: slice, width: int) -> Iterator[slice]:
         columns: columns of a group.
         width: characters in a line. A table has one at its left edge, and three more than its content in each column.
     """
-    rows = [table.cells_with_medals(i, _CONSOLE if table.medals else _MARKDOWN) for i in range(len(table.rows))]
-    rows += [table.cells(row) for row in table.summary]
-    widths = [max(map(cell_len, cells)) for cells in zip((c.heading for c in table.columns), *rows, strict=True)]
+    headings = [column.heading for column in table.columns]
+    widths = [max(map(cell_len, cells)) for cells in zip(headings, *_console_cells(table), strict=True)]
     labels = (table.label_title, *(row.label for row in (*table.rows, *table.summary)))
     widest = max(widths[columns], default=0)
     left = 4 + min(max(map(cell_len, labels)), max(width - 7 - widest, 1))
@@ -259,14 +258,18 @@ def _rich_group(table: Table, group: str, columns: slice) -> rich.table.Table:
     drawn.add_column(rich.text.Text(table.label_title), overflow="fold")
     for column in table.columns[columns]:
         drawn.add_column(rich.text.Text(column.heading), justify="right", no_wrap=True)
-    for i, row in enumerate(table.rows):
-        cells = table.cells_with_medals(i, _CONSOLE if table.medals else _MARKDOWN)[columns]
-        texts = (rich.text.Text(text) for text in (row.label, *cells))
-        drawn.add_row(*texts, end_section=i == len(table.rows) - 1)
-    for row in table.summary:
-        texts = (rich.text.Text(text) for text in (row.label, *table.cells(row)[columns]))
-        drawn.add_row(*texts, style="bold")
+    rows, cells = (*table.rows, *table.summary), _console_cells(table)
+    for number, (row, texts) in enumerate(zip(rows, cells, strict=True), start=1):
+        style = None if number <= len(table.rows) else "bold"
+        shown = map(rich.text.Text, (row.label, *texts[columns]))
+        drawn.add_row(*shown, end_section=number == len(table.rows), style=style)
     return drawn
+
+
+def _console_cells(table: Table) -> list[list[str]]:
+    """Return the cells of the rows, followed by those of the summary."""
+    rows = [table.cells_with_medals(i, _CONSOLE if table.medals else _MARKDOWN) for i in range(len(table.rows))]
+    return [*rows, *(table.cells(row) for row in table.summary)]
 
 
 def to_csv(table: Table) -> str:
