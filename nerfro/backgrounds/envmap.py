@@ -70,7 +70,7 @@ class Observed:
 
 
 def _is_fitted(settings: DictConfig) -> bool:
-    """Return whether `phase=background` takes steps, which need a field with a box."""
+    """Return whether `phase=background` takes steps."""
     return ((settings.phase.get("background") or {}).get("steps") or 0) > 0
 
 

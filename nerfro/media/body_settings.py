@@ -66,8 +66,9 @@ def expanded(medium: Mapping[str, Any]) -> dict[str, BodySettings]:
     """
     bodies, mesh = medium.get("bodies"), medium.get("mesh")
     if bodies is None:
-        body = BodySettings(mesh=None if mesh is None else str(mesh), ior=medium.get("ior"))
-        return {} if mesh is None else {"object": _with_shading(body, medium)}
+        if mesh is None:
+            return {}
+        return {"object": _with_shading(BodySettings(mesh=str(mesh), ior=medium.get("ior")), medium)}
     if not isinstance(bodies, Mapping):
         raise NerfroError(f"bodies={bodies} is not a mapping; write bodies={{NAME: {{mesh: FILE, ior: 1.5}}}}")
     if not bodies:
