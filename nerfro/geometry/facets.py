@@ -61,42 +61,78 @@ def facets_of(
         faces: vertex indices of each triangle, outward faces counter-clockwise.
         crease_degrees: angle above which edges are sharp anyway.
     """
-    from trimesh.graph import connected_component_labels
-
-    edges, size = _edges(vertices, faces), 0.5 * np.linalg.norm(area_vectors(vertices[faces]), axis=1)
+    edges = _edges(vertices, faces)
     face = _flat_faces(vertices, faces, edges)
-    num_faces = int(face.max()) + 1
-    area, num_triangles, corners = np.bincount(face, size), np.bincount(face), _num_corners(faces, face)
-    between = edges.subset(face[edges.first] != face[edges.second])
-    between = between._replace(first=face[between.first], second=face[between.second])
-    soft = between.subset(between.angle < crease_degrees)
-    region = connected_component_labels(np.stack([soft.first, soft.second], 1), num_faces)
-    region = np.unique(region, return_inverse=True)[1].reshape(-1)
-    large = area >= _typical(region, area)[region] / _SMALL
-    sharp = between.subset(between.angle >= crease_degrees)
-    rim = sum(np.bincount(region[side], sharp.length, region.max() + 1) for side in (sharp.first, sharp.second))
-    soft = soft.subset(large[soft.first] & large[soft.second])
-    of_region, count = region[soft.first], region.max() + 1
-    length = np.maximum(np.bincount(of_region, soft.length, count), np.finfo(float).tiny)
-    several = np.bincount(region, area * large * (num_triangles > 1), count) / np.bincount(region, area * large, count)
-    alike = (corners[soft.first] == corners[soft.second]) & (corners[soft.first] <= 4)
-    mixed = np.bincount(of_region, soft.length * ~alike, count) / length
-    turn, is_strip = _turn(soft, region, length)
-    decided = (np.bincount(region, area) >= _LEAST_SHARE * area.sum()) & (turn >= _LEAST_TURN)
-    is_polygonal, ends = is_strip | (several >= 0.5), rim >= _RIM * length
-    is_cut = decided & (several >= 0.5) & (mixed >= _MIXED)
+    regions = _regions_of(vertices, faces, face, edges, crease_degrees)
+    turn, ends = regions.turn, regions.ends
+    decided = (regions.area >= _LEAST_SHARE * regions.area.sum()) & (turn >= _LEAST_TURN)
+    is_polygonal = regions.is_strip | (regions.several >= 0.5)
+    is_cut = decided & (regions.several >= 0.5) & (regions.mixed >= _MIXED)
     ambiguous = decided & ~is_cut & (is_polygonal | ends) & (turn >= _DOUBTFUL_TURN)
     is_faceted = is_cut | (ambiguous & is_polygonal & ends & (turn >= _FACETED_TURN))
     if is_faceted.any():  # a body that has facets has facets on all sides
         is_faceted |= (turn >= _LEAST_TURN) & is_polygonal & ends
-    number = np.where(is_faceted[region] & large, np.arange(num_faces), -1)[face]
+    number = np.where(is_faceted[regions.number] & regions.is_large, np.arange(len(regions.number)), -1)[face]
     if not ambiguous.any():
         return Facets(number, "")
-    worst = np.where(ambiguous, np.bincount(region, area), 0).argmax()
+    worst = np.where(ambiguous, regions.area, 0).argmax()
     return Facets(
         number,
-        f"{(region == worst).sum()} flat faces that meet at about {turn[worst]:.0f} degrees may be facets or samples "
-        f"of a smooth surface, and are traced as {'flat' if is_faceted[worst] else 'smooth'}",
+        f"{(regions.number == worst).sum()} flat faces that meet at about {turn[worst]:.0f} degrees may be facets or "
+        f"samples of a smooth surface, and are traced as {'flat' if is_faceted[worst] else 'smooth'}",
+    )
+
+
+class _Regions(NamedTuple):
+    """Regions of flat faces that are connected by edges below the crease angle.
+
+    Attributes:
+        number: region of each flat face.
+        is_large: whether each flat face is no part of a rounded edge.
+        area: area of each region.
+        several: share of the area of large faces that belongs to faces of several triangles.
+        mixed: share of the edges between large faces, by length, at which neither two triangles nor two quadrilaterals
+            meet.
+        turn, is_strip: mean angle between neighbouring faces, and whether they form a strip or ring, see `_turn`.
+        ends: whether each region ends at sharp edges.
+    """
+
+    number: Int[np.ndarray, " flat"]
+    is_large: Bool[np.ndarray, " flat"]
+    area: Float[np.ndarray, " regions"]
+    several: Float[np.ndarray, " regions"]
+    mixed: Float[np.ndarray, " regions"]
+    turn: Float[np.ndarray, " regions"]
+    is_strip: Bool[np.ndarray, " regions"]
+    ends: Bool[np.ndarray, " regions"]
+
+
+def _regions_of(
+    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "F 3"], face: Int[np.ndarray, "F"],
+    edges: _Edges, crease_degrees: float,
+) -> _Regions:  # fmt: skip
+    """Connect flat faces to regions, and measure the regions; `face` is the flat face of each triangle."""
+    from trimesh.graph import connected_component_labels
+
+    area = np.bincount(face, 0.5 * np.linalg.norm(area_vectors(vertices[faces]), axis=1))
+    corners = _num_corners(faces, face)
+    between = edges.subset(face[edges.first] != face[edges.second])
+    between = between._replace(first=face[between.first], second=face[between.second])
+    sharp, soft = between.subset(between.angle >= crease_degrees), between.subset(between.angle < crease_degrees)
+    region = connected_component_labels(np.stack([soft.first, soft.second], 1), len(area))
+    region = np.unique(region, return_inverse=True)[1].reshape(-1)
+    count = region.max() + 1
+    is_large = area >= _typical(region, area)[region] / _SMALL
+    of_large = np.bincount(region, area * is_large, count)
+    several = np.bincount(region, area * is_large * (np.bincount(face) > 1), count) / of_large
+    soft = soft.subset(is_large[soft.first] & is_large[soft.second])
+    of_region = region[soft.first]
+    length = np.maximum(np.bincount(of_region, soft.length, count), np.finfo(float).tiny)
+    alike = (corners[soft.first] == corners[soft.second]) & (corners[soft.first] <= 4)
+    mixed = np.bincount(of_region, soft.length * ~alike, count) / length
+    rim = sum(np.bincount(region[side], sharp.length, count) for side in (sharp.first, sharp.second))
+    return _Regions(
+        region, is_large, np.bincount(region, area), several, mixed, *_turn(soft, region, length), rim >= _RIM * length
     )
 
 
