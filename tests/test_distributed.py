@@ -202,7 +202,7 @@ def test_every_parameter_has_a_gradient_if_no_ray_meets_the_object(tiny_default_
     module, data = build(overrides=[*tiny_default_run, "medium.learn_ior=true", "trainer.max_steps=1"])
     batch = RayTracer(module.renderer).trace(data.batches.draw(0))
     away = replace(batch, path=None, samples=None, rays=replace(batch.rays, directions=-batch.rays.directions))
-    module.trainer, module._is_logged_step = Mock(spec=Trainer, world_size=2, global_step=0), False
+    module.trainer, module.is_logged_step = Mock(spec=Trainer, world_size=2, global_step=0), False
     module.training_step(away, 0)["loss"].backward()
     assert [name for name, parameter in module.named_parameters() if parameter.grad is None] == []
 

@@ -123,7 +123,7 @@ def test_parity_of_the_losses_and_their_gradients(
 ) -> None:
     settings: dict[str, dict[str, Any]] = {
         "photometric": {},
-        "background": {"weight": 0.025, "start": 0},
+        "background": {"weight": 0.025, "start": 0, "ramp": 0, "refracted_only": False},
         "smoothness": {"weight": 1.0, "start": 0, "tile_size": len(recorded["sky_patch_directions"])},
     }
     losses: dict[str, Loss] = {name: create(find("loss", name), options) for name, options in settings.items()}

@@ -36,7 +36,7 @@ from nerfro.viewing.page import make_page
 from nerfro.viewing.trained_scene import TrainedScene
 from tests.closed_forms import Luneburg, sampled
 from tests.conftest import refused
-from tests.media.vessels import spherical_vessel
+from tests.media.vessels import GLASS, WATER, spherical_vessel
 from tests.viewing.browser import Browser, needs_chromium
 from tests.viewing.conftest import IOR, RADIUS, sky_of
 
@@ -105,7 +105,8 @@ def test_five_cameras_of_a_cube_with_bodies_inside_agree_with_nerfro(glass_cube:
 
 @needs_chromium
 def test_vessel_agrees_with_nerfro(scene: TrainedScene, tmp_path: Path) -> None:
-    vessel = spherical_vessel(tmp_path, level=0.9, resolution=64, absorption=[0.3, 1.0, 2.0, 1.0, 0.0, 0.5])
+    walls, water = {"ior": GLASS, "absorption": [0.3, 1.0, 2.0]}, {"ior": WATER, "absorption": [1.0, 0.0, 0.5]}
+    vessel = spherical_vessel(tmp_path, level=0.9, resolution=64, glass=walls, liquid=water)
     vessel_scene = in_embedded_scene(scene, vessel)
     # Dyed walls of index 1 absorb, another liquid changes the picture, and air has no index to change.
     code = f"""(() => {{ {SHOT}
