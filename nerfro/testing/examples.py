@@ -100,6 +100,7 @@ def example_batch(num_rays: int = NUM_RAYS, rays_per_pixel: int = 1) -> Batch:
         teaches_background=torch.ones(len(every), dtype=torch.bool),
         cameras=example_views().cameras,
         draws=example_draws(num_rays),
+        maps={"depth": torch.full((len(every), 1), 4.0)},
     )
 
 
