@@ -30,9 +30,13 @@ def arguments(mesh: trimesh.Trimesh, num: int) -> Arguments:
     return (torch.tensor(mesh.vertices), torch.tensor(mesh.faces), torch.tensor(1.5, dtype=torch.float64), *rays(num))
 
 
-@pytest.mark.parametrize("shape", [lens, lambda: trimesh.creation.box((1.0, 1.2, 0.8))], ids=["lens", "block"])
+@pytest.mark.parametrize(
+    ("shape", "shading"),
+    [(lens, "smooth"), (lambda: trimesh.creation.box((1.0, 1.2, 0.8)), "flat")],
+    ids=["lens", "block"],
+)
 @pytest.mark.parametrize("argument", [0, 2, 3, 4], ids=["vertices", "ior", "origins", "directions"])
-def test_gradients_are_finite_differences(shape: Callable[[], trimesh.Trimesh], argument: int) -> None:
+def test_gradients_are_finite_differences(shape: Callable[[], trimesh.Trimesh], shading: str, argument: int) -> None:
     """Of all results of rays that keep their triangles, along a random direction of one argument."""
     values, generator = list(arguments(shape(), 40)), torch.Generator().manual_seed(2)
     towards = torch.randn(values[argument].shape, generator=generator, dtype=torch.float64)
@@ -40,7 +44,7 @@ def test_gradients_are_finite_differences(shape: Callable[[], trimesh.Trimesh], 
 
     def traced(shift: Tensor | float) -> tuple[Tensor, Tensor]:
         moved = [value + shift * towards if i == argument else value for i, value in enumerate(values)]
-        bent = nerfro.bend(*moved)
+        bent = nerfro.bend(*moved, shading=shading)
         return torch.cat([bent.positions, bent.directions, bent.lengths[:, None]], -1), bent.hit
 
     (before, _), (after, hit) = traced(-step), traced(step)

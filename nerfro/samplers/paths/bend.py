@@ -114,7 +114,8 @@ def _bend_triangles(
         vertices: positions [V, 3] in world units.
         faces: indices [F, 3] of the vertices of each triangle; no two vertices have equal positions.
         ior, origins, directions: see `bend`.
-        shading: whether the triangles are samples of a `smooth` surface or `flat`; `auto` decides for each face.
+        shading: whether the triangles are samples of a `smooth` surface or `flat`; `auto` decides for each face, so the
+            decision may change while vertices are optimized.
     """
     starts, towards = (values.cpu().double() for values in _checked_rays(origins, directions))
     corners, triangles = torch.as_tensor(vertices).cpu().double(), torch.as_tensor(faces).cpu().numpy().astype(np.int64)
