@@ -9,6 +9,8 @@ import numpy as np
 import torch
 import trimesh
 from torch.nn import functional
+from trimesh.exchange.obj import export_obj
+from trimesh.exchange.ply import export_ply
 
 from nerfro.core.light import to_srgb
 from nerfro.files.images import to_8bit
@@ -95,8 +97,8 @@ def one_mesh(glass: Sequence[trimesh.Trimesh], inside: trimesh.Trimesh | None, s
         process=False,
     )
     if suffix == ".obj":
-        return str(joined.export(file_type="obj", include_normals=True)).encode()
-    return bytes(joined.export(file_type="ply", vertex_normal=True))
+        return export_obj(joined, include_normals=True, include_texture=False).encode()
+    return export_ply(joined, vertex_normal=True)
 
 
 def largest_components(mesh: TriangleMesh) -> TriangleMesh:

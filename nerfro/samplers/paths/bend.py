@@ -150,7 +150,7 @@ def _box_around(low: Any, high: Any, resolution: int) -> tuple[Any, Any]:
 
 
 def _medium(surface: MeshSurface, ior: float | Tensor, resolution: int) -> Bodies:
-    low, high = _box_around(*surface.bounds, resolution)
+    low, high = _box_around(surface.bounds[0], surface.bounds[1], resolution)
     grid = GridSettings(resolution, low.tolist(), high.tolist(), cache=resolution != _COARSE)
     return Bodies([Body("object", surface, Material(float(torch.as_tensor(ior).detach())))], grid=grid)
 
