@@ -231,6 +231,7 @@ def test_arguments_and_exit_status_are_passed_through(script: Path, cache: Path)
     assert refused.stderr == "nerfro: error: sed is not a setting; did you mean seed?\n"
 
 
+@pytest.mark.slow
 def test_recorded_command_of_a_script_repeats_the_run(script: Path, tiny_run: list[str], tmp_path: Path) -> None:
     options = [*tiny_run, "trainer.max_steps=1", f"hydra.run.dir={tmp_path / 'run'}"]
     done = python(str(script), "train", *options, folder=tmp_path)

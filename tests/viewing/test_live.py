@@ -59,6 +59,7 @@ def test_bakes_keep_training_mode_and_weights(scene: TrainedScene, server: PageS
     assert set(json.loads(server.state(0))["update"]["scene"]) == {"volume", "sky", "version"}, "the surface stays"
 
 
+@pytest.mark.slow
 @needs_chromium
 def test_browser_shows_updates_and_losses(scene: TrainedScene, server: PageServer, tmp_path: Path) -> None:
     page = LivePage(server, scene, scene.views(), "test", resolution=8)
@@ -95,6 +96,7 @@ def test_browser_tells_the_outcome_and_opens_the_final_page(
         again.close()
 
 
+@pytest.mark.slow
 def test_training_serves_its_model(train_here: Runner, tiny_run: list[str], server: PageServer, tmp_path: Path) -> None:
     options = [option for option in tiny_run if "smoothing" not in option] + ["medium=sdf_grid"]
     options += ["trainer.max_steps=2", "viewer=true", f"hydra.run.dir={tmp_path / 'run'}"]
