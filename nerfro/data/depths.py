@@ -1,4 +1,4 @@
-"""Depth images of a data set as arc lengths, the map `depth` of `Views`."""
+"""Depths of a data set as arc lengths, the map `depth` of `Views`: depth images, and points of COLMAP."""
 
 from __future__ import annotations
 
@@ -47,6 +47,30 @@ def read_depths(files: Sequence[Path | None], unit: float, cameras: Cameras) -> 
         along_axis = torch.from_numpy(np.nan_to_num(levels[rows][:, columns], nan=0, posinf=0, neginf=0) * unit)
         cosine = -cameras.image_rays(view).directions @ cameras.camera_to_world[view, :, 2]
         depths[view] = (along_axis.clamp(min=0).float() / cosine.view(size))[..., None]
+    return depths
+
+
+def depths_of_points(points: Sequence[Float[np.ndarray, "points 3"]], cameras: Cameras) -> Float[Tensor, "V H W 1"]:
+    """Compute the distances from each camera to the 3-D points that it has observed.
+
+    Args:
+        points: points of each view, in the coordinates of the cameras.
+        cameras: cameras of the views.
+
+    Returns:
+        Distance of the nearest point in each pixel, world units; 0 in pixels without a point.
+    """
+    height, width = cameras.height, cameras.width
+    depths = torch.zeros(len(points), height, width, 1)
+    for view, seen in enumerate(points):
+        positions = torch.from_numpy(seen).float()
+        pixels, along_axis = cameras.select([view]).project(positions)
+        column, row = pixels[0].floor().long().unbind(-1)
+        visible = (along_axis[0] > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        lengths = (positions - cameras.camera_to_world[view, :, 3]).norm(dim=-1)[visible]
+        index = (row * width + column)[visible]
+        nearest = torch.full((height * width,), torch.inf).scatter_reduce(0, index, lengths, "amin")
+        depths[view] = torch.where(nearest.isfinite(), nearest, 0.0).view(height, width, 1)
     return depths
 
 

@@ -18,7 +18,7 @@ from nerfro.core.cameras import Cameras, central_window
 from nerfro.core.errors import NerfroError, first_of
 from nerfro.core.paths import refuse_root, resolve_path
 from nerfro.data.base import SPLITS, DataSource, Frame, Views
-from nerfro.data.depths import DEPTH, read_depths
+from nerfro.data.depths import DEPTH, depths_of_points, read_depths
 from nerfro.data.image_files import IMAGE_SUFFIXES, Alpha, read_rgb
 from nerfro.data.lazy_images import LazyImages
 from nerfro.data.lenses import Lens, check_lenses, lens_tensors
@@ -45,6 +45,7 @@ class FrameSet:
         usable: masks of the pixels that training may use, one per frame; empty if all pixels are usable.
         depths: depth images, one per frame; empty if there are none, see `nerfro.data.depths`.
         depth_unit: world units per level of the depth images.
+        points: 3-D points that each frame has observed, world units, which give depths; empty if there are none.
     """
 
     frames: Sequence[Frame]
@@ -56,6 +57,7 @@ class FrameSet:
     usable: Sequence[Path | None] = ()
     depths: Sequence[Path | None] = ()
     depth_unit: float = 1.0
+    points: Sequence[Float[np.ndarray, "points 3"]] = ()
 
 
 @validated("data")
@@ -154,6 +156,8 @@ class PosedImages(DataSource):
         cameras = Cameras(torch.from_numpy(poses).float(), fx, fy, cx, cy, width, height, near, far, distortion)
         usable = find_usable(files, read.usable, self.downscale, stored) if any(read.usable) else None
         maps = {DEPTH: read_depths(read.depths, read.depth_unit, cameras)} if any(read.depths) else {}
+        if read.points:
+            maps[DEPTH] = depths_of_points([points - self.origin for points in read.points], cameras)
         if read.crop < 1:
             window = central_window(height, width, read.crop)
             cameras, images = cameras.crop(window), images.cut(window)

@@ -46,8 +46,8 @@ class Depth(Loss):
         """Refuse data without depths."""
         if DEPTH not in views.maps:
             raise NerfroError(
-                "loss=depth needs depths, which the data lack; set data.depth_unit (data=nerfstudio with "
-                "depth_file_path), or return Views(maps={'depth': ...}) in your data format"
+                "loss=depth needs depths, which the data lack; set data.depths=true (data=colmap) or data.depth_unit "
+                "(data=nerfstudio with depth_file_path), or return Views(maps={'depth': ...}) in your data format"
             )
         return {}
 
