@@ -98,8 +98,8 @@ def tuples(_: nn.Module, samples: types.Samples) -> object:
     return samples.s, samples.positions
 
 
-def transposed(_: nn.Module, samples: types.Samples) -> types.FieldValues:
-    return types.FieldValues(samples.s.T, samples.positions)
+def too_few(_: nn.Module, samples: types.Samples) -> types.FieldValues:
+    return types.FieldValues(samples.s[:1], samples.positions[:1])
 
 
 @pytest.mark.parametrize(
@@ -110,7 +110,7 @@ def transposed(_: nn.Module, samples: types.Samples) -> types.FieldValues:
             tuples,
             r"Broken\.forward in .*test_plugins\.py returned a tuple; return FieldValues with density \[P, N\]",
         ),
-        (Field, transposed, r"returned a FieldValues of other shapes; return FieldValues with density"),
+        (Field, too_few, r"returned a FieldValues of other shapes; return FieldValues with density"),
         (
             Background,
             lambda _, exits: exits.directions[..., :1],

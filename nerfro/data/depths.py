@@ -50,7 +50,7 @@ def read_depths(files: Sequence[Path | None], unit: float, cameras: Cameras) -> 
     return depths
 
 
-def depths_of_points(points: Sequence[Float[np.ndarray, "points 3"]], cameras: Cameras) -> Float[Tensor, "V H W 1"]:
+def depths_of_points(points: Sequence[Float[np.ndarray, "_ 3"]], cameras: Cameras) -> Float[Tensor, "V H W 1"]:
     """Compute the distances from each camera to the 3-D points that it has observed.
 
     Args:

@@ -57,7 +57,7 @@ class FrameSet:
     usable: Sequence[Path | None] = ()
     depths: Sequence[Path | None] = ()
     depth_unit: float = 1.0
-    points: Sequence[Float[np.ndarray, "points 3"]] = ()
+    points: Sequence[Float[np.ndarray, "_ 3"]] = ()
 
 
 @validated("data")

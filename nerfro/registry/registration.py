@@ -66,7 +66,6 @@ _LIGHTNING_TARGETS = frozenset(
         "loggers.WandbLogger",
         "loggers.MLFlowLogger",
         "loggers.CometLogger",
-        "loggers.NeptuneLogger",
         "strategies.DDPStrategy",
     )
 )

@@ -1,6 +1,7 @@
 """Maps per pixel, and the loss on depth against its closed form."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from omegaconf import OmegaConf
 from PIL import Image
 
 from nerfro.core.cameras import Cameras
+from nerfro.data.base import Views
 from nerfro.data.depths import read_depths
 from nerfro.geometry.space import Unbounded
 from nerfro.losses.depth import Depth
@@ -97,7 +99,9 @@ def test_maps_arrive_in_batches_by_pixel_and_follow_a_selection() -> None:
     torch.testing.assert_close(pixels.maps["number"][:, 0].long(), pixels.number)
     assert pixels.maps["two"].shape == (32, 2)
     assert torch.equal(views.select([1]).maps["number"], number[1:])
-    refused(r"Views\.maps\['x'\] has the shape \[2, 8, 16, 1\]", replace, views, maps={"x": number[:, :8]})
+    # Without the constructor, whose annotations are checked in tests alone.
+    wrong = SimpleNamespace(**vars(views) | {"maps": {"x": number[:, :8]}})
+    refused(r"Views\.maps\['x'\] has the shape \[2, 8, 16, 1\]", Views.__post_init__, wrong)
 
 
 def test_data_without_depths_are_refused_before_training() -> None:

@@ -273,7 +273,7 @@ def test_mitsuba_renders_the_same_image(
     ("what", "name", "message"),
     [
         ("fog", "a.glb", "what=fog is not known; choose page, mesh"),
-        ("mesh", "a.ply", "must end in .glb"),
+        ("mesh", "a.stl", "must end in .glb"),
         ("volume", "a.vdb", "must end in .npz"),
     ],
 )

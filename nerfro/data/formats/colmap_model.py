@@ -141,7 +141,7 @@ def read_colmap(folder: Path) -> ColmapModel:
     path = folder / f"points3D{suffix}"
     rows = list(read_points(path)) if path.is_file() else []
     points = np.array([position for position, _ in rows], dtype=np.float64).reshape(-1, 3)
-    observed = np.repeat(np.arange(len(rows)), [len(track) for _, track in rows])
+    observed = np.repeat(np.arange(len(rows)), np.array([len(track) for _, track in rows], np.int64))
     observing = np.concatenate([np.empty(0, np.int64), *(track for _, track in rows)])
     if not images:
         raise NerfroError(f"{folder / f'images{suffix}'} holds no registered image; repeat the reconstruction")
