@@ -26,9 +26,9 @@ def main() -> None:
     """
     with errors_in_one_line():
         discover()
-        chosen = _selected(sys.argv[1:])
+        pairs = _selected(sys.argv[1:])
         try:
-            for plugin, settings in chosen:
+            for plugin, settings in pairs:
                 _check(plugin, settings)
         except ContractError as error:
             raise NerfroError(str(error)) from error
