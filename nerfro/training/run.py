@@ -24,6 +24,7 @@ from nerfro.silhouettes.mesh_match import require_match
 from nerfro.training.build import Training, check_before_training, composed_training, warn_without_effect
 from nerfro.training.callbacks import StopOnSignal, Throughput, steps_by_phase
 from nerfro.training.run_folder import LAST_CHECKPOINT, begin, lock_run, next_steps, require_same_run
+from nerfro.training.run_page import write_run_page
 from nerfro.training.trainer import finish_logs, fit, make_trainer, print_profile, quieten_lightning
 from nerfro.training.viewer import Viewer
 from nerfro.viewing.camera_files import write_cameras
@@ -132,5 +133,6 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetr
             viewer.close(outcome)
     if scores is not None:
         write_scores(scores, f"{config.name} on {config.data.root}, {split} views", folder, brief=True)
+    write_run_page(folder, f"{config.name} on {config.data.root}", costs[:2], throughput.curve, scores, split or "")
     print(next_steps(folder, split))
     return scores
