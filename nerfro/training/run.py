@@ -15,6 +15,7 @@ from nerfro.core.progress import duration
 from nerfro.core.provenance import AlgorithmSettings
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.results import RunMetrics
+from nerfro.evaluation.run_page import write_run_page
 from nerfro.evaluation.scoring import score_split
 from nerfro.evaluation.tables import write_scores
 from nerfro.fields.networks import compile_networks
@@ -24,7 +25,6 @@ from nerfro.silhouettes.mesh_match import require_match
 from nerfro.training.build import Training, check_before_training, composed_training, warn_without_effect
 from nerfro.training.callbacks import StopOnSignal, Throughput, steps_by_phase
 from nerfro.training.run_folder import LAST_CHECKPOINT, begin, lock_run, next_steps, require_same_run
-from nerfro.training.run_page import write_run_page
 from nerfro.training.trainer import finish_logs, fit, make_trainer, print_profile, quieten_lightning
 from nerfro.training.viewer import Viewer
 from nerfro.viewing.camera_files import write_cameras

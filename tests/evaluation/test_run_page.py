@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 from nerfro.evaluation.results import EvaluationResult, RunMetrics, ViewScores
-from nerfro.training.run_page import write_run_page
+from nerfro.evaluation.run_page import write_run_page
 
 
 def test_page_names_scores_views_files_and_commands(tmp_path: Path) -> None:
