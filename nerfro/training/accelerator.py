@@ -121,7 +121,7 @@ def compare(module: TrainingModule, data: RayDataModule, gpu: torch.device, prec
             return Compared(f"the loss of a step is {loss[1]:.5g} instead of {loss[0]:.5g}")
         if not (error := (radiance[0] - radiance[1]).abs().amax(-1).quantile(0.98).item()) <= _RADIANCE:
             return Compared(f"the radiance of rays differs by {error:.2g} from the CPU")
-        if not (cosine := torch.cosine_similarity(*gradient, dim=0).item()) >= _COSINE:
+        if not (cosine := torch.cosine_similarity(gradient[0], gradient[1], dim=0).item()) >= _COSINE:
             return Compared(f"the gradient of a step differs from the CPU (cosine {cosine:.3f})")
         return Compared("", **{name: milliseconds(copied, data, precision) for name, copied in modules.items()})
 
