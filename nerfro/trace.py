@@ -23,8 +23,6 @@ from nerfro.rendering.scene_file import with_scene
 from nerfro.samplers.paths.thin_walls import warn_of_thin_walls
 from nerfro.samplers.paths.traced_file import TraceConfig, leave_box, make_rays, read_rays
 
-_PLOTTED_RAYS = 24
-
 
 @entry_point("trace", TraceConfig, expand=with_scene)
 def main(config: DictConfig) -> None:
@@ -57,7 +55,7 @@ def main(config: DictConfig) -> None:
     if num_exceeded:
         rich.print(f"{num_exceeded} paths reached the limit of {sampler.max_events} events and continue straight")
     if config.plot:
-        shown = torch.linspace(0, len(rays) - 1, min(len(rays), _PLOTTED_RAYS)).round().long()
+        shown = torch.linspace(0, len(rays) - 1, min(len(rays), 24)).round().long()
         draw_paths(path.select_rays(shown), medium, out.with_suffix(".png"))
         rich.print(f"drew {len(shown)} rays in {out.with_suffix('.png')}")
 

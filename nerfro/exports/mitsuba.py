@@ -26,8 +26,6 @@ from nerfro.viewing.page import page_split
 from nerfro.viewing.trained_scene import TrainedScene
 
 MITSUBA_FILES = ("_glass.ply", "_inside.ply", "_sky.hdr")  # endings of the files beside the .xml
-_MAX_DEPTH = 64  # events of a light path that the file proposes
-_NUM_SAMPLES = 64  # samples per pixel that the file proposes
 # Clip distances of the sensors, relative to the largest distance between a camera and a corner of the object's bounds.
 _NEAR_CLIP, _FAR_CLIP = 1e-4, 1e2
 _MIN_SKY_HEIGHT = 1024
@@ -59,7 +57,7 @@ def write_mitsuba(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
     cameras, absorption = scene.cameras(split).to("cpu"), absorption_of(scene.renderer.scene)
     glass_file, inside_file, sky_file = (out.with_name(out.stem + ending) for ending in MITSUBA_FILES)
     objects: dict[str, Any] = {
-        "integrator": {"type": "volpath" if absorption.any() else "path", "max_depth": _MAX_DEPTH},
+        "integrator": {"type": "volpath" if absorption.any() else "path", "max_depth": 64},
         "sky": {"type": "envmap", "filename": sky_file.name, "to_world": _Y_UP_TO_Z_UP},
     }
     glass_files = [glass_file, *(out.with_name(f"{out.stem}_glass_{body}.ply") for body in range(1, len(glass)))]
@@ -147,7 +145,7 @@ def _sensor(cameras: Cameras, view: int, reach: float) -> dict[str, Any]:
         "principal_point_offset_y": 0.5 - float(cameras.cy[view]) / cameras.height,
         "to_world": to_world,
         "film": {"type": "hdrfilm", "width": cameras.width, "height": cameras.height, "rfilter": {"type": "box"}},
-        "sampler": {"type": "independent", "sample_count": _NUM_SAMPLES},
+        "sampler": {"type": "independent", "sample_count": 64},
     }
 
 

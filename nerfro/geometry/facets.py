@@ -12,10 +12,8 @@ from nerfro.geometry.orientation import area_vectors
 # Edges with larger angles between their faces stay sharp, in degrees; 30 is a common default of modelling programs.
 CREASE_DEGREES = 30.0
 _COPLANAR = 0.1  # degrees between triangles of one flat face
-_SMALL = 20  # times smaller than most of a region, a face belongs to a rounded edge
 _LEAST_SHARE = 0.05  # of the area of the mesh; smaller regions stay smooth
 _MIXED = 0.25  # share of the edges, by length, at which neither two triangles nor two quadrilaterals meet
-_RIM = 0.1  # length of sharp edges around a region relative to the edges within it
 # Angles between faces, in degrees: cylinders of modelling programs have 30 or more sides.
 _LEAST_TURN, _DOUBTFUL_TURN, _FACETED_TURN = 2.0, 8.0, 12.5
 
@@ -122,7 +120,7 @@ def _regions_of(
     region = connected_component_labels(np.stack([soft.first, soft.second], 1), len(area))
     region = np.unique(region, return_inverse=True)[1].reshape(-1)
     count = region.max() + 1
-    is_large = area >= _typical(region, area)[region] / _SMALL
+    is_large = area >= _typical(region, area)[region] / 20  # smaller faces belong to rounded edges
     of_large = np.bincount(region, area * is_large, count)
     several = np.bincount(region, area * is_large * (np.bincount(face) > 1), count) / of_large
     soft = soft.subset(is_large[soft.first] & is_large[soft.second])
@@ -131,9 +129,8 @@ def _regions_of(
     alike = (corners[soft.first] == corners[soft.second]) & (corners[soft.first] <= 4)
     mixed = np.bincount(of_region, soft.length * ~alike, count) / length
     rim = sum(np.bincount(region[side], sharp.length, count) for side in (sharp.first, sharp.second))
-    return _Regions(
-        region, is_large, np.bincount(region, area), several, mixed, *_turn(soft, region, length), rim >= _RIM * length
-    )
+    ends = rim >= 0.1 * length
+    return _Regions(region, is_large, np.bincount(region, area), several, mixed, *_turn(soft, region, length), ends)
 
 
 def _edges(vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "F 3"]) -> _Edges:

@@ -27,7 +27,6 @@ INPUTS = "nerfro_inputs"
 # Folder of a run with copies of the files that its settings name.
 INPUTS_FOLDER = "inputs"
 _GROUPS = ("camera", "medium", "sampler", "field", "background", "model")  # whose settings may name files
-_NUM_HASHED = 8  # photographs whose content is compared; of the others, name and size
 _OF_CAMERAS = ("camera_to_world", "fx", "fy", "cx", "cy")
 # Differences below this fraction of the largest number are rounding errors of another machine.
 _TOLERANCE = 1e-5
@@ -203,7 +202,7 @@ def _hash_of_photographs(views: Views) -> str | None:
     if not views.frames:
         return None
     files = [frame.image for frame in views.frames]
-    contents = [file_hash(files[view]) for view in views.spread(_NUM_HASHED)]
+    contents = [file_hash(files[view]) for view in views.spread(8)]
     return content_hash(*views.names, *(file.stat().st_size for file in files), *contents)
 
 

@@ -48,6 +48,7 @@ def test_kernels_work_without_a_writable_folder_with_one_warning(
     assert set(Path(__file__).parent.rglob("*.nbi")) == in_tree
 
 
+@pytest.mark.slow
 def test_kernel_is_recompiled_if_a_constant_of_another_file_changes(tmp_path: Path) -> None:
     package = tmp_path / "plugin"
     package.mkdir()
