@@ -52,9 +52,9 @@ def helping_threads() -> Iterator[int]:
     HELPERS.extend(helpers)
     torch.set_num_threads(1)
     try:
-        yield number
+        yield 1 + len(HELPERS)
     finally:
         torch.set_num_threads(number)
         for helper in helpers:
+            # A thread ends with its executor, to which `share` of another thread may still give work.
             HELPERS.remove(helper)
-            helper.shutdown()

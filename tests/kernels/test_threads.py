@@ -114,7 +114,7 @@ def test_helping_threads_write_to_inference_tensors(monkeypatch: pytest.MonkeyPa
     assert values.tolist() == [1.0, 1.0]
 
 
-def test_rows_are_shared_by_all_cores_and_their_threads_end(unchecked: None) -> None:
+def test_rows_are_shared_by_all_cores(unchecked: None) -> None:
     both_threads, threads = threading.Barrier(2), set[int]()
 
     def double(rows: slice) -> torch.Tensor:

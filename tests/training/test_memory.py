@@ -17,11 +17,11 @@ from nerfro.media.analytic import Vacuum
 from nerfro.models.refractive import RefractiveModel
 from nerfro.paper.nerf import NerfField
 from nerfro.rendering import Components, Renderer
+from nerfro.rendering.memory import require_memory
 from nerfro.samplers.paths.straight import Straight
 from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import example_batch
 from nerfro.training import memory
-from nerfro.training.memory import require_memory
 from tests.conftest import refused
 from tests.pretended_gpu import GPU, OnGpu, PretendedGpu
 
