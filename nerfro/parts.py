@@ -13,6 +13,7 @@ from nerfro.core.errors import NerfroError
 from nerfro.core.paths import resolve_path
 from nerfro.core.types import Batch, Exits, FieldValues, OpticalRecord, Path, Rays, Rendering, Samples
 from nerfro.data.base import DataSource, Views
+from nerfro.evaluation.error_maps import ErrorMap
 from nerfro.evaluation.image_metrics import ImageMetric
 from nerfro.fields.base import Field
 from nerfro.files.atomic import write_atomically
@@ -36,9 +37,9 @@ from nerfro.viewing.trained_scene import TrainedScene
 
 __all__ = [
     "EXPORTS", "Background", "Batch", "Bodies", "Body", "Box", "CameraModel", "Cameras", "Components", "Contracted",
-    "Count", "DataSource", "Distance", "Draws", "Exits", "Export", "ExportConfig", "Field", "FieldValues", "Ge",
-    "Grid", "GridSettings", "Gt", "ImageMetric", "Le", "Loss", "Lt", "Material", "Medium", "MeshSurface", "Natural",
-    "NerfroError", "NotNegative", "OpticalRecord", "Path", "PathSampler", "Phase", "PointSampler", "Positive", "Rays",
+    "Count", "DataSource", "Distance", "Draws", "ErrorMap", "Exits", "Export", "ExportConfig", "Field", "FieldValues",
+    "Ge", "Grid", "GridSettings", "Gt", "ImageMetric", "Le", "Loss", "Lt", "Material", "Medium", "MeshSurface",
+    "Natural", "NerfroError", "NotNegative", "OpticalRecord", "Path", "PathSampler", "Phase", "PointSampler", "Positive", "Rays",
     "RefractiveModel", "Renderer", "Rendering", "Samples", "Scalars", "Scene", "Space", "Stratified", "Surface",
     "TrainedScene", "TrainingRun", "Unbounded", "Vectors", "Views", "invert_cdf", "load_arrays", "point_samples",
     "register", "resolve_path", "spread_uniform", "write_atomically",
