@@ -36,11 +36,11 @@ from training import SCENE, Training, write_images
 import nerfro
 from nerfro.core.types import Batch
 from nerfro.evaluation.render_view import render_view
+from nerfro.evaluation.validation import ValidationPixels
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.registry.registration import build
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.training.module import TrainingModule
-from nerfro.training.validation import ValidationPixels
 
 AXES = {
     "pixels": [128, 64, 256, 512, 1024, 1600],

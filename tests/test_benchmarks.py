@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import ANY
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ import nerfro
 from benchmarks.capture import align_to_truth
 from nerfro.files.images import save_png
 from nerfro.geometry.mesh import TriangleMesh
+from nerfro.kernels import available
 from nerfro.poses.collection import extract_frames
 from nerfro.train import main
 from tests import ball_photographs
@@ -132,6 +134,21 @@ def test_rendering_benchmark_prints_complete_tables(run: Run, trained_run: Path)
         len(table_rows(run("training", "view", trained_run / "checkpoints" / "last.ckpt", "--side", 8, "--turns", 1)))
         == 10
     )
+
+
+def test_gpu_benchmark_runs_to_its_end_without_a_gpu(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(available, "find_gpu", lambda: None)
+    short = ("--steps", 1, "--goals", 1, 2, "--sides", 8, "--experiments", "straight", "--options", *SMALL[1:6])
+    lines = run("gpu", "--out", tmp_path / "gpu.json", *short, "data.downscale=8", "batches.size=16")
+    parts = json.loads((tmp_path / "gpu.json").read_text())
+    assert parts["machine"]["gpu"] == parts["steps"]["straight"]["GPU"] == "n/a: no GPU"
+    assert len(parts["results"]) == 17
+    assert {cell for cells in parts["results"].values() for cell in cells.values()} == {"n/a: no GPU"}
+    assert parts["steps"]["straight"]["1 core"]["step"] > 0
+    assert parts["quality"]["PSNR at the end, dB"]["CPU"] > 2
+    assert list(parts["views"]) == ["8x8, one ray a pixel, s", "8x8, supersampled, s"]
+    assert parts["quality"]["seconds to 2 dB"] == {"GPU": "n/a: no GPU", "CPU": ANY}
+    assert len(table_rows(lines)) == 31 + (torch.get_num_threads() > 1)
 
 
 def test_processor_time_writes_a_finished_run(run: Run, tiny_default_run: list[str], tmp_path: Path) -> None:

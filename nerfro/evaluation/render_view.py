@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from nerfro.core.cameras import Cameras
 from nerfro.rendering import RenderedRays, Renderer
@@ -19,9 +20,9 @@ def render_view(renderer: Renderer, cameras: Cameras, view: int, subdivision: Su
     size = cameras.height * cameras.width
     pixels = torch.arange(view * size, (view + 1) * size, device=cameras.device)
     with torch.inference_mode():
-        neighbours = [
-            renderer.exit_directions(neighbour_rays(cameras, some)) for some in pixels.split(renderer.chunk_size)
-        ]
+        neighbours = renderer.map_chunks(
+            lambda rows: renderer.exit_directions(neighbour_rays(cameras, pixels[rows])), pixels, renderer.chunk_size
+        )
     angles = divergence(cameras, pixels, rendered.exit_directions, torch.cat(neighbours))
     divided = angles >= subdivision.divergence
     if subdivision.contrast is not None:
@@ -31,7 +32,11 @@ def render_view(renderer: Renderer, cameras: Cameras, view: int, subdivision: Su
     if len(pixels_to_divide) == 0:
         return rendered
     radiance, num_parts = rendered.radiance.clone(), subdivision.side**2
-    for some in pixels_to_divide.split(max(1, renderer.chunk_size // num_parts)):
-        parts = renderer.render(part_rays(cameras, pixels[some], subdivision.side)).radiance
-        radiance[some] = parts.view(-1, num_parts, 3).mean(1)
+
+    def mean_of_parts(rows: slice) -> Tensor:
+        parts = part_rays(cameras, pixels[pixels_to_divide[rows]], subdivision.side)
+        return renderer.render(parts).radiance.view(-1, num_parts, 3).mean(1)
+
+    size = max(1, renderer.chunk_size // num_parts)
+    radiance[pixels_to_divide] = torch.cat(renderer.map_chunks(mean_of_parts, pixels_to_divide, size))
     return replace(rendered, radiance=radiance)

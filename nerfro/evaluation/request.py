@@ -16,6 +16,7 @@ from nerfro.core.errors import Interrupted, NerfroError, warn
 from nerfro.core.paths import user_path
 from nerfro.files.atomic import refuse_existing, write_atomically
 from nerfro.files.folder_lock import lock_folder, require_only
+from nerfro.kernels.available import find_gpu
 from nerfro.registry.allowed import Natural, NumRays, refuse_unused
 from nerfro.samplers.subdivision import SubdivisionChanges
 
@@ -94,12 +95,12 @@ def record(folder: Path, options: EvaluateConfig) -> None:
 
 
 def report_unused_gpu(option: str) -> None:
-    """Print a line if the machine has a GPU, which `auto` does not use because compiled kernels exist only for CPUs.
+    """Print a line if the machine has a GPU, which `device=auto` does not use because compiled kernels are for CPUs.
 
     Args:
         option: option that selects the GPU.
     """
-    if torch.cuda.is_available() or torch.backends.mps.is_available():
+    if find_gpu() is not None:
         warn(
             "the CPU is used, because nerfro has no GPU kernels and its speed on a GPU is unknown; "
             f"set {option} to use the GPU nevertheless"

@@ -70,6 +70,18 @@ def number_in(file: Path, pattern: str, unit: int = 1, default: float = 0) -> fl
     return default if match is None else int(match[1]) * unit
 
 
+def find_gpu() -> torch.device | None:
+    """Return the GPU that PyTorch can use: `cuda`, which includes ROCm, or `mps`; None without one."""
+    if torch.cuda.is_available():
+        return torch.device("cuda", 0)
+    return torch.device("mps") if torch.backends.mps.is_available() else None
+
+
+def gpu_name(gpu: torch.device) -> str:
+    """Return the name of a GPU, such as "NVIDIA H200"."""
+    return torch.cuda.get_device_name(gpu) if gpu.type == "cuda" else "Apple GPU"
+
+
 @functools.cache
 def fast_bfloat16(device: str) -> bool:
     """Return whether matrix products in bfloat16 are faster than in float32 on a device: `cpu`, `cuda`, ...

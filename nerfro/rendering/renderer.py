@@ -6,7 +6,7 @@ import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, TypeVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -23,12 +23,15 @@ from nerfro.data.component import Component
 from nerfro.fields.base import Field
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.geometry.space import Space, Unbounded
+from nerfro.kernels.threads import share_rows
 from nerfro.media.base import Medium
 from nerfro.registry.allowed import validated
 from nerfro.rendering.scene import Scene
 from nerfro.samplers.base import PathSampler, PointSampler
 from nerfro.samplers.paths.surface_normals import first_normals
 from nerfro.samplers.points.stepfun import volume_weights
+
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -43,7 +46,7 @@ class Components:
         background: background radiance, from beyond the volume.
         camera: estimate of the training cameras.
         space: space that fields and samples cover.
-        chunk_size: number of rays rendered at once in evaluation, which limits the memory.
+        chunk_size: number of rays that all cores render at once in evaluation, which limits the memory.
     """
 
     medium: Medium
@@ -210,6 +213,15 @@ class Renderer(Component, nn.Module, ABC):
         """Render the radiance of any number of rays in chunks, without the other results of `render`."""
         return self._in_chunks(lambda chunk: self._render_traced(chunk, self.trace(chunk)), rays)[0]
 
+    def map_chunks(self, task: Callable[[slice], Result], like: Tensor, size: int) -> list[Result]:
+        """Call a function for chunks of rows in evaluation mode and without gradients, see `share_rows`."""
+        was_training = self.training
+        self.eval()
+        try:
+            return share_rows(task, like, size)
+        finally:
+            self.train(was_training)
+
     def _replayed(self, path: Path, rays: Rays) -> Path:
         """Replay paths with gradients, except for paths whose derivatives are too large."""
         medium = self.scene.medium
@@ -226,13 +238,8 @@ class Renderer(Component, nn.Module, ABC):
         return dataclasses.replace(path, **columns)
 
     def _in_chunks(self, render: Callable[[Rays], tuple[Tensor, ...]], rays: Rays) -> list[Tensor]:
-        """Render `chunk_size` rays at a time in evaluation mode, and concatenate the results."""
-        was_training = self.training
-        self.eval()
-        try:
-            chunks = [render(rays[i : i + self.chunk_size]) for i in range(0, max(len(rays), 1), self.chunk_size)]
-        finally:
-            self.train(was_training)
+        """Render `chunk_size` rays at a time, see `map_chunks`, and concatenate the results."""
+        chunks = self.map_chunks(lambda rows: render(rays[rows]), rays.near, self.chunk_size)
         return [torch.cat(parts) for parts in zip(*chunks, strict=True)]
 
     def _render_chunk(self, rays: Rays) -> tuple[Tensor, ...]:

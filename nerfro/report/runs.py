@@ -243,7 +243,7 @@ def read_run(folder: Path) -> EvaluatedRun:
 def device(config: Mapping[str, Any], facts: Mapping[str, Any]) -> str:
     """Return the training device, such as "NVIDIA H200" or "2 CPU threads (x86_64)"."""
     trainer = config["trainer"]
-    if facts.get("gpu") and trainer["accelerator"] not in ("auto", "cpu"):  # `auto` means the CPU
+    if facts.get("gpu") and trainer["accelerator"] not in ("auto", "cpu"):
         number = trainer["devices"]
         return facts["gpu"] if number == 1 else f"{number} x {facts['gpu']}"
     threads = facts["threads"]

@@ -15,6 +15,7 @@ from nerfro.cli.overrides import as_overrides
 from nerfro.core.errors import NerfroError, warn
 from nerfro.data.base import DataSource, Views
 from nerfro.rendering import RayTracer, Renderer
+from nerfro.rendering.memory import require_memory
 from nerfro.rendering.scene_file import SceneFile, with_scene
 from nerfro.samplers.paths.thin_walls import warn_of_thin_walls
 from nerfro.samplers.subdivision import Subdivision
@@ -32,7 +33,6 @@ from nerfro.training.data_module import RayDataModule
 from nerfro.training.derivation import derived
 from nerfro.training.effects import settings_without_effect
 from nerfro.training.init_from import initialize_from
-from nerfro.training.memory import require_memory
 from nerfro.training.module import TrainingModule
 from nerfro.training.pixel_batches import PixelBatches
 from nerfro.training.reach import CHECKED_RAYS, require_reach

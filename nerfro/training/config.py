@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast, get_args
 
-import torch
 from annotated_types import Ge, Gt, Le
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -22,6 +21,7 @@ from nerfro.data.base import DataSource
 from nerfro.data.validation_views import WithValidationViews
 from nerfro.evaluation.results import Region
 from nerfro.geometry.box import corners_of_box
+from nerfro.kernels.available import find_gpu
 from nerfro.media.analytic import Vacuum
 from nerfro.media.base import Medium
 from nerfro.media.body_settings import origin_of
@@ -135,7 +135,8 @@ class TrainerConfig:
     """Arguments of Lightning's Trainer; those that nerfro sets itself are refused. None is Lightning's default.
 
     Attributes:
-        accelerator: the CPU; gpu or cuda selects a GPU.
+        accelerator: auto trains on a GPU if its first steps agree with the CPU and take less time, else on the CPU;
+            gpu insists on a GPU.
         max_steps: -1 trains until max_time.
         max_time: such as 90s, 5m, 1.5h, 2d, or DD:HH:MM:SS.
         precision: `fastest` selects bf16-mixed if the machine has bfloat16 units, else 32-true.
@@ -148,7 +149,7 @@ class TrainerConfig:
     """
 
     _target_: str = "lightning.pytorch.Trainer"
-    accelerator: str = "auto"
+    accelerator: Literal["auto", "cpu", "gpu", "cuda", "mps"] = "auto"
     devices: Any = 1
     num_nodes: Count | None = None
     strategy: Any = "auto"
@@ -365,8 +366,9 @@ def resolve_trainer_options(config: DictConfig) -> DictConfig:
 
 
 def training_device(config: DictConfig) -> str:
-    """Return the kind of device that a run trains on, `cuda` or `cpu`; `trainer.accelerator=auto` means the CPU."""
-    return "cuda" if config.trainer.accelerator in ("gpu", "cuda") and torch.cuda.is_available() else "cpu"
+    """Return the kind of device that a run trains on, `cpu`, `cuda` or `mps`; `auto` means the CPU."""
+    gpu = find_gpu()
+    return "cpu" if gpu is None or config.trainer.accelerator in ("auto", "cpu") else gpu.type
 
 
 def require_data(config: DictConfig) -> None:

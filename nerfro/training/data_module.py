@@ -16,12 +16,12 @@ from torch import nn
 from nerfro.core.errors import NerfroError
 from nerfro.core.types import Batch
 from nerfro.data.base import Views
+from nerfro.evaluation.validation import ValidationPixels
 from nerfro.kernels.compilation import HELPERS
 from nerfro.rendering import RayTracer, Renderer
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.training.module import TrainingModule
 from nerfro.training.pixel_batches import PixelBatches
-from nerfro.training.validation import ValidationPixels
 
 # Number of validations for each validation image, so that the curve has more points; each costs a few steps.
 _VALIDATIONS_PER_IMAGE = 5

@@ -22,9 +22,11 @@ from nerfro.fields.networks import compile_networks
 from nerfro.rendering.scene_file import SceneFile
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.silhouettes.mesh_match import require_match
+from nerfro.training.accelerator import choose_accelerator, require_accelerator
 from nerfro.training.build import Training, check_before_training, composed_training, warn_without_effect
 from nerfro.training.callbacks import StopOnSignal, Throughput, steps_by_phase
 from nerfro.training.run_folder import LAST_CHECKPOINT, begin, lock_run, next_steps, require_same_run
+from nerfro.training.settings import with_values
 from nerfro.training.trainer import finish_logs, fit, make_trainer, print_profile, quieten_lightning
 from nerfro.training.viewer import Viewer
 from nerfro.viewing.camera_files import write_cameras
@@ -84,8 +86,10 @@ def run_training(composition: Composition) -> Run:
 def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetrics | None:
     """Train and evaluate; everything that can be refused is refused before training starts."""
     quieten_lightning()
+    require_accelerator(config)
     training = Training.start(config)
-    config, split = training.config, config.evaluation.split
+    accelerator = choose_accelerator(training.config, training.module, training.data)
+    config, split = with_values(training.config, {"trainer.accelerator": accelerator}), config.evaluation.split
     test = training.views if split is None else training.source.load(split).checked()
     test = test.select(range(len(test))[: config.trainer.limit_test_batches])
     metrics, renderer = ImageMetrics(), training.module.renderer

@@ -27,7 +27,7 @@ from nerfro.files.atomic import require_room, write_atomically
 from nerfro.files.folder_lock import lock_folder, require_only
 from nerfro.files.foreign_config import foreign_config, read_foreign_config
 from nerfro.files.reading import reading
-from nerfro.kernels.available import fast_bfloat16
+from nerfro.kernels.available import fast_bfloat16, gpu_name
 from nerfro.rendering import Renderer
 from nerfro.training.config import build_model, check_trained, training_device
 from nerfro.training.content import describe
@@ -142,7 +142,7 @@ def record(folder: Path, config: DictConfig) -> None:
         "python": platform.python_version(),
         "machine": platform.machine(),
         "threads": torch.get_num_threads(),
-        "gpu": torch.cuda.get_device_name() if device == "cuda" else None,
+        "gpu": None if device == "cpu" else gpu_name(torch.device(device)),
         "fast_bfloat16": fast_bfloat16(device),
         "versions": versions(),
         "algorithms": list(AlgorithmSettings.used.values()),

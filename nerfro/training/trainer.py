@@ -22,7 +22,6 @@ from omegaconf import DictConfig
 
 import nerfro.training.lightning_callbacks  # noqa: F401 - registers callbacks
 from nerfro.core.errors import NerfroError
-from nerfro.evaluation.request import report_unused_gpu
 from nerfro.files.atomic import atomic_file
 from nerfro.kernels.available import fast_bfloat16, keep_freed_memory
 from nerfro.registry.registration import build, create, find
@@ -45,7 +44,7 @@ def make_trainer(
     """Create the Trainer of a run with its callbacks and loggers.
 
     Args:
-        config: configuration of the run, see `TrainConfig`.
+        config: configuration of the run, see `TrainConfig`; its `trainer.accelerator` is not `auto`.
         folder: folder of the run.
         throughput: counter of rays and seconds.
         extra: further callbacks.
@@ -87,13 +86,11 @@ def make_trainer(
         "use_distributed_sampler": False,
         "precision": lightning_precision(config),
     }
-    processes = config.trainer.num_nodes or 1, config.trainer.devices
-    if config.trainer.strategy == "ddp" or (config.trainer.strategy == "auto" and processes not in _ONE_PROCESS):
+    if config.trainer.strategy == "ddp" or (config.trainer.strategy == "auto" and not one_process(config)):
         # Buffers, such as the index grid, are equal in all processes and need no broadcast in every step.
         ours["strategy"] = DDPStrategy(broadcast_buffers=False, find_unused_parameters=False)
-    accelerator = training_accelerator(config.trainer.accelerator)
     options = {name: value for name, value in config.trainer.items() if value is not None and name not in _OWN}
-    trainer = build(options | {"accelerator": accelerator}, **ours)
+    trainer = build(options, **ours)
     for logger in trainer.loggers:
         if isinstance(logger, CSVLogger) and trainer.is_global_zero:
             keep_rows(logger, num_steps)
@@ -120,16 +117,9 @@ def _shared(callback: Callback) -> Callback:
     return SharedTimer(timedelta(seconds=remaining))
 
 
-def training_accelerator(name: str) -> str:
-    """Replace `auto` by `cpu`, because compiled kernels exist only for CPUs, and warn of an unused GPU.
-
-    Args:
-        name: `trainer.accelerator`.
-    """
-    if name != "auto":
-        return name
-    report_unused_gpu("trainer.accelerator=gpu")
-    return "cpu"
+def one_process(config: DictConfig) -> bool:
+    """Return whether a run has one process."""
+    return (config.trainer.num_nodes or 1, config.trainer.devices) in _ONE_PROCESS
 
 
 def lightning_precision(config: DictConfig) -> str:

@@ -2,11 +2,18 @@
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import pytest
 import torch
 
+from nerfro.evaluation.render_view import render_view
 from nerfro.kernels import compilation
+from nerfro.kernels.threads import share_rows
+from nerfro.models.refractive import RefractiveModel
+from nerfro.samplers.subdivision import Subdivision
+from nerfro.testing import example_components
+from tests.cameras_at import upright_cameras
 from tests.processes import printed_by
 
 IMPORTS_ONLY = """
@@ -105,3 +112,37 @@ def test_helping_threads_write_to_inference_tensors(monkeypatch: pytest.MonkeyPa
 
         compilation.share(write, 2)
     assert values.tolist() == [1.0, 1.0]
+
+
+def test_rows_are_shared_by_all_cores(unchecked: None) -> None:
+    both_threads, threads = threading.Barrier(2), set[int]()
+
+    def double(rows: slice) -> torch.Tensor:
+        both_threads.wait(10)  # passes only if two threads have a chunk at the same time
+        threads.add(threading.get_ident())
+        assert torch.get_num_threads() == 1
+        return 2 * values[rows]
+
+    before, values = torch.get_num_threads(), torch.arange(12)
+    torch.set_num_threads(2)
+    try:
+        doubled = torch.cat(share_rows(double, values, 6))
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+    assert len(threads) == 2
+    assert torch.equal(doubled, 2 * values)
+    assert compilation.HELPERS == []
+
+
+def test_view_is_equal_on_one_and_on_two_cores(unchecked: None) -> None:
+    renderer = RefractiveModel(replace(example_components(), chunk_size=40))
+    cameras = upright_cameras(1, 12, 15.0)
+    before, views = torch.get_num_threads(), []
+    try:
+        for number in (1, 2):
+            torch.set_num_threads(number)
+            views.append(render_view(renderer, cameras, 0, Subdivision(side=2, divergence=0.0)).radiance)
+    finally:
+        torch.set_num_threads(before)
+    torch.testing.assert_close(*views, rtol=1e-5, atol=1e-6)

@@ -64,7 +64,8 @@ def test_chunk_size_bounds_the_number_of_rays_rendered_at_once(
         model.path_sampler, "forward", lambda rays, medium: (sizes.append(len(rays)), forward(rays, medium))[1]
     )
     rendered = model.render(example_rays())
-    assert sizes == [7, 7, 7, 3]
+    assert sum(sizes) == 24
+    assert max(sizes) <= 7  # several cores share the seven rays
     torch.testing.assert_close(rendered.radiance, whole[-1].radiance)
     none = model.render(example_rays()[:0])
     for name, values in vars(none).items():

@@ -16,12 +16,11 @@ from nerfro.kernels.available import available_bytes, require_bytes
 from nerfro.media.analytic import Vacuum
 from nerfro.models.refractive import RefractiveModel
 from nerfro.paper.nerf import NerfField
-from nerfro.rendering import Components, Renderer
+from nerfro.rendering import Components, Renderer, memory
+from nerfro.rendering.memory import require_memory
 from nerfro.samplers.paths.straight import Straight
 from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import example_batch
-from nerfro.training import memory
-from nerfro.training.memory import require_memory
 from tests.conftest import refused
 from tests.pretended_gpu import GPU, OnGpu, PretendedGpu
 

@@ -1,4 +1,4 @@
-"""The accelerator and the precision of a training, and of its networks."""
+"""The precision of a training, and of its networks."""
 
 import json
 import math
@@ -15,7 +15,7 @@ from nerfro.fields import relu_mlp
 from nerfro.fields.hash_grid import HashGridField
 from nerfro.kernels.available import fast_bfloat16
 from nerfro.testing import example_space
-from nerfro.training.trainer import lightning_precision, training_accelerator
+from nerfro.training.trainer import lightning_precision
 
 
 @pytest.mark.slow
@@ -28,13 +28,11 @@ def test_run_in_every_precision_ends_with_finite_scores(
     assert all(math.isfinite(value) for value in scores.values() if isinstance(value, float))
 
 
-def test_accelerator_auto_trains_on_the_cpu_and_reports_an_unused_gpu(
+def test_evaluation_on_the_cpu_reports_an_unused_gpu(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for there in (False, True):
         monkeypatch.setattr(torch.cuda, "is_available", lambda there=there: there)
-        assert training_accelerator("auto") == "cpu"
-        assert capsys.readouterr().out.count("trainer.accelerator=gpu") == int(there)
         assert find_device("auto").type == "cpu"
         assert capsys.readouterr().out.count("device=cuda") == int(there)
 

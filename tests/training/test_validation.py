@@ -16,6 +16,7 @@ from nerfro.core.light import to_srgb
 from nerfro.core.types import Rays, mean_per_pixel
 from nerfro.data.base import Views
 from nerfro.data.blender import BlenderData
+from nerfro.evaluation.validation import ValidationPixels
 from nerfro.rendering import ColourSpace, RayTracer, Renderer, Scene
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.points.stratified import Stratified
@@ -23,7 +24,6 @@ from nerfro.samplers.subdivision import Subdivision
 from nerfro.training.callbacks import OverfittingWarning
 from nerfro.training.data_module import RayDataModule, validation_interval
 from nerfro.training.pixel_batches import PixelBatches
-from nerfro.training.validation import ValidationPixels
 from tests.closed_forms import Ball
 from tests.conftest import Runner, repaint
 

@@ -12,7 +12,7 @@ from nerfro.core.draws import Draws
 from nerfro.core.errors import NerfroError
 from nerfro.core.types import Batch
 from nerfro.kernels.available import available_bytes, number_in
-from nerfro.rendering import Renderer
+from nerfro.rendering.renderer import Renderer
 
 _PROBED_RAYS = 128
 # Peak memory of a training step and of an evaluation, relative to the tensors that autograd saves for the same rays.
