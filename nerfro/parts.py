@@ -39,8 +39,8 @@ __all__ = [
     "EXPORTS", "Background", "Batch", "Bodies", "Body", "Box", "CameraModel", "Cameras", "Components", "Contracted",
     "Count", "DataSource", "Distance", "Draws", "ErrorMap", "Exits", "Export", "ExportConfig", "Field", "FieldValues",
     "Ge", "Grid", "GridSettings", "Gt", "ImageMetric", "Le", "Loss", "Lt", "Material", "Medium", "MeshSurface",
-    "Natural", "NerfroError", "NotNegative", "OpticalRecord", "Path", "PathSampler", "Phase", "PointSampler", "Positive", "Rays",
-    "RefractiveModel", "Renderer", "Rendering", "Samples", "Scalars", "Scene", "Space", "Stratified", "Surface",
-    "TrainedScene", "TrainingRun", "Unbounded", "Vectors", "Views", "invert_cdf", "load_arrays", "point_samples",
-    "register", "resolve_path", "spread_uniform", "write_atomically",
+    "Natural", "NerfroError", "NotNegative", "OpticalRecord", "Path", "PathSampler", "Phase", "PointSampler",
+    "Positive", "Rays", "RefractiveModel", "Renderer", "Rendering", "Samples", "Scalars", "Scene", "Space",
+    "Stratified", "Surface", "TrainedScene", "TrainingRun", "Unbounded", "Vectors", "Views", "invert_cdf",
+    "load_arrays", "point_samples", "register", "resolve_path", "spread_uniform", "write_atomically",
 ]  # fmt: skip

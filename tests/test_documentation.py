@@ -27,6 +27,12 @@ CHECKOUT = PACKAGE_DIR.parent
 pytestmark = pytest.mark.skipif(not (CHECKOUT / "docs").is_dir(), reason="there is no checkout with docs")
 
 
+def test_documentation_clones_from_the_address_of_the_package() -> None:
+    (address,) = re.findall(r'^Repository = "(.*)"', (CHECKOUT / "pyproject.toml").read_text(), re.MULTILINE)
+    for page in ("README.md", "docs/index.md", "docs/tutorials/first_run.md"):
+        assert re.findall(r"git clone (\S+)", (CHECKOUT / page).read_text()) == [address], page
+
+
 def python_blocks(page: str) -> list[str]:
     return re.findall(r"^```python\n(.*?)^```", (CHECKOUT / page).read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
 

@@ -1,4 +1,4 @@
-"""Exports of a trained scene for other programs: `python -m nerfro.export what=mesh`, `mitsuba`, `sky` or `volume`.
+"""Exports of a trained scene for other programs: `what=mesh`, `mitsuba`, `sky`, `volume`, `colmap` or `cameras`.
 
 See docs/guides/export_and_share.md.
 """

@@ -101,8 +101,9 @@ def check_export(name: str) -> None:
     export = export_of(name)
     endings: Sequence[str] = export.suffixes
     _require(
-        not isinstance(endings, str) and len(endings) > 0 and all(e == e.lower() and e[:1] == "." for e in endings),
-        f"suffixes={endings!r} are not a tuple of endings in lower case with a dot, such as ('.csv',)",
+        not isinstance(endings, str)
+        and (export.is_folder or (len(endings) > 0 and all(e == e.lower() and e[:1] == "." for e in endings))),
+        f"suffixes={endings!r} are not a tuple of endings in lower case with a dot, such as ('.csv',), nor ('',)",
     )
     scene = TrainedScene(example_run().renderer.eval(), ExampleData())
     with tempfile.TemporaryDirectory() as folder:
@@ -111,7 +112,7 @@ def check_export(name: str) -> None:
         with _named(f"what={name}"):
             text = export.write(scene, out, options)
         _require(isinstance(text, str) and text != "", "write returns a description of the file, which is printed")
-        _require(out.is_file(), "write writes the file `out`")
+        _require(out.is_dir() if export.is_folder else out.is_file(), "write writes `out`")
         others = {file.name for file in FilePath(folder).iterdir()} - {file.name for file in export.files(out)}
         _require(not others, f"companions lacks the endings of {', '.join(sorted(others))}")
 

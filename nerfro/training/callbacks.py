@@ -44,10 +44,12 @@ class Throughput(Callback):
         num_rays: rays trained on so far.
         seconds: wall-clock time of the training loop, without validation.
         has_begun: whether this process has begun to train, after it restored a checkpoint.
+        curve: step, seconds and loss, about once a second of this process.
     """
 
     def __init__(self) -> None:
         self.num_rays, self.seconds, self.has_begun = 0, 0.0, False
+        self.curve: list[tuple[int, float, float]] = []
         self._last: float | None = None
 
     @property
@@ -58,7 +60,7 @@ class Throughput(Callback):
         self._last, self.has_begun = time.perf_counter(), True
 
     def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: Batch, batch_idx: int
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Batch, batch_idx: int
     ) -> None:
         now = time.perf_counter()
         if self._last is not None:
@@ -66,6 +68,9 @@ class Throughput(Callback):
         self._last = now
         self.num_rays += len(batch.rays) * trainer.world_size
         pl_module.log("train/rays_per_second", self.num_rays / self.seconds)
+        # On a GPU, each point waits for the step.
+        if not self.curve or self.seconds - self.curve[-1][1] > 1.0:
+            self.curve.append((trainer.global_step, self.seconds, float(outputs["loss"])))
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if self._last is not None:  # a run that is interrupted in a phase has no step that counts its time

@@ -15,6 +15,7 @@ from nerfro.core.progress import duration
 from nerfro.core.provenance import AlgorithmSettings
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.results import RunMetrics
+from nerfro.evaluation.run_page import write_run_page
 from nerfro.evaluation.scoring import score_split
 from nerfro.evaluation.tables import write_scores
 from nerfro.fields.networks import compile_networks
@@ -138,5 +139,6 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetr
             viewer.close(outcome)
     if scores is not None:
         write_scores(scores, f"{config.name} on {config.data.root}, {split} views", folder, brief=True)
+    write_run_page(folder, f"{config.name} on {config.data.root}", costs[:2], throughput.curve, scores, split or "")
     print(next_steps(folder, split))
     return scores

@@ -101,7 +101,8 @@ def begin(folder: Path, config: DictConfig, renderer: Renderer, has_steps: bool)
     If the run has further training steps (`has_steps`), the scores of its last checkpoint are removed.
     """
     require_room(folder, needed_bytes(renderer), "hydra.run.dir")
-    for scores in (*folder.glob("metrics.*"), *folder.glob("evaluate_*/metrics.*")) if has_steps else ():
+    scored = ("metrics.*", "index.html", "evaluate_*/metrics.*")
+    for scores in (file for pattern in scored for file in folder.glob(pattern)) if has_steps else ():
         scores.unlink()
     record(folder, config)
     copy_files(folder, config)
@@ -117,7 +118,7 @@ def next_steps(folder: Path, split: str | None) -> str:
         lines.append(f"scores: {command_line('evaluate', checkpoint)}")
     else:
         lines.insert(0, f"image: {folder / 'images' / f'{split}_000.png'}")
-        lines.append(f"tables: {folder}/metrics.md, .csv and .tex for each view, and metrics.json")
+        lines.append(f"tables: {folder}/metrics.md, .csv and .tex for each view, metrics.json, and index.html for all")
     if in_sweep():
         lines.append(f"table of the sweep: {command_line('summary', as_overrides({'runs': folder.parent}))}")
     return "\n".join(lines)

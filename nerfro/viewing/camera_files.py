@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -119,25 +119,33 @@ def write_cameras(file: Path, camera: CameraModel, views: Views, origin: Float[n
     initial, estimated = views.cameras, camera.estimated(views.cameras).to("cpu")
     turned, shifted = (values.tolist() for values in motion_between(initial.camera_to_world, estimated.camera_to_world))
     gains = None if camera.exposure is None else camera.exposure.gains().tolist()
-    rational = estimated.distortion is not None and bool(estimated.distortion[:, 6:].any())
-    names = _RATIONAL if rational else _DISTORTION
-    frames = []
-    for view, frame in enumerate(views.frames):
-        lens = {"fl_x": estimated.fx, "fl_y": estimated.fy, "cx": estimated.cx, "cy": estimated.cy}
-        entry: dict[str, Any] = {"file_path": relative_path(frame.image, file.parent)}
-        entry |= {name: float(values[view]) for name, values in lens.items()}
-        if estimated.distortion is not None:
-            entry |= {name: k for name, k in zip(names, estimated.distortion[view].tolist(), strict=False) if name}
-        pose = estimated.camera_to_world[view].double().numpy()
-        pose[:, 3] += origin
-        entry["transform_matrix"] = [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]]
+    images = [relative_path(frame.image, file.parent) for frame in views.frames]
+    document = transforms_document(estimated, images, origin)
+    for view, entry in enumerate(document["frames"]):
         entry |= {"turned_degrees": turned[view], "shifted": shifted[view]}
         if gains is not None:
             entry["gain"] = gains[view]
-        frames.append(entry)
-    model = "FULL_OPENCV" if rational else "OPENCV"
-    document = {"camera_model": model, "w": initial.width, "h": initial.height, "frames": frames}
     write_atomically(file, json.dumps(document, indent=1) + "\n")
+
+
+def transforms_document(
+    cameras: Cameras, images: Sequence[str], origin: Float[np.ndarray, "3"] = WORLD_ORIGIN
+) -> dict[str, Any]:
+    """Return the content of a `transforms.json` with the paths of the images of cameras relative to `origin`."""
+    rational = cameras.distortion is not None and bool(cameras.distortion[:, 6:].any())
+    names = _RATIONAL if rational else _DISTORTION
+    lens = {"fl_x": cameras.fx, "fl_y": cameras.fy, "cx": cameras.cx, "cy": cameras.cy}
+    frames = []
+    for view, image in enumerate(images):
+        entry: dict[str, Any] = {"file_path": image}
+        entry |= {name: float(values[view]) for name, values in lens.items()}
+        if cameras.distortion is not None:
+            entry |= {name: k for name, k in zip(names, cameras.distortion[view].tolist(), strict=False) if name}
+        pose = cameras.camera_to_world[view].double().numpy()
+        pose[:, 3] += origin
+        frames.append({**entry, "transform_matrix": [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]]})
+    model = "FULL_OPENCV" if rational else "OPENCV"
+    return {"camera_model": model, "w": cameras.width, "h": cameras.height, "frames": frames}
 
 
 def _lens_of_path(document: Mapping[str, Any], entry: Mapping[str, Any], size: tuple[int, int], where: str) -> Lens:

@@ -24,7 +24,7 @@ class ExportConfig:
     Attributes:
         checkpoint: run folder, or a checkpoint in it.
         what: content and kind of the file.
-        out: output file; its ending selects the format.
+        out: output file, whose ending selects the format, or the folder of cameras and colmap.
         resolution: grid vertices along the longest side of the volume (default 128), or rows of the sky (by
             default as many as the background has, at least 512).
         half_depth: length, world units, within which dense content absorbs half the light; the surface is
@@ -51,7 +51,7 @@ class Export:
     """A format of exported files.
 
     Attributes:
-        suffixes: allowed endings of the file.
+        suffixes: allowed endings of the file; `("",)` for a folder of files.
         write: writes the file and returns a short description of the content.
         companions: endings of further files; `_sky.hdr` stands for `scene_sky.hdr` beside `scene.xml`.
         unused: options of `ExportConfig` without effect on the file.
@@ -61,6 +61,11 @@ class Export:
     write: Callable[[TrainedScene, Path, ExportConfig], str]
     companions: tuple[str, ...] = ()
     unused: tuple[str, ...] = ()
+
+    @property
+    def is_folder(self) -> bool:
+        """Whether `out` is a folder."""
+        return self.suffixes == ("",)
 
     def files(self, out: Path) -> list[Path]:
         """Return all files that `write` may write."""
@@ -79,7 +84,8 @@ def find_export(what: str, out: Path) -> Export:
     """
     export = export_of(what)
     if out.suffix.lower() not in export.suffixes:
-        raise NerfroError(f"out={out} is not a file of {what}; it must end in {' or '.join(export.suffixes)}")
+        allowed = "be a folder, without ending" if export.is_folder else f"end in {' or '.join(export.suffixes)}"
+        raise NerfroError(f"out={out} is not allowed for {what}; it must {allowed}")
     return export
 
 

@@ -29,7 +29,7 @@ class LivePage:
         self._server, self._scene, self._cameras = server, scene, views.cameras
         self._resolution = resolution
         static = {**static_parts(scene, views.cameras, views.images, split), "version": 0}
-        server.open(assemble_page(scene.name, static, self._bake(surface=True), live=True))
+        server.open(assemble_page(scene, static, self._bake(surface=True), live=True))
         self._next = time.monotonic()
 
     def update(self) -> None:

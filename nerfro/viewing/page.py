@@ -14,13 +14,14 @@ from torch import Tensor
 
 from nerfro.core.cameras import Cameras, up_direction
 from nerfro.core.errors import NerfroError
-from nerfro.core.paths import ASSETS_DIR
+from nerfro.core.paths import ASSETS_DIR, scene_name
 from nerfro.data.lazy_images import LazyImages
 from nerfro.files.atomic import write_atomically
 from nerfro.files.images import data_uri, to_8bit
 from nerfro.files.templates import fill_template
 from nerfro.geometry.space import Box, Space
 from nerfro.rendering import ColourSpace
+from nerfro.samplers.subdivision import Subdivision
 from nerfro.viewing.baking import Baked, bake_sky, bake_surface, bake_volume
 from nerfro.viewing.exports import EXPORTS, Export, ExportConfig
 from nerfro.viewing.trained_scene import TrainedScene
@@ -29,6 +30,7 @@ from nerfro.viewing.volume import MIN_OPTICAL_DEPTH, RESOLUTION, sample_field
 _TEMPLATES = ASSETS_DIR / "_page"
 _MAX_PHOTOGRAPHS = 24  # photographs on the page, spread evenly over the cameras
 _PHOTOGRAPH_SIDE = 256  # maximum size of the longer side, pixels
+_POSTER_SIDE = 384  # maximum size of the longer side, pixels
 _SEARCH_RESOLUTION = 64  # grid vertices per side for the search for the content of an unbounded field
 _SPLITS = ("test", "val", "train")  # the cameras are those of the first split that the data set has
 
@@ -44,7 +46,8 @@ def make_page(scene: TrainedScene, resolution: int) -> str:
     cameras = scene.cameras(split) if views is None else views.cameras
     images = None if views is None else views.images
     parts = bake_parts(scene, cameras, resolution, progress=True)
-    return assemble_page(scene.name, static_parts(scene, cameras, images, split), parts)
+    poster = _poster(scene, cameras) if len(cameras) else None
+    return assemble_page(scene, static_parts(scene, cameras, images, split), parts, poster=poster)
 
 
 def page_split(scene: TrainedScene) -> str:
@@ -69,15 +72,22 @@ def bake_parts(
     }
 
 
-def assemble_page(title: str, static: dict[str, Any], parts: dict[str, Baked], live: bool = False) -> str:
-    """Fill the template with `static_parts` and `bake_parts`; a live page asks its server for updates."""
+def assemble_page(
+    shown: TrainedScene, static: dict[str, Any], parts: dict[str, Baked], live: bool = False, poster: str | None = None
+) -> str:
+    """Fill the template with `static_parts` and `bake_parts`; a live page asks its server for updates.
+
+    `poster` is a picture that browsers show before the first frame, and without WebGL2.
+    """
+    title = scene_name(shown.source.root).replace("_", " ").capitalize() or shown.name or "Scene"
     scene = {**static, **{name: part.metadata for name, part in parts.items()}, "live": live}
     arrays = {name: uri for part in parts.values() for name, uri in part.packed().items()}
 
     def asset(name: str) -> Markup:
         return Markup((_TEMPLATES / name).read_text(encoding="utf-8"))
 
-    return fill_template(_TEMPLATES / "page.html.jinja", title=title, scene=scene, arrays=arrays, asset=asset)
+    template = _TEMPLATES / "page.html.jinja"
+    return fill_template(template, title=title, scene=scene, arrays=arrays, poster=poster, asset=asset)
 
 
 def static_parts(
@@ -102,6 +112,7 @@ def static_parts(
         with_photograph = {i * len(cameras) // _MAX_PHOTOGRAPHS for i in range(_MAX_PHOTOGRAPHS)}
     return {
         "linear": renderer.scene.colour_space is ColourSpace.LINEAR,
+        "origin": scene.source.origin.tolist(),
         "reflection": renderer.path_sampler.branching.max_split_events > 0,
         "orbit": {
             "target": box.mean(0).tolist(),
@@ -124,6 +135,15 @@ def static_parts(
             for view in range(len(cameras))
         ],
     }
+
+
+def _poster(scene: TrainedScene, cameras: Cameras) -> str:
+    """Render the first camera as a small picture."""
+    longest = max(cameras.width, cameras.height)
+    scale = min(2.0, _POSTER_SIDE / longest)
+    size = [max(1, round(scale * side)) for side in (cameras.width, cameras.height)]
+    rgb = scene.render(cameras.select([0]).resized(*size), Subdivision()).rgb[0]
+    return data_uri(to_8bit(rgb).cpu().numpy(), "JPEG", quality=85)
 
 
 def _thumbnail(rgb: Float[Tensor, "H W 3"]) -> str:

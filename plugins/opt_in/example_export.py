@@ -1,4 +1,4 @@
-"""Template: an export of your own in one file. Use it with `python -m nerfro.export what=cameras out=FILE.csv`.
+"""Template: an export of your own in one file. Use it with `python -m nerfro.export what=camera_centres out=FILE.csv`.
 
 The file is used only if the environment variable `NERFRO_PLUGINS` names its folder, or if you copy it to `plugins/`,
 because importing the exports takes time.
@@ -18,4 +18,4 @@ def write_centres(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
     return f"the centres of {len(centres)} cameras"
 
 
-EXPORTS["cameras"] = Export((".csv",), write_centres)
+EXPORTS["camera_centres"] = Export((".csv",), write_centres)

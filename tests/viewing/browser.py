@@ -57,6 +57,7 @@ class Browser:
         self.call("Page.navigate", url=page)
         while self._receive().get("method") != "Page.loadEventFired":
             pass
+        self.wait_for("!document.body?.hasAttribute('data-loading')")
 
     def __enter__(self) -> Browser:
         return self

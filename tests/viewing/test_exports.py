@@ -19,15 +19,18 @@ from PIL import Image
 
 from nerfro.core.errors import NerfroError
 from nerfro.core.light import to_linear, to_srgb
+from nerfro.data.formats.colmap_model import lens_of, read_colmap
 from nerfro.geometry.mesh import load_mesh
 from nerfro.geometry.space import Box
 from nerfro.media.body_settings import make_bodies
 from nerfro.samplers.subdivision import Subdivision
+from nerfro.viewing.camera_files import read_cameras
+from nerfro.viewing.camera_paths import CaptureGeometry
 from nerfro.viewing.changes import with_changed_scene
 from nerfro.viewing.exports import ExportConfig, export_of, find_export
 from nerfro.viewing.trained_scene import TrainedScene
 from tests.conftest import Runner, refused
-from tests.viewing.conftest import INSIDE_CENTRE, INSIDE_RADIUS, IOR, RADIUS, colour, sky_of
+from tests.viewing.conftest import INSIDE_CENTRE, INSIDE_RADIUS, IOR, RADIUS, Photographs, colour, sky_of
 
 CELL = 2.12 * RADIUS / 47  # of the box with its margin of air
 
@@ -269,10 +272,47 @@ def test_mitsuba_renders_the_same_image(
         assert -10 * torch.log10((picture - ours).square().mean()) > least
 
 
+def test_cameras_and_points_are_read_by_nerfro_and_pycolmap(scene: TrainedScene, tmp_path: Path) -> None:
+    bent = torch.tensor([[0.1, -0.02, 0.003, 0.0, 0.001, -0.002, 0.01, 0.02, 0.03]]).expand(3, 9)
+    scene = replace(scene, training_cameras=replace(scene.cameras("train"), distortion=bent), source=Absent())
+    expected = scene.cameras("train")
+    for what in ("colmap", "cameras"):
+        assert write(scene, what, tmp_path / what, resolution=32).startswith("3 cameras and ")
+    model = read_colmap(tmp_path / "colmap" / "sparse" / "0")
+    poses = np.stack([image.camera_to_world for image in model.images]) * [1.0, -1.0, -1.0, 1.0]
+    np.testing.assert_allclose(poses, expected.camera_to_world, atol=1e-6)
+    assert [image.name for image in model.images] == ["train_000.png", "train_001.png", "train_002.png"]
+    lens = lens_of(model.cameras[model.images[1].camera], "-")
+    assert (lens.fx, lens.cx) == pytest.approx((float(expected.fx[1]), float(expected.cx[1])))
+    assert lens.distortion == pytest.approx(bent[0].tolist())
+    # Points of the ball inside, with its colour.
+    centre = model.points.mean(0)
+    np.testing.assert_allclose(centre, INSIDE_CENTRE, atol=0.03)
+    geometry = CaptureGeometry.of(expected, scene.bounds)
+    again = read_cameras(tmp_path / "cameras" / "transforms.json", geometry)
+    torch.testing.assert_close(again.camera_to_world, expected.camera_to_world)
+    torch.testing.assert_close(again.distortion, bent.clone())
+    assert len(trimesh.load(tmp_path / "cameras" / "points.ply").vertices) == len(model.points)
+
+    pycolmap = pytest.importorskip("pycolmap")
+    opened = pycolmap.Reconstruction(tmp_path / "colmap" / "sparse" / "0")
+    assert (opened.num_images(), opened.num_points3D()) == (3, len(model.points))
+    for image in opened.images.values():
+        view = [image.name for image in model.images].index(image.name)
+        np.testing.assert_allclose(image.projection_center(), expected.camera_to_world[view, :, 3], atol=1e-6)
+
+
+class Absent(Photographs):
+    """Data that have moved."""
+
+    root = Path("/nowhere")
+
+
 @pytest.mark.parametrize(
     ("what", "name", "message"),
     [
-        ("fog", "a.glb", "what=fog is not known; choose page, mesh"),
+        ("colmap", "a.txt", "must be a folder"),
+        ("fog", "a.glb", "what=fog is not known; choose page, colmap"),
         ("mesh", "a.stl", "must end in .glb"),
         ("volume", "a.vdb", "must end in .npz"),
     ],

@@ -129,6 +129,47 @@ def test_vessel_agrees_with_nerfro(scene: TrainedScene, tmp_path: Path) -> None:
     assert psnr(picture(found["filled"]), picture(found["seen"][1])) < 30
 
 
+@needs_chromium
+def test_interleaved_passes_equal_the_full_frame(scene: TrainedScene, tmp_path: Path) -> None:
+    script = """(() => {
+      const { gl, canvas } = page.tracer;
+      [canvas.width, canvas.height] = [50, 38];
+      page.camera = 0;
+      const read = () => {
+        const pixels = new Uint8Array(4 * 50 * 38);
+        gl.readPixels(0, 0, 50, 38, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
+        return pixels;
+      };
+      const differences = (a, b) => a.filter((value, i) => value !== b[i]).length;
+      page.drawOnce();
+      const full = read();
+      const found = [];
+      for (let pass = 0; pass < 16; ++pass) {
+        for (const rows of [[0, 4], [4, 10]]) {
+          page.tracer.trace(page.view, readSettings(page.scene), [50, 38], { stride: 4, pass, rows });
+        }
+        page.tracer.show({ stride: 4, done: pass + 1 });
+        found.push(differences(full, read()));
+      }
+      return found;
+    })()"""
+    differences = ask(make_page(scene, 32), script, tmp_path)
+    assert differences[-1] == 0
+    assert all(differences[:-1])
+    assert differences[4] < differences[0]
+
+
+@needs_chromium
+def test_view_at_rest_is_traced_in_parts_at_full_resolution(scene: TrainedScene, tmp_path: Path) -> None:
+    with Browser(make_page(scene, 16), tmp_path, size=(340, 120)) as browser:
+        browser.evaluate("page.pixelDuration = 1")  # a slow machine, until it has traced a few parts
+        browser.evaluate("page.changed()")
+        browser.wait_for("page.stride === 4 && page.pass > 0")
+        browser.wait_for("page.rays > 0", 200)
+        size = browser.evaluate("[page.tracer.canvas.width, page.tracer.canvas.height]")
+        assert browser.evaluate("$('frame').textContent").startswith(f"{size[0]} x {size[1]} pixels, ")
+
+
 class Surroundings(Field):
     """Two soft coloured clouds: one beside the glass, and a large one far behind it."""
 
@@ -245,6 +286,7 @@ def test_fragment_shows_one_camera_alone(scene: TrainedScene, tmp_path: Path) ->
 def test_missing_webgl2_is_reported(scene: TrainedScene, tmp_path: Path) -> None:
     with Browser(make_page(scene, 8), tmp_path, "--disable-3d-apis") as browser:
         assert "This page needs WebGL2" in browser.evaluate("$('message').textContent")
+        assert browser.evaluate("$('poster').checkVisibility() && $('poster').naturalWidth") == 64
 
 
 def test_page_loads_nothing_and_names_its_cameras(scene: TrainedScene) -> None:

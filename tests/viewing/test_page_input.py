@@ -1,6 +1,8 @@
 """Input on a page: pointers, fingers, keys and dropped files."""
 
+import html
 import json
+import math
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,6 +11,8 @@ import torch
 
 from nerfro.evaluation.image_metrics import psnr
 from nerfro.files import lat_long
+from nerfro.viewing.camera_files import read_cameras
+from nerfro.viewing.camera_paths import CaptureGeometry
 from nerfro.viewing.page import make_page
 from nerfro.viewing.trained_scene import TrainedScene
 from tests.viewing.browser import Browser, needs_chromium
@@ -17,7 +21,7 @@ from tests.viewing.test_page import SHOT, one_ray, picture
 
 pytestmark = needs_chromium
 VIEW = "({ azimuth: page.orbit.azimuth, elevation: page.orbit.elevation, radius: page.orbit.radius, " \
-       "target: page.orbit.target, camera: page.camera, rays: page.rays })"  # fmt: skip
+       "target: page.orbit.target, camera: page.camera })"  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +53,7 @@ def test_pointer_turns_moves_and_zooms(browser: Browser) -> None:
     assert turned["elevation"] == pytest.approx(start["elevation"] + 0.2, abs=0.03)
     assert turned["radius"] == start["radius"]
     # Something new is drawn.
-    browser.wait_for("page.rays > 0")
+    browser.wait_for("page.drafted")
     browser.drag((x, y), (x + 0.1 * side, y), button="right")
     moved = browser.evaluate(VIEW)
     assert moved["azimuth"] == turned["azimuth"]
@@ -106,13 +110,102 @@ def test_test_camera_is_selected_with_the_keyboard_and_left_by_dragging(browser:
     assert browser.evaluate("$('photograph').hidden")
 
 
+def test_overview_shows_the_whole_object_from_any_view(browser: Browser) -> None:
+    browser.evaluate("page.show(1)")
+    browser.evaluate("$('reset').click()")
+    view = browser.evaluate(VIEW)
+    assert (view["camera"], view["azimuth"], view["elevation"]) == (None, 0.6, 0.35)
+    # The sphere around the object is inside of the field of view, 0.7 radians.
+    radius = browser.evaluate("page.scene.orbit.radius")
+    assert math.asin(radius / view["radius"]) < 0.35
+    assert browser.evaluate("page.orbit.target") == browser.evaluate("page.scene.orbit.target")
+
+
+def test_address_restores_view_and_settings(page: str, tmp_path: Path) -> None:
+    (tmp_path / "scene.html").write_text(page, encoding="utf-8")
+    address = (tmp_path / "scene.html").as_uri()
+    with Browser(address, tmp_path, size=(400, 300)) as browser:
+        browser.evaluate("""(() => {
+          page.orbit.turn(0.3, 0.1);
+          page.show(2);
+          $("glass").checked = false;
+          $("ior0").value = 1.75;
+          $("ior0").dispatchEvent(new Event("input", { bubbles: true }));
+        })()""")
+        browser.wait_for("location.hash.includes('ior0')")
+        before, text = browser.evaluate(VIEW), browser.evaluate("location.hash")
+    with Browser(address + text, tmp_path, size=(400, 300)) as browser:
+        after = browser.evaluate(VIEW)
+        assert after.pop("target") == pytest.approx(before.pop("target"), abs=1e-5)
+        assert after == pytest.approx(before, rel=1e-5)
+        assert after["camera"] == 2
+        assert browser.evaluate("[$('glass').checked, $('ior0').value, $('ior0-value').value]") == [
+            False,
+            "1.75",
+            "1.75",
+        ]
+
+
+def test_saved_view_is_rendered_by_nerfro(browser: Browser, scene: TrainedScene, tmp_path: Path) -> None:
+    script = f"""(() => {{ {SHOT}
+      page.orbit.turn(0.5, 0.2);
+      const saved = shot(null, 40);
+      return [saved, cameraFile(page.view, page.scene.origin)];
+    }})()"""
+    shot, document = browser.evaluate(script)
+    (tmp_path / "view.json").write_text(json.dumps(document))
+    cameras = read_cameras(tmp_path / "view.json", CaptureGeometry.of(scene.cameras("train"), scene.bounds))
+    assert (cameras.width, cameras.height) == (40, 40)
+    assert float(psnr(picture(shot), one_ray(scene, cameras)[0])) > 30
+    assert (
+        browser.evaluate("""new Promise((done) => {
+      HTMLAnchorElement.prototype.click = function () { done(this.download); };
+      $("save-picture").click();
+    })""")
+        == "picture.png"
+    )
+
+
+def test_page_in_a_frame_waits_for_a_click_and_leaves_the_wheel(page: str, tmp_path: Path) -> None:
+    frame = f'<!DOCTYPE html><title>t</title><iframe width=380 height=280 srcdoc="{html.escape(page)}"></iframe>'
+    inside = "document.querySelector('iframe').contentWindow"
+    with Browser(frame, tmp_path, size=(420, 320)) as browser:
+        browser.wait_for(f"{inside}.document.getElementById('begin')?.hidden === false")
+        assert browser.evaluate(f"{inside}.eval('page === null && $(`poster`).naturalWidth > 0')")
+        assert not browser.evaluate(f"{inside}.document.getElementById('controls').open")
+        browser.evaluate(f"{inside}.document.getElementById('begin').click()")
+        browser.wait_for(f"{inside}.eval('page !== null && page.drafted')")
+        radius = browser.evaluate(f"{inside}.eval('page.orbit.radius')")
+        browser.wheel((200, 150), -100)
+        assert browser.evaluate(f"{inside}.eval('$(`canvas`).style.touchAction')") == "pan-y"
+        assert browser.evaluate(f"{inside}.eval('page.orbit.radius')") == radius
+        browser.evaluate(f"{inside}.eval('$(`canvas`).focus()')")
+        browser.wheel((200, 150), -100)
+        browser.wait_for(f"{inside}.eval('page.orbit.radius') < {radius}")
+
+
+def test_narrow_window_begins_with_a_closed_panel_and_large_targets(page: str, tmp_path: Path) -> None:
+    with Browser(page, tmp_path, size=(500, 600)) as browser:
+        assert not browser.evaluate("$('controls').open")
+        browser.evaluate("$('controls').open = true")
+        small = """[...document.querySelectorAll("button, input:not([type=file]), summary")].filter((e) => {
+          const { width, height } = e.getBoundingClientRect();
+          return width && (width < 24 || height < 24);
+        }).map((e) => e.id)"""
+        assert browser.evaluate(small) == []
+        assert browser.evaluate("document.querySelectorAll('h1').length") == 1
+        assert browser.evaluate("$('canvas').getAttribute('role')") == "application"
+        # Nothing that changes with every frame is read aloud.
+        assert not browser.evaluate("$('frame').matches('output, [role=status], [aria-live]')")
+
+
 def test_selected_camera_is_applied_before_the_next_frame(browser: Browser) -> None:
-    browser.wait_for("page.rays > 0")
+    browser.wait_for("page.drafted")
     at_once = browser.evaluate(f"(page.show(1), {PLACE})")
-    browser.wait_for("page.rays > 0")
+    browser.wait_for("page.drafted")
     assert browser.evaluate(PLACE) == at_once
     back_at_once = browser.evaluate(f"(page.show(null), {PLACE})")
-    browser.wait_for("page.rays > 0")
+    browser.wait_for("page.drafted")
     assert browser.evaluate(PLACE) == back_at_once
     assert back_at_once["width"] > at_once["width"]
 

@@ -20,13 +20,14 @@ class Orbit {
     const sideways = Math.abs(up[0]) < 0.9 ? [1, 0, 0] : [0, 1, 0];
     this.first = unit(addScaled(sideways, -dot(sideways, up), up));
     this.second = cross(up, this.first);
-    this.fieldOfView = 0.7; // radians, along the shorter side of the image
     this.reset();
   }
 
+  // Show the whole object, with a margin.
   reset() {
+    this.fieldOfView = 0.7; // radians, along the shorter side of the image
     this.target = this.home.target;
-    this.radius = 2.5 * this.home.radius;
+    this.radius = (1.1 * this.home.radius) / Math.sin(0.5 * this.fieldOfView);
     this.azimuth = 0.6;
     this.elevation = 0.35;
   }
@@ -40,6 +41,14 @@ class Orbit {
     this.elevation = Math.asin(clamp(dot(offset, this.up) / this.radius, -1, 1));
     this.fieldOfView = 2 * Math.atan((0.5 * Math.min(...view.size)) / Math.min(...view.focal));
     this.turn(0, 0);
+  }
+
+  numbers() {
+    return [this.azimuth, this.elevation, this.radius, ...this.target, this.fieldOfView];
+  }
+
+  setNumbers([azimuth, elevation, radius, x, y, z, fieldOfView]) {
+    Object.assign(this, { azimuth, elevation, radius, target: [x, y, z], fieldOfView });
   }
 
   turn(right, up) {

@@ -2,8 +2,9 @@
 
 const $ = (id) => document.getElementById(id);
 const MAX_RAYS = 64; // rays per pixel of a view that does not change
-const MOVING_MS = 30, STILL_MS = 150; // target duration of a frame while the view changes, and afterwards
-const SCALES = { min: 0.12, max: 1 }; // sides of the traced image, as fractions of the sides of the canvas
+const MOVING_MS = 30, STILL_MS = 100; // target duration of a draft while the view changes, and of a part of a pass afterwards
+const MIN_PIXELS = 2048; // of a part of a pass, because every part waits for the browser once
+const SCALES = { min: 0.12, max: 1 }; // sides of a draft, as fractions of the sides of the canvas
 
 class Page {
   constructor(scene, images) {
@@ -13,10 +14,11 @@ class Page {
     this.tracer.load(scene, images);
     this.orbit = new Orbit(scene.orbit);
     this.camera = null; // index of the shown camera of the data set; null for the orbit
-    this.rays = 0; // rays per pixel since the last change
+    this.maxRays = MAX_RAYS;
     this.lastChange = -Infinity; // time, milliseconds
     this.pixelDuration = 5e-3; // milliseconds per pixel, a running mean; the initial value is that of a slow machine
     this.sync = null; // fence of the frame that the GPU is drawing
+    this.restart();
     if (scene.cameras.length) this.orbit.follow(viewOf(scene.cameras[0]));
     this.orbit.radius = Math.max(this.orbit.radius, 1.3 * scene.orbit.radius);
   }
@@ -30,14 +32,20 @@ class Page {
   drawOnce() {
     const { width, height } = this.tracer.canvas;
     this.tracer.trace(this.view, readSettings(this.scene), [width, height]);
-    this.tracer.show();
+    this.tracer.show({ stride: 1, done: 1 });
   }
 
   // Restart drawing after a change of view, scene or settings.
   changed() {
-    this.rays = 0;
+    this.restart();
+    this.onChange?.();
     this.lastChange = performance.now();
     this.requestFrame();
+  }
+
+  restart() {
+    this.drafted = false; // whether a small image of the view is shown
+    this.rays = this.pass = this.row = 0; // complete rays per pixel, complete passes of the next ray, and rows of the next pass
   }
 
   requestFrame() {
@@ -47,33 +55,71 @@ class Page {
     });
   }
 
-  // Trace the next ray of each pixel, at the resolution that the duration of previous frames allows.
+  // Draw the next part of the image: first a draft of low resolution, then, when the view does not change, a few rows of a
+  // pass at a time, so that the page never waits long for the graphics driver.
   step(now) {
-    const { gl, canvas } = this.tracer;
-    if (this.sync) {
-      if (gl.getSyncParameter(this.sync, gl.SYNC_STATUS) !== gl.SIGNALED) return this.requestFrame();
-      gl.deleteSync(this.sync);
-      this.sync = null;
-      const duration = performance.now() - this.frameStart;
-      this.pixelDuration += 0.4 * (duration / (this.tracedSize[0] * this.tracedSize[1]) - this.pixelDuration);
-      this.showStatus(duration);
-    }
+    if (this.isBusy()) return this.requestFrame();
     this.resizeCanvas();
-    const moving = now - this.lastChange < 250;
-    if (!moving && this.wasMoving) this.rays = 0;
-    this.wasMoving = moving;
-    if (this.rays >= (moving ? 1 : MAX_RAYS)) return moving ? this.requestFrame() : undefined;
-    const allowed = Math.sqrt((moving ? MOVING_MS : STILL_MS) / (this.pixelDuration * canvas.width * canvas.height));
-    const scale = clamp(allowed, SCALES.min, SCALES.max);
-    // All rays that are averaged are traced at the same resolution.
-    if (this.rays === 0) this.tracedSize = [canvas.width, canvas.height].map((side) => Math.max(1, Math.round(scale * side)));
-    this.frameStart = performance.now();
-    this.tracer.trace(this.view, readSettings(this.scene), this.tracedSize, jitter(this.rays), 1 / (this.rays + 1));
-    this.tracer.show();
-    this.sync = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
-    gl.flush();
-    this.shownRays = ++this.rays;
+    if (!this.drafted) this.drawDraft();
+    else if (now - this.lastChange >= 250) {
+      if (this.rays >= this.maxRays) return;
+      this.drawRows();
+    }
     this.requestFrame();
+  }
+
+  isBusy() {
+    const { gl } = this.tracer;
+    if (!this.sync) return false;
+    if (gl.getSyncParameter(this.sync, gl.SYNC_STATUS) !== gl.SIGNALED) return true;
+    gl.deleteSync(this.sync);
+    this.sync = null;
+    // The first draft includes the compilation of the shader.
+    if (this.isWarm) {
+      // A part of the image may take longer than the previous ones, which must not happen twice.
+      const change = (performance.now() - this.frameStart) / this.numPixels - this.pixelDuration;
+      this.pixelDuration += (change > 0 ? 0.7 : 0.2) * change;
+    }
+    this.isWarm = true;
+    return false;
+  }
+
+  drawDraft() {
+    const { width, height } = this.tracer.canvas;
+    const scale = clamp(Math.sqrt(MOVING_MS / (this.pixelDuration * width * height)), SCALES.min, SCALES.max);
+    const size = [width, height].map((side) => Math.max(1, Math.round(scale * side)));
+    this.draw(size, size[0] * size[1], { target: "draft" }, { stride: 1, done: 0 });
+    this.drafted = true;
+    this.showStatus(size);
+  }
+
+  // Trace the next rows of the next pass of the next ray of each pixel. A fast machine traces all pixels in one pass.
+  drawRows() {
+    const { width, height } = this.tracer.canvas;
+    const affordable = STILL_MS / this.pixelDuration;
+    if (this.rays + this.pass + this.row === 0) this.stride = affordable >= width * height ? 1 : 4;
+    const { stride, pass, rays } = this;
+    const [columns, lines] = [width, height].map((side) => Math.ceil(side / stride));
+    const numRows = Math.max(1, Math.floor(Math.max(affordable, MIN_PIXELS) / columns));
+    const rows = [this.row, Math.min(lines, this.row + numRows)];
+    this.row = rows[1] % lines;
+    if (this.row === 0) this.pass = (pass + 1) % stride ** 2;
+    if (this.row === 0 && this.pass === 0) ++this.rays;
+    const options = { stride, pass, rows, jitter: jitter(rays), weight: 1 / (rays + 1) };
+    const shown = { stride, done: this.rays > 0 ? stride ** 2 : this.pass };
+    this.draw([width, height], columns * (rows[1] - rows[0]), options, this.row === 0 ? shown : null);
+    if (this.row === 0) this.showStatus([width, height]);
+  }
+
+  // Trace a part of the image, and show the complete parts (`shown`, see Tracer.show), or none.
+  draw(size, numPixels, options, shown) {
+    const { gl } = this.tracer;
+    this.frameStart = performance.now();
+    this.numPixels = numPixels;
+    this.tracer.trace(this.view, readSettings(this.scene), size, options);
+    this.sync = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    if (shown) this.tracer.show(shown);
+    gl.flush();
   }
 
   // Set the displayed size of the canvas and of the photograph beside it; images of cameras keep their aspect ratio.
@@ -96,19 +142,20 @@ class Page {
 
   // Give the canvas one pixel per pixel of the screen. This clears the canvas, so a frame must be drawn next.
   resizeCanvas() {
+    if (document.body.classList.contains("one-camera")) return;
     const { canvas } = this.tracer;
     const ratio = Math.min(window.devicePixelRatio || 1, 2);
     const size = this.layOut().map((side) => Math.max(1, Math.round(side * ratio)));
     if (canvas.width !== size[0] || canvas.height !== size[1]) {
       [canvas.width, canvas.height] = size;
-      this.rays = 0;
+      this.restart();
     }
   }
 
-  showStatus(milliseconds) {
-    const [width, height] = this.tracedSize;
-    const rays = this.shownRays === 1 ? "1 ray" : `${this.shownRays} rays`;
-    $("frame").value = `${width} x ${height}, ${milliseconds.toFixed(0)} ms, ${rays} a pixel`;
+  showStatus([width, height]) {
+    const rays = this.rays === 1 ? "1 ray" : `${this.rays} rays`;
+    const quality = this.rays ? `${rays} per pixel` : this.pass ? `${this.pass} of ${this.stride ** 2} passes` : "draft";
+    $("frame").textContent = `${width} x ${height} pixels, ${quality}`;
   }
 
   // Show the view of a camera of the data set beside its photograph, or (null) the orbit, which starts at the present eye.
@@ -117,6 +164,7 @@ class Page {
     this.camera = camera;
     const photograph = camera === null ? undefined : this.scene.cameras[camera].photograph;
     $("photograph").hidden = !photograph;
+    $("stage").classList.toggle("compared", Boolean(photograph));
     if (photograph) $("photograph").src = photograph;
     $("photograph").alt = photograph ? `photograph ${this.scene.cameras[camera].name}` : "";
     for (const button of document.querySelectorAll("#cameras button")) {
@@ -169,9 +217,13 @@ function initControls(page) {
     if (event.target.matches("button")) page.show(event.target.value === "" ? null : Number(event.target.value));
   });
   $("reset").addEventListener("click", () => {
-    page.orbit.reset();
     page.show(null);
+    page.orbit.reset();
   });
+  for (const button of document.querySelectorAll("#cameras button[value]")) {
+    const { photograph } = scene.cameras[button.value] ?? {};
+    if (photograph) button.prepend(Object.assign(new Image(), { src: photograph, alt: "" }));
+  }
 }
 
 function initSkyInput(page) {
@@ -221,6 +273,7 @@ function initCanvasInput(page) {
     change(page.orbit);
     page.changed();
   };
+  if (inFrame) canvas.style.touchAction = "pan-y";
   canvas.addEventListener("pointerdown", (event) => {
     canvas.setPointerCapture(event.pointerId);
     pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
@@ -243,6 +296,8 @@ function initCanvasInput(page) {
   canvas.addEventListener(
     "wheel",
     (event) => {
+      // In a frame, the wheel scrolls the page around it until the image has been clicked.
+      if (inFrame && document.activeElement !== canvas) return;
       event.preventDefault();
       changeOrbit((orbit) => orbit.zoom(Math.exp(clamp(event.deltaY, -100, 100) * 0.0015)));
     },
@@ -279,35 +334,57 @@ function showOneCamera(page) {
   canvas.width = canvas.height = size;
   canvas.style.width = canvas.style.height = `${size}px`;
   page.camera = number;
-  page.drawOnce();
+  page.maxRays = 1;
+  page.drafted = true;
+  // A small picture is complete when the page has loaded.
+  if (size <= 256) page.drawOnce();
+  else page.requestFrame();
   return true;
 }
 
-function start() {
+// Start the page, after a click if it is part of another page, which should not wait for it.
+async function start() {
   const scene = JSON.parse($("scene").textContent);
+  const alone = new URLSearchParams(location.hash.slice(1)).has("camera");
+  if (window.innerWidth <= 700 || inFrame) $("controls").open = false;
+  if (inFrame && !alone && !scene.live) await clickOnPoster();
+  if (!alone) await nextPaint();
   const images = Object.fromEntries([...document.querySelectorAll("#arrays img")].map((image) => [image.id, image]));
-  const page = new Page(scene, images);
+  page = new Page(scene, images);
   initControls(page);
   window.addEventListener("hashchange", () => location.reload());
   if (!showOneCamera(page)) {
     initSkyInput(page);
     initCanvasInput(page);
-    if (window.innerWidth <= 700) $("controls").open = false;
+    initState(page);
+    initSaving(page);
     new ResizeObserver(() => page.changed()).observe($("stage"));
-    page.changed();
-    page.step(performance.now()); // immediately, so that the page never shows an empty canvas
+    page.step(performance.now()); // immediately, so that the poster is followed by an image of the scene
   }
-  return page;
+  document.body.removeAttribute("data-loading");
+  if (scene.live) pollUpdates(page);
+}
+
+const inFrame = window.self !== window.top;
+const nextPaint = () => new Promise((done) => requestAnimationFrame(() => setTimeout(done)));
+
+function clickOnPoster() {
+  $("begin").hidden = false;
+  $("loading").hidden = true;
+  return new Promise((done) =>
+    $("begin").addEventListener("click", () => {
+      $("begin").hidden = true;
+      $("loading").hidden = false;
+      done();
+    }));
 }
 
 // The images with the arrays are decoded when the page has loaded, so drawing starts then.
 let page = null;
 window.addEventListener("load", () => {
-  try {
-    page = start();
-    if (page.scene.live) pollUpdates(page);
-  } catch (error) {
+  start().catch((error) => {
+    document.body.removeAttribute("data-loading");
     document.body.classList.add("broken");
     $("message").textContent = error.message;
-  }
+  });
 });

@@ -12,6 +12,9 @@ precision highp usampler3D;
 
 // Camera. Pixels are counted from the upper left corner of the image; the axes are right, up and back (OpenGL).
 uniform vec2 focal, principal, jitter;
+// Pixels of this pass: every `stride`-th one in both directions, from `first` on; they fill the target from `corner` on.
+uniform int stride;
+uniform ivec2 first, corner;
 uniform float height;
 uniform mat3 axes;
 uniform vec3 eye;
@@ -335,7 +338,8 @@ vec3 pathRadiance(vec3 x, vec3 d) {
 }
 
 void main() {
-  vec2 pixel = vec2(gl_FragCoord.x, height - gl_FragCoord.y) + jitter;
+  vec2 centre = vec2(stride * (ivec2(gl_FragCoord.xy) - corner) + first) + 0.5;
+  vec2 pixel = vec2(centre.x, height - centre.y) + jitter;
   vec3 direction = vec3((pixel.x - principal.x) / focal.x, (principal.y - pixel.y) / focal.y, -1.0);
   // The largest half-precision number is 65504.
   colour = vec4(min(pathRadiance(eye, normalize(axes * direction)), 6e4), 1.0);

@@ -3,6 +3,10 @@
 // Textures of the tracing program, in the order of their texture units.
 const UNITS = ["coefficients", "clearance", "volume", "occupied", "sky", "picture"];
 
+// First pixel of each interleaved pass over blocks of 4x4 pixels. The first four passes have every second pixel.
+const PASSES = [0, 10, 2, 8, 5, 15, 7, 13, 4, 14, 6, 12, 1, 11, 3, 9].map((at) => [at % 4, at >> 2]);
+const ORDER = PASSES.map((_, at) => PASSES.findIndex(([x, y]) => 4 * y + x === at));
+
 class Tracer {
   constructor(canvas) {
     const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false });
@@ -13,9 +17,9 @@ class Tracer {
     this.gl = gl;
     this.canvas = canvas;
     this.textures = {};
-    this.target = gl.createTexture();
-    this.buffer = gl.createFramebuffer();
-    this.size = [0, 0];
+    const target = () => ({ texture: gl.createTexture(), buffer: gl.createFramebuffer(), size: [0, 0] });
+    this.targets = { draft: target(), traced: target() };
+    this.shown = { stride: 1, done: 0 };
     gl.bindVertexArray(gl.createVertexArray());
   }
 
@@ -73,13 +77,19 @@ class Tracer {
     }
   }
 
-  // Trace one ray through each pixel, at the offset `jitter` from its centre, and blend the result with the previous rays
-  // by `weight`. See camera.js for views; the resolution of the traced image may differ from `view.size`.
-  trace(view, settings, [width, height], jitter = [0, 0], weight = 1) {
+  // Trace one ray through each pixel of a pass, at the offset `jitter` from its centre, and blend the result with the
+  // previous rays by `weight`. Pass number `pass` has every `stride`-th pixel in both directions, so that `stride` squared
+  // passes have all of them; `rows` limits it to rows from the first number to before the second. The passes are side by
+  // side in the target. See camera.js for views; the resolution of the traced image may differ from `view.size`.
+  trace(view, settings, [width, height], { target = "traced", stride = 1, pass = 0, rows, jitter = [0, 0], weight = 1 } = {}) {
     const gl = this.gl;
-    this.resize(width, height);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.buffer);
-    gl.viewport(0, 0, width, height);
+    const size = [width, height].map((side) => Math.ceil(side / stride));
+    const [low, high] = rows ?? [0, size[1]];
+    this.resize(this.targets[target], size.map((side) => side * stride));
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.targets[target].buffer);
+    const first = PASSES[pass];
+    const corner = first.map((at, axis) => at * size[axis]);
+    gl.viewport(corner[0], corner[1] + low, size[0], high - low);
     gl.useProgram(this.programs.trace.program);
     UNITS.forEach((name, unit) => {
       gl.activeTexture(gl.TEXTURE0 + unit);
@@ -91,7 +101,7 @@ class Tracer {
     this.setUniforms("trace", {
       focal: [view.focal[0] * scale[0], view.focal[1] * scale[1]],
       principal: [view.principal[0] * scale[0], view.principal[1] * scale[1]],
-      jitter, height, axes: view.axes, eye: view.eye, near: view.near,
+      jitter, stride, first, corner, height, axes: view.axes, eye: view.eye, near: view.near,
       numVertices: surface.numVertices, gridLow: surface.low.flat(), gridHigh: surface.high.flat(),
       boxLow: alongAxes(Math.min, surface.low), boxHigh: alongAxes(Math.max, surface.high),
       distanceUnit: surface.distanceUnits, clearanceUnit: surface.clearanceUnits, blockCells: surface.blockCells,
@@ -117,15 +127,20 @@ class Tracer {
     gl.disable(gl.BLEND);
   }
 
-  // Scale the traced image to the canvas.
-  show() {
+  // Show the passes that are complete, number `done`, on the canvas, or before the first pass the small image of the view.
+  show(shown = this.shown) {
     const gl = this.gl;
+    this.shown = shown;
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.viewport(0, 0, this.canvas.width, this.canvas.height);
     gl.useProgram(this.programs.show.program);
-    gl.activeTexture(gl.TEXTURE0);
-    gl.bindTexture(gl.TEXTURE_2D, this.target);
-    this.setUniforms("show", { size: [this.canvas.width, this.canvas.height], linear: this.scene.linear });
+    Object.values(this.targets).forEach(({ texture }, unit) => {
+      gl.activeTexture(gl.TEXTURE0 + unit);
+      gl.bindTexture(gl.TEXTURE_2D, texture);
+    });
+    this.setUniforms("show", {
+      draft: 0, traced: 1, size: [this.canvas.width, this.canvas.height], ...shown, order: ORDER, linear: this.scene.linear,
+    });
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
@@ -141,16 +156,16 @@ class Tracer {
     }, 0);
   }
 
-  resize(width, height) {
-    if (this.size[0] === width && this.size[1] === height) return;
+  resize(target, [width, height]) {
+    if (target.size[0] === width && target.size[1] === height) return;
     const gl = this.gl;
-    this.size = [width, height];
+    target.size = [width, height];
     gl.activeTexture(gl.TEXTURE0);
-    gl.bindTexture(gl.TEXTURE_2D, this.target);
+    gl.bindTexture(gl.TEXTURE_2D, target.texture);
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA16F, width, height, 0, gl.RGBA, gl.HALF_FLOAT, null);
     this.filter(gl.TEXTURE_2D, gl.LINEAR);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.buffer);
-    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.target, 0);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, target.buffer);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, target.texture, 0);
   }
 
   bind(name, target, filter) {
@@ -208,7 +223,8 @@ class Tracer {
     const gl = this.gl;
     const setters = {
       [gl.FLOAT]: "uniform1fv", [gl.FLOAT_VEC2]: "uniform2fv", [gl.FLOAT_VEC3]: "uniform3fv",
-      [gl.INT]: "uniform1iv", [gl.BOOL]: "uniform1iv", [gl.INT_VEC3]: "uniform3iv",
+      [gl.INT]: "uniform1iv", [gl.BOOL]: "uniform1iv", [gl.INT_VEC2]: "uniform2iv", [gl.INT_VEC3]: "uniform3iv",
+      [gl.SAMPLER_2D]: "uniform1iv",
     };
     for (const [name, value] of Object.entries(values)) {
       const uniform = this.programs[program].uniforms[name];
