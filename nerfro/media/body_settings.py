@@ -108,7 +108,7 @@ def origin_of(medium: Any) -> Float[np.ndarray, "3"]:
 def make_bodies(
     mesh: str | None = None,
     ior: Positive = 1.5,
-    resolution: Resolution = 128,
+    resolution: Resolution | None = None,
     box_min: Sequence[float] | None = None,
     box_max: Sequence[float] | None = None,
     shell_voxels: Positive = 0.1,
@@ -119,6 +119,7 @@ def make_bodies(
     bodies: dict[str, Any] | None = None,
     shading: Shading = "auto",
     crease_degrees: CreaseAngle | None = None,
+    max_gigabytes: Positive = 3.0,
 ) -> Bodies:
     """Make bodies of constant index with closed surfaces, which are sharp for `snell` and thin shells for `eikonal`.
 
@@ -128,7 +129,8 @@ def make_bodies(
         mesh: closed triangle mesh of the body, world units, any format trimesh reads; with `bodies`, the mesh of bodies
             that have none.
         ior: refractive index of the body.
-        resolution: vertices along each side of the grid of each body.
+        resolution: vertices along each side of the grid of each body. By default 128, and more for a body with thin
+            walls in air, so that most of its walls have five voxels.
         box_min, box_max: corners of all grids, world units; None for the bounds of each surface and a margin of air.
         shell_voxels: half width of the smooth interface that the Eikonal equation sees, voxels.
         accept_open_mesh: accept meshes with holes. Rays along three axes decide by majority whether a point is inside.
@@ -141,6 +143,7 @@ def make_bodies(
             face.
         crease_degrees: edges with larger angles between their triangles are sharp. If it is given, `auto` looks for no
             facets; by default 30.
+        max_gigabytes: memory up to which thin walls raise the resolution of a grid; 3 are enough for 360 vertices.
     """
     settings = expanded(
         {"mesh": mesh, "ior": ior, "bodies": bodies, "shading": shading, "crease_degrees": crease_degrees}
@@ -148,7 +151,7 @@ def make_bodies(
     if not settings:
         raise NerfroError("medium=sdf_grid needs mesh; add medium.mesh=..., or bodies={NAME: {mesh: FILE, ior: 1.5}}")
     learn = learned_quantities(learn_ior, learn_absorption)
-    grid = GridSettings(resolution, box_min, box_max, shell_voxels, cache)
+    grid = GridSettings(resolution, box_min, box_max, shell_voxels, cache, max_gigabytes)
     grid.require_memory(len(settings))  # before the surfaces are read
     members = []
     for name, body in settings.items():
