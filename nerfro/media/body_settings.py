@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import resolve_path
+from nerfro.geometry.gltf import glass_of_file
 from nerfro.geometry.mesh import local_origin, origin_of_file
 from nerfro.media.bodies import Bodies, Body, GridSettings
 from nerfro.media.material import Abbe, Learns, Material, find_material, learned_quantities
@@ -31,7 +32,8 @@ class BodySettings:
     Attributes:
         mesh: closed triangle mesh, world units; by default `medium.mesh`.
         surface: name and settings of another surface (`python -m nerfro.plugins surface`), in place of a mesh.
-        ior: refractive index, of the d line if the body disperses light.
+        ior: refractive index, of the d line if the body disperses light; by default, with `abbe` and `absorption`, that
+            of the material of a glTF file.
         material: material of the catalogue (`python -m nerfro.plugins material`), with its dispersion.
         abbe: Abbe number; without one, the index of a body with `ior` is the same for all colours.
         absorption: coefficients of red, green and blue per world unit, or one for all.
@@ -107,7 +109,7 @@ def origin_of(medium: Any) -> Float[np.ndarray, "3"]:
 @register("medium", "sdf_grid")
 def make_bodies(
     mesh: str | None = None,
-    ior: Positive = 1.5,
+    ior: Positive | None = None,
     resolution: Resolution | None = None,
     box_min: Sequence[float] | None = None,
     box_max: Sequence[float] | None = None,
@@ -128,7 +130,7 @@ def make_bodies(
     Args:
         mesh: closed triangle mesh of the body, world units, any format trimesh reads; with `bodies`, the mesh of bodies
             that have none.
-        ior: refractive index of the body.
+        ior: refractive index of the body; by default that of the material in a glTF file, or 1.5.
         resolution: vertices along each side of the grid of each body. By default 128, and more for a body with thin
             walls in air, so that most of its walls have five voxels.
         box_min, box_max: corners of all grids, world units; None for the bounds of each surface and a margin of air.
@@ -155,6 +157,7 @@ def make_bodies(
     grid.require_memory(len(settings))  # before the surfaces are read
     members = []
     for name, body in settings.items():
+        body = _with_material_of_file(body, None if bodies else 1.5)
         surface = make_surface(surface_settings(name, body), accept_open_mesh)
         members.append(Body(name, surface, make_material(name, body, learn), body.priority))
     return Bodies(members, grid=grid)
@@ -185,6 +188,22 @@ def surface_settings(name: str, body: BodySettings) -> Mapping[str, Any]:
     if body.shading is not None or body.crease_degrees is not None:
         raise NerfroError(f"shading and crease_degrees of bodies.{name} belong to its surface; write them in surface:")
     return body.surface
+
+
+def _with_material_of_file(body: BodySettings, ior: float | None) -> BodySettings:
+    """Add index, absorption and Abbe number of the material in a glTF file to a body without index.
+
+    Args:
+        body: settings of the body.
+        ior: index of a body whose mesh has no refractive material.
+    """
+    if body.ior is not None or body.material is not None:
+        return body
+    glass = None if body.mesh is None else glass_of_file(resolve_path(body.mesh))
+    if glass is None:
+        return dataclasses.replace(body, ior=ior)
+    abbe, absorption = body.abbe or glass.abbe, body.absorption or list(glass.absorption)
+    return dataclasses.replace(body, ior=glass.ior, abbe=abbe, absorption=absorption)
 
 
 def make_material(name: str, body: BodySettings, learn: Sequence[str] = ()) -> Material:
