@@ -153,7 +153,12 @@ class ViewSplits(DataSet):
 
     @property
     def camera(self) -> Pinhole:
-        return Pinhole.square(CAMERA_ANGLE_X, self.options.resolution)
+        return Pinhole.square(self.angle_x, self.options.resolution)
+
+    @property
+    def angle_x(self) -> float:
+        """Horizontal field of view, radians."""
+        return CAMERA_ANGLE_X
 
     def planned(self) -> list[PlannedImage]:
         planned = []
@@ -184,7 +189,7 @@ class ViewSplits(DataSet):
                 for view in planned
                 if view.image_path.startswith(f"{split}/")
             ]
-            content = {"camera_angle_x": CAMERA_ANGLE_X, "frames": frames}
+            content = {"camera_angle_x": self.angle_x, "frames": frames}
             write_json(self.folder / f"transforms_{split}.json", content)
 
     def next_command(self) -> str:
@@ -196,6 +201,11 @@ class ViewSplits(DataSet):
 def fingerprint(scene: SyntheticScene) -> str:
     """Compute a short hash of a scene, so that images of different scenes are not mixed in one folder."""
     digest = hashlib.sha256(repr((scene.ior, scene.tint, scene.absorption)).encode())
+    for part in scene.parts:
+        properties = (part.name, part.ior, part.absorption, part.outer_ior, part.outer_absorption, part.albedo)
+        digest.update(repr(properties).encode())
+    textures = [part.texture.tobytes() for part in scene.parts if part.texture is not None]
+    digest.update(b"".join(textures))
     for surface in (scene.glass, scene.interior):
         for array in (surface.vertices, surface.faces, surface.normals, surface.colours):
             if array is not None:
