@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nerfro.core.errors import NerfroError
-from nerfro.files.reading import MAX_JSON_BYTES, read_json
+from nerfro.files.reading import MAX_JSON_BYTES, read_json, reading
 
 # The y axis is up in glTF (specification 2.0, section 3.4), and the z axis in nerfro: (x, y, z) becomes (x, z, -y).
 Z_UP_TO_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
@@ -178,16 +178,22 @@ def glass_of_file(path: Path) -> GltfGlass | None:
     """Return the optical properties of the bodies in a glTF file; None for a file without refractive materials.
 
     Raises:
-        NerfroError: the bodies have different materials.
+        NerfroError: the file is damaged, or the bodies have different materials.
     """
-    document = read_document(path) if is_gltf(path) and path.is_file() else None
-    if not isinstance(document, dict):
+    if not is_gltf(path):
         return None
-    materials = [Primitive("", "", np.eye(4), material).glass for material in document.get("materials", [])]
-    glass = {material for material in materials if material is not None}
-    if len(glass) > 1:
+    with reading(path, "mesh ", advice="export it again"):
+        materials = read_document(path).get("materials", [])
+        used = {Primitive("", "", np.eye(4), material).glass for material in materials} - {None}
+    glass = next(iter(used), None)
+    if len(used) > 1:
         raise NerfroError(
-            f"mesh {path} has {len(glass)} refractive materials; give the index (medium.ior), or write the bodies one "
+            f"mesh {path} has {len(used)} refractive materials; give the index (medium.ior), or write the bodies one "
             f"by one with nerfro.synthesize scene={path}, whose output has a scene.json"
         )
-    return next(iter(glass), None)
+    if glass is not None and not (0 < glass.ior < np.inf and np.isfinite(glass.absorption).all()):
+        raise NerfroError(
+            f"mesh {path} has a material with the index {glass.ior:g} and the absorption {list(glass.absorption)}; "
+            "give the index and the absorption of the body (bodies.NAME.ior, bodies.NAME.absorption)"
+        )
+    return glass

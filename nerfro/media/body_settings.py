@@ -157,8 +157,8 @@ def make_bodies(
     grid.require_memory(len(settings))  # before the surfaces are read
     members = []
     for name, body in settings.items():
-        body = _with_material_of_file(body, None if bodies else 1.5)
         surface = make_surface(surface_settings(name, body), accept_open_mesh)
+        body = _with_material_of_file(body, None if bodies else 1.5)
         members.append(Body(name, surface, make_material(name, body, learn), body.priority))
     return Bodies(members, grid=grid)
 

@@ -114,7 +114,8 @@ class GltfViews(ViewSplits):
             mesh = self.folder / "bodies" / f"{part.name}.ply"
             part.surface.save(mesh)
             absorption = [float(value) for value in part.absorption] if any(part.absorption) else []
-            bodies[part.name] = BodySettings(mesh=str(mesh), ior=part.ior, abbe=part.abbe, absorption=absorption)
+            # The images show no dispersion, so the bodies have no Abbe number.
+            bodies[part.name] = BodySettings(mesh=str(mesh), ior=part.ior, absorption=absorption)
         SceneFile(data=data, bodies=bodies).save(self.folder / SCENE)
         super().finish(planned)
 
@@ -192,7 +193,7 @@ def _part(primitive: Primitive, geometry: Any) -> Part:
         vertices.astype(np.float32), corners.astype(np.int32), normals.astype(np.float32), None if glass else colours
     )
     if glass is not None:
-        return Part(primitive.node, surface, glass.ior, glass.absorption, glass.abbe)
+        return Part(primitive.node, surface, glass.ior, glass.absorption)
     pixels = None if texture is None else np.asarray(texture.convert("RGB"), np.float32) / 255
     return Part(primitive.node, surface, albedo=tuple(albedo.tolist()), texture=pixels, texture_coordinates=coordinates)
 
@@ -233,7 +234,7 @@ def _nested(parts: list[Part]) -> list[Part]:
             surface = replace(surface, faces=surface.faces[:, ::-1].copy(), normals=-surface.normals)
             part = replace(part, surface=surface)
             if outer is not None:
-                part = replace(part, ior=1.0, absorption=(0.0, 0.0, 0.0), abbe=None)
+                part = replace(part, ior=1.0, absorption=(0.0, 0.0, 0.0))
         if outer is not None and outer.ior is not None:
             part = replace(part, outer_ior=outer.ior, outer_absorption=outer.absorption)
         nested[part.name] = part
@@ -290,7 +291,7 @@ def _not_modelled(document: Mapping[str, Any]) -> Iterator[str]:
             if base.get("baseColorFactor", [1.0])[:3] != [1.0] * 3 or "baseColorTexture" in base:
                 yield f"{name}: the colour of the surface is not modelled; set an attenuation colour"
             if extensions.get("KHR_materials_dispersion", {}).get("dispersion", 0) > 0:
-                yield f"{name}: images show the index of the d line; scene.json has the Abbe number"
+                yield f"{name}: dispersion is not modelled; images and scene.json have the index of the d line"
         elif base.get("metallicFactor", 1.0) > 0:
             yield f"{name}: metal is not modelled; it is diffuse"
         if any(material.get("emissiveFactor", [])) or "emissiveTexture" in material:

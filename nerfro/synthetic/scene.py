@@ -68,7 +68,6 @@ class Part:
         surface: triangles with normals; vertex colours, if there are any, are factors of the albedo.
         ior: refractive index of a body; None for content.
         absorption: absorption of a body for each colour channel, per world unit.
-        abbe: Abbe number of a body; images show the index of the d line.
         outer_ior: refractive index around a body.
         outer_absorption: absorption around the surface, per world unit.
         albedo: linear albedo of content.
@@ -80,7 +79,6 @@ class Part:
     surface: SurfaceMesh
     ior: float | None = None
     absorption: Vector = (0.0, 0.0, 0.0)
-    abbe: float | None = None
     outer_ior: float = 1.0
     outer_absorption: Vector = (0.0, 0.0, 0.0)
     albedo: Vector = (1.0, 1.0, 1.0)
