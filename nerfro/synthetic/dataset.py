@@ -141,7 +141,7 @@ class ViewSplits(DataSet):
     """Views from all sides in Blender format, in splits."""
 
     META = "meta.json"
-    FILES = (
+    FILES: ClassVar[tuple[str, ...]] = (
         *(f"transforms_{split}.json" for split in SPLITS),
         *(f"{folder}{split}/r_*.png" for split in SPLITS for folder in ("", "masks/")),
         *("mesh.ply", "interior.ply", "sky.png", "sky.exr", META),

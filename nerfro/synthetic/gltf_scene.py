@@ -105,7 +105,7 @@ class GltfViews(ViewSplits):
         distances = np.linalg.norm(vertices - np.asarray(self.scene.aim), axis=1)
         orbit = np.linalg.norm(centres - np.asarray(self.scene.aim), axis=1)
         nearest = max(0.05 * orbit.min(), 0.9 * (orbit.min() - distances.max()))
-        data = {"type": "blender", "root": str(self.folder)}
+        data: dict[str, Any] = {"type": "blender", "root": str(self.folder)}
         data |= {"near": float(nearest), "far": float(1.1 * (orbit.max() + distances.max()))}
         bodies = {}
         for part in self.scene.parts:
@@ -167,7 +167,8 @@ def _part(primitive: Primitive, geometry: Any) -> Part:
     """Convert the triangles of a node to world units, z axis up, with the normals of the file or flat ones."""
     if not isinstance(geometry, trimesh.Trimesh):
         raise NerfroError(f"{primitive.node} consists of points or lines; remove it from the scene")
-    mesh, turn = geometry.copy(), np.eye(4)
+    mesh: Any = geometry.copy()
+    turn = np.eye(4)
     has_normals = "vertex_normals" in geometry._cache
     visual, colours = mesh.visual, None
     coordinates = getattr(visual, "uv", None)
