@@ -48,12 +48,12 @@ class ViewConfig:
 @entry_point("view", ViewConfig)
 def main(options: ViewConfig) -> None:
     """Serve the page until Ctrl-C."""
-    scene = load(options.checkpoint, options.device, options.root)
     server = PageServer(options.host, options.port)
-    server.open(make_page(scene, options.resolution))
-    print(f"nerfro: {scene.name} on {server.url}; Ctrl-C ends it", flush=True)
+    print(f"nerfro: {options.checkpoint} on {server.url}; Ctrl-C ends it", flush=True)
     if options.open:
-        open_page(server.url)
+        open_page(server.url)  # the browser starts while the page is made
+    scene = load(options.checkpoint, options.device, options.root)
+    server.open(make_page(scene, options.resolution))
     signal.pause()
 
 

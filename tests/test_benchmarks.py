@@ -97,6 +97,7 @@ def test_all_benchmarks_are_run_by_a_test() -> None:
         assert file.stem in source
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("part", "num_rows"),
     [
@@ -112,6 +113,7 @@ def test_training_benchmark_prints_complete_tables(part: tuple, num_rows: int, r
     assert len(table_rows(run("training", *part))) == num_rows
 
 
+@pytest.mark.slow
 def test_profile_of_a_step_lists_each_module_once(
     run: Run, tiny_default_run: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -154,6 +156,7 @@ def test_comparison_keeps_finished_rows_and_repeats_interrupted_ones(
     assert os.sched_getaffinity(0) == affinity
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "num_rows"),
     [
@@ -167,6 +170,7 @@ def test_tables_of_optics_and_kernels_are_complete(arguments: tuple, num_rows: i
     assert len(table_rows(run(*arguments))) == num_rows
 
 
+@pytest.mark.slow
 def test_figures_of_optics_are_written(run: Run, tmp_path: Path) -> None:
     run("optics_pictures", "--folder", tmp_path, "--resolution", 48, "--side", 8)
     assert len(list(tmp_path.glob("optics_*.png"))) == 5
@@ -241,6 +245,7 @@ def write_capture(root: Path) -> Path:
     return root
 
 
+@pytest.mark.slow
 def test_cameras_benchmark_writes_its_runs(
     run: Run, tiny_default_run: list[str], tiny_scene: Path, tmp_path: Path
 ) -> None:
@@ -277,6 +282,7 @@ def test_mitsuba_export_benchmark_compares_with_mitsuba(run: Run, trained_run: P
     )
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("mitsuba")
 def test_glassware_benchmark_renders_and_scores_a_perfect_reconstruction(
     run: Run, trained_run: Path, tmp_path: Path

@@ -5,6 +5,7 @@ import re
 import shlex
 import subprocess
 import sys
+import urllib.request
 from pathlib import Path
 
 import pytest
@@ -124,9 +125,12 @@ def test_completion_of_commands_options_and_choices(
 
 
 def test_demo_opens_the_page_and_prints_the_score_in_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run_here: Runner
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run_here: Runner, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    received: list[str] = []
+
     def train(overrides: list[str], out: Path) -> Run:
+        received[:] = overrides[5:]
         print("much")
         print("nerfro: the page: http://localhost:1", flush=True)
         if "seed=7" in overrides:
@@ -135,15 +139,35 @@ def test_demo_opens_the_page_and_prints_the_score_in_one_line(
         return Run(out, RunMetrics(scores))
 
     monkeypatch.setattr(nerfro, "train", train)
-    monkeypatch.setattr(nerfro, "export", lambda run, what, out: print("more") or out)
+
+    def export(run: Run, what: str, out: Path) -> Path:
+        print("more")
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text("the final page")
+        return out
+
+    monkeypatch.setattr(nerfro, "export", export)
     opened: list[str] = []
     monkeypatch.setattr(nerfro.demo, "open_page", opened.append)
     monkeypatch.chdir(tmp_path)
     done = run_here("demo")
     assert opened == ["http://localhost:1"]
-    address, last = done.out.splitlines()
+    address, score, following = done.out.splitlines()
     assert address == "nerfro: the page: http://localhost:1"
-    assert last.startswith("PSNR 31.3 dB on 1 photographs that were not trained on; page: ")
+    assert score.startswith("PSNR 31.3 dB on 1 photographs that were not trained on; page: ")
+    assert re.fullmatch(r"next, a film: .*render checkpoint=outputs/\S+ path=orbit out=outputs/\S+/orbit", following)
+    shown: list[bytes] = []
+
+    def pause() -> None:
+        address = re.findall(r"http://localhost:\d+", capsys.readouterr().out)[-1]
+        with urllib.request.urlopen(address) as answer:
+            shown.append(answer.read())
+
+    monkeypatch.setattr(nerfro.demo.signal, "pause", pause)
+    run_here("demo", "serve=true", "seed=1")
+    assert shown == [b"the final page"]
+    assert received == ["seed=1"]
+    assert "give serve=true or serve=false" in run_here("demo", "serve=maybe", code=1).err
     assert run_here("demo", "seed=7", code=1).err.endswith("nerfro: error: no seven\n")
 
 
@@ -207,6 +231,7 @@ def test_arguments_and_exit_status_are_passed_through(script: Path, cache: Path)
     assert refused.stderr == "nerfro: error: sed is not a setting; did you mean seed?\n"
 
 
+@pytest.mark.slow
 def test_recorded_command_of_a_script_repeats_the_run(script: Path, tiny_run: list[str], tmp_path: Path) -> None:
     options = [*tiny_run, "trainer.max_steps=1", f"hydra.run.dir={tmp_path / 'run'}"]
     done = python(str(script), "train", *options, folder=tmp_path)

@@ -68,6 +68,7 @@ def test_experiment_trains_for_two_steps(experiment: str, train_here: Runner, tm
     assert OmegaConf.load(tmp_path / "config.yaml").name == experiment
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "experiment", ["refractive", "glass", "glass_room", "unknown", "straight", "mipnerf_sky", "nerf"]
 )

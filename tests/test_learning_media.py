@@ -13,6 +13,7 @@ from tests.conftest import Runner, weights_of
 FIELDS = {"width": 8, "depth": 2, "skip": 0}
 
 
+@pytest.mark.slow
 def test_medium_of_constant_index_learns_from_adaptive_paths() -> None:
     # At the start n is 1 everywhere and nothing bends, yet images must be able to say that something should.
     discover()

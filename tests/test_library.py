@@ -82,6 +82,7 @@ def test_run_is_loaded_rendered_and_exported(trained_run: Path, tmp_path: Path, 
     run_here("export", *common, "what=sky", f"out={sky}", code=1)  # nothing is overwritten
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("interface", ["mesh", "sdf"])
 def test_paths_through_a_ball_match_closed_form(interface: str, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setenv("NERFRO_CACHE", str(tmp_path / "cache"))

@@ -61,6 +61,7 @@ def _change_masks(capture: Path, change: Callable[[np.ndarray], np.ndarray], cou
         Image.fromarray(change(np.array(Image.open(path)))).save(path)
 
 
+@pytest.mark.slow
 def test_preprocess_carves_a_ball_from_its_silhouettes(preprocess: Callable[..., str], capture: Path) -> None:
     printed = preprocess("medium.ior=1.33")
     surface = load_mesh(capture / "mesh.ply")
@@ -110,6 +111,7 @@ def test_body_of_revolution_is_fitted_on_request(preprocess: Callable[..., str],
     assert abs(radii(capture).mean() - RADIUS) < 0.06
 
 
+@pytest.mark.slow
 def test_vessel_is_fitted_on_request(preprocess: Callable[..., str], capture: Path) -> None:
     printed = preprocess("medium.ior=1.33", "smoothing=0", "vessel=true", "room=false", "data.downscale=2")
     command = shlex.split(printed.split("train on the vessel: ")[1])
@@ -145,6 +147,7 @@ def test_options_of_the_hull_are_refused_beside_a_mesh(preprocess: Callable[...,
     assert "smoothing=0.5 has no effect with mesh=..., which replaces the hull; remove it" in printed
 
 
+@pytest.mark.slow
 def test_index_of_a_named_body_without_material_is_estimated(preprocess: Callable[..., str], capture: Path) -> None:
     save(photographs([1.45]), capture, UTM)
     ball = f"bodies={{ball: {{mesh: {capture / 'mesh.ply'}, absorption: [0.1]}}}}"
@@ -155,6 +158,7 @@ def test_index_of_a_named_body_without_material_is_estimated(preprocess: Callabl
     assert found.absorption == [0.1]
 
 
+@pytest.mark.slow
 def test_index_search_and_refinement_work_far_from_the_origin(
     preprocess: Callable[..., str], capture: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -239,6 +243,7 @@ def test_hull_needs_masks_of_only_some_views(preprocess: Callable[..., str], cap
     assert abs(radii(capture).mean() - RADIUS) < 0.05
 
 
+@pytest.mark.slow
 def test_disagreeing_masks_name_the_number_that_may_be_wrong(preprocess: Callable[..., str], capture: Path) -> None:
     def cut(mask: np.ndarray) -> np.ndarray:  # something stands in front of the object's side
         mask[:, int(np.quantile(np.flatnonzero(mask.any(0)), 0.7)) :] = 0

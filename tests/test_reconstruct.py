@@ -319,6 +319,7 @@ def test_photographs_pass_every_stage_once(
     assert printed.endswith(f"report: {pretended.out}/report/report.html\npage: {pretended.out}/page.html\n")
 
 
+@pytest.mark.slow
 def test_changed_inputs_repeat_the_dependent_stages(reconstruct: Runner, pretended: Pretended) -> None:
     reconstruct()
     pretended.write("../silhouettes/IMG_1.png")
@@ -333,6 +334,7 @@ def test_changed_inputs_repeat_the_dependent_stages(reconstruct: Runner, pretend
     assert pretended.names == [*ALL, *ALL[1:], "summary"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("doubts", "psnr", "chosen", "printed"),
     [
@@ -376,6 +378,7 @@ def test_pixels_of_the_object_order_the_trials_and_never_remove_the_last_body_or
     assert [trial.folder for trial in worth_a_trial(hypotheses(scene), unsupported)] == tried
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("choice", "experiment"), [("straight", "straight"), ("solid", "unknown"), ("vessel", "glass")]
 )
@@ -390,6 +393,7 @@ def test_given_hypothesis_is_trained_without_trials(
     assert ("medium=vessel" in train) == (choice == "vessel")
 
 
+@pytest.mark.slow
 def test_run_of_an_unknown_hypothesis_is_kept_under_another_name(reconstruct: Runner, pretended: Pretended) -> None:
     reconstruct("train=+experiment=glass_room")
     assert "kept as" not in reconstruct("train=+experiment=glass_room logger=none").out
@@ -398,6 +402,7 @@ def test_run_of_an_unknown_hypothesis_is_kept_under_another_name(reconstruct: Ru
     assert pretended.ran[-3][1][:2] == ["+experiment=glass", "medium=vessel"]
 
 
+@pytest.mark.slow
 def test_given_solid_body_of_unknown_index_is_tried_with_common_indices(
     reconstruct: Runner, pretended: Pretended
 ) -> None:
@@ -462,6 +467,7 @@ def test_without_lpips_of_every_hypothesis_psnr_alone_decides(capsys: pytest.Cap
     assert "disagree" not in printed
 
 
+@pytest.mark.slow
 def test_printed_command_continues_with_the_other_hypothesis(
     run_here: Runner, reconstruct: Runner, pretended: Pretended
 ) -> None:
@@ -536,6 +542,7 @@ def test_picture_shows_every_hypothesis_beside_three_photographs(tmp_path: Path)
     refused("val_003.png", draw_trials, trials, views)
 
 
+@pytest.mark.slow
 def test_missing_picture_of_the_hypotheses_is_a_warning(
     reconstruct: Runner, pretended: Pretended, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -548,6 +555,7 @@ def test_missing_picture_of_the_hypotheses_is_a_warning(
     assert not any(option.startswith("pictures=") for option in dict(pretended.ran)["summary"])
 
 
+@pytest.mark.slow
 def test_interrupted_training_is_resumed(reconstruct: Runner, pretended: Pretended) -> None:
     pretended.ends["train"] = KeyboardInterrupt()
     stopped = reconstruct("trial_steps=0", code=130)
@@ -570,6 +578,7 @@ def test_failed_stage_is_named_and_later_stages_do_not_run(reconstruct: Runner, 
     assert pretended.names == ["calibrate", "preprocess", "preprocess"]
 
 
+@pytest.mark.slow
 def test_failed_page_does_not_fail_the_reconstruction(reconstruct: Runner, pretended: Pretended) -> None:
     pretended.ends["export"] = NerfroError("the index varies in space")
     done = reconstruct("trial_steps=0")
@@ -577,6 +586,7 @@ def test_failed_page_does_not_fail_the_reconstruction(reconstruct: Runner, prete
     assert done.out.endswith(f"report: {pretended.out}/report/report.html\n")
 
 
+@pytest.mark.slow
 def test_scene_file_selects_the_experiment(run_here: Runner, pretended: Pretended, tiny_scene: Path) -> None:
     asked = "data=blender", f"data.root={tiny_scene}", "outlines={r_0:[1,2,9,9]}", "medium=vessel", "medium.wall=0.1"
     pretended.surroundings, pretended.doubts, pretended.medium = "near", ["shallow"], {"type": "vessel", "wall": 0.1}
@@ -632,6 +642,7 @@ def test_unknown_surroundings_are_refused_before_training(reconstruct: Runner, p
     reconstruct("trial_steps=0", "train=+experiment=glass_room")
 
 
+@pytest.mark.slow
 def test_posed_photographs_of_a_ball_become_a_scene(
     run_here: Runner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

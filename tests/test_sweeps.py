@@ -46,6 +46,7 @@ def written(folder: Path) -> dict[str, int]:
     return {path.parent.name: path.stat().st_mtime_ns for path in folder.glob("*/metrics.json")}
 
 
+@pytest.mark.slow
 def test_finished_cells_are_skipped_and_new_ones_added(sweep: Runner, tmp_path: Path) -> None:
     sweep("seed=0,1")
     before = written(tmp_path / "sweep")
@@ -60,6 +61,7 @@ def test_finished_cells_are_skipped_and_new_ones_added(sweep: Runner, tmp_path: 
     assert {name: after[name] for name in before} == before
 
 
+@pytest.mark.slow
 def test_failing_cell_does_not_stop_other_cells(sweep: Runner, tiny_scene: Path, tmp_path: Path) -> None:
     late = tmp_path / "late.ply"
     swept = f"medium.mesh={late},{tiny_scene / 'mesh.ply'}"
@@ -75,6 +77,7 @@ def test_failing_cell_does_not_stop_other_cells(sweep: Runner, tiny_scene: Path,
     assert before.items() <= written(tmp_path / "sweep").items()
 
 
+@pytest.mark.slow
 def test_cell_of_another_configuration_or_other_data_is_never_replaced(
     sweep: Runner, tiny_scene: Path, tmp_path: Path
 ) -> None:
@@ -118,6 +121,7 @@ class RecordingSweeper(BasicSweeper):
 """
 
 
+@pytest.mark.slow
 def test_sweepers_of_other_packages_receive_the_metric_to_optimize(
     sweep: Runner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -246,6 +250,7 @@ def test_launchers_run_cells_in_other_processes(
     assert json.loads(run.read_text())["command"].startswith("python -m nerfro.train data.root=")
 
 
+@pytest.mark.slow
 def test_damaged_record_repeats_only_its_own_cell(sweep: Runner, tmp_path: Path) -> None:
     sweep("seed=0,1")
     record = sorted((tmp_path / "sweep").glob("*/cell.json"))[0]

@@ -97,6 +97,7 @@ def test_interrupted_rendering_is_resumed(tmp_path):
     assert not list(folder.rglob("*.partial"))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("mitsuba")
 def test_existing_data_set_is_replaced_only_on_request_and_other_files_are_kept(tmp_path):
     folder = synthesize(small(tmp_path / "scene")).folder

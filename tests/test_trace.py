@@ -67,6 +67,7 @@ def test_exit_directions_of_a_ball_match_closed_form(
         assert (out["events"] == events * out["hit"])[clear].all()
 
 
+@pytest.mark.slow
 def test_bodies_by_name_are_those_of_the_short_form(trace: Callable[..., str], tmp_path: Path) -> None:
     _write_rays(tmp_path / "rays.npz")
     trimesh.creation.icosphere(3, 0.4).export(tmp_path / "inner.ply")

@@ -64,3 +64,8 @@ def user_path(location: str | Path) -> Path:
         return Path(location).expanduser()
     except RuntimeError as error:
         raise NerfroError(f"{location}: the home folder is unknown; give the full path") from error
+
+
+def shown(folder: Path) -> str:
+    """Format a folder relative to the current folder, if it lies below this."""
+    return str(folder.relative_to(Path.cwd())) if folder.is_relative_to(Path.cwd()) else str(folder)

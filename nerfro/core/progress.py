@@ -31,6 +31,14 @@ class _LogFile:
         sys.stderr.flush()
 
 
+def duration(seconds: float) -> str:
+    """Format a duration, such as "1 h 30 min", "4 min" or "20 s"."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    parts = [f"{number} {unit}" for number, unit in ((hours, "h"), (minutes, "min"), (rest, "s")) if number]
+    return " ".join(parts) or "0 s"
+
+
 def progress_bar(description: str, total: float | None, items: Iterable[Any] | None = None, **options: Any) -> tqdm:
     """Create a progress bar with the remaining time on standard error; `update(n)` adds completed work.
 

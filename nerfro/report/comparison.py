@@ -8,10 +8,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from nerfro.core.errors import NerfroError
+from nerfro.core.paths import shown
 from nerfro.evaluation.image_metrics import ImageMetric, image_metrics
 from nerfro.evaluation.results import FULL, OBJECT, Region
 from nerfro.evaluation.tables import MISSING, Column, Row, Table, short
-from nerfro.report.runs import Budget, EvaluatedRun, EvaluationSet, shown
+from nerfro.report.runs import Budget, EvaluatedRun, EvaluationSet
 from nerfro.training.settings import TABLE_ROW, settings
 
 

@@ -11,14 +11,15 @@ import torch
 from omegaconf import OmegaConf
 
 from nerfro.core.errors import NerfroError
-from nerfro.core.paths import PACKAGE_DIR
+from nerfro.core.paths import PACKAGE_DIR, shown
+from nerfro.core.progress import duration
 from nerfro.evaluation.error_maps import SQUARED_ERROR_LIMIT
 from nerfro.evaluation.tables import Table
 from nerfro.files.drawing import magma
 from nerfro.files.images import load_png
 from nerfro.files.templates import fill_template
 from nerfro.report.comparison import Comparison
-from nerfro.report.runs import EvaluatedRun, device, duration, shown
+from nerfro.report.runs import EvaluatedRun, device
 from nerfro.report.views import PNG_SIDE, Selection, embed_image, scene_images
 
 _TEMPLATES = PACKAGE_DIR / "report"

@@ -16,7 +16,8 @@ from omegaconf.errors import OmegaConfBaseException
 
 from nerfro.cli.overrides import as_overrides, command_line
 from nerfro.core.errors import NerfroError, first_of
-from nerfro.core.paths import EMBEDDED_PREFIX, refuse_root, scene_name, user_path
+from nerfro.core.paths import EMBEDDED_PREFIX, refuse_root, scene_name, shown, user_path
+from nerfro.core.progress import duration
 from nerfro.evaluation.results import RunMetrics, read_metrics_json
 from nerfro.files.foreign_config import read_foreign_config
 from nerfro.files.reading import open_image, read_json
@@ -237,19 +238,6 @@ def read_run(folder: Path) -> EvaluatedRun:
         raise NerfroError(
             f"the run {shown(folder)} is not in the format of nerfro.train ({type(error).__name__}: {reason}); omit it"
         ) from error
-
-
-def duration(seconds: float) -> str:
-    """Format a duration, such as "1 h 30 min", "4 min" or "20 s"."""
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    parts = [f"{number} {unit}" for number, unit in ((hours, "h"), (minutes, "min"), (rest, "s")) if number]
-    return " ".join(parts) or "0 s"
-
-
-def shown(folder: Path) -> str:
-    """Format a folder relative to the current folder, if it lies below this."""
-    return str(folder.relative_to(Path.cwd())) if folder.is_relative_to(Path.cwd()) else str(folder)
 
 
 def device(config: Mapping[str, Any], facts: Mapping[str, Any]) -> str:

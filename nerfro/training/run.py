@@ -11,6 +11,7 @@ from omegaconf import DictConfig
 
 from nerfro.cli.calls import Composition
 from nerfro.core.distributed import leave
+from nerfro.core.progress import duration
 from nerfro.core.provenance import AlgorithmSettings
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.results import RunMetrics
@@ -88,8 +89,8 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetr
     optimizer = training.module.configure_optimizers()
     num_steps = require_same_run(folder, checkpoint, config, optimizer, training.views)
     throughput, interruption = Throughput(), StopOnSignal()
-    callbacks = [interruption, *([Viewer(config, training.source, test)] if config.viewer else [])]
-    trainer = make_trainer(config, folder, throughput, callbacks, num_steps)
+    viewers = [Viewer(config, training.source, test)] if config.viewer else []
+    trainer = make_trainer(config, folder, throughput, [interruption, *viewers], num_steps)
     require_match(renderer.scene.medium, training.views)
     memory = check_before_training(renderer, training.data, trainer)
     if trainer.is_global_zero:
@@ -105,6 +106,8 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetr
         return None
     if interruption.received:
         finish_logs(trainer, {})
+        for viewer in viewers:
+            viewer.close("The training was interrupted, and is saved.")
         print(f"nerfro: interrupted after step {trainer.global_step} and saved", flush=True)
         raise KeyboardInterrupt
     cameras = renderer.to(trainer.strategy.root_device).scene.camera
@@ -115,15 +118,18 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetr
     states = {callback.state_key: callback.state_dict() for callback in trainer.callbacks}  # type: ignore[attr-defined]
     costs = trainer.global_step, throughput.seconds, throughput.rays_per_second
     print(f"{costs[0]} steps in {costs[1]:.0f} s, {costs[2] or 0:,.0f} rays/s")
-    scores, logged = None, {}
+    scores, logged, outcome = None, {}, f"Training is complete: {duration(costs[1])}."
     try:
         if split is not None:
             subdivision = Subdivision(**config.evaluation.subdivision)
             result, treated = score_split(renderer, test, metrics, folder, subdivision, split)
             logged = {f"{split}/{name}": mean for name, mean in result.means().items()}
             scores = RunMetrics(result, *costs, treated, steps_by_phase(states, costs[0]))
+            outcome = f"{outcome[:-1]}, PSNR {result.mean('psnr'):.1f} dB on {len(test)} {split} views."
     finally:
         finish_logs(trainer, logged)
+        for viewer in viewers:
+            viewer.close(outcome)
     if scores is not None:
         write_scores(scores, f"{config.name} on {config.data.root}, {split} views", folder, brief=True)
     print(next_steps(folder, split))

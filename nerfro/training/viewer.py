@@ -60,7 +60,16 @@ class Viewer(Callback):
             self._server.add_loss(trainer.global_step, float(outputs["loss"]))
         self._live.update()
 
-    def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if self._live is not None:
+            self._live.finish()
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        self.close(f"The training has stopped: {type(exception).__name__}.")
+
+    def close(self, outcome: str) -> None:
+        """Tell the browsers how the training has ended, and stop the server."""
         if self._server is not None:
+            self._server.complete(outcome)
             self._server.close()
             self._server = self._live = None

@@ -44,6 +44,11 @@ class LivePage:
         scale = (0.02 * 5.0 / duration) ** (1 / 3)
         self._resolution = round(min(max(self._resolution * min(max(scale, 0.7), 1.3), 24), 128))
 
+    def finish(self) -> None:
+        """Publish the final model, if a browser shows the page."""
+        if self._server.watched:
+            self.show()
+
     def show(self) -> None:
         """Publish the current model."""
         medium = self._scene.renderer.scene.medium

@@ -20,8 +20,13 @@ from urllib.parse import parse_qs, urlsplit
 from nerfro.core.errors import NerfroError
 
 _WATCHED_SECONDS = 10.0  # a page counts as watched for so long after a request
+_DELIVERY_SECONDS = 5.0  # a browser asks for the state every two seconds
 # Placeholder until the page is complete; browsers reload the placeholder every two seconds.
-_PLACEHOLDER = b'<!DOCTYPE html><meta http-equiv="refresh" content="2"><title>nerfro</title><p>The page is being made.'
+_PLACEHOLDER = (
+    b'<!DOCTYPE html><html lang="en"><meta charset="utf-8"><meta http-equiv="refresh" content="2"><title>nerfro</title>'
+    b'<body style="background:#111;color:#eef1f5;font:1.1rem system-ui,sans-serif;padding:2rem"><h1>nerfro</h1>'
+    b"<p>The page is being made, and appears here in a moment."
+)
 
 _FOREIGN, _NOT_FOUND = b"open the page by the address that nerfro has printed", b"this server has only the page at /"
 
@@ -49,6 +54,8 @@ class PageServer:
     Attributes:
         ends: whether the answer to the present request is the last one.
         ended: set after the browser has received the last answer.
+        outcome: sentence about the end of the training; None before.
+        outcome_sent: set after a browser has received the outcome.
 
     Raises:
         NerfroError: the address is not available.
@@ -63,7 +70,10 @@ class PageServer:
         self.url = f"http://{host}:{self._server.server_address[1]}"
         self._lock, self._requests = threading.Lock(), threading.Lock()
         self._to_answer, self.ends, self.ended = answer, False, threading.Event()
+        self.outcome: str | None = None
+        self.outcome_sent = threading.Event()
         self._page, self._update, self._version = _PLACEHOLDER, b"null", 0
+        self._is_final = False
         self._losses: list[tuple[int, float]] = []
         self._last_request = -_WATCHED_SECONDS
         threading.Thread(target=self._server.serve_forever, daemon=True, name="page server").start()
@@ -73,10 +83,10 @@ class PageServer:
         """Whether a browser has sent a request recently."""
         return time.monotonic() - self._last_request < _WATCHED_SECONDS
 
-    def open(self, page: str) -> None:
-        """Replace the placeholder by the page."""
+    def open(self, page: str, is_final: bool = False) -> None:
+        """Replace the placeholder by the page; browsers with a live page offer to open a final one."""
         with self._lock:
-            self._page = page.encode()
+            self._page, self._is_final = page.encode(), is_final
 
     def finish(self) -> None:
         """Make the answer to the present request the last one."""
@@ -93,11 +103,18 @@ class PageServer:
         with self._lock:
             self._losses.append((step, loss))
 
+    def complete(self, outcome: str) -> None:
+        """Tell the browsers that the training has ended, and wait a few seconds until one that watches knows."""
+        with self._lock:
+            self.outcome = outcome
+        if self.watched:
+            self.outcome_sent.wait(_DELIVERY_SECONDS)
+
     def page(self) -> bytes:
         return self._page
 
     def state(self, after: int) -> bytes:
-        """Return the training curve, and the update for a page of version `after`, as JSON."""
+        """Return the training curve, its outcome, and the update for a page of version `after`, as JSON."""
         self._last_request = time.monotonic()
         with self._lock:
             # The curve has at most 500 points.
@@ -105,7 +122,8 @@ class PageServer:
             # Counted from the end, because the page states the last loss.
             losses = json.dumps(self._losses[::-every][::-1]).encode()
             update = self._update if self._version > after else b"null"
-        return b'{"losses": ' + losses + b', "update": ' + update + b"}"
+            end = json.dumps({"outcome": self.outcome, "final": self._is_final}).encode()
+        return end[:-1] + b', "losses": ' + losses + b', "update": ' + update + b"}"
 
     def answer(self, request: bytes) -> tuple[HTTPStatus, bytes]:
         """Answer a request of the page; requests are answered one after the other."""
@@ -155,7 +173,10 @@ class _Handler(BaseHTTPRequestHandler):
         elif address.path == "/state":
             after = parse_qs(address.query).get("after", ["0"])[0]
             version = int(after) if re.fullmatch(r"[0-9]{1,18}", after) else 0
+            is_complete = page.outcome is not None
             self._answer(HTTPStatus.OK, page.state(version), "application/json")
+            if is_complete:
+                page.outcome_sent.set()
         else:
             self._answer(HTTPStatus.NOT_FOUND, _NOT_FOUND, "text/plain")
 

@@ -96,6 +96,7 @@ def test_test_view_treatments_are_reported_by_name(train: Runner, tmp_path: Path
             torch.testing.assert_close(poses[Path(frame["file_path"]).name], expected)
 
 
+@pytest.mark.slow
 def test_resumed_run_with_refined_cameras_equals_an_uninterrupted_run(train: Runner, tmp_path: Path) -> None:
     options = ["camera=refined", "camera.lens=true", "camera.exposure=true", "phase.cameras={start: 2, every: 2}"]
     options += ["evaluation=none", "optimizer.final_learning_rate=1e-2"]

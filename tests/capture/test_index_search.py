@@ -56,6 +56,7 @@ def test_correlated_indices_are_reported_as_uncertain() -> None:
     assert any("the views do not agree" in doubt for doubt in found.doubts)
 
 
+@pytest.mark.slow
 def test_opaque_ball_has_no_index() -> None:
     found = search(photographs([1.5], opaque=True))
     assert found.doubts

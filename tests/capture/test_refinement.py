@@ -67,6 +67,7 @@ def degrees_off(medium: Bodies, num_views: int = 6) -> float:
     return float(torch.rad2deg(torch.cat(errors)).median())
 
 
+@pytest.mark.slow
 def test_refinement_recovers_a_dent_despite_a_wrong_index() -> None:
     before = solid([1.49])
     found = refined(before, learn_index=True)
@@ -80,6 +81,7 @@ def test_refinement_recovers_a_dent_despite_a_wrong_index() -> None:
     assert abs(radius[(vertices / radius[:, None]) @ AXIS < 0].mean() - RADIUS) < 0.1 * DEPTH
 
 
+@pytest.mark.slow
 def test_refinement_keeps_a_correct_surface() -> None:
     before = dented()
     found = refined(before)
@@ -160,6 +162,7 @@ def preprocess(tmp_path: Path, run_here: Runner) -> Callable:
     return run
 
 
+@pytest.mark.slow
 def test_preprocess_writes_the_refined_surface(preprocess: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
     quick = RefinementSettings((DescentStage(75, 5e-4, (3.0, 1.0)),), 2000, (8, 16))
     monkeypatch.setattr(refinement, "RefinementSettings", lambda: quick)
@@ -183,6 +186,7 @@ def test_failed_refinement_keeps_the_surface(preprocess: Callable, monkeypatch: 
     np.testing.assert_allclose(load_mesh(out / "mesh.ply").vertices, given.vertices, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_refinement_starts_with_the_estimated_index(preprocess: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
     begun: list[Bodies] = []
 

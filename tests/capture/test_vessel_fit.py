@@ -58,6 +58,7 @@ def observed(cylinder: Path, glass: Bodies) -> Observations:
     return observations
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "lengths",
     [{"wall": 0.025, "foot": 0.1, "fillet": 0.12}, {"wall": 0.025, "foot": 0.1, "fillet": 0.12, "level": 0.64}],

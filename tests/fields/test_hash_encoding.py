@@ -79,6 +79,7 @@ def test_positions_have_gradients_after_an_evaluation() -> None:
     assert positions.grad.any()
 
 
+@pytest.mark.slow
 def test_gradient_does_not_depend_on_the_number_of_threads() -> None:
     threads, gradients = torch.get_num_threads(), []
     try:

@@ -9,6 +9,7 @@ from tests.fuzz.world import World
 _NUM_CASES = {"data_formats": 60, "single_files": 60, "checkpoints": 20}  # the others are commands, of which 8 are run
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_broken_inputs_are_refused_in_one_line(kind: str, world: World) -> None:
     for number in range(_NUM_CASES.get(kind, 8)):

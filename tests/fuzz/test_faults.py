@@ -172,6 +172,7 @@ def test_locked_folder_and_root_of_a_file_system_are_refused(command: str, world
             assert words in line
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["train", "evaluate", "render", "trace", "summary", "export", "calibrate"])
 def test_full_disk_at_any_file_gives_a_one_line_error(
     command: str, world: World, monkeypatch: pytest.MonkeyPatch

@@ -21,6 +21,7 @@ def _winding_number(points: np.ndarray, mesh: TriangleMesh) -> np.ndarray:
     return np.arctan2(volume, scale).sum(-1) / (2 * np.pi)
 
 
+@pytest.mark.slow
 def test_fractions_are_counts_of_sub_samples_inside_by_winding_number() -> None:
     mesh = mesh_of(trimesh.creation.annulus(0.4, 0.9, 0.7))
     size = 12

@@ -53,6 +53,7 @@ def test_importing_kernels_does_not_change_settings_of_numba() -> None:
     assert printed_by("-c", IMPORTS_ONLY, NUMBA_NUM_THREADS="2") == "{}\nno threads\n"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("chosen", "used"), [("default", "workqueue"), ("omp", "omp")])
 def test_two_threads_may_trace_concurrently_on_the_chosen_threading_layer(chosen: str, used: str) -> None:
     printed = printed_by("-c", TWO_THREADS, NUMBA_NUM_THREADS="2", NUMBA_THREADING_LAYER=chosen)

@@ -100,6 +100,7 @@ def read(root: Path, view: int) -> np.ndarray:
     return levels > 127
 
 
+@pytest.mark.slow
 def test_one_box_produces_all_masks(tmp_path: Path, photographs: list, command: Callable[..., str]) -> None:
     picture, _, pose = photographs[0]
     away = picture, None, pose * [-1, 1, -1, 1]
@@ -247,6 +248,7 @@ def test_mistakes_are_reported_in_one_line(capture: Path, mask: Callable[..., st
     assert not list((capture / "photos").glob("mask_*"))
 
 
+@pytest.mark.slow
 def test_neighbour_at_the_same_position_does_not_guide_a_mask(
     photographs: list, tmp_path: Path, command: Callable[..., str]
 ) -> None:
@@ -294,6 +296,7 @@ def choose(browser: Browser, view: int) -> str:
     return f"state.outlines['{name}']"
 
 
+@pytest.mark.slow
 @needs_chromium
 def test_drawn_outlines_give_the_masks_of_the_command(
     capture: Path, photographs: list, tmp_path: Path, command: Callable[..., str]

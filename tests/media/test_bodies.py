@@ -124,6 +124,7 @@ def test_priority_or_order_decides_where_bodies_overlap(
     assert float(n) == pytest.approx(settings[owner]["ior"], abs=1e-6)
 
 
+@pytest.mark.slow
 def test_index_and_absorption_of_two_bodies_are_learned_together(tmp_path: Path) -> None:
     files = [_ball(tmp_path, centre) for centre in CENTRES]
     medium = _medium(

@@ -100,6 +100,7 @@ def test_light_enters_an_opening_freely_and_meets_water_glass_and_air(tmp_path: 
     )
 
 
+@pytest.mark.slow
 def test_slanted_rays_enter_an_opening_as_in_the_reference_implementation(tmp_path: Path) -> None:
     glass = _glass(tmp_path)
     random = np.random.default_rng(0)
@@ -135,6 +136,7 @@ def test_paths_through_a_glass_have_gradients_by_its_indices(tmp_path: Path) -> 
         assert found[body].item() == pytest.approx(expected.item(), rel=0.02)
 
 
+@pytest.mark.slow
 def test_cavity_and_liquid_surfaces_have_their_volumes(tmp_path: Path) -> None:
     vessel = spherical_vessel(tmp_path, level=0.9)
     inner, top = RADIUS - WALL, 0.1

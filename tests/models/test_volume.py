@@ -1,5 +1,6 @@
 """A volume of all space learns a glass ball in a painted room with a toy in front of it."""
 
+import pytest
 import torch
 from torch.nn.functional import normalize
 
@@ -87,6 +88,7 @@ def scores(space: Space, background: Background, num_steps: int = 150) -> list[f
     return [float(-10 * torch.log10(e.mean())) for e in (error, error[path.refracted], error[toy])]
 
 
+@pytest.mark.slow
 def test_volume_of_all_space_learns_a_room_better_than_box_and_environment_map() -> None:
     volume = scores(SPACE, ConstantBackground([0.0, 0.0, 0.0]))
     sky = scores(Box([[-0.85] * 3, [0.85] * 3]), EnvironmentMap([4, 8, 16, 32]))

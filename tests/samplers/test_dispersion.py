@@ -73,6 +73,7 @@ def test_dispersion_of_a_prism_matches_closed_form(tmp_path: FilePath) -> None:
     assert path.throughput.tolist() == [[half, none, none]] * 2 + [[none, half, none]] * 2 + [[none, none, half]] * 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("branches", ["none", "all"])
 def test_every_band_is_traced_as_a_ray_of_its_colour(branches: str) -> None:
     rays, sampler = random_rays(60, 2.0, seed=3, far=6), Snell(branches=branches)  # type: ignore[arg-type]

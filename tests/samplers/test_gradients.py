@@ -91,6 +91,7 @@ def test_autodiff_agrees_with_central_differences(
     torch.testing.assert_close(gradient, expected, rtol=1e-6, atol=0)
 
 
+@pytest.mark.slow
 def test_gradient_of_a_voxel_grid_matches_central_differences() -> None:
     box = _double(-1.5, -1.5, -1.5, 1.5, 1.5, 1.5).reshape(2, 3)
     radius = grid_points(1.5, 16, torch.float64).norm(dim=-1)

@@ -35,6 +35,7 @@ CASES = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("sampler", "kind"), CASES)
 def test_far_does_not_cut_a_path_inside_the_object(tmp_path: FilePath, sampler: PathSampler, kind: str) -> None:
     medium = _medium(tmp_path, kind)

@@ -167,6 +167,7 @@ def _voxels() -> VoxelGrid:
     return VoxelGrid.from_occupancy(inside.double(), BOX, 1.5, 5, 1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("sampler", "make"), REFINED)
 def test_replayed_values_equal_traced_values_with_finite_gradients(
     sampler: PathSampler, make: Callable[[FilePath], Medium], tmp_path: FilePath

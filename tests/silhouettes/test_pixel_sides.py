@@ -61,6 +61,7 @@ def test_displaced_surface_moves_to_the_outlines(silhouettes: Silhouettes, off: 
     assert abs(radius - RADIUS) / width < 0.03
 
 
+@pytest.mark.slow
 def test_fitted_surface_has_the_size_of_the_body() -> None:
     """It is 0.09 pixels too small if the sides of pixels are not looked at."""
     size, axes = 48, np.array([0.8, 0.6, 0.45])

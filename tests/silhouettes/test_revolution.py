@@ -72,6 +72,7 @@ def test_box_is_no_body_of_revolution(capsys: pytest.CaptureFixture[str]) -> Non
         assert sides == pytest.approx([0.3, 0.9, 1.2], abs=0.15)
 
 
+@pytest.mark.slow
 def test_bodies_of_revolution_are_detected_by_their_masks(monkeypatch: pytest.MonkeyPatch) -> None:
     cameras = _cameras()
     masks = _masks(_glass(), cameras)

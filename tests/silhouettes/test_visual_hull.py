@@ -145,6 +145,7 @@ def test_body_is_closed_at_the_box() -> None:
     assert mesh.bounds[0] == pytest.approx([2.25, 2.75, 3.75])
 
 
+@pytest.mark.slow
 def test_fit_is_smooth_despite_uneven_triangles_of_marching_cubes() -> None:
     silhouettes = photographed_softly(trimesh.creation.icosphere(5, 0.7), cameras_around(24, 48))
     fitted = fit_surface(hull(silhouettes, 32), silhouettes)
@@ -155,6 +156,7 @@ def test_fit_is_smooth_despite_uneven_triangles_of_marching_cubes() -> None:
     assert np.linalg.norm(fitted.vertices, axis=1) == pytest.approx(0.7, rel=0.005)
 
 
+@pytest.mark.slow
 def test_fit_to_few_views_is_closer_to_the_body_than_the_visual_hull() -> None:
     embedded = load_mesh(ASSETS_DIR / "torus" / "mesh.ply")
     body = trimesh.Trimesh(embedded.vertices * 1.4 / np.ptp(embedded.bounds, axis=0).max(), embedded.faces)
@@ -167,6 +169,7 @@ def test_fit_to_few_views_is_closer_to_the_body_than_the_visual_hull() -> None:
     assert fit_error < 0.6 * hull_error  # 0.9 if the weight of steady curvature follows the validation error
 
 
+@pytest.mark.slow
 def test_fit_is_invariant_to_the_unit_of_length() -> None:
     silhouettes = photographed(trimesh.creation.box((1.2, 0.9, 0.7)), cameras_around(12, 32))
     carved = hull(silhouettes, 16)

@@ -44,6 +44,7 @@ def test_newest_supported_library_is_chosen() -> None:
     assert newest([Path("libLLVM.so.19.1"), *old, Path("libLLVM.so.18.1")]) == Path("libLLVM.so.19.1")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("library", ["/missing/libLLVM.so", *OLD[-1:]])
 def test_without_a_usable_library_a_scene_is_rendered_by_the_scalar_variant(library: str) -> None:
     """In a process of its own, because Dr.Jit loads a library only once."""

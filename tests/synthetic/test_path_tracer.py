@@ -125,6 +125,7 @@ def test_background_pixels_show_the_sky_in_the_direction_of_the_pixel(poses):
         assert np.abs(picture - expected)[background].max() < 2e-3
 
 
+@pytest.mark.slow
 def test_missing_mitsuba_names_the_extra_to_install():
     """In a process of its own, which has not imported Mitsuba before."""
     code = "import sys; sys.modules['mitsuba'] = None; from nerfro.registry.registration import discover; discover()\n"

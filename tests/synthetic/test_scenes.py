@@ -43,6 +43,7 @@ def test_signed_distances_are_lipschitz_continuous(solid):
     assert (change <= np.linalg.norm(steps, axis=1) * (1 + 1e-9) + 1e-12).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in SCENES if name != "dolphin_capture"])
 def test_scene_is_closed_inside_the_box_and_has_contrast(name):
     scene = find_scene(name).build(spacing=0.02)

@@ -127,6 +127,7 @@ def _errors(medium: Bodies, rays: Rays, by_mitsuba: tuple[Tensor, Tensor, Tensor
     return errors[through_water], errors[steady]
 
 
+@pytest.mark.slow
 def test_rays_through_a_half_full_glass_match_mitsuba(
     mesh: str, rays: Rays, by_mitsuba: tuple[Tensor, Tensor, Tensor]
 ) -> None:

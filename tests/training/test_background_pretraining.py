@@ -45,6 +45,7 @@ def weights(train: Runner, tmp_path: Path) -> Callable[..., dict[str, Tensor]]:
     return run
 
 
+@pytest.mark.slow
 def test_only_the_background_is_fitted_before_the_first_step(weights: Callable[..., dict[str, Tensor]]) -> None:
     without, learned = weights("without", "phase.background.steps=0"), weights("with", "phase.background.steps=20")
     changed = {name for name, value in learned.items() if not torch.equal(value, without[name])}

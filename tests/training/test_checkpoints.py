@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import pytest
 import torch
 
 import nerfro
@@ -10,6 +11,7 @@ from tests.conftest import Runner, weights_of
 SHORT = ["evaluation.every=10", "evaluation=none", "trainer.max_steps=6"]
 
 
+@pytest.mark.slow
 def test_best_checkpoints_and_averages_are_evaluated_and_loaded(
     train: Runner, tmp_path: Path, evaluate_here: Runner
 ) -> None:

@@ -59,6 +59,7 @@ def test_files_of_the_medium_and_cameras_are_compared_with_a_checkpoint(tmp_path
     refused(r"content of the file medium\.bodies\.water\.mesh", require_same_inputs, checkpoint, path, config, views)
 
 
+@pytest.mark.slow
 def test_changed_surface_is_reported_in_loading_and_refused_in_resuming(
     train: Runner, tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

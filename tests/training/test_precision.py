@@ -18,6 +18,7 @@ from nerfro.testing import example_space
 from nerfro.training.trainer import lightning_precision, training_accelerator
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("precision", "model"), [("64-true", "train"), ("bf16-mixed", "train_paper")])
 def test_run_in_every_precision_ends_with_finite_scores(
     precision: str, model: str, request: pytest.FixtureRequest, tmp_path: Path

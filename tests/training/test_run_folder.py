@@ -56,6 +56,7 @@ def test_files_of_others_in_the_run_folder_are_kept(
     assert (folder / file).read_text() == "foreign"
 
 
+@pytest.mark.slow
 def test_run_without_checkpoints_is_not_replaced_and_begins_again_on_request(train: Runner, begun: Path) -> None:
     weights = weights_of(begun)
     shutil.rmtree(begun / "checkpoints")
@@ -115,6 +116,7 @@ def test_file_in_place_of_the_run_folder_is_refused(below: str, train: Runner, t
     assert (tmp_path / "file").read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_temporary_files_of_killed_processes_are_removed_and_others_kept(train: Runner, begun: Path) -> None:
     killed, written = (begun / "images" / f".{name}.png.{'a1' * 8}.partial" for name in ("killed", "written"))
     foreign = begun / "images" / ".foreign.partial"

@@ -56,6 +56,7 @@ def learn(train: Runner) -> Runner:
     return functools.partial(train, *box, *quick, *parts, *steps)
 
 
+@pytest.mark.slow
 def test_overfitting_warns_once(learn: Runner, noise: Path, tmp_path: Path) -> None:
     finished = learn(f"data.root={noise}", "logger=tensorboard", "trainer.log_every_n_steps=1")
     warnings = [line for line in finished.out.splitlines() if LINE in line]

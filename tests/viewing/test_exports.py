@@ -39,6 +39,7 @@ def write(scene: TrainedScene, what: str, out: Path, **options: object) -> str:
     return find_export(what, out).write(scene, out, asked)
 
 
+@pytest.mark.slow
 def test_glb_contains_glass_as_dielectric_and_the_content_as_emission(scene: TrainedScene, tmp_path: Path) -> None:
     write(scene, "mesh", tmp_path / "ball.glb")
     loaded = trimesh.load(tmp_path / "ball.glb", process=False)
@@ -130,6 +131,7 @@ def test_export_and_import_bend_rays_equally(scene: TrainedScene, tmp_path: Path
     assert angle.quantile(0.98) < 1e-3
 
 
+@pytest.mark.slow
 def test_mitsuba_accepts_strong_absorption(scene: TrainedScene, tmp_path: Path) -> None:
     write(scene.with_(absorption=[0.5, 1.0, 2.0]), "mitsuba", tmp_path / "dark.xml")
     medium = ElementTree.parse(tmp_path / "dark.xml").getroot().find("shape/medium")
@@ -178,6 +180,7 @@ def test_mitsuba_scenes_contain_separate_bodies(two_bodies: TrainedScene, tmp_pa
         write(two_bodies, "mitsuba", tmp_path / "overlapping.xml")
 
 
+@pytest.mark.slow
 def test_mitsuba_sensors_that_differ_from_the_cameras_are_named(
     scene: TrainedScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -204,6 +207,7 @@ def validated(file: Path) -> dict:
     return json.loads(done.stdout)
 
 
+@pytest.mark.slow
 def test_glb_passes_khronos_validator(scene: TrainedScene, tmp_path: Path) -> None:
     write(scene.with_(absorption=[0.1, 0.2, 0.3]), "mesh", tmp_path / "ball.glb")
     report = validated(tmp_path / "ball.glb")
@@ -241,6 +245,7 @@ def test_exported_volume_is_the_field_at_the_vertices_of_a_grid(scene: TrainedSc
     np.testing.assert_allclose(rgb[inside], colour(torch.from_numpy(places[inside])), atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("what", "suffix"), [("page", ".html"), ("volume", ".npz"), ("mesh", ".glb"), ("mitsuba", ".xml")]
 )

@@ -2,6 +2,7 @@
 
 import json
 import re
+import time
 from pathlib import Path
 
 import pytest
@@ -58,6 +59,7 @@ def test_bakes_keep_training_mode_and_weights(scene: TrainedScene, server: PageS
     assert set(json.loads(server.state(0))["update"]["scene"]) == {"volume", "sky", "version"}, "the surface stays"
 
 
+@pytest.mark.slow
 @needs_chromium
 def test_browser_shows_updates_and_losses(scene: TrainedScene, server: PageServer, tmp_path: Path) -> None:
     page = LivePage(server, scene, scene.views(), "test", resolution=8)
@@ -70,6 +72,31 @@ def test_browser_shows_updates_and_losses(scene: TrainedScene, server: PageServe
     assert server.watched
 
 
+@needs_chromium
+def test_browser_tells_the_outcome_and_opens_the_final_page(
+    scene: TrainedScene, server: PageServer, tmp_path: Path
+) -> None:
+    page = LivePage(server, scene, scene.views(), "test", resolution=8)
+    server.add_loss(3, 0.5)
+    with Browser(server.url, tmp_path) as browser:
+        browser.wait_for("document.body.textContent.includes('step 3')")
+        page.finish()
+        server.complete("Training is complete: PSNR 31.3 dB.")
+        assert server.outcome_sent.is_set()
+        server.close()
+        browser.wait_for("$('outcome').textContent.includes('PSNR 31.3 dB')")
+        time.sleep(3)  # the browser asks again, and its page is no error
+        assert browser.evaluate("$('message').textContent + page.scene.version") == "1"
+        again = PageServer("localhost", int(server.url.rpartition(":")[2]))
+        again.open("<!DOCTYPE html><title>final</title>", is_final=True)
+        again.complete("The final page is ready.")
+        browser.wait_for("$('outcome').querySelector('a') !== null")
+        browser.evaluate("$('outcome').querySelector('a').click()")
+        browser.wait_for("document.title === 'final'")
+        again.close()
+
+
+@pytest.mark.slow
 def test_training_serves_its_model(train_here: Runner, tiny_run: list[str], server: PageServer, tmp_path: Path) -> None:
     options = [option for option in tiny_run if "smoothing" not in option] + ["medium=sdf_grid"]
     options += ["trainer.max_steps=2", "viewer=true", f"hydra.run.dir={tmp_path / 'run'}"]

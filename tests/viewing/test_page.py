@@ -93,6 +93,7 @@ def glass_cube(scene: TrainedScene) -> TrainedScene:
     return in_embedded_scene(scene, medium)
 
 
+@pytest.mark.slow
 @needs_chromium
 def test_five_cameras_of_a_cube_with_bodies_inside_agree_with_nerfro(glass_cube: TrainedScene, tmp_path: Path) -> None:
     views = [0, 4, 8, 12, 16]
@@ -103,6 +104,7 @@ def test_five_cameras_of_a_cube_with_bodies_inside_agree_with_nerfro(glass_cube:
     assert min(scores) > 30, scores
 
 
+@pytest.mark.slow
 @needs_chromium
 def test_vessel_agrees_with_nerfro(scene: TrainedScene, tmp_path: Path) -> None:
     walls, water = {"ior": GLASS, "absorption": [0.3, 1.0, 2.0]}, {"ior": WATER, "absorption": [1.0, 0.0, 0.5]}
@@ -142,6 +144,7 @@ class Surroundings(Field):
         return FieldValues(density, radiance / density[..., None].clamp(min=1e-9))
 
 
+@pytest.mark.slow
 @needs_chromium
 def test_contracted_surroundings_are_shown(scene: TrainedScene, tmp_path: Path) -> None:
     space = Contracted([[-2.0] * 3, [2.0] * 3], 2.0, near=1.0)
@@ -160,6 +163,7 @@ def test_contracted_surroundings_are_shown(scene: TrainedScene, tmp_path: Path) 
         assert float(psnr(empty, rgb)) < 28, "the surroundings are much of what is seen"
 
 
+@pytest.mark.slow
 @needs_chromium
 def test_controls_change_index_glass_reflection_tint_and_sky(scene: TrainedScene, tmp_path: Path) -> None:
     lamp = lat_long.directions(32)

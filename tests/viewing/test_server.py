@@ -25,7 +25,9 @@ def test_page_and_its_updates_are_served(server: PageServer) -> None:
     server.open("<p>page")
     assert get(server, "/") == (200, "<p>page")
     assert not server.watched
-    assert json.loads(get(server, "/state?after=0")[1]) == {"losses": [], "update": None}
+    assert json.loads(get(server, "/state?after=0")[1]) == {
+        "outcome": None, "final": False, "losses": [], "update": None,
+    }  # fmt: skip
     assert server.watched
     server.add_loss(3, 0.5)
     server.publish({"volume": {"step": 1}}, {"sky": "data:,"})
@@ -33,6 +35,17 @@ def test_page_and_its_updates_are_served(server: PageServer) -> None:
     assert state["losses"] == [[3, 0.5]]
     assert state["update"] == {"scene": {"volume": {"step": 1}, "version": 1}, "arrays": {"sky": "data:,"}}
     assert json.loads(get(server, "/state?after=1")[1])["update"] is None
+
+
+def test_end_of_a_training_waits_until_a_browser_knows(server: PageServer) -> None:
+    server.complete("unwatched")  # returns at once
+    assert not server.outcome_sent.is_set()
+    assert json.loads(get(server, "/state")[1])["outcome"] == "unwatched"
+    assert server.outcome_sent.wait(10)
+    server.complete("PSNR 31.3 dB")
+    server.open("<p>final", is_final=True)
+    state = json.loads(get(server, "/state")[1])
+    assert (state["outcome"], state["final"]) == ("PSNR 31.3 dB", True)
 
 
 @pytest.mark.parametrize("path", ["/../pyproject.toml", "/etc/passwd", "/%2e%2e/pyproject.toml", "/index.html"])

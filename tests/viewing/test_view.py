@@ -1,6 +1,7 @@
 """`python -m nerfro.view` serves the page of a trained run."""
 
 import signal
+import time
 import urllib.request
 from pathlib import Path
 
@@ -12,8 +13,13 @@ def test_run_is_served_until_ctrl_c(trained_run: Path, tmp_path: Path) -> None:
     served = Command("view", options, tmp_path / "log")
     try:
         address = served.until(r"on (http://localhost:\d+); Ctrl-C ends it")[1]
-        with urllib.request.urlopen(address) as answer:
-            assert "<canvas" in answer.read().decode()
+        text = ""
+        deadline = time.monotonic() + 120
+        while "<canvas" not in text and time.monotonic() < deadline:  # the page is made after the address is printed
+            time.sleep(0.2)
+            with urllib.request.urlopen(address) as answer:
+                text = answer.read().decode()
+        assert "<canvas" in text
     finally:
         served.send(signal.SIGINT)
     assert served.wait() == 130, served.errors

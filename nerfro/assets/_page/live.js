@@ -2,6 +2,8 @@
 
 const POLL_INTERVAL = 2000; // milliseconds
 
+let hasEnded = false; // whether the server has told the outcome of the training
+
 async function pollUpdates(page) {
   for (;;) {
     // A hidden page sends no requests, so that the training spends no time on updates.
@@ -14,13 +16,24 @@ async function fetchUpdate(page) {
   try {
     const answer = await fetch(`state?after=${page.scene.version}`, { cache: "no-store" });
     if (!answer.ok) throw new Error(`${answer.status} ${answer.statusText}`);
-    const { losses, update } = await answer.json();
+    const { losses, update, outcome, final } = await answer.json();
     showLosses(losses);
     if (update) await applyUpdate(page, update);
     $("message").textContent = "";
+    if (outcome) showOutcome(outcome, final);
   } catch (error) {
-    $("message").textContent = `nerfro does not answer (${error.message}); it may have ended.`;
+    // After the end, the page remains as it is; `nerfro demo` answers again when the final page is ready.
+    if (!hasEnded) $("message").textContent = `nerfro does not answer (${error.message}); it may have ended.`;
   }
+}
+
+// Show how the training has ended, and a link to the final page if the server has one.
+function showOutcome(outcome, final) {
+  hasEnded = true;
+  $("outcome").textContent = `${outcome} `;
+  if (!final) return;
+  const link = Object.assign(document.createElement("a"), { href: location.pathname, textContent: "Open the final page" });
+  $("outcome").append(link);
 }
 
 async function applyUpdate(page, { scene, arrays }) {
