@@ -147,7 +147,7 @@ class ViewSplits(DataSet):
         *("mesh.ply", "interior.ply", "sky.png", "sky.exr", META),
     )
     FACTS: ClassVar[dict[str, Any]] = {"box": ((-1.5, -1.5, -1.5), (1.5, 1.5, 1.5)), "near": 2.0, "far": 6.0}
-    OPTIONS = ("resolution", "spp", "test_spp", "views", "fresnel", "seed")
+    OPTIONS: ClassVar[tuple[str, ...]] = ("resolution", "spp", "test_spp", "views", "fresnel", "seed")
     NOUN = "views"
     WIDTH = CAMERA_DISTANCE * CAMERA_ANGLE_X
 
@@ -181,7 +181,8 @@ class ViewSplits(DataSet):
         self.scene.glass.save(self.folder / "mesh.ply")
         write_image(self.folder / "sky.png", to_srgb(sky))
         if self.options.extras:
-            self.scene.interior.save(self.folder / "interior.ply")
+            if len(self.scene.interior.faces):
+                self.scene.interior.save(self.folder / "interior.ply")
             lat_long.save_lat_long(self.folder / "sky.exr", torch.from_numpy(sky))
         for split in SPLITS:
             frames = [

@@ -167,21 +167,21 @@ def _part(primitive: Primitive, geometry: Any) -> Part:
     """Convert the triangles of a node to world units, z axis up, with the normals of the file or flat ones."""
     if not isinstance(geometry, trimesh.Trimesh):
         raise NerfroError(f"{primitive.node} consists of points or lines; remove it from the scene")
-    mesh: Any = geometry.copy()
-    turn = np.eye(4)
-    has_normals = "vertex_normals" in geometry._cache
-    visual, colours = mesh.visual, None
+    # trimesh computes normals on demand; before the first access, the cache holds only normals from the file.
+    has_normals, turn = "vertex_normals" in geometry._cache, np.eye(4)
+    normals = geometry.vertex_normals if has_normals else None
+    mesh = trimesh.Trimesh(geometry.vertices, geometry.faces, vertex_normals=normals, process=False)
+    visual: Any = geometry.visual
+    colours = None
     coordinates = getattr(visual, "uv", None)
     if visual.kind == "vertex":
         colours = visual.vertex_colors[:, :3] / 255
     turn[:3, :3] = Z_UP_TO_Y_UP.T
-    if has_normals:
-        mesh.vertex_normals = geometry.vertex_normals  # copies lose the cache
     mesh.apply_transform(turn @ primitive.to_world)
     corners = np.arange(3 * len(mesh.faces)).reshape(-1, 3)
     # Without normals, triangles are flat (glTF 2.0, section 3.7.2.1).
-    normals = mesh.vertex_normals[mesh.faces] if has_normals else np.repeat(mesh.face_normals[:, None], 3, 1)
-    vertices, normals = (np.asarray(a).reshape(-1, 3) for a in (mesh.triangles, normals))
+    corner_normals = mesh.vertex_normals[mesh.faces] if has_normals else np.repeat(mesh.face_normals[:, None], 3, 1)
+    vertices, corner_normals = (np.asarray(a).reshape(-1, 3) for a in (mesh.triangles, corner_normals))
     base = primitive.material.get("pbrMetallicRoughness", {})
     albedo = np.array(base.get("baseColorFactor", [1.0] * 4)[:3])
     texture = getattr(getattr(visual, "material", None), "baseColorTexture", None)
@@ -191,7 +191,10 @@ def _part(primitive: Primitive, geometry: Any) -> Part:
     if coordinates is not None:  # rows of textures run downwards, and v of trimesh upwards
         coordinates = np.stack([coordinates[:, 0], 1 - coordinates[:, 1]], -1)[mesh.faces].reshape(-1, 2)
     surface = SurfaceMesh(
-        vertices.astype(np.float32), corners.astype(np.int32), normals.astype(np.float32), None if glass else colours
+        vertices.astype(np.float32),
+        corners.astype(np.int32),
+        corner_normals.astype(np.float32),
+        None if glass else colours,
     )
     if glass is not None:
         return Part(primitive.node, surface, glass.ior, glass.absorption)
