@@ -2,7 +2,7 @@
 
 Examples:
     nerfro synthesize scene=torus resolution=128 out=outputs/scenes/torus
-    nerfro synthesize scene=ship ior=1.33 seed=1
+    nerfro synthesize scene=glass.glb sky=room.hdr cameras=above
 """
 
 from __future__ import annotations

@@ -44,6 +44,7 @@ def main(config: DictConfig) -> None:
         "exit_directions": path.exit_directions,
         "path_lengths": lengths,
         "hit": path.refracted,
+        "events": trace.num_events,
     }
     if path.splits:
         arrays |= {"ray": path.ray, "throughput": path.throughput}

@@ -8,6 +8,8 @@ import pytest
 import torch
 import trimesh
 
+import nerfro
+from nerfro.media.body_settings import make_bodies
 from tests.closed_forms import ball_exits, beam
 from tests.conftest import UTM, Runner, moved_mesh
 
@@ -61,6 +63,8 @@ def test_exit_directions_of_a_ball_match_closed_form(
         missed = ~out["hit"] & clear
         np.testing.assert_allclose(out["path_lengths"][missed], 5.5, atol=1e-4)
         assert (out["path_lengths"][out["hit"]] > 5.3).all()
+        events = 0 if "sampler/path=eikonal" in options else 2
+        assert (out["events"] == events * out["hit"])[clear].all()
 
 
 @pytest.mark.slow
@@ -186,3 +190,12 @@ def test_every_path_of_a_ray_that_splits_is_written(trace: Callable[..., str], t
         expected = np.array([1.0, 0, 0]) - 2 * normal[:, :1] * normal
         np.testing.assert_allclose(mirrored[inner], expected, atol=2e-2)
     assert (tmp_path / "out.png").exists()
+
+
+def test_polylines_meet_the_triangles(tmp_path: Path) -> None:
+    shape = trimesh.creation.icosahedron()
+    shape.export(tmp_path / "body.ply")
+    medium = make_bodies(str(tmp_path / "body.ply"), 1.5, resolution=16, cache=False, shading="flat")
+    (path,) = nerfro.polylines(medium, [[0.1, 0.2, -3.0]], [[0.05, 0.02, 1.0]], interface="mesh")
+    heights = ((path[1:3, None] - shape.triangles[:, 0]) * shape.face_normals).sum(-1)
+    np.testing.assert_allclose(heights.max(1), 0, atol=1e-5)

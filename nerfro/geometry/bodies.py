@@ -65,7 +65,7 @@ def require_simple(mesh: TriangleMesh) -> None:
         return
     points = (points - torch.from_numpy(mesh.bounds.mean(0))) / extent
     # Where faces of two bodies coincide, Embree finds one of them; the line in the other direction avoids them.
-    windings = torch.stack([_crossings(triangles, points, sign * inwards)[1] for sign in (1, -1)])
+    windings = torch.stack([crossings(triangles, points, sign * inwards)[1] for sign in (1, -1)])
     buried = (windings.abs() >= 2).all(0).double().mean().item()
     if buried > _MOST_BURIED:
         raise NerfroError(
@@ -114,12 +114,12 @@ def _is_on_one_side(others: MeshIntersector, own: Float[np.ndarray, "F 3 3"]) ->
     points = torch.from_numpy(np.einsum("nfc,fcx->nfx", weights, some).reshape(-1, 3))
     lines = torch.nn.functional.normalize(torch.from_numpy(generator.normal(size=(3, 3))), dim=-1)
     # For points on a surface, the parities of the two directions differ.
-    met = [_crossings(others, points, (sign * line).expand_as(points))[0] for line in lines for sign in (1, -1)]
+    met = [crossings(others, points, (sign * line).expand_as(points))[0] for line in lines for sign in (1, -1)]
     odd = torch.stack(met) % 2 == 1
     return bool(odd.all(0).any() != (~odd).all(0).any())
 
 
-def _crossings(
+def crossings(
     triangles: MeshIntersector, points: Float[Tensor, "points 3"], along: Float[Tensor, "points 3"]
 ) -> tuple[Int[Tensor, " points"], Int[Tensor, " points"]]:
     """Return how many triangles the line from each point crosses, and the winding number at the point."""

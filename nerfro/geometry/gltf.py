@@ -1,25 +1,77 @@
-"""Orientation and compression of glTF files."""
+"""Materials, nodes, compression and orientation of glTF files."""
 
 from __future__ import annotations
 
+import importlib.util
 import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from nerfro.core.errors import NerfroError
-from nerfro.files.reading import MAX_JSON_BYTES, read_json
+from nerfro.files.reading import MAX_JSON_BYTES, read_json, reading
 
 # The y axis is up in glTF (specification 2.0, section 3.4), and the z axis in nerfro: (x, y, z) becomes (x, z, -y).
 Z_UP_TO_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+_DRACO = "KHR_draco_mesh_compression"
 _COMPRESSIONS = {
-    "KHR_draco_mesh_compression": "Draco",
+    _DRACO: "Draco",
     "EXT_meshopt_compression": "meshopt",
     "KHR_meshopt_compression": "meshopt",
     "KHR_mesh_quantization": "quantized positions",
 }
+_MODES = range(6)  # points, lines and triangles as trimesh reads them, in order of the file
+
+
+@dataclass(frozen=True)
+class GltfGlass:
+    """Optical properties of a material with `KHR_materials_transmission`.
+
+    Attributes:
+        ior: refractive index, of the d line.
+        absorption: coefficients of red, green and blue, per unit of the file.
+        abbe: Abbe number; None without dispersion.
+    """
+
+    ior: float
+    absorption: tuple[float, float, float]
+    abbe: float | None
+
+
+@dataclass(frozen=True)
+class Primitive:
+    """A set of triangles of a node.
+
+    Attributes:
+        node: name of the node.
+        geometry: name of the geometry in the scene that trimesh reads.
+        to_world: node to world, y axis up.
+        material: material of the file; empty for the default material.
+    """
+
+    node: str
+    geometry: str
+    to_world: Float[np.ndarray, "4 4"]
+    material: Mapping[str, Any]
+
+    @property
+    def glass(self) -> GltfGlass | None:
+        """Optical properties of a refractive material; None for other materials."""
+        extensions = self.material.get("extensions", {})
+        if not extensions.get("KHR_materials_transmission", {}).get("transmissionFactor", 0) > 0:
+            return None
+        volume = extensions.get("KHR_materials_volume", {})
+        colour = np.array(volume.get("attenuationColor", [1.0, 1.0, 1.0]), np.float64)
+        # Beer-Lambert: light of the attenuation colour is left after the attenuation distance.
+        red, green, blue = -np.log(colour.clip(1e-12, 1)) / volume.get("attenuationDistance", np.inf) + 0.0
+        dispersion = extensions.get("KHR_materials_dispersion", {}).get("dispersion", 0)
+        ior = float(extensions.get("KHR_materials_ior", {}).get("ior", 1.5))
+        return GltfGlass(ior, (float(red), float(green), float(blue)), 20 / dispersion if dispersion > 0 else None)
 
 
 def is_gltf(path: Path) -> bool:
@@ -28,20 +80,22 @@ def is_gltf(path: Path) -> bool:
 
 
 def require_readable(path: Path) -> None:
-    """Raise an error if a glTF file is compressed, and print once that its y axis is up.
+    """Raise an error if a glTF file is compressed and cannot be decoded, and print once that its y axis is up.
 
     Raises:
         NerfroError: the geometry is compressed.
     """
-    document = _document(path)
+    document = read_document(path)
     if not isinstance(document, dict):
         return  # trimesh describes the damage
     used = [name for key in ("extensionsRequired", "extensionsUsed") for name in document.get(key) or ()]
+    decoded = {_DRACO} if importlib.util.find_spec("DracoPy") is not None else set()
     for name, compression in _COMPRESSIONS.items():
-        if name in used:
+        if name in used and name not in decoded:
+            decoder = ", or pip install 'nerfro[gltf]', which decodes it" if name == _DRACO else ""
             raise NerfroError(
                 f"mesh {path} is compressed by {compression} ({name}), which nerfro does not read; export it without "
-                "compression (in Blender, without the option Compression), or as ply"
+                f"compression (in Blender, without the option Compression), or as ply{decoder}"
             )
     _announce(path)
 
@@ -51,7 +105,7 @@ def _announce(path: Path) -> None:
     print(f"nerfro: the y axis is up in the glTF file {path}; (x, y, z) becomes (x, -z, y), with z up")
 
 
-def _document(path: Path) -> Any:
+def read_document(path: Path) -> Any:
     """Return the JSON document of a glTF file; None if there is none."""
     if path.suffix.lower() == ".gltf":
         return read_json(path, "export it again")
@@ -61,3 +115,85 @@ def _document(path: Path) -> Any:
         if header[:4] != b"glTF" or header[16:] != b"JSON" or size > MAX_JSON_BYTES:
             return None
         return json.loads(file.read(size))
+
+
+def world_nodes(document: Mapping[str, Any]) -> Iterator[tuple[Mapping[str, Any], Float[np.ndarray, "4 4"]]]:
+    """Yield all nodes of the scene with their matrices to the world, y axis up."""
+    nodes = document.get("nodes", [])
+    children = {child for node in nodes for child in node.get("children", [])}
+    scenes = document.get("scenes", [])
+    roots = [number for number in range(len(nodes)) if number not in children]
+    if scenes:
+        roots = scenes[document.get("scene", 0)].get("nodes", [])
+    waiting = [(number, np.eye(4)) for number in reversed(roots)]
+    while waiting:
+        number, parent = waiting.pop()
+        to_world = parent @ _matrix(nodes[number])
+        yield nodes[number], to_world
+        waiting += [(child, to_world) for child in reversed(nodes[number].get("children", []))]
+
+
+def primitives_of(document: Mapping[str, Any], geometries: list[str]) -> list[Primitive]:
+    """Return the triangles of all nodes with their materials.
+
+    Args:
+        document: JSON document of the file.
+        geometries: names of the geometries that trimesh has read from the file, in order.
+
+    Raises:
+        NerfroError: the file has other geometries.
+    """
+    owners = [(mesh, p) for mesh, content in enumerate(document.get("meshes", [])) for p in content["primitives"]]
+    owners = [(mesh, primitive) for mesh, primitive in owners if primitive.get("mode", 4) in _MODES]
+    if len(owners) != len(geometries):
+        raise NerfroError(f"the glTF file has {len(owners)} sets of triangles, but {len(geometries)} are readable")
+    materials, primitives = document.get("materials", []), []
+    for node, to_world in world_nodes(document):
+        for (mesh, primitive), geometry in zip(owners, geometries, strict=True):
+            if node.get("mesh") == mesh:
+                number = primitive.get("material")
+                material = {} if number is None else materials[number]
+                primitives.append(Primitive(node.get("name", geometry), geometry, to_world, material))
+    return primitives
+
+
+def _matrix(node: Mapping[str, Any]) -> Float[np.ndarray, "4 4"]:
+    if "matrix" in node:
+        return np.array(node["matrix"], np.float64).reshape(4, 4).T
+    x, y, z, w = node.get("rotation", [0.0, 0.0, 0.0, 1.0])
+    turn = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    matrix = np.eye(4)
+    matrix[:3, :3] = turn * np.array(node.get("scale", [1.0, 1.0, 1.0]))
+    matrix[:3, 3] = node.get("translation", [0.0, 0.0, 0.0])
+    return matrix
+
+
+def glass_of_file(path: Path) -> GltfGlass | None:
+    """Return the optical properties of the bodies in a glTF file; None for a file without refractive materials.
+
+    Raises:
+        NerfroError: the file is damaged, or the bodies have different materials.
+    """
+    if not is_gltf(path):
+        return None
+    with reading(path, "mesh ", advice="export it again"):
+        materials = read_document(path).get("materials", [])
+        used = {Primitive("", "", np.eye(4), material).glass for material in materials} - {None}
+    glass = next(iter(used), None)
+    if len(used) > 1:
+        raise NerfroError(
+            f"mesh {path} has {len(used)} refractive materials; give the index (medium.ior), or write the bodies one "
+            f"by one with nerfro.synthesize scene={path}, whose output has a scene.json"
+        )
+    if glass is not None and not (0 < glass.ior < np.inf and np.isfinite(glass.absorption).all()):
+        raise NerfroError(
+            f"mesh {path} has a material with the index {glass.ior:g} and the absorption {list(glass.absorption)}; "
+            "give the index and the absorption of the body (bodies.NAME.ior, bodies.NAME.absorption)"
+        )
+    return glass

@@ -15,7 +15,7 @@ from nerfro.files.atomic import write_atomically
 from nerfro.files.reading import reading
 from nerfro.geometry.facets import CREASE_DEGREES
 from nerfro.geometry.file_normals import informative_normals
-from nerfro.geometry.gltf import Z_UP_TO_Y_UP, is_gltf, require_readable
+from nerfro.geometry.gltf import Z_UP_TO_Y_UP, is_gltf, primitives_of, read_document, require_readable
 from nerfro.geometry.orientation import area_vectors, inward_faces
 from nerfro.registry.allowed import Coordinate, check
 
@@ -206,13 +206,22 @@ def load_points(path: Path) -> Float[np.ndarray, "points 3"]:
 
 
 def _parse(path: Path) -> Any:
-    """Read a file with trimesh; scenes of several bodies become one mesh."""
+    """Read a file with trimesh; scenes of several bodies become one mesh.
+
+    Of glTF files with refractive materials, only the objects of these materials are read.
+    """
     import trimesh
 
     if is_gltf(path):
         require_readable(path)
     loaded: Any = trimesh.load(path, process=False)
-    return loaded.to_mesh() if isinstance(loaded, trimesh.Scene) else loaded
+    if not isinstance(loaded, trimesh.Scene):
+        return loaded
+    if is_gltf(path):
+        primitives = primitives_of(read_document(path), list(loaded.geometry))
+        glass = {primitive.geometry for primitive in primitives if primitive.glass is not None}
+        loaded.delete_geometry([name for name in loaded.geometry if glass and name not in glass])
+    return loaded.to_mesh()
 
 
 def merge_vertices(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -18,6 +19,7 @@ from nerfro.core.variants import variant
 from nerfro.geometry.box import corners_of_box
 from nerfro.geometry.intersection import LayeredIntersector, Triangles
 from nerfro.geometry.mesh import TriangleMesh, local_origin
+from nerfro.geometry.thickness import FEW, MIN_VOXELS, thickness
 from nerfro.kernels.available import require_bytes
 from nerfro.kernels.constants import constant
 from nerfro.kernels.tolerances import MIN_COSINE, SAFE_SHARE, STEPS_PER_SHELL
@@ -31,6 +33,7 @@ from nerfro.registry.allowed import Positive, Resolution
 if TYPE_CHECKING:
     from nerfro.kernels.lookup import Solids
 
+_RESOLUTION = 128  # vertices along each side of a grid without thin walls
 _AIR = 4  # voxels around a body if the box of its grid is not given
 _COLOURS = ("red", "green", "blue")
 # Paths record bodies as 8-bit integers.
@@ -59,17 +62,52 @@ class GridSettings:
     """Settings of the grids of signed distances, one for each body.
 
     Attributes:
-        resolution: vertices along each side of a grid.
+        resolution: vertices along each side of a grid; None for 128, and more if a body has free thin walls.
         box_min, box_max: corners of all grids, world units; None for the bounds of each surface and a margin of air.
         shell_voxels: half width of the smooth interface that the Eikonal equation sees, voxels.
         cache: whether the distances are kept in the cache folder.
+        max_gigabytes: memory up to which thin walls raise the resolution of a grid, while the grid is built.
     """
 
-    resolution: Resolution = 128
+    resolution: Resolution | None = None
     box_min: Sequence[float] | None = None
     box_max: Sequence[float] | None = None
     shell_voxels: Positive = 0.1
     cache: bool = True
+    max_gigabytes: Positive = 3.0
+
+    def for_body(self, name: str, surface: Surface, others: Sequence[Surface]) -> GridSettings:
+        """Return the same settings with a resolution at which the walls of a body have enough voxels.
+
+        Args:
+            name: name of the body, for a line about its walls.
+            surface: surface of the body.
+            others: surfaces of the other bodies; walls that separate the body from another one count as thick.
+        """
+        if self.resolution is not None:
+            return self
+        coarse = replace(self, resolution=_RESOLUTION)
+        mesh, meshes = surface.mesh, [other.mesh for other in others if other.mesh is not None]
+        if mesh is None or not mesh.is_closed:
+            return coarse
+        try:
+            walls = thickness(mesh, [other for other in meshes if other.is_closed])
+        except NerfroError:  # without Embree
+            return coarse
+        spacing = float(np.ptp(coarse.box(surface), axis=0).max()) / (_RESOLUTION - 1)
+        thin = walls < MIN_VOXELS * spacing
+        if thin.mean() <= FEW:
+            return coarse
+        # The margin of air has a fixed number of voxels if the box follows the surface.
+        air = 0 if self.box_min is not None else 2 * _AIR
+        finer = (_RESOLUTION - 1 - air) * MIN_VOXELS * spacing / float(np.quantile(walls, FEW, method="lower"))
+        most = int((self.max_gigabytes * 1e9 / BYTES_PER_VERTEX) ** (1 / 3))
+        resolution = max(_RESOLUTION, min(math.ceil(finer) + 1 + air, most))
+        print(
+            f"nerfro: the grid of {name} has {resolution} vertices along each side (medium.resolution), because walls "
+            f"of its surface are about {np.median(walls[thin]):.3g} world units thin"
+        )
+        return replace(self, resolution=resolution)
 
     def box(self, surface: Surface) -> Float[np.ndarray, "2 3"]:
         """Return the corners of the grid of a surface, world units.
@@ -81,21 +119,23 @@ class GridSettings:
                 fit into it.
         """
         low, high = surface.bounds
+        resolution = self.resolution or _RESOLUTION
         if self.box_min is not None and self.box_max is not None:
             box = corners_of_box(self.box_min, self.box_max)
-            check_margin(surface.bounds, box, self.resolution, 2)
+            check_margin(surface.bounds, box, resolution, 2)
             return box
         if self.box_min is not None or self.box_max is not None:
             raise NerfroError(
                 "medium.box_min and medium.box_max belong together; give both, or neither for the bounds of the mesh"
             )
         sides = np.maximum(high - low, 0.5 * (high - low).max())
-        share = min(2 * _AIR / (self.resolution - 1), 0.5)
+        share = min(2 * _AIR / (resolution - 1), 0.5)
         return 0.5 * (low + high) + np.array([[-0.5], [0.5]]) * sides / (1 - share)
 
     def require_memory(self, num_bodies: int) -> None:
         """Refuse grids that need more memory than is available."""
-        require_bytes(num_bodies * BYTES_PER_VERTEX * self.resolution**3, f"medium.resolution={self.resolution}")
+        resolution = self.resolution or _RESOLUTION
+        require_bytes(num_bodies * BYTES_PER_VERTEX * resolution**3, f"medium.resolution={resolution}")
 
 
 class Bodies(Medium):
@@ -137,19 +177,27 @@ class Bodies(Medium):
         surfaces = [body.surface for body in bodies]
         self.origin, self.nested = local_origin(surfaces[0].bounds), nested
         self._set_materials([body.name for body in bodies], [body.material for body in bodies])
-        boxes = [grid.box(surface) for surface in surfaces]
-        self.shell = grid.shell_voxels * min(float((box[1] - box[0]).min()) for box in boxes) / (grid.resolution - 1)
+        boxes, resolutions = [], []
+        for body in bodies:
+            settings = grid.for_body(body.name, body.surface, [s for s in surfaces if s is not body.surface])
+            boxes.append(settings.box(body.surface))
+            resolutions.append(settings.resolution or _RESOLUTION)
+        sides = [float((box[1] - box[0]).min()) for box in boxes]
+        self.shell = grid.shell_voxels * min(side / (n - 1) for side, n in zip(sides, resolutions, strict=True))
         meshes = [surface.mesh.relative_to(self.origin) for surface in surfaces if surface.mesh is not None]
         self.meshes = meshes if len(meshes) == len(surfaces) else []
         bounds = np.stack([surface.bounds for surface in surfaces], 1) - self.origin
         self._content_box = torch.from_numpy(np.stack([bounds[0].min(0), bounds[1].max(0)])).float()
-        self._set_grids(self._sampled(body, box, grid) for body, box in zip(bodies, boxes, strict=True))
+        self._set_grids(
+            self._sampled(body, box, resolution, grid.cache)
+            for body, box, resolution in zip(bodies, boxes, resolutions, strict=True)
+        )
         for body in bodies:  # so that the training is independent of the world unit
             body.material.scale_absorption(0.5 * float(np.ptp(body.surface.bounds, 0).max()))
 
-    def _sampled(self, body: Body, box: Float[np.ndarray, "2 3"], grid: GridSettings) -> DistanceGrid:
+    def _sampled(self, body: Body, box: Float[np.ndarray, "2 3"], resolution: int, cache: bool) -> DistanceGrid:
         relative = torch.from_numpy(box - self.origin).float()  # rounded before the distances are computed
-        vertices = Grid(relative.double().numpy() + self.origin, grid.resolution, cache=grid.cache)
+        vertices = Grid(relative.double().numpy() + self.origin, resolution, cache=cache)
         sampled = body.surface.sampled(vertices, relative)
         if not (self.nested or (sampled.distances < 0).any()):
             raise NerfroError(

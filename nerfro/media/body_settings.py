@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import resolve_path
+from nerfro.geometry.gltf import glass_of_file
 from nerfro.geometry.mesh import local_origin, origin_of_file
 from nerfro.media.bodies import Bodies, Body, GridSettings
 from nerfro.media.material import Abbe, Learns, Material, find_material, learned_quantities
@@ -31,7 +32,8 @@ class BodySettings:
     Attributes:
         mesh: closed triangle mesh, world units; by default `medium.mesh`.
         surface: name and settings of another surface (`python -m nerfro.plugins surface`), in place of a mesh.
-        ior: refractive index, of the d line if the body disperses light.
+        ior: refractive index, of the d line if the body disperses light; by default, with `abbe` and `absorption`, that
+            of the material of a glTF file.
         material: material of the catalogue (`python -m nerfro.plugins material`), with its dispersion.
         abbe: Abbe number; without one, the index of a body with `ior` is the same for all colours.
         absorption: coefficients of red, green and blue per world unit, or one for all.
@@ -107,8 +109,8 @@ def origin_of(medium: Any) -> Float[np.ndarray, "3"]:
 @register("medium", "sdf_grid")
 def make_bodies(
     mesh: str | None = None,
-    ior: Positive = 1.5,
-    resolution: Resolution = 128,
+    ior: Positive | None = None,
+    resolution: Resolution | None = None,
     box_min: Sequence[float] | None = None,
     box_max: Sequence[float] | None = None,
     shell_voxels: Positive = 0.1,
@@ -119,6 +121,7 @@ def make_bodies(
     bodies: dict[str, Any] | None = None,
     shading: Shading = "auto",
     crease_degrees: CreaseAngle | None = None,
+    max_gigabytes: Positive = 3.0,
 ) -> Bodies:
     """Make bodies of constant index with closed surfaces, which are sharp for `snell` and thin shells for `eikonal`.
 
@@ -127,8 +130,9 @@ def make_bodies(
     Args:
         mesh: closed triangle mesh of the body, world units, any format trimesh reads; with `bodies`, the mesh of bodies
             that have none.
-        ior: refractive index of the body.
-        resolution: vertices along each side of the grid of each body.
+        ior: refractive index of the body; by default that of the material in a glTF file, or 1.5.
+        resolution: vertices along each side of the grid of each body. By default 128, and more for a body with thin
+            walls in air, so that most of its walls have five voxels.
         box_min, box_max: corners of all grids, world units; None for the bounds of each surface and a margin of air.
         shell_voxels: half width of the smooth interface that the Eikonal equation sees, voxels.
         accept_open_mesh: accept meshes with holes. Rays along three axes decide by majority whether a point is inside.
@@ -141,6 +145,7 @@ def make_bodies(
             face.
         crease_degrees: edges with larger angles between their triangles are sharp. If it is given, `auto` looks for no
             facets; by default 30.
+        max_gigabytes: memory up to which thin walls raise the resolution of a grid; 3 are enough for 360 vertices.
     """
     settings = expanded(
         {"mesh": mesh, "ior": ior, "bodies": bodies, "shading": shading, "crease_degrees": crease_degrees}
@@ -148,11 +153,12 @@ def make_bodies(
     if not settings:
         raise NerfroError("medium=sdf_grid needs mesh; add medium.mesh=..., or bodies={NAME: {mesh: FILE, ior: 1.5}}")
     learn = learned_quantities(learn_ior, learn_absorption)
-    grid = GridSettings(resolution, box_min, box_max, shell_voxels, cache)
+    grid = GridSettings(resolution, box_min, box_max, shell_voxels, cache, max_gigabytes)
     grid.require_memory(len(settings))  # before the surfaces are read
     members = []
     for name, body in settings.items():
         surface = make_surface(surface_settings(name, body), accept_open_mesh)
+        body = _with_material_of_file(body, None if bodies else 1.5)
         members.append(Body(name, surface, make_material(name, body, learn), body.priority))
     return Bodies(members, grid=grid)
 
@@ -182,6 +188,22 @@ def surface_settings(name: str, body: BodySettings) -> Mapping[str, Any]:
     if body.shading is not None or body.crease_degrees is not None:
         raise NerfroError(f"shading and crease_degrees of bodies.{name} belong to its surface; write them in surface:")
     return body.surface
+
+
+def _with_material_of_file(body: BodySettings, ior: float | None) -> BodySettings:
+    """Add index, absorption and Abbe number of the material in a glTF file to a body without index.
+
+    Args:
+        body: settings of the body.
+        ior: index of a body whose mesh has no refractive material.
+    """
+    if body.ior is not None or body.material is not None:
+        return body
+    glass = None if body.mesh is None else glass_of_file(resolve_path(body.mesh))
+    if glass is None:
+        return dataclasses.replace(body, ior=ior)
+    abbe, absorption = body.abbe or glass.abbe, body.absorption or list(glass.absorption)
+    return dataclasses.replace(body, ior=glass.ior, abbe=abbe, absorption=absorption)
 
 
 def make_material(name: str, body: BodySettings, learn: Sequence[str] = ()) -> Material:

@@ -141,19 +141,24 @@ class ViewSplits(DataSet):
     """Views from all sides in Blender format, in splits."""
 
     META = "meta.json"
-    FILES = (
+    FILES: ClassVar[tuple[str, ...]] = (
         *(f"transforms_{split}.json" for split in SPLITS),
         *(f"{folder}{split}/r_*.png" for split in SPLITS for folder in ("", "masks/")),
         *("mesh.ply", "interior.ply", "sky.png", "sky.exr", META),
     )
     FACTS: ClassVar[dict[str, Any]] = {"box": ((-1.5, -1.5, -1.5), (1.5, 1.5, 1.5)), "near": 2.0, "far": 6.0}
-    OPTIONS = ("resolution", "spp", "test_spp", "views", "fresnel", "seed")
+    OPTIONS: ClassVar[tuple[str, ...]] = ("resolution", "spp", "test_spp", "views", "fresnel", "seed")
     NOUN = "views"
     WIDTH = CAMERA_DISTANCE * CAMERA_ANGLE_X
 
     @property
     def camera(self) -> Pinhole:
-        return Pinhole.square(CAMERA_ANGLE_X, self.options.resolution)
+        return Pinhole.square(self.angle_x, self.options.resolution)
+
+    @property
+    def angle_x(self) -> float:
+        """Horizontal field of view, radians."""
+        return CAMERA_ANGLE_X
 
     def planned(self) -> list[PlannedImage]:
         planned = []
@@ -176,7 +181,8 @@ class ViewSplits(DataSet):
         self.scene.glass.save(self.folder / "mesh.ply")
         write_image(self.folder / "sky.png", to_srgb(sky))
         if self.options.extras:
-            self.scene.interior.save(self.folder / "interior.ply")
+            if len(self.scene.interior.faces):
+                self.scene.interior.save(self.folder / "interior.ply")
             lat_long.save_lat_long(self.folder / "sky.exr", torch.from_numpy(sky))
         for split in SPLITS:
             frames = [
@@ -184,7 +190,7 @@ class ViewSplits(DataSet):
                 for view in planned
                 if view.image_path.startswith(f"{split}/")
             ]
-            content = {"camera_angle_x": CAMERA_ANGLE_X, "frames": frames}
+            content = {"camera_angle_x": self.angle_x, "frames": frames}
             write_json(self.folder / f"transforms_{split}.json", content)
 
     def next_command(self) -> str:
@@ -196,6 +202,11 @@ class ViewSplits(DataSet):
 def fingerprint(scene: SyntheticScene) -> str:
     """Compute a short hash of a scene, so that images of different scenes are not mixed in one folder."""
     digest = hashlib.sha256(repr((scene.ior, scene.tint, scene.absorption)).encode())
+    for part in scene.parts:
+        properties = (part.name, part.ior, part.absorption, part.outer_ior, part.outer_absorption, part.albedo)
+        digest.update(repr(properties).encode())
+    textures = [part.texture.tobytes() for part in scene.parts if part.texture is not None]
+    digest.update(b"".join(textures))
     for surface in (scene.glass, scene.interior):
         for array in (surface.vertices, surface.faces, surface.normals, surface.colours):
             if array is not None:

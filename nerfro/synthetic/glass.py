@@ -22,7 +22,7 @@ def register_materials(variant: str) -> None:
     `fresnel`, the material also reflects partially, like Mitsuba's dielectric.
     Parameters: `int_ior` and `ext_ior` (floats; the latter is 1 by default), `tint` (linear RGB factor for each
     transmission), `fresnel` (bool), and `absorption` (RGB per world unit), which attenuates light that reaches the
-    surface from inside.
+    surface from inside; `outer_absorption` attenuates light from outside, for a body within another one.
 
     `embedded_in_glass` is the nested BSDF of an object inside the body, attenuated in the same way (`absorption`).
     Together, the two materials attenuate every segment of a path inside the body at its end.
@@ -39,6 +39,7 @@ def _transmitting_glass(mi: Any, dr: Any) -> type:
             self.ior = mi.Float(properties.get("int_ior", 1.5) / properties.get("ext_ior", 1.0))
             self.tint = mi.Color3f(properties.get("tint", mi.ScalarColor3f(1.0)))
             self.absorption = mi.Color3f(properties.get("absorption", mi.ScalarColor3f(0.0)))
+            self.outer_absorption = mi.Color3f(properties.get("outer_absorption", mi.ScalarColor3f(0.0)))
             self.fresnel = bool(properties.get("fresnel", False))
             sides = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide
             reflection = mi.BSDFFlags.DeltaReflection | sides
@@ -63,8 +64,10 @@ def _transmitting_glass(mi: Any, dr: Any) -> type:
                 reflected, mi.UInt32(+mi.BSDFFlags.DeltaReflection), mi.UInt32(+mi.BSDFFlags.DeltaTransmission)
             )
             # A negative cosine means that the ray reaches the surface from inside.
-            depth = dr.select(cosine < 0, interaction.t, 0.0)
-            value = dr.select(reflected, mi.Color3f(1.0), self.tint) * dr.exp(-self.absorption * depth)
+            absorption = dr.select(cosine < 0, self.absorption, self.outer_absorption)
+            value = dr.select(reflected, mi.Color3f(1.0), self.tint)
+            # Camera rays in air start outside; 0 times an infinite distance would not be a number.
+            value *= dr.select(absorption > 0, dr.exp(-absorption * interaction.t), 1.0)
             return sampled, mi.Spectrum(value) & active
 
         def eval(self, context, interaction, wo, active=True):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, Literal
 
 from annotated_types import Ge, Le
 
@@ -31,7 +31,8 @@ class SynthesizeConfig:
     """Options of `nerfro.synthesize`.
 
     Attributes:
-        scene: scene to render; dolphin_capture makes photographs without poses.
+        scene: scene to render, or a glTF file (.glb, .gltf) whose refractive materials become bodies; dolphin_capture
+            makes photographs without poses.
         out: folder of the data set; by default outputs/scenes/SCENE.
         resolution: side of the square images, pixels; width of photographs, which are 4:3.
         spp: samples per pixel of training and validation views.
@@ -42,6 +43,8 @@ class SynthesizeConfig:
         absorption: absorption of the glass for red, green and blue, per world unit.
         ior: refractive index of the glass; by default that of the scene.
         seed: seed of viewpoints and sampler.
+        sky: lat-long image of the surroundings (.hdr, .exr, .png, .jpg), in place of those of the scene.
+        cameras: poses for a glTF file: those of the file, an orbit around the bodies, or the upper half of the orbit.
         sky_height: rows of sky.png.
         extras: whether to write interior.ply and sky.exr, which training does not need.
         variant: variant of Mitsuba: auto, llvm_ad_rgb, cuda_ad_rgb or scalar_rgb.
@@ -60,6 +63,8 @@ class SynthesizeConfig:
     absorption: list[NotNegative] = field(default_factory=lambda: [0.0] * 3)
     ior: Positive | None = None
     seed: Natural = 0
+    sky: str | None = None
+    cameras: Literal["orbit", "above", "file"] = "orbit"
     sky_height: Annotated[int, Ge(16), Le(16384)] = 1024
     extras: bool = True
     variant: str = "auto"

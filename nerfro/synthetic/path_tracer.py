@@ -7,6 +7,7 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from nerfro.core.light import to_linear
 from nerfro.core.optional import optional
 from nerfro.synthetic import llvm
 from nerfro.synthetic.glass import EMBEDDED, PLUGIN, register_materials
-from nerfro.synthetic.scene import Panel, Sky, SyntheticScene
+from nerfro.synthetic.scene import Panel, Part, Sky, SyntheticScene
 from nerfro.synthetic.surface import SurfaceMesh
 
 VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb", "scalar_rgb")
@@ -97,16 +98,6 @@ class PathTracer:
     def __init__(self, scene: SyntheticScene, fresnel: bool, camera: Pinhole, variant: str = "auto") -> None:
         self.mitsuba = mi = load_mitsuba(variant)
         self.camera = camera
-        absorption = {"absorption": mi.ScalarColor3f(*scene.absorption)}
-        glass: dict = {"type": PLUGIN, "int_ior": scene.ior, "tint": mi.ScalarColor3f(*scene.tint), "fresnel": fresnel}
-        glass |= absorption
-        absorbs = any(scene.absorption)
-        if fresnel and not absorbs:
-            tint = {"type": "rgb", "value": list(scene.tint)}
-            glass = {"type": "dielectric", "int_ior": scene.ior, "ext_ior": 1.0, "specular_transmittance": tint}
-        paint = {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_color"}}
-        if absorbs:
-            paint = {"type": EMBEDDED, "nested": paint, **absorption}
         surroundings = {f"panel_{number}": panel_shape(mi, panel) for number, panel in enumerate(scene.panels)}
         if scene.sky is not None:
             # Two texels per pixel of the background.
@@ -115,14 +106,15 @@ class PathTracer:
             upright = mi.ScalarTransform4f().rotate([1, 0, 0], 90)
             texture = mi.Bitmap(envmap_texture(scene.sky, height, np.asarray(upright.matrix)[:3, :3]))
             surroundings["sky"] = {"type": "envmap", "bitmap": texture, "to_world": upright}
-        self.glass = mi.load_dict({"type": "scene", "glass": triangle_shape(mi, "glass", scene.glass, glass)})
+        glass, content = _part_shapes(mi, scene, fresnel) if scene.parts else _shapes(mi, scene, fresnel)
+        self.glass = mi.load_dict({"type": "scene", **glass})
         self.scene = mi.load_dict(
             {
                 "type": "scene",
                 "integrator": {"type": "path", "max_depth": MAX_DEPTH, "rr_depth": ROULETTE_DEPTH},
                 **surroundings,
-                "glass": triangle_shape(mi, "glass", scene.glass, glass),
-                "interior": triangle_shape(mi, "interior", scene.interior, paint),
+                **glass,
+                **content,
             }
         )
 
@@ -229,15 +221,63 @@ def panel_shape(mi: ModuleType, panel: Panel) -> dict:
     return shape | {"bsdf": {"type": "diffuse", "reflectance": linear}}
 
 
-def triangle_shape(mi: ModuleType, name: str, surface: SurfaceMesh, material: dict):
+def _shapes(mi: ModuleType, scene: SyntheticScene, fresnel: bool) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the shapes of the glass and of the interior with their materials."""
+    absorption = {"absorption": mi.ScalarColor3f(*scene.absorption)}
+    glass: dict = {"type": PLUGIN, "int_ior": scene.ior, "tint": mi.ScalarColor3f(*scene.tint), "fresnel": fresnel}
+    glass |= absorption
+    absorbs = any(scene.absorption)
+    if fresnel and not absorbs:
+        tint = {"type": "rgb", "value": list(scene.tint)}
+        glass = {"type": "dielectric", "int_ior": scene.ior, "ext_ior": 1.0, "specular_transmittance": tint}
+    paint = {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_color"}}
+    if absorbs:
+        paint = {"type": EMBEDDED, "nested": paint, **absorption}
+    glass_shape = triangle_shape(mi, "glass", scene.glass, glass)
+    return {"glass": glass_shape}, {"interior": triangle_shape(mi, "interior", scene.interior, paint)}
+
+
+def _part_shapes(mi: ModuleType, scene: SyntheticScene, fresnel: bool) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the shapes of the bodies and of the contents of a scene with parts."""
+    bodies, contents = {}, {}
+    for number, part in enumerate(scene.parts):
+        outer = mi.ScalarColor3f(*part.outer_absorption)
+        if part.ior is not None:
+            glass = {"type": PLUGIN, "int_ior": part.ior, "ext_ior": part.outer_ior, "fresnel": fresnel}
+            glass |= {"absorption": mi.ScalarColor3f(*part.absorption), "outer_absorption": outer}
+            bodies[f"body_{number}"] = triangle_shape(mi, part.name, part.surface, glass)
+            continue
+        paint: dict[str, Any] = {"type": "twosided", "nested": {"type": "diffuse", "reflectance": _albedo(mi, part)}}
+        if any(part.outer_absorption):
+            paint = {"type": EMBEDDED, "nested": paint, "absorption": outer}
+        shape = triangle_shape(mi, part.name, part.surface, paint, part.texture_coordinates)
+        contents[f"content_{number}"] = shape
+    return bodies, contents
+
+
+def _albedo(mi: ModuleType, part: Part) -> dict[str, Any]:
+    if part.surface.colours is not None:
+        return {"type": "mesh_attribute", "name": "vertex_color"}
+    if part.texture is None or part.texture_coordinates is None:
+        return {"type": "rgb", "value": list(part.albedo)}
+    linear = to_linear(part.texture) * np.asarray(part.albedo)
+    return {"type": "bitmap", "bitmap": mi.Bitmap(np.ascontiguousarray(linear, np.float32)), "raw": True}
+
+
+def triangle_shape(
+    mi: ModuleType, name: str, surface: SurfaceMesh, material: dict, texture_coordinates: np.ndarray | None = None
+):
     """Return a Mitsuba mesh; vertex colours become the attribute `vertex_color`, decoded to linear albedo."""
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict(material)
-    mesh = mi.Mesh(name, len(surface.vertices), len(surface.faces), has_vertex_normals=True, props=properties)
+    size, has_texture = (len(surface.vertices), len(surface.faces)), texture_coordinates is not None
+    mesh = mi.Mesh(name, *size, has_vertex_normals=True, has_vertex_texcoords=has_texture, props=properties)
     if surface.colours is not None:
         mesh.add_attribute("vertex_color", 3, to_linear(surface.colours).astype(np.float32).ravel())
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = surface.vertices.ravel()
+    if texture_coordinates is not None:
+        parameters["vertex_texcoords"] = texture_coordinates.astype(np.float32).ravel()
     parameters["faces"] = surface.faces.astype(np.uint32).ravel()
     parameters.update()
     # Normals come last, because some versions of Mitsuba replace normals by averages over facets when positions change.

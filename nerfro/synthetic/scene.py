@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -60,6 +60,33 @@ class Panel:
 
 
 @dataclass(frozen=True)
+class Part:
+    """A surface with a material of its own: a refractive body, or diffuse content.
+
+    Attributes:
+        name: name in messages and files.
+        surface: triangles with normals; vertex colours, if there are any, are factors of the albedo.
+        ior: refractive index of a body; None for content.
+        absorption: absorption of a body for each colour channel, per world unit.
+        outer_ior: refractive index around a body.
+        outer_absorption: absorption around the surface, per world unit.
+        albedo: linear albedo of content.
+        texture: further factor of the albedo, sRGB in [0, 1], float32 [H, W, 3], or None.
+        texture_coordinates: float32 [V, 2] from the upper left corner of the texture, or None.
+    """
+
+    name: str
+    surface: SurfaceMesh
+    ior: float | None = None
+    absorption: Vector = (0.0, 0.0, 0.0)
+    outer_ior: float = 1.0
+    outer_absorption: Vector = (0.0, 0.0, 0.0)
+    albedo: Vector = (1.0, 1.0, 1.0)
+    texture: np.ndarray | None = None
+    texture_coordinates: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
 class SyntheticScene:
     """A refractive object in world units, z up.
 
@@ -72,7 +99,8 @@ class SyntheticScene:
         tint: linear factor per colour channel on each crossing of the glass surface, as in the paper's image formation,
             where paths are not absorbed.
         absorption: absorption of the glass for each colour channel, per world unit (Beer-Lambert).
-        aim: point in the centre of the photographs.
+        aim: point in the centre of the images.
+        parts: bodies and contents with materials of their own, which are rendered in place of glass and interior.
     """
 
     ior: float
@@ -83,3 +111,16 @@ class SyntheticScene:
     tint: Vector = (1.0, 1.0, 1.0)
     absorption: Vector = (0.0, 0.0, 0.0)
     aim: Vector = (0.0, 0.0, 0.0)
+    parts: tuple[Part, ...] = ()
+
+    def with_glass(self, ior: float | None, absorption: Vector) -> SyntheticScene:
+        """Return the scene with another index, unless it is None, and another absorption of the glass.
+
+        An absorption of zero leaves that of parts unchanged.
+        """
+        parts = self.parts
+        if ior is not None:
+            parts = tuple(replace(part, ior=ior) if part.ior is not None else part for part in parts)
+        if any(absorption):
+            parts = tuple(replace(part, absorption=absorption) if part.ior is not None else part for part in parts)
+        return replace(self, ior=self.ior if ior is None else ior, absorption=absorption, parts=parts)

@@ -3,28 +3,48 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from types import ModuleType
+
+import numpy as np
+import torch
 
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import user_path
 from nerfro.core.progress import progress_bar
+from nerfro.files import lat_long
 from nerfro.files.folder_lock import lock_folder
+from nerfro.geometry.gltf import is_gltf
 from nerfro.synthetic.dataset import DataSet, ViewSplits
+from nerfro.synthetic.gltf_scene import GltfScene
 from nerfro.synthetic.options import SynthesizeConfig
 from nerfro.synthetic.path_tracer import PathTracer, load_mitsuba
-from nerfro.synthetic.scene import SyntheticScene
+from nerfro.synthetic.scene import Sky, SyntheticScene
 from nerfro.synthetic.scenes import SCENES
 
 
-def find_scene(name: str) -> ModuleType:
-    """Return the module of a scene.
+def find_scene(name: str) -> ModuleType | GltfScene:
+    """Return the module of a scene, or the scene of a glTF file.
 
     Raises:
-        NerfroError: the name is unknown.
+        NerfroError: the name is unknown, or the file cannot be used.
     """
-    if name not in SCENES:
-        raise NerfroError(f"unknown scene '{name}'; choose one of {', '.join(SCENES)}")
-    return SCENES[name]
+    if name in SCENES:
+        return SCENES[name]
+    if is_gltf(Path(name)):
+        return GltfScene(user_path(name))
+    raise NerfroError(f"unknown scene '{name}'; choose one of {', '.join(SCENES)}, or a glTF file (.glb, .gltf)")
+
+
+def load_sky(path: Path) -> Sky:
+    """Return the radiance of a lat-long image as a function of the direction."""
+    image = lat_long.load_lat_long(path)
+
+    def sky(directions: np.ndarray) -> np.ndarray:
+        points = torch.from_numpy(np.asarray(directions, np.float32)).reshape(-1, 3)
+        return lat_long.sample(image, points, image.shape[1]).numpy().reshape(directions.shape)
+
+    return sky
 
 
 def synthesize(options: SynthesizeConfig) -> DataSet:
@@ -38,15 +58,17 @@ def synthesize(options: SynthesizeConfig) -> DataSet:
     """
     if len(options.absorption) != 3:
         raise NerfroError(f"absorption={list(options.absorption)} is not allowed; give red, green and blue")
-    folder = user_path(options.out or f"outputs/scenes/{options.scene}")
+    folder = user_path(options.out or f"outputs/scenes/{Path(options.scene).stem}")
+    module, sky = find_scene(options.scene), None if options.sky is None else load_sky(user_path(options.sky))
     with lock_folder(folder, "out"):
-        module = find_scene(options.scene)
         data_type: type[DataSet] = getattr(module, "DATA_SET", ViewSplits)
         # Colours have a resolution of half a pixel of the images.
         scene: SyntheticScene = module.build(spacing=max(0.5 * data_type.WIDTH / options.resolution, 0.0025))
-        ior = scene.ior if options.ior is None else options.ior
+        scene = scene.with_glass(options.ior, tuple(options.absorption))
+        if sky is not None:
+            scene = replace(scene, sky=sky)
         mitsuba = load_mitsuba(options.variant)  # a missing Mitsuba is reported before files are removed
-        data = data_type(options, replace(scene, absorption=tuple(options.absorption), ior=ior), folder)
+        data = data_type(options, scene, folder)
         data.prepare(mitsuba)
         planned = data.planned()
         waiting = data.missing(planned)

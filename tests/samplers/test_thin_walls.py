@@ -88,3 +88,18 @@ def test_thin_walls_are_not_checked_without_embree(
     monkeypatch.setitem(sys.modules, "embreex.mesh_construction", None)
     _exits(tmp_path / "ball.ply", "sdf", 32)
     assert "warning" not in capsys.readouterr().out
+
+
+def test_resolution_follows_thin_walls_in_air(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    glass = {"mesh": str(_hollow_ball(tmp_path / "hollow.ply", 0.06)), "ior": 1.5}
+    trimesh.creation.icosphere(4, 0.94).export(tmp_path / "water.ply")
+    water = {"mesh": str(tmp_path / "water.ply"), "ior": 1.33}
+    empty = make_bodies(bodies={"glass": glass}, cache=False)
+    assert "the grid of glass has" in capsys.readouterr().out
+    warn_of_thin_walls(Snell(), empty)
+    full = make_bodies(bodies={"glass": glass, "water": water}, cache=False)
+    limited = make_bodies(bodies={"glass": glass}, cache=False, max_gigabytes=0.2)
+    assert "warning" not in capsys.readouterr().out
+    assert 160 < len(empty.grids[0].distances) < 200
+    assert [len(grid.distances) for grid in full.grids] == [128, 128]
+    assert len(limited.grids[0].distances) == 146  # 64 bytes per vertex

@@ -165,7 +165,11 @@ def _bent(path: Path, medium: Bodies, box: Float[Tensor, "2 3"], starts: Float[T
 
 
 def polylines(
-    medium: Medium, origins: ArrayLike | Tensor, directions: ArrayLike | Tensor, length: float | None = None
+    medium: Medium,
+    origins: ArrayLike | Tensor,
+    directions: ArrayLike | Tensor,
+    length: float | None = None,
+    interface: Literal["mesh", "sdf"] = "sdf",
 ) -> list[np.ndarray]:
     """Trace rays through a medium, and return the vertices of the paths, for example for a plot.
 
@@ -174,6 +178,7 @@ def polylines(
         origins, directions: rays [R, 3], world units; directions need not have unit length.
         length: length of the paths, world units; bent paths end outside of the medium. By default, paths end well
             beyond the medium.
+        interface: `mesh` traces the triangles of bodies, `sdf` smooth surfaces; see `sampler/path=snell`.
 
     Returns:
         One array of vertices [S, 3] for each ray.
@@ -183,7 +188,7 @@ def polylines(
     """
     rays = make_rays(*_checked_rays(origins, directions), medium, 0.0, length)
     if medium.bodies is not None:
-        path = Snell()(rays, medium)
+        path = Snell(interface)(rays, medium)
     else:
         discover()  # the sampler is a plugin
         path = find("sampler/path", "eikonal").cls()(rays, medium)

@@ -6,24 +6,17 @@ import math
 
 import numpy as np
 import torch
-from jaxtyping import Float
 
 from nerfro.core.errors import NerfroError, warn
 from nerfro.geometry.bodies import points_below
-from nerfro.geometry.intersection import MeshIntersector
-from nerfro.geometry.mesh import TriangleMesh
+from nerfro.geometry.thickness import FEW, MIN_VOXELS, thickness
 from nerfro.media.base import Medium
 from nerfro.media.bodies import Bodies
 from nerfro.samplers.base import PathSampler
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.paths.traced_file import make_rays
 
-# Thickness, in voxels, below which the spline of one side of a wall contains the fold of the distances in its middle.
-# Median error of exit directions behind a hollow ball of index 1.5: 0.01 degrees at 4.8 voxels, 0.6 at 3, and 2 at 1.8.
-_MIN_VOXELS = 5.0
-# Share of the surface that may belong to thinner parts, such as the surroundings of a sharp edge.
-_FEW = 0.2
-_NUM_POINTS, _NUM_RAYS = 4096, 512
+_NUM_RAYS = 512
 # Median error of exit directions, in degrees, below which walls may be thin; a pixel of 400 covers about 0.1 degrees.
 _LEAST_ERROR = 0.1
 _MAX_VERTICES = 512  # largest resolution that the warning recommends
@@ -42,19 +35,19 @@ def warn_of_thin_walls(sampler: PathSampler, medium: Medium) -> None:
             voxels = thickness(mesh) / float(grid.spacing.max())
         except NerfroError:  # without Embree
             return
-        thin = voxels < _MIN_VOXELS
-        if thin.mean() <= _FEW:
+        thin = voxels < MIN_VOXELS
+        if thin.mean() <= FEW:
             continue
         if error is None:
             error = _median_error(bodies)
         if error < _LEAST_ERROR:
             return
-        factor = _MIN_VOXELS / float(np.quantile(voxels, _FEW))
+        factor = MIN_VOXELS / float(np.quantile(voxels, FEW))
         resolution = math.ceil((len(grid.distances) - 1) * factor) + 1
         finer = f"raise the resolution of the grid to {resolution}, " if resolution <= _MAX_VERTICES else ""
         warn(
             f"{thin.mean():.0%} of the surface of {name} bounds walls of about {np.median(voxels[thin]):.1f} voxels, "
-            f"which bend rays in wrong directions below {_MIN_VOXELS:.0f} voxels; {finer}trace triangles "
+            f"which bend rays in wrong directions below {MIN_VOXELS:.0f} voxels; {finer}trace triangles "
             "(sampler/path=snell sampler.path.interface=mesh), or describe a cavity as a body of index 1"
         )
 
@@ -73,11 +66,3 @@ def _median_error(bodies: Bodies) -> float:
     rays = make_rays(start + torch.from_numpy(medium.origin), towards, medium, 0.0, None)
     by_grid, by_triangles = (Snell(interface)(rays, medium).exit_directions for interface in ("sdf", "mesh"))
     return float(torch.rad2deg(2 * torch.asin((0.5 * (by_grid - by_triangles).norm(dim=-1)).clamp(max=1))).median())
-
-
-def thickness(mesh: TriangleMesh) -> Float[np.ndarray, " points"]:
-    """Return the distance to the opposite side at random points of a closed surface, world units."""
-    start, inwards = points_below(mesh, _NUM_POINTS)
-    intersector = MeshIntersector(mesh.triangles)
-    hit = intersector.first_hits(start, inwards)
-    return intersector.distance(start[hit >= 0], inwards[hit >= 0], hit[hit >= 0]).numpy()

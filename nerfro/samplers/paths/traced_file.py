@@ -38,9 +38,9 @@ class TraceConfig:
     Attributes:
         medium: plugin of the group `medium`.
         rays: .npz file with `origins` and `directions` [R, 3], world units and unit directions.
-        out: .npz file to write, with `exit_positions` and `exit_directions` [R, 3], `path_lengths` and `hit`
-            [R]. If rays split, there is one row for each polyline, and the arrays `ray` (row in `rays`) and
-            `throughput` [P, 3].
+        out: .npz file to write, with `exit_positions` and `exit_directions` [R, 3], `path_lengths`, `hit` and
+            `events` (refractions and reflections) [R]. If rays split, there is one row for each polyline, and the
+            arrays `ray` (row in `rays`) and `throughput` [P, 3].
         near: arc length at which paths begin.
         far: arc length at which paths end. Bent paths end outside the box of the medium, beyond `far` if
             necessary. By default, all paths end at the exit from the box.
