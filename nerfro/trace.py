@@ -38,7 +38,7 @@ def main(config: DictConfig) -> None:
     rays = make_rays(origins, directions, medium, config.near, config.far)
     trace = sampler.trace(rays, medium)
     path, num_exceeded = trace.path, int(trace.exceeded.sum())
-    positions, lengths = (path.end_positions, path.far) if config.far is not None else leave_box(path, medium)
+    positions, lengths = (path.end_positions, path.far) if config.far is not None else leave_box(path, medium.box)
     arrays = {
         "exit_positions": positions + torch.from_numpy(medium.origin),
         "exit_directions": path.exit_directions,

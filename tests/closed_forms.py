@@ -13,6 +13,10 @@ from nerfro.media.base import Medium
 from nerfro.media.bodies import Bodies
 from nerfro.media.distance_grid import DistanceGrid, DistanceGrids
 from nerfro.media.material import Abbe, Material
+from nerfro.testing.examples import LuneburgLens as Luneburg
+from nerfro.testing.optics import angle
+
+__all__ = ["Luneburg", "angle"]
 
 Squared = Callable[[Tensor], tuple[Tensor, Tensor]]
 
@@ -29,20 +33,6 @@ class FunctionMedium(Medium):
         squared, gradient = self.squared(positions)
         n = squared.sqrt()
         return n, gradient / (2 * n[..., None])
-
-
-class Luneburg(Medium):
-    """The Luneburg lens of radius 1, with air around it."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.register_buffer("box", torch.tensor([[-1.0] * 3, [1.0] * 3]), persistent=False)
-
-    def forward(self, positions: Tensor) -> tuple[Tensor, Tensor]:
-        squared, gradient = luneburg(positions)
-        inside = squared > 1
-        n = torch.where(inside, squared, 1.0).sqrt()
-        return n, torch.where(inside[..., None], gradient / (2 * n[..., None]), 0.0)
 
 
 class FreeBodies(Bodies):
@@ -174,11 +164,6 @@ def random_rays(num: int, width: float, seed: int, far: float) -> Rays:
     directions = torch.nn.functional.normalize(torch.randn(num, 3, generator=generator), dim=-1)
     targets = width * (torch.rand(num, 3, generator=generator) - 0.5)
     return make_rays(targets - 3 * directions, directions, 0.5, far)
-
-
-def angle(a: Tensor, b: Tensor) -> Tensor:
-    """Angle between unit vectors in degrees, exact for small ones."""
-    return torch.rad2deg(2 * torch.asin((0.5 * torch.linalg.vector_norm(a.double() - b.double(), dim=-1)).clamp(max=1)))
 
 
 def ball_exits(rays: Rays, radius: float, ior: float | Tensor, centre: Sequence[float] = (0, 0, 0)) -> Tensor:

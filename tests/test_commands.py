@@ -209,6 +209,7 @@ def test_pages_open_in_graphical_browsers_and_are_printed_over_ssh(
 
 
 COMMANDS = {file.stem for file in PACKAGE_DIR.glob("*.py") if "\n@entry_point" in file.read_text()} | {
+    "check",
     "demo",
     "plugins",
 }

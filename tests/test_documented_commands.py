@@ -65,7 +65,7 @@ def commands(page: str) -> Iterator[tuple[str, list[str]]]:
     for block in BLOCK.findall(PAGES[page].replace("\\\n", " ")):
         for command, options in COMMAND.findall(block):
             options = options.rstrip('"') if options.count('"') % 2 else options
-            if command != "plugins":
+            if command not in ("check", "plugins"):
                 yield command or "train", shlex.split(FLAG.sub("", options), comments=True)
 
 

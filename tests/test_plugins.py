@@ -16,11 +16,13 @@ from omegaconf import DictConfig
 from PIL import Image
 from torch import nn
 
+from nerfro.backgrounds.base import Background
 from nerfro.cli.options import Described
 from nerfro.core import types
 from nerfro.core.paths import PLUGINS_DIR
 from nerfro.data.base import DataSource, Views
 from nerfro.data.blender import BlenderData
+from nerfro.fields.base import Field
 from nerfro.losses.base import Loss
 from nerfro.media.base import Medium
 from nerfro.media.surface import Surface
@@ -30,6 +32,10 @@ from nerfro.testing import (
     ContractError,
     check,
     check_export,
+    example_ball,
+    example_path,
+    example_rays,
+    example_samples,
 )
 from nerfro.training.phases.base import Phase, TrainingRun
 from nerfro.viewing.exports import EXPORTS, Export, find_export
@@ -86,6 +92,46 @@ def test_failing_plugin_is_named_with_the_cause(
 ) -> None:
     folder = write_plugin("broken", source)
     refused(f"^plugin {folder / 'broken.py'} cannot be imported: {cause}", discover, folder)
+
+
+def tuples(_: nn.Module, samples: types.Samples) -> object:
+    return samples.s, samples.positions
+
+
+def too_few(_: nn.Module, samples: types.Samples) -> types.FieldValues:
+    return types.FieldValues(samples.s[:1], samples.positions[:1])
+
+
+@pytest.mark.parametrize(
+    ("base", "forward", "message"),
+    [
+        (
+            Field,
+            tuples,
+            r"Broken\.forward in .*test_plugins\.py returned a tuple; return FieldValues with density \[P, N\]",
+        ),
+        (Field, too_few, r"returned a FieldValues of other shapes; return FieldValues with density"),
+        (
+            Background,
+            lambda _, exits: exits.directions[..., :1],
+            r"returned a Tensor of shape .* radiance \[\.\.\., 3\] in",
+        ),
+        (
+            PointSampler,
+            lambda _, path, previous, draws=None: None,
+            "returned a NoneType; return Samples on all polylines",
+        ),
+        (PathSampler, lambda _, rays, medium: example_path(4), "returned a Path of other shapes; return a Path with"),
+    ],
+)
+def test_result_that_breaks_the_contract_names_the_file_and_what_was_expected(
+    base: type, forward: Callable[..., object], message: str
+) -> None:
+    inputs = {Field: example_samples(), Background: example_path().exits(), PointSampler: example_path(),
+              PathSampler: example_rays()}  # fmt: skip
+    others = {PointSampler: [None], PathSampler: [example_ball()]}
+    made = type("Broken", (base,), {"forward": forward, "__module__": __name__, "num_levels": 1})()
+    refused(message, made, inputs[base], *others.get(base, []))
 
 
 METRIC = """
@@ -228,7 +274,12 @@ def test_medium_of_varying_index_keeps_its_contract(members: dict[str, object]) 
         ("phase", Phase, phase(overflow), "parameters are finite after a step"),
         ("phase", Phase, phase(noise), "random numbers of a step depend on its number"),
         ("phase", Phase, phase(lambda parameter: parameter.typo), "phase=broken raised AttributeError"),
-        ("sampler/path", PathSampler, {"forward": lambda *_: None}, "forward returned None, not Path"),
+        (
+            "sampler/path",
+            PathSampler,
+            {"forward": lambda *_: None},
+            "returned a NoneType; return a Path with a polyline for each ray",
+        ),
         (
             "phase",
             Phase,

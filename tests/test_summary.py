@@ -233,6 +233,13 @@ def test_command_prints_writes_all_forms_and_refuses_to_overwrite(tmp_path: Path
     summarize(runs, f"out={out}", "overwrite=true")
 
 
+def test_tables_of_runs_without_a_limit_lie_in_the_output_folder(tmp_path: Path, summarize: Runner) -> None:
+    write_run(tmp_path / "run", "mine", 21.0, max_time=None)
+    summarize(f"runs=[{tmp_path / 'run'}]", f"out={tmp_path / 'out'}")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "run"]
+    assert (tmp_path / "out" / "unlimited.csv").read_text()
+
+
 @pytest.mark.parametrize(
     ("override", "said"),
     [

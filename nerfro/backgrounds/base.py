@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from typing import Any
 
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from nerfro.core.results import require_results
 from nerfro.core.types import Exits
 from nerfro.data.component import Component
 
@@ -16,6 +18,11 @@ class Background(Component, nn.Module, ABC):
 
     It is in the colour space of the model: linear, or sRGB with `model.colour=srgb`.
     """
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        contract = "radiance [..., 3] in the shape of exits.directions"
+        require_results(cls, Tensor, contract, lambda radiance, exits: radiance.shape == exits.directions.shape)
 
     @abstractmethod
     def forward(self, exits: Exits) -> Float[Tensor, "*batch 3"]:

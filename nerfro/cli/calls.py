@@ -108,6 +108,7 @@ def composed(
     overrides: Sequence[str],
     expand: Expand,
     check: Callable[[DictConfig], None] | None = None,
+    config_dir: str | Path | None = None,
 ) -> Iterator[Composition]:
     """Compose the configuration of a command for a call from Python.
 
@@ -120,6 +121,7 @@ def composed(
         overrides: settings as on the command line.
         expand: function that replaces overrides that stand for several settings, see `Composer`.
         check: further check of the configuration.
+        config_dir: further folder of YAML files, as `--config-dir`.
 
     Raises:
         NerfroError: a setting does not exist, or its value is not allowed.
@@ -127,18 +129,20 @@ def composed(
 
     composer = Composer(command, schema, check, expand)
     arguments = composer.overrides(overrides)
+    folders = [] if config_dir is None else [str(config_dir)]
     try:
-        with composer.hydra() as hydra:
+        with composer.hydra(folders) as hydra:
             job = hydra.compose_config(command, arguments, RunMode.RUN, with_log_configuration=False, from_shell=False)
     except HydraException as error:
-        describe(command, schema).require_known(arguments)
+        if not folders:  # which may have other groups
+            describe(command, schema).require_known(arguments)
         raise NerfroError(in_one_line(error)) from error
     with open_dict(job):
         job.hydra.runtime.output_dir = job.hydra.run.dir
     config = copy.deepcopy(job)
     with open_dict(config):
         del config["hydra"]
-    with _as_main_program(command, arguments, job):
+    with _as_main_program(command, [*arguments, *(f"--config-dir={folder}" for folder in folders)], job):
         yield Composition.of_job(config)
 
 

@@ -14,7 +14,7 @@ from nerfro.cli.entry import print_version, program
 from nerfro.cli.failures import errors_in_one_line
 from nerfro.cli.options import Described, recall, usage
 
-_WITHOUT_CONFIGURATION = ("demo", "plugins")  # commands
+_WITHOUT_CONFIGURATION = ("check", "demo", "plugins")  # commands
 
 
 def begin(command: str) -> None:

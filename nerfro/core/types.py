@@ -19,8 +19,8 @@ are defined where they are used. A name on its own begins with a space, which li
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -436,6 +436,7 @@ class Pixels:
         cameras: all training cameras.
         window: all training cameras, cropped to the window of the first steps (`batches.precrop_steps`).
         photographed: function that returns the colours of pixels by number.
+        maps: further values of each pixel by name, see `Batch`.
     """
 
     number: Int[Tensor, "Q"]
@@ -445,6 +446,7 @@ class Pixels:
     cameras: Cameras
     window: Cameras
     photographed: Callable[[Int[Tensor, "P"]], Float[Tensor, "P 3"]]
+    maps: Mapping[str, Float[Tensor, "Q _"]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -466,6 +468,7 @@ class Batch:
         draws: random numbers of the step, with an index for each ray.
         path: paths of the rays without gradients; None before tracing.
         samples: samples of the first sampling level, if they were chosen with the paths.
+        maps: further values of each pixel by name, from `Views.maps`, such as `depth`.
     """
 
     rays: Rays
@@ -478,6 +481,7 @@ class Batch:
     draws: Draws
     path: Path | None = None
     samples: Samples | None = None
+    maps: Mapping[str, Float[Tensor, "Q _"]] = field(default_factory=dict)
 
     @property
     def ray_view(self) -> Int[Tensor, "R"]:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import copy
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -53,6 +53,8 @@ class Views:
         masks: coverage of each pixel [H, W] by the refractive object in [0, 1], or None if the data set has no masks.
         names: names of the images in the data set.
         usable: pixels [H, W] that training may use (1 or True), or None if all pixels are usable.
+        maps: further values of each pixel by name, in the resolution of the images, which losses find in `batch.maps`.
+            The map `depth` has one channel: the arc length of the ray through the pixel, world units; 0 if unknown.
         frames: image and mask files, if the data format knows them; otherwise empty.
         mask_labels: labels of the object in the mask files, see `nerfro.data.image_files.read_mask`.
 
@@ -65,6 +67,7 @@ class Views:
     masks: LazyImages | Float[Tensor, "V H W"] | None
     names: list[str]
     usable: LazyImages | Bool[Tensor, "V H W"] | None = None
+    maps: Mapping[str, Float[Tensor, "V H W _"]] = field(default_factory=dict)
     frames: Sequence[Frame] = ()
     mask_labels: Sequence[int] | None = None
 
@@ -76,6 +79,10 @@ class Views:
                     f"Views.{name} is a {type(value).__name__}; give one tensor of all views, as by torch.stack, or "
                     "LazyImages"
                 )
+        size = len(self.names), self.cameras.height, self.cameras.width
+        for name, values in self.maps.items():
+            if tuple(values.shape[:3]) != size or values.ndim != 4:
+                raise NerfroError(f"Views.maps['{name}'] has the shape {list(values.shape)}; give {[*size, 'C']}")
 
     def __len__(self) -> int:
         return len(self.names)
@@ -89,10 +96,14 @@ class Views:
         }
         images = {name: p[indices] if isinstance(p, Tensor) else p for name, p in images.items()}
         names, frames = [self.names[view] for view in indices], [self.frames[view] for view in indices if self.frames]
+        images["maps"] = {name: values[indices] for name, values in self.maps.items()}
         return replace(self, cameras=self.cameras.select(indices), names=names, frames=frames, **images)
 
     def joined(self, other: Views) -> Views | None:
-        """Append other views, without masks of usable pixels; None unless all image and mask files have one size."""
+        """Append other views; None unless all image and mask files have one size.
+
+        The result has neither masks of usable pixels nor maps.
+        """
         parts = self.images, other.images, self.masks, other.masks
         if not all(isinstance(part, LazyImages) for part in parts) or self.images.shape != other.images.shape:
             return None
@@ -105,6 +116,7 @@ class Views:
             names=[*self.names, *other.names],
             frames=[*self.frames, *other.frames],
             usable=None,
+            maps={},
         )
 
     def spread(self, most: int) -> list[int]:

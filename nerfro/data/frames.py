@@ -18,6 +18,7 @@ from nerfro.core.cameras import Cameras, central_window
 from nerfro.core.errors import NerfroError, first_of
 from nerfro.core.paths import refuse_root, resolve_path
 from nerfro.data.base import SPLITS, DataSource, Frame, Views
+from nerfro.data.depths import DEPTH, depths_of_points, read_depths
 from nerfro.data.image_files import IMAGE_SUFFIXES, Alpha, read_rgb
 from nerfro.data.lazy_images import LazyImages
 from nerfro.data.lenses import Lens, check_lenses, lens_tensors
@@ -42,6 +43,9 @@ class FrameSet:
         near, far: bounds of the rays (arc lengths, world units) that apply where the options leave these open.
         crop: fraction of each side that is kept around the centre.
         usable: masks of the pixels that training may use, one per frame; empty if all pixels are usable.
+        depths: depth images, one per frame; empty if there are none, see `nerfro.data.depths`.
+        depth_unit: world units per level of the depth images.
+        points: 3-D points that each frame has observed, world units, which give depths; empty if there are none.
     """
 
     frames: Sequence[Frame]
@@ -51,6 +55,9 @@ class FrameSet:
     far: float = math.inf
     crop: float = 1.0
     usable: Sequence[Path | None] = ()
+    depths: Sequence[Path | None] = ()
+    depth_unit: float = 1.0
+    points: Sequence[Float[np.ndarray, "_ 3"]] = ()
 
 
 @validated("data")
@@ -148,11 +155,16 @@ class PosedImages(DataSource):
         fx, fy, cx, cy = (intrinsics * scale).float().unbind(-1)
         cameras = Cameras(torch.from_numpy(poses).float(), fx, fy, cx, cy, width, height, near, far, distortion)
         usable = find_usable(files, read.usable, self.downscale, stored) if any(read.usable) else None
+        maps = {DEPTH: read_depths(read.depths, read.depth_unit, cameras)} if any(read.depths) else {}
+        if read.points:
+            maps[DEPTH] = depths_of_points([points - self.origin for points in read.points], cameras)
         if read.crop < 1:
             window = central_window(height, width, read.crop)
             cameras, images = cameras.crop(window), images.cut(window)
             masks, usable = masks and masks.cut(window), usable and usable.cut(window)
-        return Views(cameras, images, masks, [frame.name for frame in frames], usable, frames, self.mask_labels)
+            top, left = window.top, window.left
+            maps = {n: m[:, top : top + window.height, left : left + window.width] for n, m in maps.items()}
+        return Views(cameras, images, masks, [frame.name for frame in frames], usable, maps, frames, self.mask_labels)
 
     def _require_precision(self, centres: Float[np.ndarray, "V 3"]) -> None:
         """Refuse cameras that are far from the origin compared with the distances between the cameras."""

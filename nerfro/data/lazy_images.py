@@ -35,7 +35,7 @@ def decoded_once() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class LazyImages:
-    """Image files of one size. `images[i]` decodes a file and returns values in [0, 1].
+    """Image files of one size. `images[i]` or `images[:2]` decodes files and returns values in [0, 1].
 
     The result has shape [H, W, 3], or [H, W] for masks. Create an instance with `LazyImages.of`.
 
@@ -105,7 +105,9 @@ class LazyImages:
     def __len__(self) -> int:
         return len(self.files)
 
-    def __getitem__(self, index: int) -> Float[Tensor, "H W *C"]:
+    def __getitem__(self, index: int | slice) -> Float[Tensor, "..."]:
+        if isinstance(index, slice):
+            return torch.stack([self[number] for number in range(len(self))[index]])
         return torch.from_numpy(to_unit(self.levels(index)))
 
     def __iter__(self) -> Iterator[Float[Tensor, "H W *C"]]:

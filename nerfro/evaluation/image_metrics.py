@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import ClassVar, Literal
 
 import torch
@@ -12,7 +13,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from nerfro.core.errors import NerfroError
+from nerfro.core.errors import NerfroError, nearest_of
 from nerfro.evaluation.error_maps import SQUARED_ERROR_LIMIT, ErrorMap, squared_error_map
 from nerfro.evaluation.regions import mean_over, require_images
 from nerfro.evaluation.ssim import WINDOW, ssim, ssim_map
@@ -95,9 +96,21 @@ def image_metrics() -> dict[str, type[ImageMetric]]:
     return {plugin.name: plugin.cls for plugin in _in_order()}
 
 
-def build_metrics() -> dict[str, ImageMetric]:
-    """Build all registered metrics, by name in the order of tables; `prepare` makes each of them ready."""
-    return {plugin.name: create(plugin, {}) for plugin in _in_order()}
+def build_metrics(names: Sequence[str] | None = None) -> dict[str, ImageMetric]:
+    """Build metrics by name, in the order of tables.
+
+    Args:
+        names: names of registered metrics; by default all.
+
+    Raises:
+        NerfroError: a metric is not registered, or `names` is empty.
+    """
+    registered = {plugin.name: plugin for plugin in _in_order()}
+    selected = registered if names is None else names
+    unknown = next((name for name in selected if name not in registered), None)
+    if unknown is not None or not selected:
+        raise NerfroError(f"metrics={list(selected)}: {nearest_of(str(unknown), list(registered))}")
+    return {name: create(plugin, {}) for name, plugin in registered.items() if name in selected}
 
 
 def _in_order() -> list[Plugin]:

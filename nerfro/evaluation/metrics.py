@@ -18,11 +18,15 @@ from nerfro.files.images import round_to_8bit
 
 
 class ImageMetrics(nn.Module):
-    """All scores of each view: on the full image, on the object's mask and on the crop around the object."""
+    """Scores of each view: on the full image, on the object's mask and on the crop around the object.
 
-    def __init__(self) -> None:
+    Args:
+        names: names of the metrics; by default all registered ones.
+    """
+
+    def __init__(self, names: Sequence[str] | None = None) -> None:
         super().__init__()
-        self.metrics: Mapping[str, ImageMetric] = build_metrics()
+        self.metrics: Mapping[str, ImageMetric] = build_metrics(names)
         self.modules_to_move = nn.ModuleList(self.metrics.values())  # `to` moves modules of such lists alone
 
     @torch.no_grad()
@@ -76,15 +80,15 @@ class ImageMetrics(nn.Module):
         return {name: None if math.isnan(score) else score for name, score in scores.items()}
 
     def _notes(self, views: Sequence[ViewScores]) -> dict[str, str]:
-        notes = {}
-        unmasked = [view.name for view in views if view.regions and view.score("psnr", "mask") is None]
+        notes, first = {}, next(iter(self.metrics))
+        unmasked = [view.name for view in views if view.regions and view.score(first, "mask") is None]
         if unmasked:
             notes["mask"] = f"the mask is missing or covers half of no pixel in {', '.join(unmasked)}"
         scored = [
             (view, region)
             for view in views
             for region in (FULL, *OBJECT_REGIONS)
-            if view.score("psnr", region) is not None
+            if view.score(first, region) is not None
         ]
         for name, metric in self.metrics.items():
             if any(view.score(name, region) is None for view, region in scored):

@@ -106,6 +106,17 @@ class Table:
     medals: bool = False
     notes: tuple[str, ...] = ()
 
+    def __getitem__(self, cell: tuple[str, str]) -> Score:
+        """Return a number by the label of its row and the title of its column, as in `table["mean", "PSNR"]`."""
+        label, title = cell
+        row = next(row for row in (*self.summary, *self.rows) if row.label == label)
+        return row.values[[column.title for column in self.columns].index(title)]
+
+    def __str__(self) -> str:
+        return to_markdown(self)
+
+    _repr_markdown_ = __str__  # in notebooks
+
     def medal_of(self, row: int, column: int) -> str:
         """Return the medal of a number in `rows`, one of `MEDALS`, or an empty string.
 

@@ -10,7 +10,7 @@ import trimesh
 from trimesh.exchange.gltf import export_glb
 
 from nerfro.core.errors import NerfroError
-from nerfro.exports.meshes import glass_meshes, inside_mesh
+from nerfro.exports.meshes import glass_meshes, inside_mesh, one_mesh
 from nerfro.files.atomic import write_atomically
 from nerfro.geometry.gltf import Z_UP_TO_Y_UP
 from nerfro.media.material import Dispersion
@@ -20,11 +20,13 @@ from nerfro.viewing.trained_scene import TrainedScene
 
 
 def write_mesh(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
-    """Write the surfaces of the glass and of the dense content as .glb."""
-    glass, inside = glass_meshes(scene, options.triangles), inside_mesh(scene, options.resolution, options.half_depth)
+    """Write the surfaces of the glass and of the dense content, as .glb with materials, or as one mesh (.ply, .obj)."""
+    suffix = out.suffix.lower()
+    glass = glass_meshes(scene, options.triangles if suffix == ".glb" else None)
+    inside = inside_mesh(scene, options.resolution, options.half_depth)
     if not glass and inside is None:
         raise NerfroError("the scene has neither glass nor dense content to write; raise half_depth")
-    write_atomically(out, _encode_glb(scene, glass, inside))
+    write_atomically(out, _encode_glb(scene, glass, inside) if suffix == ".glb" else one_mesh(glass, inside, suffix))
     content = "nothing solid inside" if inside is None else f"{len(inside.faces)} triangles inside"
     return f"{sum(len(mesh.faces) for mesh in glass)} triangles of glass, {content}"
 
@@ -88,4 +90,4 @@ def _glass_material(
     return {"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.0}, "extensions": extensions}
 
 
-EXPORTS["mesh"] = Export((".glb",), write_mesh, unused=("sky",))
+EXPORTS["mesh"] = Export((".glb", ".ply", ".obj"), write_mesh, unused=("sky",))

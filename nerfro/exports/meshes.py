@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,11 @@ import torch
 import trimesh
 from jaxtyping import Float, Int
 from torch.nn import functional
+from trimesh.exchange.obj import export_obj
+from trimesh.exchange.ply import export_ply
 
+from nerfro.core.light import to_srgb
+from nerfro.files.images import to_8bit
 from nerfro.geometry.bodies import bodies_of
 from nerfro.geometry.interpolation import trilinear
 from nerfro.geometry.mesh import TriangleMesh
@@ -126,6 +131,31 @@ def inside_mesh(scene: TrainedScene, resolution: int | None, half_depth: float |
     return trimesh.Trimesh(
         mesh.vertices, mesh.faces, vertex_normals=normals.numpy(), vertex_attributes={"radiance": linear}, process=False
     )
+
+
+def one_mesh(glass: Sequence[trimesh.Trimesh], inside: trimesh.Trimesh | None, suffix: str) -> bytes:
+    """Encode all surfaces as one mesh in world coordinates, with normals, and sRGB colours of the content.
+
+    Args:
+        glass: surfaces of the bodies, which become white.
+        inside: dense content, or None.
+        suffix: ending of the file, `.ply` or `.obj`.
+    """
+    parts = [*glass, *([] if inside is None else [inside])]
+    colours = [np.full((len(mesh.vertices), 3), 255, np.uint8) for mesh in glass]
+    if inside is not None:
+        colours.append(to_8bit(to_srgb(torch.from_numpy(inside.vertex_attributes["radiance"]))).numpy())
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in parts)])
+    joined = trimesh.Trimesh(
+        np.concatenate([mesh.vertices for mesh in parts]),
+        np.concatenate([mesh.faces + start for mesh, start in zip(parts, starts, strict=False)]),
+        vertex_normals=np.concatenate([mesh.vertex_normals for mesh in parts]),
+        vertex_colors=np.concatenate(colours),
+        process=False,
+    )
+    if suffix == ".obj":
+        return export_obj(joined, include_normals=True, include_texture=False).encode()
+    return export_ply(joined, vertex_normal=True)
 
 
 def largest_components(mesh: TriangleMesh) -> TriangleMesh:

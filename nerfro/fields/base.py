@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from nerfro.core.cameras import Cameras
+from nerfro.core.results import require_results
 from nerfro.core.types import FieldValues, Samples
 from nerfro.data.component import Component
 
@@ -26,6 +27,11 @@ class Field(Component, nn.Module, ABC):
     Positions and densities are in world units, and directions are unit vectors. Colours are linear radiance, or sRGB
     with `model.colour=srgb`.
     """
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        contract = "FieldValues with density [P, N] and radiance [P, N, 3] for samples.positions [P, N, 3]"
+        require_results(cls, FieldValues, contract, _fits)
 
     @property
     def bounds(self) -> Float[Tensor, "2 3"] | None:
@@ -57,6 +63,10 @@ class Field(Component, nn.Module, ABC):
         Returns:
             Density [P, N] and colour [P, N, 3].
         """
+
+
+def _fits(values: FieldValues, samples: Samples) -> bool:
+    return values.density.shape == samples.s.shape and values.radiance.shape == samples.positions.shape
 
 
 def evaluate_selected(decoder: Decoder, samples: Samples, selected: Bool[Tensor, "P N"] | None = None) -> FieldValues:

@@ -120,36 +120,60 @@ def load_mesh(path: Path, accept_open_mesh: bool = False) -> TriangleMesh:
         loaded = _parse(path)
     vertices = np.asarray(getattr(loaded, "vertices", ()), np.float64)
     faces = np.asarray(getattr(loaded, "faces", ()), np.int64)
+    # trimesh computes normals on demand; before the first access, the cache holds only normals from the file.
+    read = np.asarray(loaded.vertex_normals, np.float64) if "vertex_normals" in loaded._cache else None
+    return make_mesh(vertices, faces, f"mesh {path}", accept_open_mesh, read, turn)
+
+
+def make_mesh(
+    vertices: Float[np.ndarray, "..."],
+    faces: Int[np.ndarray, "..."],
+    what: str = "the mesh",
+    accept_open_mesh: bool = False,
+    normals: Float[np.ndarray, "..."] | None = None,
+    turn: Float[np.ndarray, "3 3"] | None = None,
+) -> TriangleMesh:
+    """Check vertices and triangles, merge duplicate vertices, and let all triangles face outwards.
+
+    Args:
+        vertices, faces: positions [V, 3] in world units, and vertex indices of triangles [F, 3].
+        what: name of the mesh in messages.
+        accept_open_mesh: whether a mesh with holes is accepted.
+        normals: normals at the vertices, or None.
+        turn: rotation of vertices and normals.
+
+    Raises:
+        NerfroError: the mesh is empty, not finite, or has unaccepted holes.
+    """
     if len(vertices) == 0 or len(faces) == 0:
-        raise NerfroError(f"mesh {path} has no triangles; export a surface instead of a point cloud or an empty scene")
+        raise NerfroError(f"{what} has no triangles; export a surface instead of a point cloud or an empty scene")
     if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
-        raise NerfroError(f"mesh {path} is not made of triangles of points with three coordinates; export it again")
+        raise NerfroError(f"{what} is not made of triangles of points with three coordinates; export it again")
+    turn = np.eye(3) if turn is None else turn
     vertices = vertices @ turn
     if not np.isfinite(vertices).all():
-        raise NerfroError(f"mesh {path} has vertices that are not finite; export it again")
+        raise NerfroError(f"{what} has vertices that are not finite; export it again")
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise NerfroError(f"mesh {path} has triangles with indices of missing vertices; export it again")
-    check(f"mesh {path} reaches too far; scale it to about one unit: ", {"coordinate": Coordinate},
+        raise NerfroError(f"{what} has triangles with indices of missing vertices; export it again")
+    check(f"{what} reaches too far; scale it to about one unit: ", {"coordinate": Coordinate},
           {"coordinate": float(vertices.flat[np.abs(vertices).argmax()])})  # fmt: skip
     extents = np.ptp(vertices, axis=0)
     # Boxes are stored with seven significant digits.
     if extents.min() <= 1e-4 * extents.max():
         raise NerfroError(
-            f"mesh {path} is {extents.min():g} world units thin and {extents.max():g} long, so it has no inside; "
+            f"{what} is {extents.min():g} world units thin and {extents.max():g} long, so it has no inside; "
             "export a solid"
         )
-    # trimesh computes normals on demand; before the first access, the cache holds only normals from the file.
-    read = np.asarray(loaded.vertex_normals, np.float64) if "vertex_normals" in loaded._cache else None
-    if read is not None and read.shape != vertices.shape:
-        raise NerfroError(f"mesh {path} has normals of shape {list(read.shape)} for its vertices; export it again")
-    if read is not None:
-        length = np.linalg.norm(read, axis=-1, keepdims=True)
-        read = np.divide(read, length, out=np.zeros(read.shape), where=np.isfinite(length) & (length > 0))
-        read = (read @ turn)[faces]
-    mesh = _facing_outwards(merge_vertices(vertices, faces, read))
+    if normals is not None and normals.shape != vertices.shape:
+        raise NerfroError(f"{what} has normals of shape {list(normals.shape)} for its vertices; export it again")
+    if normals is not None:
+        length = np.linalg.norm(normals, axis=-1, keepdims=True)
+        normals = np.divide(normals, length, out=np.zeros(normals.shape), where=np.isfinite(length) & (length > 0))
+        normals = (normals @ turn)[faces]
+    mesh = _facing_outwards(merge_vertices(vertices, faces, normals))
     if not accept_open_mesh and not mesh.is_closed:
         raise NerfroError(
-            f"mesh {path} is not watertight, so its inside is not defined; close its holes, "
+            f"{what} is not watertight, so its inside is not defined; close its holes, "
             "or set medium.accept_open_mesh=true to decide by majority along the three axes"
         )
     return mesh

@@ -128,6 +128,13 @@ class MeshSurface(Surface):
         mesh = load_mesh(resolve_path(file), accept_open_mesh)
         self._set(_shaded(mesh, file, shading, crease_degrees))
 
+    @classmethod
+    def of(cls, mesh: TriangleMesh, shading: Shading = "auto") -> MeshSurface:
+        """Make the surface of a mesh in memory; see the class for `shading`."""
+        surface = MeshSurface.__new__(MeshSurface)
+        surface._set(_shaded(mesh, "the mesh", shading, None))
+        return surface
+
     def _set(self, mesh: TriangleMesh) -> None:
         self.mesh, self.bounds = mesh, mesh.bounds
         if mesh.is_closed:

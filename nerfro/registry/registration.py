@@ -24,7 +24,7 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.plugins import Plugins
 from hydra.errors import InstantiationException
 from hydra.plugins.search_path_plugin import SearchPathPlugin
-from hydra.utils import instantiate
+from hydra.utils import get_class, instantiate
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -64,6 +64,8 @@ _LIGHTNING_TARGETS = frozenset(
         "loggers.TensorBoardLogger",
         "loggers.CSVLogger",
         "loggers.WandbLogger",
+        "loggers.MLFlowLogger",
+        "loggers.CometLogger",
         "strategies.DDPStrategy",
     )
 )
@@ -201,9 +203,12 @@ def build(node: object, **parts: object) -> Any:
     if target in _LIGHTNING_TARGETS:
         try:
             require_lightning(node)
-            return instantiate(node, **parts)
+            own = inspect.signature(get_class(target)).parameters
+            return instantiate(node, **{name: parts[name] for name in parts if name in own})
         except (InstantiationException, OmegaConfBaseException) as error:
             reason = str(error.__cause__ or error).strip().split("\n", 1)[0]
+            if isinstance(error.__cause__, ImportError):
+                raise NerfroError(f"{target} needs another package ({reason}); install it with pip") from error
             raise NerfroError(f"{target}: {reason}; check this object's fields in conf/") from error
     plugin = plugin_of(node)
     return create(plugin, node, **{name: parts[name] for name in plugin.parts if name in parts})

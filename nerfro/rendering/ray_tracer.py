@@ -84,6 +84,7 @@ class RayTracer:
             draws=draws,
             path=traced.path,
             samples=self._renderer.point_sampler.choose_ahead(traced.path, draws),
+            maps=pixels.maps,
         )
 
     def through(

@@ -58,16 +58,17 @@ class Budget:
 
     @property
     def label(self) -> str:
-        """Limits, such as "4 min on 1 CPU thread (x86_64)" or "200,000 steps of 1,024 rays"."""
+        """Limits, such as "4 min on 1 CPU thread (x86_64)", "200,000 steps of 1,024 rays" or "unlimited"."""
         steps = "" if self.steps is None else f"{self.steps:,} steps of {self.rays:,} rays"
         if self.seconds is None:
-            return steps
+            return steps or "unlimited"
         return f"{duration(self.seconds)} on {self.device}" + (f" and at most {steps}" if steps else "")
 
     @property
     def title(self) -> str:
         """Limits as the title of a table."""
-        return f"Budget: at most {self.label}"
+        is_limited = self.seconds is not None or self.steps is not None
+        return f"Budget: {'at most ' if is_limited else ''}{self.label}"
 
 
 @dataclass(frozen=True)

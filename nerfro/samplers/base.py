@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from jaxtyping import Bool
 from torch import Tensor, nn
 
 from nerfro.core.draws import Draws
+from nerfro.core.results import require_results
 from nerfro.core.types import Path, Rays, Rendering, Samples
 from nerfro.data.component import Component
 from nerfro.fields.base import Field
@@ -33,6 +35,11 @@ class PathSampler(nn.Module, ABC):
     branching = ONE_PATH
     max_events = 16
     wavelengths: Sequence[float] = (610.0, 550.0, 465.0)
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        contract = "a Path with a polyline for each ray, as by Path.unbranched"
+        require_results(cls, Path, contract, lambda path, rays: path.num_rays == len(rays))
 
     @abstractmethod
     def forward(self, rays: Rays, medium: Medium) -> Path:
@@ -78,6 +85,11 @@ class PointSampler(Component, nn.Module, ABC):
     """
 
     num_levels: int
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        contract = "Samples on all polylines of the path, as by point_samples(path, s) with s [P, N]"
+        require_results(cls, Samples, contract, lambda samples, path: len(samples.s) == len(path.s))
 
     @abstractmethod
     def forward(self, path: Path, previous: Rendering | None, draws: Draws | None = None) -> Samples:

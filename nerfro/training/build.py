@@ -39,7 +39,9 @@ from nerfro.training.reach import CHECKED_RAYS, require_reach
 from nerfro.training.schedule import Schedule
 
 
-def build(experiment: str | None = None, overrides: Sequence[str] = ()) -> tuple[TrainingModule, RayDataModule]:
+def build(
+    experiment: str | None = None, overrides: Sequence[str] = (), config_dir: str | Path | None = None
+) -> tuple[TrainingModule, RayDataModule]:
     """Build an experiment for any Trainer of Lightning.
 
     `lightning.Trainer(max_steps=1000).fit(module, datamodule=data)` trains it. The settings `trainer`, `logger`,
@@ -49,6 +51,7 @@ def build(experiment: str | None = None, overrides: Sequence[str] = ()) -> tuple
     Args:
         experiment: name of an experiment in conf/experiment; by default, the configuration of `python -m nerfro.train`.
         overrides: settings as on the command line, such as `["medium.ior=1.5", "field=nerf"]`.
+        config_dir: folder with YAML files of your own, such as `config_dir/experiment/mine.yaml`, as `--config-dir`.
 
     Returns:
         The module, which contains the model as `module.renderer`, and the training and validation data.
@@ -56,7 +59,7 @@ def build(experiment: str | None = None, overrides: Sequence[str] = ()) -> tuple
     Raises:
         NerfroError: a setting is not allowed, or the data cannot be read.
     """
-    with composed_training(experiment, overrides) as composition:
+    with composed_training(experiment, overrides, config_dir=config_dir) as composition:
         warn_without_effect(composition)
         if composition.config.callbacks:
             warn("nerfro.build ignores callbacks; give them to your own Trainer: lightning.Trainer(callbacks=[...])")
@@ -69,6 +72,7 @@ def composed_training(
     overrides: Sequence[str],
     scene: SceneFile | str | Path | None = None,
     out: str | Path | None = None,
+    config_dir: str | Path | None = None,
 ) -> AbstractContextManager[Composition]:
     """Compose the configuration of a training, see `nerfro.training.run.train` and `nerfro.cli.calls.composed`."""
     arguments = [] if experiment is None else [f"+experiment={experiment}"]
@@ -79,7 +83,7 @@ def composed_training(
         overrides = with_scene(overrides, names)
         return scene.added_to(overrides, names, "scene") if isinstance(scene, SceneFile) else overrides
 
-    return composed("train", TrainConfig, arguments, expand, check_run)
+    return composed("train", TrainConfig, arguments, expand, check_run, config_dir)
 
 
 def warn_without_effect(composition: Composition) -> None:

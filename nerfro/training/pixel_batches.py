@@ -53,6 +53,7 @@ class PixelBatches:
         self._share = slice(batch_size)
         self.cameras = cameras = views.cameras
         self._pixels = PixelStore(views.images)
+        self._maps = {name: values.flatten(0, 2) for name, values in views.maps.items()}
         self._full = central_window(cameras.height, cameras.width, 1.0)
         self._crop = central_window(cameras.height, cameras.width, precrop_fraction if precrop_steps > 0 else 1.0)
         if batching == "single_image" and batch_size > self._crop.height * self._crop.width:
@@ -84,12 +85,13 @@ class PixelBatches:
         """Return the same sequence on another device, with cameras in another precision."""
         moved = copy.copy(self)
         moved.cameras, moved._pixels = self.cameras.to(device, dtype), self._pixels.to(device)
+        moved._maps = {name: values.to(device) for name, values in self._maps.items()}
         return moved
 
     @property
     def pixel_bytes(self) -> int:
-        """Size of the colours of all training pixels in memory."""
-        return self._pixels.nbytes
+        """Size of the colours and maps of all training pixels in memory."""
+        return self._pixels.nbytes + sum(values.nbytes for values in self._maps.values())
 
     def release_memory(self) -> None:
         """Release the memory of mapped pixels, which are read again on demand."""
@@ -131,6 +133,7 @@ class PixelBatches:
             cameras=cameras,
             window=cameras if window == self._full else cameras.crop(window),
             photographed=self.photographed,
+            maps={name: values[number] for name, values in self._maps.items()},
         )
 
     @property

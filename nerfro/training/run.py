@@ -51,6 +51,7 @@ def train(
     experiment: str | None = None,
     overrides: Sequence[str] = (),
     out: str | Path | None = None,
+    config_dir: str | Path | None = None,
 ) -> Run:
     """Train an experiment, and evaluate it on the test views.
 
@@ -60,6 +61,7 @@ def train(
         experiment: name of an experiment in conf/experiment; by default, the configuration of `python -m nerfro.train`.
         overrides: settings as on the command line, such as `["trainer.max_time=2m", "field=nerf"]`.
         out: folder of the run; by default a new folder in `outputs`.
+        config_dir: folder with YAML files of your own, as `--config-dir`.
 
     Returns:
         The run, which `nerfro.load`, `nerfro.evaluate`, `nerfro.render` and `nerfro.export` take.
@@ -67,7 +69,7 @@ def train(
     Raises:
         NerfroError: a setting is not allowed, or the data cannot be read.
     """
-    with composed_training(experiment, overrides, scene, out) as composition:
+    with composed_training(experiment, overrides, scene, out, config_dir) as composition:
         warn_without_effect(composition)
         return run_training(composition)
 

@@ -18,7 +18,10 @@ from nerfro.core.progress import track
 from nerfro.core.types import Exits
 from nerfro.core.variants import variant
 from nerfro.data.base import DataSource, Views
+from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.render_view import render_view
+from nerfro.evaluation.results import FULL, Region
+from nerfro.evaluation.tables import Table, views_table
 from nerfro.fields.base import Field
 from nerfro.files import lat_long
 from nerfro.files.images import data_uri, to_8bit
@@ -126,6 +129,35 @@ class TrainedScene:
         views = track("render", range(len(cameras)), disable=not progress)
         rendered = [scene._render_view(cameras, view, subdivision or self.subdivision) for view in views]
         return RenderedViews(*(torch.stack(images) for images in zip(*rendered, strict=True)))
+
+    def evaluate(
+        self, views: Views | str = "test", metrics: Sequence[str] | None = None, region: Region = FULL
+    ) -> Table:
+        """Render views with their given cameras, and score the images as `nerfro.evaluate` does, without files.
+
+        Args:
+            views: a split of the data, or any views, such as `scene.views("test").select([0, 1])`.
+            metrics: names of metrics, such as `["psnr", "lpips"]`; by default all registered ones.
+            region: `full`, or `mask` and `crop` of the object, which need masks.
+
+        Returns:
+            Table with a row for each view and a row `mean`. `table["mean", "PSNR"]` is a number, and `print(table)`
+            prints Markdown.
+
+        Raises:
+            NerfroError: a metric does not exist, or the views have no masks for the region.
+        """
+        scorer = ImageMetrics(metrics)
+        split, views = (views, self.views(views)) if isinstance(views, str) else ("given", views)
+        if region != FULL and views.masks is None:
+            raise NerfroError(f"region={region} needs masks, which the {split} views lack; set region='full'")
+        scores = []
+        for view in track("evaluate", range(len(views))):
+            rgb, coverage = self._render_view(views.cameras, view, self.subdivision)[0], None
+            if views.masks is not None:
+                coverage = views.masks[view]
+            scores.append(scorer.score(views.names[view], rgb, views.images[view], coverage))
+        return views_table(scorer.result(scores), f"{self.name}, {split} views", region)
 
     def _render_view(self, cameras: Cameras, view: int, subdivision: Subdivision) -> tuple[Tensor, ...]:
         rays = render_view(self.renderer, cameras.to(self.renderer.scene.device), view, subdivision)

@@ -227,3 +227,21 @@ def test_largest_of_several_models_is_used_and_named(write, tmp_path, capsys):
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 1, "the line is printed once"
     assert f"{root}/sparse/0 (2 images), {root}/sparse/1 (6 images); {root}/sparse/1 is used" in lines[0]
+
+
+@pytest.mark.parametrize("form", ["binary", "text"])
+def test_points_give_depths_to_the_images_that_observe_them(form: str, tmp_path: Path) -> None:
+    """Only the second image of the file, v0, observes the points."""
+    views = load(write_colmap(tmp_path, form=form), "test", depths=True)
+    assert views.names == ["top/v0.png", "top/v3.png"]
+    depth = views.maps["depth"][..., 0]
+    assert not depth[1].any()
+    pixels, along_axis = views.cameras.select([0]).project(TORCH_POINTS)
+    column, row = pixels[0].long().unbind(-1)
+    inside = (along_axis[0] > 0) & (column >= 0) & (column < WIDTH) & (row >= 0) & (row < HEIGHT)
+    assert inside.sum() > 3
+    nearest = torch.full_like(depth[0], torch.inf)
+    for x, y, point in zip(column[inside], row[inside], TORCH_POINTS[inside], strict=True):
+        distance = (point - views.cameras.camera_to_world[0, :, 3]).norm()
+        nearest[y, x] = torch.minimum(nearest[y, x], distance)
+    torch.testing.assert_close(depth[0], torch.where(nearest.isfinite(), nearest, 0.0))

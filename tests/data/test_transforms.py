@@ -392,3 +392,25 @@ def test_default_format_names_the_format_of_a_folder(form: str, name: str, tmp_p
         BlenderData(str(root)).load,
         "train",
     )
+
+
+def test_depth_images_become_arc_lengths_in_every_split_and_size(tmp_path: Path) -> None:
+    """Depths along the optical axis, of points that the cameras see, are distances from the cameras."""
+    root = write_nerfstudio(tmp_path, frame=lambda i: {"depth_file_path": f"depths/{i}.png"})
+    (root / "depths").mkdir()
+    for i in range(6):
+        Image.fromarray(np.full((HEIGHT, WIDTH), 1500 + i, np.uint16)).save(root / f"depths/{i}.png")
+    assert NerfstudioData(str(root)).load("train").maps == {}
+    views = NerfstudioData(str(root), depth_unit=0.001, downscale=2).load("train")
+    depth = views.maps["depth"]
+    assert depth.shape == (len(views), *views.images.shape, 1)
+    rays, view = views.cameras.image_rays(1), int(Path(views.names[1]).stem[2:])
+    points = rays.origins + depth[1].view(-1, 1) * rays.directions
+    _, along_axis = views.cameras.select([1]).project(points)
+    torch.testing.assert_close(along_axis[0], torch.full((len(points),), 0.001 * (1500 + view)))
+    refused("depth_file_path", NerfstudioData(str(write_nerfstudio(tmp_path / "b")), depth_unit=1.0).load, "train")
+
+
+def test_a_slice_of_images_is_a_tensor(tmp_path: Path) -> None:
+    images = NerfstudioData(str(write_nerfstudio(tmp_path))).load("train").images
+    assert torch.equal(images[1:3], torch.stack([images[1], images[2]]))

@@ -64,3 +64,12 @@ def test_score_that_is_never_computed_and_data_that_are_missing_are_refused(
     )
     data._load_test = None
     refused("the data have no test views", trainer.test, module, datamodule=data, verbose=False)
+
+
+def test_experiments_of_an_own_folder_are_built(tiny_default_run: list[str], tmp_path: Path, unchecked: None) -> None:
+    (tmp_path / "experiment").mkdir()
+    (tmp_path / "experiment" / "mine.yaml").write_text("# @package _global_\noptimizer:\n  learning_rate: 0.0123\n")
+    settings = [*tiny_default_run, "trainer.max_steps=4"]
+    module, _ = nerfro.build("mine", settings, config_dir=tmp_path)
+    assert module.optimizer_config.learning_rate == 0.0123
+    refused("mine", nerfro.build, "mine", settings)

@@ -1,5 +1,6 @@
 """Arguments of Lightning's Trainer take effect or are refused with a reason, and callbacks are selected by name."""
 
+import importlib.util
 import inspect
 import json
 import re
@@ -23,7 +24,7 @@ from nerfro.training.config import TrainConfig, TrainerConfig, clock_time, resol
 from nerfro.training.pixel_batches import PixelBatches
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
 from nerfro.training.trainer import _OWN
-from tests.conftest import Runner, refused, weights_of
+from tests.conftest import Runner, composed, refused, weights_of
 
 REFUSED = {
     name: reason
@@ -79,6 +80,7 @@ def test_cfg_refuses_the_settings_that_training_refuses_with_the_same_error(
 @pytest.mark.parametrize("key", ["runtime.cwd", "runtime.output_dir", "job.name"])
 def test_settings_may_refer_to_hydra(key: str, train: Runner) -> None:
     printed = train("trainer.max_steps=1", f"data.root=${{hydra:{key}}}/data", "--cfg", "job")
+    assert "not checked: the data, the device and the memory, which train checks" in printed.err
     assert f"root: ${{hydra:{key}}}/data" in printed.out
 
 
@@ -270,3 +272,11 @@ def test_options_of_a_base_class_are_inherited() -> None:
     sampler = build({"_target_": plugin.target, "sparsity": 4, "num_samples": 32})
     assert sampler.num_samples == 8
     assert isinstance(sampler, torch.nn.Module)
+
+
+@pytest.mark.parametrize(("name", "package"), [("mlflow", "mlflow"), ("comet", "comet")])
+def test_loggers_of_lightning_are_options_and_name_a_missing_package(name: str, package: str, tmp_path: Path) -> None:
+    config = composed(f"logger={name}")
+    assert set(config.logger) == {"tensorboard", "csv", name}
+    if importlib.util.find_spec(package) is None and importlib.util.find_spec(f"{package}_ml") is None:
+        refused(f"needs another package .*{package}.*; install it with pip", build, config.logger[name], save_dir=".")

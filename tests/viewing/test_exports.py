@@ -103,6 +103,21 @@ def two_bodies(scene: TrainedScene, tmp_path: Path) -> TrainedScene:
     return replace(scene, renderer=with_changed_scene(scene.renderer, medium=medium))
 
 
+@pytest.mark.parametrize("suffix", [".ply", ".obj"])
+def test_one_mesh_contains_glass_and_content_in_world_coordinates(
+    suffix: str, scene: TrainedScene, tmp_path: Path
+) -> None:
+    write(scene, "mesh", tmp_path / f"ball{suffix}")
+    loaded = trimesh.load(tmp_path / f"ball{suffix}", process=False)
+    distances = np.linalg.norm(loaded.vertices - INSIDE_CENTRE, axis=1)
+    of_content = np.abs(distances - INSIDE_RADIUS) < CELL
+    np.testing.assert_allclose(np.linalg.norm(loaded.vertices[~of_content], axis=1), RADIUS, atol=1e-4)
+    colours = np.asarray(loaded.visual.vertex_colors)[:, :3]
+    assert (colours[~of_content] == 255).all()
+    expected = to_srgb(colour(torch.from_numpy(np.asarray(loaded.vertices[of_content]))))
+    np.testing.assert_allclose(colours[of_content] / 255, expected, atol=0.01)
+
+
 def test_glb_contains_each_body_with_its_material(two_bodies: TrainedScene, tmp_path: Path) -> None:
     write(two_bodies, "mesh", tmp_path / "two.glb")
     loaded = trimesh.load(tmp_path / "two.glb", process=False)
@@ -316,7 +331,7 @@ class Absent(Photographs):
     [
         ("colmap", "a.txt", "must be a folder"),
         ("fog", "a.glb", "what=fog is not known; choose page, colmap"),
-        ("mesh", "a.ply", "must end in .glb"),
+        ("mesh", "a.stl", "must end in .glb"),
         ("volume", "a.vdb", "must end in .npz"),
     ],
 )

@@ -1,11 +1,14 @@
 """Renderings of a scene match closed forms, and changed copies do not change the scene."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 
+import nerfro
 from nerfro.core.variants import variant
+from nerfro.evaluation.results import read_metrics_json
 from nerfro.files import lat_long
 from nerfro.samplers.paths.snell import Snell
 from nerfro.viewing.changes import with_changed_scene
@@ -149,3 +152,18 @@ def test_invalid_changes_of_a_scene_are_refused_in_one_line(scene: TrainedScene,
 def test_index_of_a_scene_without_glass_cannot_be_set(scene: TrainedScene) -> None:
     assert len(scene.with_(glass=False, ior=1.4).ior) == 0
     refused("no bodies on which rays bend", lambda: scene.with_(glass=False).with_(ior=1.4))
+
+
+def test_scores_in_memory_are_those_of_the_command(trained_run: Path) -> None:
+    scene = nerfro.load(trained_run)
+    written = read_metrics_json(trained_run / "metrics.json").result
+    views = scene.views("test").select([1, 0])
+    table = scene.evaluate(views, ["ssim", "psnr"])
+    assert [column.title for column in table.columns] == ["PSNR", "SSIM"]
+    assert [row.label for row in table.rows] == views.names
+    for row, view in zip(table.rows, (1, 0), strict=True):
+        assert row.values == pytest.approx((written.views[view].scores["psnr"], written.views[view].scores["ssim"]))
+    assert table["mean", "PSNR"] == pytest.approx(sum(row.values[0] for row in table.rows) / 2)
+    assert "| *mean* |" in str(table)
+    refused("did you mean psnr", scene.evaluate, views, ["psrn"])
+    refused("needs masks", scene.evaluate, replace(views, masks=None), ["psnr"], "mask")

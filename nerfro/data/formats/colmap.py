@@ -40,6 +40,7 @@ class ColmapData(PosedImages):
         images: folder of the images within the root.
         model: folder of the model within the root. By default, the model with the most images in the first of the
             folders sparse, colmap/sparse and the root that has one, itself or in numbered folders, as sparse/0.
+        depths: whether the 3-D points that an image has observed give the depths of their pixels, see the loss `depth`.
         test_every: every n-th image by name, from the first, belongs to val and test.
     """
 
@@ -48,11 +49,12 @@ class ColmapData(PosedImages):
         root: str,
         images: str = "images",
         model: str | None = None,
+        depths: bool = False,
         test_every: Every = 8,
         **options: Any,
     ) -> None:
         super().__init__(root, **options)
-        self.images, self.model, self.test_every = images, model, test_every
+        self.images, self.model, self.depths, self.test_every = images, model, depths, test_every
 
     def read(self, split: str) -> FrameSet:
         folder = self._model_folder
@@ -74,7 +76,8 @@ class ColmapData(PosedImages):
         for image in images:
             camera, where = model.cameras[image.camera], f"{folder}: camera {image.camera}"
             lenses.append(lens_of(camera, where).resized((camera.width, camera.height), size, where))
-        return FrameSet(frames, lenses, "opencv", near, far)
+        points = [model.seen_by(image) for image in images] if self.depths else []
+        return FrameSet(frames, lenses, "opencv", near, far, points=points)
 
     def _edges(self, model: ColmapModel, image: ColmapImage, folder: Path) -> Float[np.ndarray, "2 2"]:
         camera = model.cameras[image.camera]

@@ -1,7 +1,7 @@
 """Reader of COLMAP reconstructions, text or binary (https://colmap.github.io/format.html).
 
 pycolmap is not used because version 4.2 accepts a truncated cameras.bin silently and runs out of memory on a truncated
-points3D.bin. Tracks of 3-D points are skipped.
+points3D.bin. Features are skipped.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from nerfro.core.errors import NerfroError, warn
@@ -43,6 +43,10 @@ _NUM_PARAMS = dict(CAMERA_MODELS)
 MODEL_FOLDERS = ("sparse", "colmap/sparse", "")
 
 
+Point = tuple[tuple[float, ...], Int[np.ndarray, " track"]]
+"""Position of a 3-D point, and the identifiers of the images that have observed it."""
+
+
 @dataclass(frozen=True)
 class ColmapCamera:
     """Intrinsics: name of the camera model, image size in pixels and parameters of the model."""
@@ -55,8 +59,9 @@ class ColmapCamera:
 
 @dataclass(frozen=True)
 class ColmapImage:
-    """A registered image: path within the image folder, camera identifier and pose with OpenCV axes."""
+    """A registered image: identifier, path within the image folder, camera identifier and pose with OpenCV axes."""
 
+    number: int
     name: str
     camera: int
     camera_to_world: Float[np.ndarray, "3 4"]
@@ -64,11 +69,24 @@ class ColmapImage:
 
 @dataclass(frozen=True)
 class ColmapModel:
-    """A reconstruction: cameras by identifier, images sorted by name, positions of the 3-D points in world units."""
+    """A reconstruction.
+
+    Attributes:
+        cameras: cameras by identifier.
+        images: images sorted by name.
+        points: positions of the 3-D points, world units.
+        observed, observing: index of the point and identifier of the image of each observation.
+    """
 
     cameras: dict[int, ColmapCamera]
     images: list[ColmapImage]
     points: Float[np.ndarray, "points 3"]
+    observed: Int[np.ndarray, " observations"]
+    observing: Int[np.ndarray, " observations"]
+
+    def seen_by(self, image: ColmapImage) -> Float[np.ndarray, "seen 3"]:
+        """Return the points that an image has observed."""
+        return self.points[np.unique(self.observed[self.observing == image.number])]
 
 
 def find_model_folder(folders: Iterable[Path]) -> Path | None:
@@ -121,7 +139,10 @@ def read_colmap(folder: Path) -> ColmapModel:
     cameras = dict(read_cameras(folder / f"cameras{suffix}"))
     images = sorted(read_images(folder / f"images{suffix}"), key=lambda image: image.name)
     path = folder / f"points3D{suffix}"
-    points = np.array(list(read_points(path)) if path.is_file() else [], dtype=np.float64).reshape(-1, 3)
+    rows = list(read_points(path)) if path.is_file() else []
+    points = np.array([position for position, _ in rows], dtype=np.float64).reshape(-1, 3)
+    observed = np.repeat(np.arange(len(rows)), np.array([len(track) for _, track in rows], np.int64))
+    observing = np.concatenate([np.empty(0, np.int64), *(track for _, track in rows)])
     if not images:
         raise NerfroError(f"{folder / f'images{suffix}'} holds no registered image; repeat the reconstruction")
     for one, other in pairwise(images):
@@ -130,7 +151,7 @@ def read_colmap(folder: Path) -> ColmapModel:
     for image in images:
         if image.camera not in cameras:
             raise NerfroError(f"{folder}: image {image.name} has camera {image.camera}, which the model does not hold")
-    return ColmapModel(cameras, images, points)
+    return ColmapModel(cameras, images, points, observed, observing)
 
 
 class _Binary:
@@ -184,15 +205,16 @@ def _binary_images(path: Path) -> Iterator[ColmapImage]:
         name = file.name()
         (num_features,) = file.take("Q")
         file.skip(24 * num_features)  # x, y and identifier of the 3-D point
-        yield _image(name, values[1:5], values[5:8], values[8], path)
+        yield _image(values[0], name, values[1:5], values[5:8], values[8], path)
 
 
-def _binary_points(path: Path) -> Iterator[tuple[float, ...]]:
+def _binary_points(path: Path) -> Iterator[Point]:
     file = _Binary(path)
     for _ in file.items():
         values = file.take("Q3d3BdQ")
+        start = file.offset
         file.skip(8 * values[-1])  # track: pairs of image and feature
-        yield values[1:4]
+        yield values[1:4], np.frombuffer(file.content, "<i4", 2 * values[-1], start)[::2].astype(np.int64)
 
 
 def _text_rows(
@@ -231,17 +253,17 @@ def _text_cameras(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
 
 
 def _text_images(path: Path) -> Iterator[ColmapImage]:
-    parsers, form = (str, *[float] * 7, int, str), "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
-    for _, (_, *pose, camera, name) in _text_rows(path, form, parsers, features=True):
-        yield _image(name, tuple(pose[:4]), tuple(pose[4:]), camera, path)
+    parsers, form = (int, *[float] * 7, int, str), "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+    for _, (number, *pose, camera, name) in _text_rows(path, form, parsers, features=True):
+        yield _image(number, name, tuple(pose[:4]), tuple(pose[4:]), camera, path)
 
 
-def _text_points(path: Path) -> Iterator[tuple[float, ...]]:
-    def position(words: str) -> tuple[float, float, float]:
-        x, y, z = map(float, words.split()[:3])
-        return x, y, z
+def _text_points(path: Path) -> Iterator[Point]:
+    def point(words: str) -> Point:
+        (x, y, z), track = map(float, words.split()[:3]), words.split()[7::2]  # after a colour and an error
+        return (x, y, z), np.array(track, np.int64)
 
-    return (point for _, (_, point) in _text_rows(path, "POINT3D_ID X Y Z ...", (str, position)))
+    return (row for _, (_, row) in _text_rows(path, "POINT3D_ID X Y Z ...", (str, point)))
 
 
 def _camera(model: str, width: int, height: int, params: tuple[float, ...], where: str) -> ColmapCamera:
@@ -255,13 +277,15 @@ def _camera(model: str, width: int, height: int, params: tuple[float, ...], wher
     return ColmapCamera(model, width, height, params)
 
 
-def _image(name: str, quaternion: tuple[float, ...], shift: tuple[float, ...], camera: int, path: Path) -> ColmapImage:
+def _image(
+    number: int, name: str, quaternion: tuple[float, ...], shift: tuple[float, ...], camera: int, path: Path
+) -> ColmapImage:
     norm = float(np.linalg.norm(quaternion))
     if not (np.isfinite(norm) and np.isfinite(shift).all()) or abs(norm - 1) > 1e-3:
         raise NerfroError(f"{path}: image {name} has no valid pose (quaternion {quaternion}); export the model again")
     # COLMAP stores world-to-camera poses, with the scalar part of the quaternion first.
     inverse = Rotation.from_quat([*quaternion[1:], quaternion[0]]).inv()
-    return ColmapImage(name, camera, np.column_stack([inverse.as_matrix(), -inverse.apply(shift)]))
+    return ColmapImage(number, name, camera, np.column_stack([inverse.as_matrix(), -inverse.apply(shift)]))
 
 
 _READERS = {

@@ -20,7 +20,7 @@ from nerfro.data.masks import find_mask
 from nerfro.data.transforms import Manifest, find_splits, parse_manifest, read_manifest
 from nerfro.files.reading import same_content
 from nerfro.geometry.mesh import load_points
-from nerfro.registry.allowed import check
+from nerfro.registry.allowed import Positive, check
 from nerfro.registry.registration import register
 
 _MASK_KEY = "object_mask_path"
@@ -39,6 +39,8 @@ class NerfstudioData(PosedImages):
             (`ply_file_path`) or from the cameras, see `find_bounds`.
         options: see `PosedImages`.
         missing: whether to `skip` frames whose image does not exist, with a warning, or to `refuse` the data set.
+        depth_unit: world units per level of the depth images (`depth_file_path`), such as 0.001 for millimetres; None
+            to read no depths.
         test_every: every n-th frame by name, from the first, belongs to val and test, unless the file has the lists
             {train,val,test}_filenames.
     """
@@ -47,11 +49,12 @@ class NerfstudioData(PosedImages):
         self,
         root: str,
         missing: Literal["skip", "refuse"] = "skip",
+        depth_unit: Positive | None = None,
         test_every: Every = 10,
         **options: Any,
     ) -> None:
         super().__init__(root, **options)
-        self.skip_missing, self.test_every = missing == "skip", test_every
+        self.skip_missing, self.depth_unit, self.test_every = missing == "skip", depth_unit, test_every
 
     def split_files(self) -> Mapping[str, Path]:
         return {} if self._single else find_splits(self.root)
@@ -79,7 +82,16 @@ class NerfstudioData(PosedImages):
         entries: Any = manifest.document["frames"]
         frames, stated = [manifest.frames[i] for i in indices], [entries[i].get("mask_path") for i in indices]
         usable = [path and find_mask(self.root, frame.image, path) for path, frame in zip(stated, frames, strict=True)]
-        return FrameSet(frames, manifest.lenses(indices), "opengl", *self._bounds, usable=usable)
+        depths = [] if self.depth_unit is None else [self._depth_file(manifest, entries[i]) for i in indices]
+        lenses, unit = manifest.lenses(indices), self.depth_unit or 1.0
+        return FrameSet(frames, lenses, "opengl", *self._bounds, usable=usable, depths=depths, depth_unit=unit)
+
+    def _depth_file(self, manifest: Manifest, entry: Mapping[str, Any]) -> Path:
+        stated = entry.get("depth_file_path")
+        if not isinstance(stated, str):
+            name = entry["file_path"]
+            raise NerfroError(f"{manifest.path}: '{name}' has no depth_file_path; add it, or leave data.depth_unit out")
+        return self.root / stated.replace("\\", "/")
 
     @functools.cached_property
     def _bounds(self) -> tuple[float, float]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Literal, NamedTuple
+import functools
+from pathlib import Path as FilePath
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -13,17 +14,24 @@ from torch import Tensor
 from torch.nn import functional
 
 from nerfro.core.errors import NerfroError
-from nerfro.core.paths import resolve_path
-from nerfro.geometry.mesh import load_mesh
+from nerfro.core.types import Path
+from nerfro.geometry.intersection import Triangles
+from nerfro.geometry.mesh import make_mesh
+from nerfro.geometry.normals import attached_normals
 from nerfro.media.base import Medium
-from nerfro.media.body_settings import make_bodies
+from nerfro.media.bodies import Bodies, Body, GridSettings
+from nerfro.media.material import Material
+from nerfro.media.surface import MeshSurface, Shading
 from nerfro.registry.registration import discover, find
+from nerfro.samplers.paths.replay import intersect_triangles, replay
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.paths.thin_walls import warn_of_thin_walls
 from nerfro.samplers.paths.traced_file import leave_box, make_rays
 
 # Margin of air around the body in voxels; the grid needs at least two.
 _MARGIN = 4
+# Resolution of the grid for triangles in tensors, which decides only whether rays begin inside.
+_COARSE = 16
 
 
 class Bent(NamedTuple):
@@ -42,9 +50,10 @@ class Bent(NamedTuple):
     hit: Bool[Tensor, "R"]
 
 
+@functools.singledispatch
 def bend(
-    mesh: str | Path,
-    ior: float,
+    mesh: Any,
+    ior: float | Tensor,
     origins: ArrayLike | Tensor,
     directions: ArrayLike | Tensor,
     interface: Literal["mesh", "sdf"] = "mesh",
@@ -52,8 +61,14 @@ def bend(
 ) -> Bent:
     """Trace rays through a body of constant index by Snell's law, including total reflection.
 
+    `bend(vertices, faces, ior, origins, directions, shading="auto")` takes the triangles as tensors, traces them in
+    double precision, and has gradients with respect to the vertices. In both forms, the results have gradients with
+    respect to the index and the rays if these are tensors that require gradients. Silhouettes that move, and
+    refractions that appear, have no gradients; see `nerfro.samplers.paths.replay`.
+
     Args:
-        mesh: file of a closed triangle mesh in world units, in any format that trimesh reads.
+        mesh: file of a closed triangle mesh in world units, in any format that trimesh reads, or an object with
+            `vertices` and `faces`, such as `trimesh.Trimesh`.
         ior: refractive index of the body; the index outside is 1.
         origins, directions: rays [R, 3] in the world of the mesh; directions need not have unit length.
         interface: `mesh` traces the triangles, `sdf` a smooth surface; see `sampler/path=snell`.
@@ -69,16 +84,84 @@ def bend(
     if resolution <= 2 * _MARGIN + 1:
         raise NerfroError(f"resolution={resolution} is not allowed; give at least {2 * _MARGIN + 2}")
     starts, towards = _checked_rays(origins, directions)
-    low, high = load_mesh(resolve_path(mesh)).bounds
-    margin = (high - low).max() * _MARGIN / (resolution - 1 - 2 * _MARGIN)
-    low, high = (low - margin).tolist(), (high + margin).tolist()
-    medium = make_bodies(str(mesh), ior, resolution, low, high)
+    if isinstance(mesh, (str, FilePath)):
+        surface = MeshSurface(str(mesh))
+    else:
+        surface = MeshSurface.of(make_mesh(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)))
+    medium = _medium(surface, ior, resolution)
     sampler = Snell(interface)
     warn_of_thin_walls(sampler, medium)
-    path = sampler(make_rays(starts, towards, medium, 0.0, None), medium)
-    positions, path_lengths = leave_box(path, medium)
-    positions = (positions + torch.from_numpy(medium.origin)).to(starts)
-    return Bent(positions, path.exit_directions, path_lengths, path.refracted)
+    rays = make_rays(starts, towards, medium, 0.0, None)
+    path = sampler(rays.detach(), medium)
+    if _learns(ior, origins, directions):
+        path = sampler.replay(path, rays, medium.with_indices(torch.as_tensor(ior)[None]))
+    return _bent(path, medium, medium.box, starts)
+
+
+@bend.register(Tensor)
+@bend.register(np.ndarray)
+def _bend_triangles(
+    vertices: ArrayLike | Tensor,
+    faces: ArrayLike | Tensor,
+    ior: float | Tensor,
+    origins: ArrayLike | Tensor,
+    directions: ArrayLike | Tensor,
+    shading: Shading = "auto",
+) -> Bent:
+    """Trace rays through triangles with gradients; see `bend`.
+
+    Args:
+        vertices: positions [V, 3] in world units.
+        faces: indices [F, 3] of the vertices of each triangle; no two vertices have equal positions.
+        ior, origins, directions: see `bend`.
+        shading: whether the triangles are samples of a `smooth` surface or `flat`; `auto` decides for each face, so the
+            decision may change while vertices are optimized.
+    """
+    starts, towards = (values.cpu().double() for values in _checked_rays(origins, directions))
+    corners, triangles = torch.as_tensor(vertices).cpu().double(), torch.as_tensor(faces).cpu().numpy().astype(np.int64)
+    checked = make_mesh(corners.detach().numpy(), triangles)
+    if len(checked.vertices) != len(corners) or len(checked.faces) != len(triangles):
+        raise NerfroError("the mesh repeats vertices or triangles; merge them before tracing")
+    # `make_mesh` sorts the vertices.
+    order = torch.from_numpy(np.unique(corners.detach().numpy(), axis=0, return_index=True)[1])
+    surface = MeshSurface.of(checked, shading)
+    medium = _medium(surface, ior, _COARSE)
+    sampler, origin = Snell("mesh"), torch.from_numpy(medium.origin)
+    rays = make_rays(starts, towards, medium, 0.0, None, torch.float64)
+    path, corners = sampler(rays.detach(), medium), corners[order] - origin
+    if _learns(vertices, ior, origins, directions):
+        attached = Triangles(
+            corners[torch.from_numpy(checked.faces)],
+            attached_normals(surface.mesh.relative_to(medium.origin), corners),
+            medium.triangles.body,
+        )
+        assert path.record is not None
+        indexed = medium.with_indices(torch.as_tensor(ior)[None])
+        path = replay(path, rays, indexed, intersect_triangles(attached, path.record.triangle))
+    # In double precision, and moved by the vertices.
+    box = torch.stack(_box_around(corners.amin(0), corners.amax(0), _COARSE))
+    return _bent(path, medium, box, starts)
+
+
+def _box_around(low: Any, high: Any, resolution: int) -> tuple[Any, Any]:
+    """Add the margin of air to the bounds of a body."""
+    margin = (high - low).max() * _MARGIN / (resolution - 1 - 2 * _MARGIN)
+    return low - margin, high + margin
+
+
+def _medium(surface: MeshSurface, ior: float | Tensor, resolution: int) -> Bodies:
+    low, high = _box_around(surface.bounds[0], surface.bounds[1], resolution)
+    grid = GridSettings(resolution, low.tolist(), high.tolist(), cache=resolution != _COARSE)
+    return Bodies([Body("object", surface, Material(float(torch.as_tensor(ior).detach())))], grid=grid)
+
+
+def _learns(*values: object) -> bool:
+    return any(isinstance(value, Tensor) and value.requires_grad for value in values)
+
+
+def _bent(path: Path, medium: Bodies, box: Float[Tensor, "2 3"], starts: Float[Tensor, "R 3"]) -> Bent:
+    positions, lengths = leave_box(path, box)
+    return Bent((positions + torch.from_numpy(medium.origin)).to(starts), path.exit_directions, lengths, path.refracted)
 
 
 def polylines(
@@ -113,7 +196,10 @@ def _checked_rays(
     origins: ArrayLike | Tensor, directions: ArrayLike | Tensor
 ) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R 3"]]:
     """Convert rays to tensors with unit directions."""
-    starts, towards = (torch.as_tensor(np.asarray(values)) for values in (origins, directions))
+    starts, towards = (
+        values if isinstance(values, Tensor) else torch.as_tensor(np.asarray(values))
+        for values in (origins, directions)
+    )
     starts, towards = (values if values.is_floating_point() else values.double() for values in (starts, towards))
     if starts.ndim != 2 or starts.shape[1:] != (3,) or starts.shape != towards.shape or not len(starts):
         raise NerfroError(f"origins {list(starts.shape)} and directions {list(towards.shape)} must both be [R, 3]")

@@ -59,30 +59,35 @@ class TraceConfig:
 
 
 def make_rays(
-    origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"], medium: Medium, near: float, far: float | None
+    origins: Float[Tensor, "R 3"],
+    directions: Float[Tensor, "R 3"],
+    medium: Medium,
+    near: float,
+    far: float | None,
+    dtype: torch.dtype = torch.float32,
 ) -> Rays:
-    """Create rays in single precision, relative to the medium's origin, from near to far.
+    """Create rays relative to the medium's origin, from near to far.
 
     Without `far`, the paths are long enough to leave the medium's box.
     """
-    origins, directions = (origins - torch.from_numpy(medium.origin)).float(), directions.float()
+    origins, directions = (origins - torch.from_numpy(medium.origin)).to(dtype), directions.to(dtype)
     if far is None:
         centre, diagonal = medium.box.mean(0), float(torch.linalg.vector_norm(medium.box[1] - medium.box[0]))
-        distance = float(torch.linalg.vector_norm(origins - centre, dim=-1).max())
+        distance = float(torch.linalg.vector_norm(origins.detach() - centre, dim=-1).max())
         far = max(distance, near) + (_DIAGONALS + 0.5) * diagonal
     if not 0 <= near < far:
         raise NerfroError(f"near={near}, far={far} is no range; near must be at least 0 and below far")
-    ones = torch.ones(len(origins))
+    ones = torch.ones(len(origins), dtype=dtype)
     return Rays(origins, directions, 0 * ones, near * ones, far * ones)
 
 
-def leave_box(path: Path, medium: Medium) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R"]]:
-    """Return positions and arc lengths of the exits from the box, or of the first vertex for rays beside the box."""
+def leave_box(path: Path, box: Float[Tensor, "2 3"]) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R"]]:
+    """Return positions and arc lengths of the exits from a box, or of the first vertex for rays beside the box."""
     # Short rows repeat the last vertex, so the last event is the last vertex before far.
     last = (path.s < path.far[:, None]).sum(-1).sub(1).clamp(min=0)
     rows = torch.arange(len(last))
     start = path.positions[rows, last]
-    enter, leave = intersect_box(medium.box, start, path.exit_directions)
+    enter, leave = intersect_box(box, start, path.exit_directions)
     ahead = torch.where(enter < leave, leave, 0.0).clamp(min=0).minimum(path.far - path.s[rows, last])
     return start + ahead[:, None] * path.exit_directions, path.s[rows, last] + ahead
 
