@@ -21,7 +21,7 @@ import nerfro.poses.structure_from_motion
 import nerfro.silhouettes.surface
 import nerfro.training.lightning_callbacks  # noqa: F401 - registers callbacks, as the others register settings
 from nerfro.cli.failures import errors_in_one_line
-from nerfro.cli.options import plugin_options
+from nerfro.cli.options import laid_out, plugin_options
 from nerfro.core.provenance import AlgorithmSettings
 from nerfro.media.material import MATERIALS
 from nerfro.registry.registration import Plugin, discover, find, plugins
@@ -43,7 +43,7 @@ def main() -> None:
         for plugin in _chosen(arguments):
             print(f"{plugin.kind}={plugin.name}  {plugin.summary}")
             for option in plugin_options(plugin, ""):
-                print(option)
+                print(laid_out(str(option)))
 
 
 def _print_materials() -> None:

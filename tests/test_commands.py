@@ -12,7 +12,7 @@ import pytest
 
 import nerfro.demo
 from nerfro.cli.completion import completions
-from nerfro.cli.options import Described, recall, remember
+from nerfro.cli.options import Described, Option, laid_out, recall, remember
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import PACKAGE_DIR
 from nerfro.evaluation.results import EvaluationResult, RunMetrics, ViewScores
@@ -58,6 +58,24 @@ def test_help_version_and_mistakes_do_not_wait_for_torch(arguments: list[str], p
     assert not {"torch", "lightning"} & set(imports)
     others = [line for line in done.stderr.splitlines(keepends=True) if not line.startswith("import time")]
     assert "".join([done.stdout, *others]) == printed
+
+
+def test_help_fits_the_terminal_and_lists_the_options_that_contain_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = "\n".join([
+        "Train.", "", "Examples:", "    nerfro train " + "long=1 " * 20, "Options of model:",
+        str(Option("model.sampler", "str", "a", "Point sampler. " + "It is long. " * 20)),
+        str(Option("model.width", "int", 3, "Width of a layer.")),
+    ])  # fmt: skip
+    for width in (80, 60):
+        monkeypatch.setenv("COLUMNS", str(width))
+        lines = laid_out(text).splitlines()
+        assert max(len(line) for line in lines if "nerfro train" not in line) <= width
+        assert "    nerfro train " + "long=1 " * 20 in lines
+    selected = laid_out(text, ["SAMPLER"])
+    assert selected.startswith("  model.sampler=a  (str)\n      Point sampler. It is long.")
+    assert "model.width" not in selected
+    assert laid_out(text, ["width", "layer"]) == "  model.width=3  (int)\n      Width of a layer."
+    refused("no option contains fog", laid_out, text, ["fog"])
 
 
 @pytest.mark.parametrize(

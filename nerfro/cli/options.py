@@ -15,6 +15,7 @@ import inspect
 import json
 import os
 import re
+import shutil
 import sys
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
@@ -40,7 +41,37 @@ _ADDED_PLUGINS = {
     "phase": "+phase.NAME={}",
     "surface": "+bodies.BODY.surface.name=NAME",
 }
-_WIDTH = 100  # characters in a line of the help
+
+
+_HEADING, _TEXT = " " * 2, " " * 6  # indents of an option or a choice, and of the explanation below it
+
+
+def laid_out(text: str, words: Sequence[str] = ()) -> str:
+    """Fit the help to the width of the terminal, and select the options that contain all words.
+
+    Raises:
+        NerfroError: no option contains the words.
+    """
+    entries: list[list[str]] = []
+    for line in text.splitlines():
+        if line.startswith(_TEXT) and entries:
+            entries[-1].append(line)
+        else:
+            entries.append([line])
+    if words:
+        options = [entry for entry in entries if re.match(rf"{_HEADING}\S", entry[0])]
+        entries = [entry for entry in options if all(word.lower() in "\n".join(entry).lower() for word in words)]
+        if not entries:
+            raise NerfroError(f"no option contains {' and '.join(words)}; --help without words lists all options")
+    # Longer lines are hard to read.
+    width = min(max(shutil.get_terminal_size((100, 24)).columns, 40), 120)
+    lines = []
+    for line in (line for entry in entries for line in entry):
+        indent = len(line) - len(line.lstrip())
+        # Examples, which are indented by four, can be copied only if they are not wrapped.
+        further = " " * (indent if indent != len(_HEADING) else 4)
+        lines += [line] if indent == 4 else textwrap.wrap(line, width, subsequent_indent=further) or [""]
+    return "\n".join(lines)
 
 
 class Option(NamedTuple):
@@ -62,8 +93,7 @@ class Option(NamedTuple):
         default = "null" if self.default is None else str(self.default)
         default = default.lower() if isinstance(self.default, bool) else default
         heading = f"  {self.name}={default}" + ("" if self.type == "any" else f"  ({self.type})")
-        lines = textwrap.wrap(heading, _WIDTH, subsequent_indent=" " * 4)
-        lines += textwrap.wrap(self.text, _WIDTH, initial_indent=" " * 6, subsequent_indent=" " * 6)
+        lines = [heading, *([f"{_TEXT}{' '.join(self.text.split())}"] if self.text else [])]
         return "\n".join(lines).replace("`", "")
 
 
@@ -88,7 +118,8 @@ class Described:
             NerfroError: a setting or an option does not exist.
         """
         if {"-h", "--help"} & {*arguments} and not ("hydra" in arguments and self.choices):
-            print(self.help)
+            words = [word for word in arguments if re.fullmatch(r"[\w./]+", word) and word != "hydra"]
+            print(laid_out(self.help, words))
             sys.exit()
         # Other folders of configurations may have other groups.
         if not any(argument.startswith(("--config", "-c", "hydra.searchpath")) for argument in arguments):
@@ -187,7 +218,7 @@ def usage(command: str) -> str:
 def _page(command: str, options: Sequence[Option], choices: Mapping[str, Sequence[str]]) -> str:
     lines = [usage(command), *(["Choices:"] if choices else [])]
     for choice, names in choices.items():
-        lines.append(textwrap.fill(f"  {choice}  ({', '.join(names)})", _WIDTH, subsequent_indent=" " * 6))
+        lines.append(f"{_HEADING}{choice}  ({', '.join(names)})")
     lines += [""] if choices else []
     sections: dict[str, list[Option]] = {}
     for option in options:

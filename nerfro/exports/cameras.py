@@ -66,11 +66,16 @@ def write_transforms(scene: TrainedScene, out: Path, options: ExportConfig) -> s
 
 
 def _training_cameras(scene: TrainedScene) -> tuple[Cameras, list[tuple[Path, Path | None]]]:
-    """Return the cameras as trained, and photograph and folder of the data of each; without data, a name alone."""
+    """Return the cameras as trained, and photograph and folder of the data of each, or a name if these are unknown."""
     cameras = scene.cameras("train").to("cpu")
-    if not scene.has_data:
-        return cameras, [(Path(f"train_{view:03d}.png"), None) for view in range(len(cameras))]
-    return cameras, [(frame.image, scene.source.root) for frame in scene.views("train").frames]
+    views = scene.views("train") if scene.has_data else None
+    if views is not None and views.frames:
+        # Views that were held back from the training have no trained camera, and refined cameras have moved a little.
+        of_data = views.cameras.to("cpu").camera_to_world
+        frame = torch.cdist(cameras.camera_to_world.flatten(1), of_data.flatten(1)).argmin(1).tolist()
+        if len({*frame}) == len(cameras):
+            return cameras, [(views.frames[number].image, scene.source.root) for number in frame]
+    return cameras, [(Path(f"train_{view:03d}.png"), None) for view in range(len(cameras))]
 
 
 def _poses(scene: TrainedScene, cameras: Cameras) -> tuple[Float[np.ndarray, "V 3 3"], Float[np.ndarray, "V 3"]]:
@@ -110,5 +115,5 @@ def _write_lines(file: Path, lines: list[str]) -> None:
     write_atomically(file, "\n".join(line.rstrip(" ") for line in lines) + "\n")
 
 
-EXPORTS["colmap"] = Export(("",), write_colmap, unused=("sky",))
-EXPORTS["cameras"] = Export(("",), write_transforms, unused=("sky",))
+EXPORTS["colmap"] = Export(("",), write_colmap, unused=("sky", "triangles"))
+EXPORTS["cameras"] = Export(("",), write_transforms, unused=("sky", "triangles"))

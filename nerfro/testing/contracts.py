@@ -112,7 +112,10 @@ def check_export(name: str) -> None:
         with _named(f"what={name}"):
             text = export.write(scene, out, options)
         _require(isinstance(text, str) and text != "", "write returns a description of the file, which is printed")
-        _require(out.is_dir() if export.is_folder else out.is_file(), "write writes `out`")
+        _require(
+            out.is_dir() if export.is_folder else out.is_file(),
+            "write writes the file `out`" if not export.is_folder else "write writes the folder `out`",
+        )
         others = {file.name for file in FilePath(folder).iterdir()} - {file.name for file in export.files(out)}
         _require(not others, f"companions lacks the endings of {', '.join(sorted(others))}")
 
