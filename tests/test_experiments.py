@@ -9,7 +9,7 @@ import pytest
 from omegaconf import DictConfig, OmegaConf
 
 from nerfro.core.paths import CONF_DIR
-from nerfro.registry.registration import build, discover
+from nerfro.registry.registration import build, create, discover, find
 from nerfro.training.build import Training
 from tests.conftest import QUIET, Runner, composed, write_tiny_scene
 
@@ -160,6 +160,16 @@ def test_experiments_of_glass_learn_all_bodies_without_their_own_settings(experi
     bodies = f"medium.bodies={{own: {{{ball}, learn: [ior]}}, common: {{{ball}}}}}"
     medium = build(composed(f"+experiment={experiment}", bodies, "medium.resolution=16", "medium.cache=false").medium)
     assert [list(material.learned()) for material in medium.materials] == [["ior"], learned]
+
+
+def test_short_trials_of_bent_rays_have_the_penalties_of_straight_rays() -> None:
+    """Otherwise the trials of `nerfro.reconstruct` compare penalties instead of hypotheses."""
+    straight, bent = (composed(f"+experiment={name}").loss for name in ("straight", "glass_room"))
+    assert straight.keys() == bent.keys()
+    for name in straight:
+        one, other = (create(find("loss", name), {k: v for k, v in loss[name].items() if k != "_target_"})
+                      for loss in (straight, bent))  # fmt: skip
+        assert sum(map(other.weight_at, range(600))) <= 2 * sum(map(one.weight_at, range(600))), name
 
 
 def test_settings_of_the_paper_match_the_authors() -> None:
