@@ -120,7 +120,7 @@ def test_exits_begin_at_the_last_straight_segment() -> None:
 def test_pixel_is_the_encoded_mean_of_radiance() -> None:
     one = torch.zeros(1, dtype=torch.long)
     batch = replace(
-        example_batch(), ray_pixel=one.expand(NUM_RAYS), pixel_number=one, view=one, rgb=torch.zeros(1, 3),
+        example_batch(), maps={}, ray_pixel=one.expand(NUM_RAYS), pixel_number=one, view=one, rgb=torch.zeros(1, 3),
         teaches_background=torch.ones(1, dtype=torch.bool),
     )  # fmt: skip
     radiance = torch.zeros(NUM_RAYS, 3)

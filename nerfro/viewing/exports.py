@@ -86,8 +86,9 @@ def find_export(what: str, out: Path) -> Export:
     """
     export = export_of(what)
     if out.suffix.lower() not in export.suffixes:
-        allowed = "be a folder, without ending" if export.is_folder else f"end in {' or '.join(export.suffixes)}"
-        raise NerfroError(f"out={out} is not allowed for {what}; it must {allowed}")
+        if export.is_folder:
+            raise NerfroError(f"out={out} is not a folder of {what}; it must be a folder, without ending")
+        raise NerfroError(f"out={out} is not a file of {what}; it must end in {' or '.join(export.suffixes)}")
     return export
 
 

@@ -156,6 +156,7 @@ def batch() -> Batch:
     rows = torch.arange(3)
     return replace(
         example_batch(8),
+        maps={},
         ray_pixel=PIXEL,
         pixel_number=rows,
         view=0 * rows,
