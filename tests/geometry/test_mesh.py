@@ -1,5 +1,7 @@
 """Reading meshes, and the messages about bad ones."""
 
+import json
+import struct
 import sys
 from pathlib import Path
 from typing import Any
@@ -64,6 +66,32 @@ def test_compressed_gltf_is_refused(extension: str, name: str, tmp_path: Path, m
     refused(
         rf"a\.glb is compressed by {name} \({extension}\).*export it without compression", load_mesh, tmp_path / "a.glb"
     )
+
+
+def test_meshes_compressed_by_draco_are_decoded(tmp_path: Path) -> None:
+    draco = pytest.importorskip("DracoPy")
+    ball = trimesh.creation.icosphere(2, 0.7)
+    encoded = draco.encode(np.asarray(ball.vertices, np.float32), faces=np.asarray(ball.faces, np.uint32))
+    extension = {"bufferView": 0, "attributes": {"POSITION": 0}}
+    primitive = {"attributes": {"POSITION": 0}, "indices": 1, "extensions": {"KHR_draco_mesh_compression": extension}}
+    document = {
+        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
+        "extensionsUsed": ["KHR_draco_mesh_compression"], "extensionsRequired": ["KHR_draco_mesh_compression"],
+        "meshes": [{"primitives": [primitive]}], "buffers": [{"byteLength": len(encoded)}],
+        "bufferViews": [{"buffer": 0, "byteLength": len(encoded)}],
+        "accessors": [
+            {"componentType": 5126, "type": "VEC3", "count": len(ball.vertices),
+             "min": ball.bounds[0].tolist(), "max": ball.bounds[1].tolist()},
+            {"componentType": 5125, "type": "SCALAR", "count": ball.faces.size},
+        ],
+    }  # fmt: skip
+    chunks = [(b"JSON", json.dumps(document).encode(), b" "), (b"BIN\0", encoded, b"\0")]
+    padded = [(kind, content + filling * (-len(content) % 4)) for kind, content, filling in chunks]
+    body = b"".join(struct.pack("<I", len(content)) + kind + content for kind, content in padded)
+    (tmp_path / "ball.glb").write_bytes(b"glTF" + struct.pack("<II", 2, 12 + len(body)) + body)
+    mesh = load_mesh(tmp_path / "ball.glb")
+    assert (len(mesh.vertices), len(mesh.faces)) == (162, 320)
+    assert np.linalg.norm(mesh.vertices, axis=1) == pytest.approx(0.7, abs=1e-3)
 
 
 def test_files_without_triangles_or_with_nan_are_named(tmp_path: Path) -> None:
