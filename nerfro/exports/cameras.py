@@ -115,5 +115,5 @@ def _write_lines(file: Path, lines: list[str]) -> None:
     write_atomically(file, "\n".join(line.rstrip(" ") for line in lines) + "\n")
 
 
-EXPORTS["colmap"] = Export(("",), write_colmap, unused=("sky", "triangles"))
-EXPORTS["cameras"] = Export(("",), write_transforms, unused=("sky", "triangles"))
+EXPORTS["colmap"] = Export(("",), write_colmap, unused=("sky",))
+EXPORTS["cameras"] = Export(("",), write_transforms, unused=("sky",))

@@ -22,8 +22,7 @@ from nerfro.viewing.trained_scene import TrainedScene
 def write_mesh(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
     """Write the surfaces of the glass and of the dense content, as .glb with materials, or as one mesh (.ply, .obj)."""
     suffix = out.suffix.lower()
-    glass = glass_meshes(scene, options.triangles if suffix == ".glb" else None)
-    inside = inside_mesh(scene, options.resolution, options.half_depth)
+    glass, inside = glass_meshes(scene), inside_mesh(scene, options.resolution, options.half_depth)
     if not glass and inside is None:
         raise NerfroError("the scene has neither glass nor dense content to write; raise half_depth")
     write_atomically(out, _encode_glb(scene, glass, inside) if suffix == ".glb" else one_mesh(glass, inside, suffix))

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 import torch
 import trimesh
-from jaxtyping import Float, Int
 from torch.nn import functional
 from trimesh.exchange.obj import export_obj
 from trimesh.exchange.ply import export_ply
@@ -19,71 +17,16 @@ from nerfro.files.images import to_8bit
 from nerfro.geometry.bodies import bodies_of
 from nerfro.geometry.interpolation import trilinear
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.geometry.normals import corner_normals
 from nerfro.viewing.surface import level_set
 from nerfro.viewing.trained_scene import TrainedScene
 from nerfro.viewing.volume import POINTS_AT_ONCE, RESOLUTION, sample_field
 
 
-def glass_meshes(scene: TrainedScene, max_triangles: int | None = None) -> list[trimesh.Trimesh]:
-    """Triangulate the surface of each body, with vertex normals; returns an empty list without bodies.
-
-    With `max_triangles`, surfaces of more triangles are simplified.
-    """
+def glass_meshes(scene: TrainedScene) -> list[trimesh.Trimesh]:
+    """Triangulate the surface of each body, with vertex normals; returns an empty list without bodies."""
     if scene.renderer.scene.medium.bodies is None:
         return []
-    meshes = scene.surface if max_triangles is None else [simplified(mesh, max_triangles) for mesh in scene.surface]
-    return [_with_vertex_normals(mesh) for mesh in meshes]
-
-
-def simplified(mesh: TriangleMesh, max_triangles: int) -> TriangleMesh:
-    """Merge the vertices in each cell of a grid that is as coarse as needed for the number of triangles.
-
-    Of each cell, the vertex remains that is nearest to the minimum of the quadric error, so that edges and corners stay
-    sharp and all vertices are on the surface.
-
-    Source:
-        P. Lindstrom, "Out-of-core simplification of large polygonal models", SIGGRAPH 2000.
-    """
-    if len(mesh.faces) <= max_triangles:
-        return mesh
-    triangles = mesh.triangles
-    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])  # by twice the area
-    # A cell of side h on a flat surface becomes two triangles of h * h / 2.
-    side = math.sqrt(np.linalg.norm(normals, axis=-1).sum() / max_triangles)
-    while True:
-        cells = np.floor((mesh.vertices - mesh.vertices.min(0)) / side).astype(np.int64)
-        cell = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
-        faces = cell[mesh.faces]
-        proper = (faces != np.roll(faces, 1, axis=1)).all(1)
-        # Opposite sides of a thin wall may meet in one cell; of equal triangles, one remains.
-        first = np.unique(np.sort(faces[proper], axis=1), axis=0, return_index=True)[1]
-        if 0 < len(first) <= max_triangles:
-            break
-        side *= 1.1 if len(first) else 0.5
-    kept = _nearest_to_optimum(mesh, normals, cell)
-    coarse = replace(mesh, vertices=mesh.vertices[kept], faces=faces[proper][np.sort(first)], normals=None, facets=None)
-    return replace(coarse, normals=corner_normals(coarse))
-
-
-def _nearest_to_optimum(
-    mesh: TriangleMesh, normals: Float[np.ndarray, "F 3"], cell: Int[np.ndarray, " vertices"]
-) -> Int[np.ndarray, " cells"]:
-    """Return the vertex of each cell with the smallest distance to the minimum of the cell's quadric error."""
-    count, corner_cell = cell.max() + 1, cell[mesh.faces].reshape(-1)
-    repeated = np.repeat(normals, 3, axis=0)
-    offset = (repeated * mesh.triangles.reshape(-1, 3)).sum(-1)
-    matrix, right, centre = np.zeros((count, 3, 3)), np.zeros((count, 3)), np.zeros((count, 3))
-    np.add.at(matrix, corner_cell, repeated[:, :, None] * repeated[:, None])
-    np.add.at(right, corner_cell, repeated * offset[:, None])
-    np.add.at(centre, cell, mesh.vertices)
-    centre /= np.bincount(cell)[:, None]
-    # Where the surface is flat, the minimum is a plane, on which the mean of the vertices decides.
-    weak = 1e-3 * np.trace(matrix, axis1=1, axis2=2)[:, None] + 1e-30
-    optimum = np.linalg.solve(matrix + weak[..., None] * np.eye(3), (right + weak * centre)[..., None])[..., 0]
-    distance = np.linalg.norm(mesh.vertices - optimum[cell], axis=-1)
-    order = np.lexsort((distance, cell))
-    return order[np.unique(cell[order], return_index=True)[1]]
+    return [_with_vertex_normals(mesh) for mesh in scene.surface]
 
 
 def _with_vertex_normals(mesh: TriangleMesh) -> trimesh.Trimesh:

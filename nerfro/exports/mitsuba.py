@@ -171,4 +171,4 @@ def _numbers(values: Iterable[float]) -> str:
     return " ".join(f"{value:.9g}" for value in values)
 
 
-EXPORTS["mitsuba"] = Export((".xml",), write_mitsuba, MITSUBA_FILES, unused=("triangles",))
+EXPORTS["mitsuba"] = Export((".xml",), write_mitsuba, MITSUBA_FILES)

@@ -27,7 +27,6 @@ class ExportConfig:
         out: output file, whose ending selects the format, or the folder of cameras and colmap.
         resolution: grid vertices along the longest side of the volume (default 128), or rows of the sky (by
             default as many as the background has, at least 512).
-        triangles: largest number of triangles of each body in .glb files.
         half_depth: length, world units, within which dense content absorbs half the light; the surface is
             extracted at this density. By default a hundredth of the object's longest side.
         sky: lat-long image that replaces the sky (.hdr, .exr, .png, .jpg).
@@ -40,7 +39,6 @@ class ExportConfig:
     what: ExportName = MISSING
     out: str = MISSING
     resolution: Count | None = None
-    triangles: Count = 20_000
     half_depth: Positive | None = None
     sky: str | None = None
     root: str | None = None

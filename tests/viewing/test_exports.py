@@ -20,8 +20,7 @@ from PIL import Image
 from nerfro.core.errors import NerfroError
 from nerfro.core.light import to_linear, to_srgb
 from nerfro.data.formats.colmap_model import lens_of, read_colmap
-from nerfro.exports.meshes import simplified
-from nerfro.geometry.mesh import TriangleMesh, load_mesh
+from nerfro.geometry.mesh import load_mesh
 from nerfro.geometry.space import Box
 from nerfro.media.body_settings import make_bodies
 from nerfro.samplers.paths.snell import Snell
@@ -72,23 +71,6 @@ def test_glb_contains_glass_as_dielectric_and_the_content_as_emission(scene: Tra
     # The z axis is up in nerfro, and the y axis in the file.
     lifted = loaded.graph.get("inside")[0][:3, :3] @ INSIDE_CENTRE
     np.testing.assert_allclose(lifted, [INSIDE_CENTRE[0], INSIDE_CENTRE[2], -INSIDE_CENTRE[1]], atol=1e-6)
-
-
-@pytest.mark.parametrize("shape", [trimesh.creation.box((2, 1.4, 1)), trimesh.creation.icosphere(2, 1.0)])
-def test_simplified_surface_keeps_shape_edges_and_normals(shape: trimesh.Trimesh) -> None:
-    while len(shape.faces) < 20_000:
-        shape = shape.subdivide()
-    fine = TriangleMesh(np.asarray(shape.vertices), np.asarray(shape.faces))
-    coarse = simplified(fine, 2000)
-    assert 1000 < len(coarse.faces) <= 2000
-    assert coarse.normals is not None
-    again = trimesh.Trimesh(coarse.vertices, coarse.faces, process=False)
-    assert again.is_watertight
-    assert again.volume == pytest.approx(shape.volume, rel=0.02)
-    np.testing.assert_allclose(again.bounds, shape.bounds, atol=0.05)
-    cosine = (coarse.normals * again.face_normals[:, None]).sum(-1)
-    assert cosine[again.area_faces > 1e-6].min() > 0.8
-    assert simplified(fine, 10**6) is fine
 
 
 @pytest.fixture
@@ -363,13 +345,7 @@ def test_unknown_exports_and_endings_are_refused(what: str, name: str, message: 
 
 @pytest.mark.parametrize(
     ("what", "option"),
-    [
-        ("page", "half_depth=1"),
-        ("sky", "half_depth=1"),
-        ("volume", "sky=a.hdr"),
-        ("mesh", "sky=a.hdr"),
-        ("colmap", "triangles=9"),
-    ],
+    [("page", "half_depth=1"), ("sky", "half_depth=1"), ("volume", "sky=a.hdr"), ("mesh", "sky=a.hdr")],
 )
 def test_option_without_effect_on_an_export_is_refused(
     what: str, option: str, run_here: Runner, tmp_path: Path
