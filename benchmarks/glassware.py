@@ -38,6 +38,7 @@ from nerfro.synthetic.scene import SyntheticScene as Scene
 from nerfro.synthetic.scenes import distance, patterns, photographs
 from nerfro.synthetic.scenes import dolphin_capture as dolphin
 from nerfro.synthetic.surface import SurfaceMesh as Surface
+from nerfro.synthetic.surface import join
 from nerfro.viewing.film import write_film
 
 GLASS, WATER = 1.5, 1.333
@@ -247,7 +248,7 @@ def furniture(spacing: float) -> tuple[list[Panel], Surface]:
             else (lambda p, c=centre, s=size: distance.ball(p, c, s))
         )
         solids.append(painted_solid(solid, centre, size + 0.03, 100 * number))
-    return panels, distance.join(solids)
+    return panels, join(solids)
 
 
 def render(kind: str, folder: Path, count: int, width: int, spp: int) -> None:

@@ -35,7 +35,7 @@ from nerfro.synthetic.dataset import PlannedImage, ViewSplits
 from nerfro.synthetic.path_tracer import Pinhole
 from nerfro.synthetic.scene import Part, SyntheticScene
 from nerfro.synthetic.scenes import torus
-from nerfro.synthetic.surface import SurfaceMesh
+from nerfro.synthetic.surface import SurfaceMesh, join
 from nerfro.synthetic.viewpoints import look_at_origin
 
 _DISTANCE = 3.1  # of the cameras of an orbit, in half diagonals of the bodies
@@ -150,11 +150,11 @@ class GltfScene:
         """Return the scene under the sky of the scene `torus`."""
         bodies = [part for part in self.parts if part.ior is not None]
         contents = [part.surface for part in self.parts if part.ior is None]
-        glass = _united([part.surface for part in bodies])
+        glass = join([part.surface for part in bodies])
         centre = 0.5 * (glass.vertices.min(0) + glass.vertices.max(0)).astype(np.float64)
         first = bodies[0]
         assert first.ior is not None
-        return SyntheticScene(first.ior, glass, _united(contents), torus.sky, aim=centre, parts=tuple(self.parts))
+        return SyntheticScene(first.ior, glass, join(contents), torus.sky, aim=centre, parts=tuple(self.parts))
 
 
 def _without_scale(pose: np.ndarray) -> np.ndarray:
@@ -259,21 +259,6 @@ def _is_within(surface: SurfaceMesh, body: SurfaceMesh) -> bool:
 def _volume(surface: SurfaceMesh) -> float:
     a, b, c = surface.vertices[surface.faces].astype(np.float64).swapaxes(0, 1)
     return float((np.cross(a, b) * c).sum() / 6)
-
-
-def _united(surfaces: list[SurfaceMesh]) -> SurfaceMesh:
-    """Return all triangles of some surfaces, without colours unless all have some."""
-    if not surfaces:
-        return SurfaceMesh(np.empty((0, 3), np.float32), np.empty((0, 3), np.int32), np.empty((0, 3), np.float32))
-    starts = np.cumsum([0, *(len(surface.vertices) for surface in surfaces[:-1])])
-    faces = [surface.faces + start for surface, start in zip(surfaces, starts, strict=True)]
-    colours = [surface.colours for surface in surfaces if surface.colours is not None]
-    return SurfaceMesh(
-        np.concatenate([surface.vertices for surface in surfaces]),
-        np.concatenate(faces).astype(np.int32),
-        np.concatenate([surface.normals for surface in surfaces]),
-        np.concatenate(colours) if len(colours) == len(surfaces) else None,
-    )
 
 
 _MODELLED = {"KHR_materials_transmission", "KHR_materials_ior", "KHR_materials_volume"}

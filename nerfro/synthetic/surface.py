@@ -40,6 +40,20 @@ class SurfaceMesh:
         write_atomically(path, trimesh.exchange.ply.export_ply(self.as_trimesh(), vertex_normal=True))
 
 
+def join(surfaces: Sequence[SurfaceMesh]) -> SurfaceMesh:
+    """Join surfaces to one surface, without colours unless all have some; no surfaces give an empty one."""
+    if not surfaces:
+        return SurfaceMesh(np.empty((0, 3), np.float32), np.empty((0, 3), np.int32), np.empty((0, 3), np.float32))
+    offsets = np.cumsum([0] + [len(surface.vertices) for surface in surfaces[:-1]])
+    colours = [surface.colours for surface in surfaces if surface.colours is not None]
+    return SurfaceMesh(
+        vertices=np.concatenate([surface.vertices for surface in surfaces]),
+        faces=np.concatenate([surface.faces + offset for surface, offset in zip(surfaces, offsets, strict=True)]),
+        normals=np.concatenate([surface.normals for surface in surfaces]),
+        colours=np.concatenate(colours) if len(colours) == len(surfaces) else None,
+    )
+
+
 def rounded_box(half_sides: Sequence[float] | np.ndarray, radius: float, edge_steps: int) -> SurfaceMesh:
     """Mesh a box around the origin whose edges and corners are rounded with `radius`, watertight.
 

@@ -126,17 +126,6 @@ def moved(surface: SurfaceMesh, offset: Vector) -> SurfaceMesh:
     return replace(surface, vertices=(surface.vertices + np.asarray(offset)).astype(np.float32))
 
 
-def join(surfaces: Sequence[SurfaceMesh]) -> SurfaceMesh:
-    """Join coloured surfaces to one surface."""
-    offsets = np.cumsum([0] + [len(surface.vertices) for surface in surfaces[:-1]])
-    return SurfaceMesh(
-        vertices=np.concatenate([surface.vertices for surface in surfaces]),
-        faces=np.concatenate([surface.faces + offset for surface, offset in zip(surfaces, offsets, strict=True)]),
-        normals=np.concatenate([surface.normals for surface in surfaces]),
-        colours=np.concatenate([surface.colours for surface in surfaces if surface.colours is not None]),
-    )
-
-
 def _gradient(distance: Distance, points: np.ndarray, step: float) -> np.ndarray:
     """Return central differences of `distance`, [V, 3]."""
     offsets = step * np.eye(3)

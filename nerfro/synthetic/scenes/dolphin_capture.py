@@ -18,7 +18,6 @@ from nerfro.synthetic.scenes.distance import (
     ball,
     capsule,
     ellipsoid,
-    join,
     mirrored,
     moved,
     painted,
@@ -26,6 +25,7 @@ from nerfro.synthetic.scenes.distance import (
 )
 from nerfro.synthetic.scenes.patterns import chosen, fractal_noise, hashed, mix, smoothstep
 from nerfro.synthetic.scenes.photographs import Photographs
+from nerfro.synthetic.surface import join
 
 DATA_SET = Photographs
 

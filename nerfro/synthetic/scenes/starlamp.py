@@ -10,6 +10,7 @@ from nerfro.core.light import to_linear
 from nerfro.synthetic.scene import SyntheticScene
 from nerfro.synthetic.scenes import distance
 from nerfro.synthetic.scenes.patterns import chosen, fractal_noise, hashed, mix, smoothstep
+from nerfro.synthetic.surface import join
 
 OUTER, INNER, HALF_DEPTH, ROUNDING = 0.84, 0.44, 0.34, 0.10
 PLANET_RADIUS, RING_RADII = 0.21, (0.27, 0.37)
@@ -142,4 +143,4 @@ def build(spacing: float) -> SyntheticScene:
     extent = np.full(3, 1.1 * RING_RADII[1])
     rings = distance.painted(ring, ring_colours, -extent, extent, min(spacing, 0.006))
     glass = distance.triangulate(star_prism, (-OUTER, -HALF_DEPTH, -OUTER), (OUTER, HALF_DEPTH, OUTER), 0.010)
-    return SyntheticScene(ior=1.5, glass=glass, interior=distance.join([planet, rings]), sky=sky)
+    return SyntheticScene(ior=1.5, glass=glass, interior=join([planet, rings]), sky=sky)
