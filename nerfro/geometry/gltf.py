@@ -62,16 +62,21 @@ class Primitive:
     @property
     def glass(self) -> GltfGlass | None:
         """Optical properties of a refractive material; None for other materials."""
-        extensions = self.material.get("extensions", {})
-        if not extensions.get("KHR_materials_transmission", {}).get("transmissionFactor", 0) > 0:
-            return None
-        volume = extensions.get("KHR_materials_volume", {})
-        colour = np.array(volume.get("attenuationColor", [1.0, 1.0, 1.0]), np.float64)
-        # Beer-Lambert: light of the attenuation colour is left after the attenuation distance.
-        red, green, blue = -np.log(colour.clip(1e-12, 1)) / volume.get("attenuationDistance", np.inf) + 0.0
-        dispersion = extensions.get("KHR_materials_dispersion", {}).get("dispersion", 0)
-        ior = float(extensions.get("KHR_materials_ior", {}).get("ior", 1.5))
-        return GltfGlass(ior, (float(red), float(green), float(blue)), 20 / dispersion if dispersion > 0 else None)
+        return glass_of(self.material)
+
+
+def glass_of(material: Mapping[str, Any]) -> GltfGlass | None:
+    """Return the optical properties of a refractive material; None for other materials."""
+    extensions = material.get("extensions", {})
+    if not extensions.get("KHR_materials_transmission", {}).get("transmissionFactor", 0) > 0:
+        return None
+    volume = extensions.get("KHR_materials_volume", {})
+    colour = np.array(volume.get("attenuationColor", [1.0, 1.0, 1.0]), np.float64)
+    # Beer-Lambert: light of the attenuation colour is left after the attenuation distance.
+    red, green, blue = -np.log(colour.clip(1e-12, 1)) / volume.get("attenuationDistance", np.inf) + 0.0
+    dispersion = extensions.get("KHR_materials_dispersion", {}).get("dispersion", 0)
+    ior = float(extensions.get("KHR_materials_ior", {}).get("ior", 1.5))
+    return GltfGlass(ior, (float(red), float(green), float(blue)), 20 / dispersion if dispersion > 0 else None)
 
 
 def is_gltf(path: Path) -> bool:
@@ -158,17 +163,12 @@ def primitives_of(document: Mapping[str, Any], geometries: list[str]) -> list[Pr
 
 
 def _matrix(node: Mapping[str, Any]) -> Float[np.ndarray, "4 4"]:
+    from scipy.spatial.transform import Rotation
+
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
-    x, y, z, w = node.get("rotation", [0.0, 0.0, 0.0, 1.0])
-    turn = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
     matrix = np.eye(4)
+    turn = Rotation.from_quat(node.get("rotation", [0.0, 0.0, 0.0, 1.0])).as_matrix()
     matrix[:3, :3] = turn * np.array(node.get("scale", [1.0, 1.0, 1.0]))
     matrix[:3, 3] = node.get("translation", [0.0, 0.0, 0.0])
     return matrix
@@ -184,7 +184,7 @@ def glass_of_file(path: Path) -> GltfGlass | None:
         return None
     with reading(path, "mesh ", advice="export it again"):
         materials = read_document(path).get("materials", [])
-        used = {Primitive("", "", np.eye(4), material).glass for material in materials} - {None}
+        used = {glass_of(material) for material in materials} - {None}
     glass = next(iter(used), None)
     if len(used) > 1:
         raise NerfroError(
