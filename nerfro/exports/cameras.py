@@ -13,11 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from nerfro.core.cameras import Cameras
 from nerfro.core.errors import NerfroError
-from nerfro.core.light import to_srgb
 from nerfro.core.paths import relative_path
-from nerfro.exports.meshes import glass_meshes, inside_mesh
+from nerfro.exports.meshes import colours_of, glass_meshes, inside_mesh
 from nerfro.files.atomic import write_atomically
-from nerfro.files.images import to_8bit
 from nerfro.viewing.camera_files import transforms_document
 from nerfro.viewing.exports import EXPORTS, Export, ExportConfig
 from nerfro.viewing.trained_scene import TrainedScene
@@ -32,8 +30,7 @@ def write_colmap(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
     model = out / "sparse" / "0"
     names = [f"{image.stem}.png" if root is None else relative_path(image, root) for image, root in images]
     lenses = [_colmap_lens(cameras, view) for view in range(len(cameras))]
-    lines = [f"{i} {lens} " for i, lens in enumerate(lenses, 1)]
-    _write_lines(model / "cameras.txt", lines)
+    _write_lines(model / "cameras.txt", [f"{i} {lens}" for i, lens in enumerate(lenses, 1)])
     rotations, centres = _poses(scene, cameras)
     # COLMAP stores world-to-camera poses with axes right, down and forward, and the scalar part of quaternions first.
     inverse = Rotation.from_matrix(rotations * [1.0, -1.0, -1.0]).inv()
@@ -99,8 +96,7 @@ def _points(scene: TrainedScene, options: ExportConfig) -> Points:
     """Return points of the dense content with their colours, or of the glass if there is none; world units, sRGB."""
     inside = inside_mesh(scene, options.resolution, options.half_depth)
     if inside is not None:
-        radiance = torch.from_numpy(np.asarray(inside.vertex_attributes["radiance"])).float()
-        positions, colours = np.asarray(inside.vertices), to_8bit(to_srgb(radiance.clamp(0, 1))).numpy()
+        positions, colours = np.asarray(inside.vertices), colours_of(inside)
     else:
         positions = np.concatenate([np.zeros((0, 3)), *(mesh.vertices for mesh in glass_meshes(scene))])
         colours = np.full(positions.shape, 128, np.uint8)
@@ -111,8 +107,7 @@ def _points(scene: TrainedScene, options: ExportConfig) -> Points:
 
 
 def _write_lines(file: Path, lines: list[str]) -> None:
-    file.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(file, "\n".join(line.rstrip(" ") for line in lines) + "\n")
+    write_atomically(file, "\n".join(lines) + "\n")
 
 
 EXPORTS["colmap"] = Export(("",), write_colmap, unused=("sky",))

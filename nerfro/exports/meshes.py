@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 import trimesh
+from jaxtyping import UInt8
 from torch.nn import functional
 from trimesh.exchange.obj import export_obj
 from trimesh.exchange.ply import export_ply
@@ -87,7 +88,7 @@ def one_mesh(glass: Sequence[trimesh.Trimesh], inside: trimesh.Trimesh | None, s
     parts = [*glass, *([] if inside is None else [inside])]
     colours = [np.full((len(mesh.vertices), 3), 255, np.uint8) for mesh in glass]
     if inside is not None:
-        colours.append(to_8bit(to_srgb(torch.from_numpy(inside.vertex_attributes["radiance"]))).numpy())
+        colours.append(colours_of(inside))
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in parts)])
     joined = trimesh.Trimesh(
         np.concatenate([mesh.vertices for mesh in parts]),
@@ -99,6 +100,11 @@ def one_mesh(glass: Sequence[trimesh.Trimesh], inside: trimesh.Trimesh | None, s
     if suffix == ".obj":
         return export_obj(joined, include_normals=True, include_texture=False).encode()
     return export_ply(joined, vertex_normal=True)
+
+
+def colours_of(inside: trimesh.Trimesh) -> UInt8[np.ndarray, "V 3"]:
+    """Return the sRGB colours of the vertices of `inside_mesh`."""
+    return to_8bit(to_srgb(torch.from_numpy(inside.vertex_attributes["radiance"]))).numpy()
 
 
 def largest_components(mesh: TriangleMesh) -> TriangleMesh:
