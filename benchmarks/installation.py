@@ -20,10 +20,12 @@ from packaging.utils import canonicalize_name
 
 STARTS = {
     "import torch": ["-c", "import torch"],
+    "import lightning.pytorch": ["-c", "import lightning.pytorch"],
     "import nerfro": ["-c", "import nerfro"],
     "nerfro --help": ["-m", "nerfro", "--help"],
     "nerfro train --help": ["-m", "nerfro", "train", "--help"],
     "nerfro train, with a misspelt option": ["-m", "nerfro", "train", "sed=1"],
+    "nerfro train --cfg job": ["-m", "nerfro", "train", "--cfg", "job"],
     "nerfro plugins": ["-m", "nerfro", "plugins"],
 }
 PROJECT = Path(__file__).resolve().parent.parent

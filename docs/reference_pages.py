@@ -20,7 +20,6 @@ from nerfro.__main__ import commands
 from nerfro.cli.options import google_docstring, plugin_options, schema_options, store_schema
 from nerfro.core.paths import CONF_DIR
 from nerfro.registry.registration import KINDS, Plugin, discover, plugins
-from nerfro.training import lightning_callbacks  # noqa: F401 - registers callbacks
 from nerfro.training.config import TrainConfig
 
 _CHOOSE = {"loss": "+loss.NAME.weight=0.1", "phase": "+phase.NAME={}", "callbacks": "callbacks=NAME"}

@@ -18,8 +18,7 @@ import nerfro.cli.startup
 import nerfro.masks.masking
 import nerfro.pipeline.trials
 import nerfro.poses.structure_from_motion
-import nerfro.silhouettes.surface
-import nerfro.training.lightning_callbacks  # noqa: F401 - registers callbacks, as the others register settings
+import nerfro.silhouettes.surface  # noqa: F401 - registers settings, as the imports above
 from nerfro.cli.failures import errors_in_one_line
 from nerfro.cli.options import laid_out, plugin_options
 from nerfro.core.provenance import AlgorithmSettings

@@ -16,19 +16,20 @@ from nerfro.cli.calls import Composition
 from nerfro.cli.entry import entry_point
 from nerfro.evaluation.results import RunMetrics, optimized
 from nerfro.rendering.scene_file import with_scene
-from nerfro.training.build import warn_without_effect
-from nerfro.training.config import TrainConfig, check_run
-from nerfro.training.run import run_training
+from nerfro.training.config import TrainConfig, check_run, require_inputs
+from nerfro.training.effects import warn_without_effect
 from nerfro.training.sweeps import run_cell
 
 
-@entry_point("train", TrainConfig, check=check_run, expand=with_scene)
+@entry_point("train", TrainConfig, check=check_run, check_inputs=require_inputs, expand=with_scene)
 def main(config: DictConfig) -> float | None:
     """Train one experiment, evaluate it, and return `optimized_metric`, which sweepers of Hydra optimize."""
     composition = Composition.of_job(config)
     warn_without_effect(composition)
 
     def train(config: DictConfig) -> RunMetrics | None:
+        from nerfro.training.run import run_training  # Lightning takes seconds, and compositions do not need it
+
         return run_training(replace(composition, config=config)).scores
 
     scores = run_cell(config, composition.folder, train)

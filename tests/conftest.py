@@ -84,7 +84,6 @@ def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
 def restored_registry(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Forget the plugins that a test discovers."""
     import nerfro.registry.registration
-    import nerfro.training.lightning_callbacks  # registers callbacks, which the restoration would else remove
 
     nerfro.registry.registration.discover()
     monkeypatch.setattr(nerfro.registry.registration, "_plugins", dict(nerfro.registry.registration._plugins))

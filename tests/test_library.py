@@ -82,6 +82,12 @@ def test_run_is_loaded_rendered_and_exported(trained_run: Path, tmp_path: Path, 
     run_here("export", *common, "what=sky", f"out={sky}", code=1)  # nothing is overwritten
 
 
+def test_composition_does_not_import_lightning() -> None:
+    arguments = ["train", "--cfg", "job", "+callbacks=early_stopping", "callbacks.early_stopping.monitor=val/psnr"]
+    program = f"import sys; sys.argv = {arguments}; from nerfro.train import main; main()"
+    printed_by("-c", f"{program}; assert not {{'lightning', 'torchmetrics'}} & set(sys.modules)")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("interface", ["mesh", "sdf"])
 def test_paths_through_a_ball_match_closed_form(interface: str, tmp_path: Path, monkeypatch) -> None:

@@ -8,7 +8,6 @@ from omegaconf import OmegaConf
 from torch import nn
 
 import nerfro.registry.registration
-import nerfro.training.lightning_callbacks
 from nerfro.core.errors import NerfroError
 from nerfro.registry.registration import build, configure, discover, find, register
 from nerfro.training.config import build_each

@@ -47,6 +47,7 @@ class Composer:
         expand: function that replaces arguments that stand for several settings; it also receives the names of the
             settings of the root.
         verbatim: keys whose values are texts that may contain commas and equals signs, which Hydra would parse.
+        check_inputs: check of the data and the device, which `--cfg job` calls after printing the configuration.
     """
 
     command: str
@@ -54,6 +55,7 @@ class Composer:
     check: Callable[[DictConfig], None] | None = None
     expand: Expand | None = None
     verbatim: tuple[str, ...] = ()
+    check_inputs: Callable[[DictConfig], None] | None = None
 
     def overrides(self, arguments: Sequence[str]) -> list[str]:
         """Write the arguments of a command line in the grammar of Hydra."""
@@ -77,6 +79,14 @@ class Composer:
             if self.check is not None:
                 self.check(config)
         return settings
+
+    def check_printed(self, hydra: Hydra) -> str:
+        """Check the data and the device of the configuration that Hydra has printed, and say what is not checked."""
+        job = getattr(hydra.config_loader, "job", None)
+        if self.check_inputs is None or job is None:
+            return "the data, the device and the memory"
+        self.check_inputs(job)
+        return "the pixels, the object and the memory"
 
     @contextlib.contextmanager
     def hydra(self, folders: Sequence[str] = ()) -> Iterator[Hydra]:
@@ -133,7 +143,12 @@ class _ConfigLoader(GuardedConfigLoader):
     """Composition of a configuration, also of each job of a sweep, with the checks of the command.
 
     Launchers hand the object to their workers.
+
+    Attributes:
+        job: the last checked configuration of a job, without interpolations.
     """
+
+    job: DictConfig | None = None
 
     def __init__(self, check_job: Callable[[DictConfig], Any], config_search_path: ConfigSearchPath) -> None:
         super().__init__(config_search_path)
@@ -162,6 +177,8 @@ class _ConfigLoader(GuardedConfigLoader):
             with flag_override(job, ["struct", "readonly"], False):
                 del job["hydra"]
             set_types(config, self._check_job(job))
+            OmegaConf.resolve(job)
+            self.job = job
         finally:
             hydra_config.cfg = before
 

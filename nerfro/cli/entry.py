@@ -37,6 +37,7 @@ def entry_point(
     verbatim: tuple[str, ...] = (),
     check: Callable[[DictConfig], None] | None = None,
     expand: Expand | None = None,
+    check_inputs: Callable[[DictConfig], None] | None = None,
 ) -> Callable[[Task], Callable[[], None]]:
     """Decorate the main function of a command, which receives a checked configuration.
 
@@ -45,9 +46,9 @@ def entry_point(
 
     Args:
         command: name of the command, and of its YAML file in conf/.
-        schema, verbatim, check, expand: see `Composer`.
+        schema, verbatim, check, expand, check_inputs: see `Composer`.
     """
-    composer = Composer(command, schema, check, expand, verbatim)
+    composer = Composer(command, schema, check, expand, verbatim, check_inputs)
 
     def decorate(task: Task) -> Callable[[], None]:
         @functools.wraps(task)
@@ -100,7 +101,8 @@ def _run_by_hydra(composer: Composer, task: Task, flags: Namespace, parser: Argu
             hydra.hydra_help(name, args_parser=parser, args=flags)
         elif flags.cfg:
             hydra.show_cfg(name, overrides, flags.cfg, flags.package, flags.resolve)
-            print(f"nerfro: not checked: the data, the device and the memory, which {command} checks", file=sys.stderr)
+            unchecked = composer.check_printed(hydra)
+            print(f"nerfro: not checked: {unchecked}, which {command} checks", file=sys.stderr)
         elif flags.info:
             hydra.show_info(flags.info, name, overrides)
         elif flags.shell_completion:

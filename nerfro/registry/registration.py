@@ -52,7 +52,7 @@ SEVERAL = ("loss", "phase", "callbacks")  # a run may have several plugins of th
 _BUILT_IN = (
     "camera", "camera.refined", "media", "media.surfaces", "samplers.paths", "samplers.points", "fields", "backgrounds",
     "losses", "models", "paper", "data", "data.formats", "evaluation.image_metrics", "evaluation.perceptual",
-    "training.phases", "viewing.page", "exports",
+    "training.lightning_callbacks", "training.phases", "viewing.page", "exports",
 )  # fmt: skip
 ENTRY_POINTS = "nerfro.plugins"
 

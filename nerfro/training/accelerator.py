@@ -52,16 +52,6 @@ class Compared(NamedTuple):
     cpu: float = 0.0
 
 
-def require_accelerator(config: DictConfig) -> None:
-    """Refuse `trainer.accelerator=gpu`, `cuda` or `mps` on a machine without such a device."""
-    name, gpu = config.trainer.accelerator, find_gpu()
-    if name not in ("auto", "cpu") and (gpu is None or name not in ("gpu", gpu.type)):
-        raise NerfroError(
-            f"trainer.accelerator={name} needs a device that PyTorch {torch.__version__} does not find here; take auto "
-            "or cpu, or install a driver and a version of PyTorch for the device"
-        )
-
-
 def choose_accelerator(config: DictConfig, module: TrainingModule, data: RayDataModule) -> str:
     """Return `trainer.accelerator`, where `auto` becomes `gpu` if a GPU gives the results of the CPU in less time.
 

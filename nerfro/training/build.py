@@ -31,7 +31,7 @@ from nerfro.training.config import (
 )
 from nerfro.training.data_module import RayDataModule
 from nerfro.training.derivation import derived
-from nerfro.training.effects import settings_without_effect
+from nerfro.training.effects import warn_without_effect
 from nerfro.training.init_from import initialize_from
 from nerfro.training.module import TrainingModule
 from nerfro.training.pixel_batches import PixelBatches
@@ -84,12 +84,6 @@ def composed_training(
         return scene.added_to(overrides, names, "scene") if isinstance(scene, SceneFile) else overrides
 
     return composed("train", TrainConfig, arguments, expand, check_run, config_dir)
-
-
-def warn_without_effect(composition: Composition) -> None:
-    """Warn of given settings that have no effect in combination with the other settings."""
-    for line in settings_without_effect(composition.config, composition.overrides):
-        warn(line)
 
 
 @dataclass(frozen=True)

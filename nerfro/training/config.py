@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast, get_args
 
+import torch
 from annotated_types import Ge, Gt, Le
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -371,6 +372,16 @@ def training_device(config: DictConfig) -> str:
     return "cpu" if gpu is None or config.trainer.accelerator in ("auto", "cpu") else gpu.type
 
 
+def require_accelerator(config: DictConfig) -> None:
+    """Refuse `trainer.accelerator=gpu`, `cuda` or `mps` on a machine without such a device."""
+    name, gpu = config.trainer.accelerator, find_gpu()
+    if name not in ("auto", "cpu") and (gpu is None or name not in ("gpu", gpu.type)):
+        raise NerfroError(
+            f"trainer.accelerator={name} needs a device that PyTorch {torch.__version__} does not find here; take auto "
+            "or cpu, or install a driver and a version of PyTorch for the device"
+        )
+
+
 def require_data(config: DictConfig) -> None:
     """Refuse the missing data of a synthetic scene; the message names the command that renders the scene."""
     scene, root = scene_name(config.data.root), resolve_path(config.data.root)
@@ -378,6 +389,17 @@ def require_data(config: DictConfig) -> None:
         small = ["resolution=128", "spp=256", "test_spp=1024", "views.val=10", "views.test=20"]
         command = command_line("synthesize", [*as_overrides({"scene": scene, "out": root}), *small])
         raise NerfroError(f"{root} holds no data yet; run {command} first")
+
+
+def require_inputs(config: DictConfig) -> None:
+    """Refuse a configuration whose device or photographs are missing on this machine; images are not decoded.
+
+    Raises:
+        NerfroError: there is no such device, or the folder of the data lacks a file or has a damaged one.
+    """
+    require_accelerator(config)
+    require_data(config)
+    build_data(config).load("train")
 
 
 def build_data(config: DictConfig) -> DataSource:

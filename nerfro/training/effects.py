@@ -10,10 +10,18 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
+from nerfro.cli.calls import Composition
+from nerfro.core.errors import warn
 from nerfro.registry.allowed import OnlyWith, hints_of, schema_of, untyped
 from nerfro.registry.registration import SEVERAL, Plugin, find, plugin_of
 from nerfro.training.config import TrainConfig
 from nerfro.training.settings import flat
+
+
+def warn_without_effect(composition: Composition) -> None:
+    """Warn of given settings that have no effect in combination with the other settings."""
+    for line in settings_without_effect(composition.config, composition.overrides):
+        warn(line)
 
 
 def settings_without_effect(config: DictConfig, overrides: Iterable[str]) -> list[str]:

@@ -1,28 +1,90 @@
 """Callbacks of Lightning that a configuration may choose by name, as in `+callbacks=learning_rate_monitor`.
 
-Callbacks that conflict with those of every run (progress, time limit), or that need epochs, are left out.
+Callbacks that conflict with those of every run (progress, time limit), or that need epochs, are left out. The
+functions import Lightning, because the composition of a configuration does not need it, and the import takes seconds.
 """
 
 from __future__ import annotations
 
 from typing import Literal
 
-from lightning.pytorch import callbacks
-
 from nerfro.core.errors import NerfroError
 from nerfro.registry.allowed import Count, Natural, Share
-from nerfro.registry.registration import add, register
+from nerfro.registry.registration import register
 
-for _name, _cls in {
-    "device_stats_monitor": callbacks.DeviceStatsMonitor,
-    "early_stopping": callbacks.EarlyStopping,
-    "learning_rate_monitor": callbacks.LearningRateMonitor,
-}.items():
-    add("callbacks", _name, _cls)
+Mode = Literal["min", "max"]
+
+
+@register("callbacks", "device_stats_monitor")
+def device_stats_monitor(cpu_stats: bool | None = None) -> object:
+    """Log statistics of the device, such as its memory.
+
+    Args:
+        cpu_stats: whether statistics of the CPU are logged; None if the run trains on it, which needs psutil.
+    """
+    from lightning.pytorch.callbacks import DeviceStatsMonitor
+
+    return DeviceStatsMonitor(cpu_stats)
+
+
+@register("callbacks", "early_stopping")
+def early_stopping(
+    monitor: str,
+    min_delta: float = 0.0,
+    patience: Natural = 3,
+    mode: Mode | None = None,
+    check_finite: bool = True,
+    stopping_threshold: float | None = None,
+    divergence_threshold: float | None = None,
+) -> object:
+    """Stop the training when a logged value stops improving.
+
+    Args:
+        monitor: logged value, such as val/psnr.
+        min_delta: smallest change that counts as an improvement.
+        patience: number of validations without an improvement before the training stops.
+        mode: whether small or large values are good; None for max with PSNR and SSIM, else min.
+        check_finite: stop when the value is NaN or infinite.
+        stopping_threshold: stop as soon as the value is better.
+        divergence_threshold: stop as soon as the value is worse.
+    """
+    from lightning.pytorch.callbacks import EarlyStopping
+
+    return EarlyStopping(
+        monitor,
+        min_delta,
+        patience,
+        mode=mode or _mode(monitor),
+        check_finite=check_finite,
+        stopping_threshold=stopping_threshold,
+        divergence_threshold=divergence_threshold,
+    )
+
+
+@register("callbacks", "learning_rate_monitor")
+def learning_rate_monitor(
+    logging_interval: Literal["step", "epoch"] | None = None, log_momentum: bool = False, log_weight_decay: bool = False
+) -> object:
+    """Log the learning rate of each group of parameters.
+
+    Args:
+        logging_interval: when the rates are logged; None for the interval of the schedule.
+        log_momentum: whether the momentum is logged as well.
+        log_weight_decay: whether the weight decay is logged as well.
+    """
+    from lightning.pytorch.callbacks import LearningRateMonitor
+
+    return LearningRateMonitor(logging_interval, log_momentum, log_weight_decay)
 
 
 @register("callbacks", "model_checkpoint")
-class ModelCheckpoint(callbacks.ModelCheckpoint):
+def model_checkpoint(
+    monitor: str | None = None,
+    mode: Mode | None = None,
+    save_top_k: int = 1,
+    filename: str = "step{step:06d}",
+    dirpath: str | None = None,
+) -> object:
     """Save the best checkpoints of a run after validations, beside `checkpoints/last.ckpt`, which every run has.
 
     Args:
@@ -32,30 +94,21 @@ class ModelCheckpoint(callbacks.ModelCheckpoint):
         filename: name of the files, in which {step} and {val/psnr} stand for values.
         dirpath: folder; None for `checkpoints` of the run.
     """
+    from lightning.pytorch.callbacks import ModelCheckpoint
 
-    def __init__(
-        self,
-        monitor: str | None = None,
-        mode: Literal["min", "max"] | None = None,
-        save_top_k: int = 1,
-        filename: str = "step{step:06d}",
-        dirpath: str | None = None,
-    ) -> None:
-        if monitor is None and save_top_k not in (-1, 0, 1):
-            raise NerfroError(
-                f"callbacks.model_checkpoint.save_top_k={save_top_k} needs a value that ranks the checkpoints; add "
-                "callbacks.model_checkpoint.monitor=val/psnr"
-            )
-        if filename == "last":
-            raise NerfroError(
-                "callbacks.model_checkpoint.filename=last is the checkpoint of the run; take another name"
-            )
-        mode = mode or ("max" if monitor is not None and monitor.endswith(("psnr", "ssim")) else "min")
-        super().__init__(dirpath, filename, monitor, mode=mode, save_top_k=save_top_k, auto_insert_metric_name=False)
+    if monitor is None and save_top_k not in (-1, 0, 1):
+        raise NerfroError(
+            f"callbacks.model_checkpoint.save_top_k={save_top_k} needs a value that ranks the checkpoints; add "
+            "callbacks.model_checkpoint.monitor=val/psnr"
+        )
+    if filename == "last":
+        raise NerfroError("callbacks.model_checkpoint.filename=last is the checkpoint of the run; take another name")
+    mode = mode or _mode(monitor or "")
+    return ModelCheckpoint(dirpath, filename, monitor, mode=mode, save_top_k=save_top_k, auto_insert_metric_name=False)
 
 
 @register("callbacks", "weight_averaging")
-class WeightAveraging(callbacks.EMAWeightAveraging):
+def weight_averaging(decay: Share = 0.999, every: Count = 1, start: Natural = 0) -> object:
     """Average the weights over the steps; validation, scores and checkpoints have the exponential moving average.
 
     Args:
@@ -63,7 +116,11 @@ class WeightAveraging(callbacks.EMAWeightAveraging):
         every: number of steps between two updates.
         start: step of the first update.
     """
+    from lightning.pytorch.callbacks import EMAWeightAveraging
 
-    def __init__(self, decay: Share = 0.999, every: Count = 1, start: Natural = 0) -> None:
-        # Buffers, such as the density grid, are states and no weights; the average has their latest values.
-        super().__init__(use_buffers=False, decay=decay, update_every_n_steps=every, update_starting_at_step=start)
+    # Buffers, such as the density grid, are states and no weights; the average has their latest values.
+    return EMAWeightAveraging(use_buffers=False, decay=decay, update_every_n_steps=every, update_starting_at_step=start)
+
+
+def _mode(monitor: str) -> Mode:
+    return "max" if monitor.endswith(("psnr", "ssim")) else "min"

@@ -22,9 +22,11 @@ from nerfro.fields.networks import compile_networks
 from nerfro.rendering.scene_file import SceneFile
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.silhouettes.mesh_match import require_match
-from nerfro.training.accelerator import choose_accelerator, require_accelerator
-from nerfro.training.build import Training, check_before_training, composed_training, warn_without_effect
+from nerfro.training.accelerator import choose_accelerator
+from nerfro.training.build import Training, check_before_training, composed_training
 from nerfro.training.callbacks import StopOnSignal, Throughput, steps_by_phase
+from nerfro.training.config import require_accelerator
+from nerfro.training.effects import warn_without_effect
 from nerfro.training.run_folder import LAST_CHECKPOINT, begin, lock_run, next_steps, require_same_run
 from nerfro.training.settings import with_values
 from nerfro.training.trainer import finish_logs, fit, make_trainer, print_profile, quieten_lightning

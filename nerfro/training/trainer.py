@@ -20,7 +20,6 @@ from lightning.pytorch.profilers import AdvancedProfiler, PyTorchProfiler, Simpl
 from lightning.pytorch.strategies import DDPStrategy
 from omegaconf import DictConfig
 
-import nerfro.training.lightning_callbacks  # noqa: F401 - registers callbacks
 from nerfro.core.errors import NerfroError
 from nerfro.files.atomic import atomic_file
 from nerfro.kernels.available import fast_bfloat16, keep_freed_memory

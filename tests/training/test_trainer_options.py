@@ -79,9 +79,21 @@ def test_cfg_refuses_the_settings_that_training_refuses_with_the_same_error(
 
 @pytest.mark.parametrize("key", ["runtime.cwd", "runtime.output_dir", "job.name"])
 def test_settings_may_refer_to_hydra(key: str, train: Runner) -> None:
-    printed = train("trainer.max_steps=1", f"data.root=${{hydra:{key}}}/data", "--cfg", "job")
-    assert "not checked: the data, the device and the memory, which train checks" in printed.err
-    assert f"root: ${{hydra:{key}}}/data" in printed.out
+    printed = train("trainer.max_steps=1", f"ckpt_path=${{hydra:{key}}}/data", "--cfg", "job")
+    assert "not checked: the pixels, the object and the memory, which train checks" in printed.err
+    assert f"ckpt_path: ${{hydra:{key}}}/data" in printed.out
+
+
+def test_cfg_refuses_missing_data_and_devices_after_the_configuration(
+    train: Runner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DATA", str(tmp_path / "gone"))
+    printed = train("trainer.max_steps=1", "data.root=${oc.env:DATA}", "--cfg", "job", code=1)
+    assert "root: ${oc.env:DATA}" in printed.out
+    assert printed.error == f"data.root={tmp_path / 'gone'} is not a folder; give the folder of the data set"
+    monkeypatch.setattr("nerfro.training.config.find_gpu", lambda: None)
+    refused_gpu = train("trainer.max_steps=1", "trainer.accelerator=gpu", "--cfg", "job", code=1)
+    assert refused_gpu.error.startswith("trainer.accelerator=gpu needs a device")
 
 
 @pytest.mark.parametrize("name", REFUSED)
