@@ -1,4 +1,4 @@
-"""Changes of a trained model: another sky, other indices or absorption, no glass, or nothing inside."""
+"""Changes of a trained model: another sky, other indices or absorption, no glass, nothing inside, or normals."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from nerfro.backgrounds.constant import ConstantBackground
 from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.core.errors import NerfroError
 from nerfro.core.light import to_srgb
@@ -24,7 +25,33 @@ class EmptyField(Field):
         return FieldValues(torch.zeros_like(samples.s), torch.zeros_like(samples.positions))
 
 
-def with_changed_scene(renderer: Renderer, **changes: nn.Module) -> Renderer:
+class NormalsField(Field):
+    """Radiance field whose radiance is the normal of another field, the unit vector against its density gradient.
+
+    Args:
+        field: the field.
+    """
+
+    def __init__(self, field: Field) -> None:
+        super().__init__()
+        self.field = field
+
+    @property
+    def bounds(self) -> Float[Tensor, "2 3"] | None:
+        return self.field.bounds
+
+    def forward(self, samples: Samples) -> FieldValues:
+        density = self.field(samples).density
+        normals, solid = torch.zeros_like(samples.positions), density > 0
+        if solid.any():
+            with torch.inference_mode(False), torch.enable_grad():  # renderings have no gradients otherwise
+                positions = samples.positions[solid].clone().requires_grad_()
+                (gradient,) = torch.autograd.grad(self.field.density(positions).sum(), positions)
+            normals[solid] = -nn.functional.normalize(gradient, dim=-1).to(normals)
+        return FieldValues(density, normals)
+
+
+def with_changed_scene(renderer: Renderer, **changes: object) -> Renderer:
     """Copy a renderer with some components of its scene replaced; the copy shares all other components."""
     return variant(renderer, scene=variant(renderer.scene, **changes))
 
@@ -72,6 +99,15 @@ def without_glass(renderer: Renderer) -> Renderer:
 def without_inside(renderer: Renderer) -> Renderer:
     """Replace the radiance fields by empty ones, so that only glass and background remain."""
     return with_changed_scene(renderer, fields=nn.ModuleList(EmptyField() for _ in renderer.scene.fields))
+
+
+def with_normals(renderer: Renderer) -> Renderer:
+    """Show normals of the content as linear radiance, before black and without absorption."""
+    scene, colours = renderer.scene, ColourSpace.LINEAR
+    if scene.medium.absorption is not None:
+        renderer = with_absorption(renderer, torch.zeros(len(scene.medium.indices), 3))
+    fields, black = nn.ModuleList(map(NormalsField, scene.fields)), ConstantBackground().to(scene.device)
+    return with_changed_scene(renderer, fields=fields.eval(), background=black, colour_space=colours)
 
 
 def _of_bodies(values: Tensor, current: Tensor, name: str) -> Tensor:

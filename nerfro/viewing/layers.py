@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from nerfro.core.cameras import Cameras
 from nerfro.viewing.trained_scene import RenderedViews, TrainedScene
@@ -21,6 +22,7 @@ class Layer:
 
     Attributes:
         glass, inside: whether the rendered scene contains the glass, and the content of the glass.
+        normals: whether the content shows its normals.
         values: values in their units: linear radiance, world units or unit vectors.
         shown: values as sRGB in [0, 1]; depth is scaled to the bounds of the camera's rays.
     """
@@ -29,10 +31,11 @@ class Layer:
     inside: bool
     values: Callable[[RenderedViews], Images]
     shown: Callable[[RenderedViews, Cameras], Images]
+    normals: bool = False
 
     def of(self, scene: TrainedScene) -> TrainedScene:
         """Return the scene with the components of this layer."""
-        return scene if self.glass and self.inside else scene.with_(glass=self.glass, inside=self.inside)
+        return scene.with_(glass=self.glass, inside=self.inside, normals=self.normals)
 
 
 def _grey(values: Float[Tensor, "V H W"]) -> Images:
@@ -50,6 +53,11 @@ def _vector_image(values: Images) -> Images:
     return torch.where((values == 0).all(-1, keepdim=True), 0.0, 0.5 + 0.5 * values).clamp(0, 1)
 
 
+def _content_normals(rendered: RenderedViews) -> Images:
+    """Return the composited normals as unit vectors; zero in pixels of low opacity."""
+    return torch.where(rendered.opacity[..., None] < 0.5, 0.0, normalize(rendered.radiance, dim=-1))
+
+
 def _colours(glass: bool = True, inside: bool = True) -> Layer:
     return Layer(glass, inside, lambda rendered: rendered.radiance, lambda rendered, _: rendered.rgb)
 
@@ -58,6 +66,9 @@ LAYERS = {
     "rgb": _colours(),
     "depth": Layer(True, True, lambda rendered: rendered.depth[..., None], _depth_image),
     "normals": Layer(True, True, lambda r: r.normals, lambda r, _: _vector_image(r.normals)),
+    "content_normals": Layer(
+        True, True, _content_normals, lambda r, _: _vector_image(_content_normals(r)), normals=True
+    ),
     "opacity": Layer(True, True, lambda r: r.opacity[..., None], lambda r, _: _grey(r.opacity)),
     "exits": Layer(True, True, lambda r: r.exit_directions, lambda r, _: _vector_image(r.exit_directions)),
     "glass": _colours(inside=False),

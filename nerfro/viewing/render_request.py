@@ -50,7 +50,8 @@ class RenderConfig:
         target: point in the centre of the still image, world units; by default the centre of the object.
         fov: horizontal field of view, degrees; by default that of the photographs.
         resolution: width in pixels, or [width, height]; by default that of the photographs.
-        what: rgb, depth, normals, opacity, exits, glass (nothing inside), inside (no glass), or sky (neither).
+        what: rgb, depth, normals (of the glass), content_normals, opacity, exits, glass (nothing inside), inside (no
+            glass), or sky (neither).
         sky: lat-long image that replaces the sky (.hdr, .exr, .png, .jpg).
         subdivision: pixels with several rays (see docs/concepts/background.md); by default as in the evaluation
             of the run.
@@ -76,7 +77,7 @@ class RenderConfig:
     target: list[float] | None = None
     fov: Angle | None = None
     resolution: Any = None
-    what: Literal["rgb", "depth", "normals", "opacity", "exits", "glass", "inside", "sky"] = "rgb"
+    what: Literal["rgb", "depth", "normals", "content_normals", "opacity", "exits", "glass", "inside", "sky"] = "rgb"
     sky: str | None = None
     subdivision: SubdivisionChanges = dataclasses.field(default_factory=SubdivisionChanges)
     chunk_size: Count | None = None

@@ -28,7 +28,7 @@ from nerfro.files.images import data_uri, to_8bit
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.rendering import Renderer
 from nerfro.samplers.subdivision import Subdivision
-from nerfro.viewing.changes import with_absorption, with_indices, with_sky, without_glass, without_inside
+from nerfro.viewing.changes import with_absorption, with_indices, with_normals, with_sky, without_glass, without_inside
 from nerfro.viewing.surface import surface_of
 
 
@@ -225,6 +225,7 @@ class TrainedScene:
         absorption: Sequence[float] | Tensor | None = None,
         glass: bool = True,
         inside: bool = True,
+        normals: bool = False,
     ) -> TrainedScene:
         """Return a copy with some components replaced; the copy shares all other components.
 
@@ -234,6 +235,9 @@ class TrainedScene:
             absorption: absorption of red, green and blue in the first body [3], or in each body [K, 3], per world unit.
             glass: False removes the glass, so that all rays are straight.
             inside: False removes the content of the glass.
+            normals: True replaces the radiance of the content by its normals, from the gradient of the density, and the
+                background by black. `normalize(scene.with_(normals=True).render(cameras).radiance, dim=-1)` are unit
+                vectors.
 
         Raises:
             NerfroError: the model lacks the component, or a value is invalid.
@@ -250,4 +254,6 @@ class TrainedScene:
             renderer = without_glass(renderer)
         if not inside:
             renderer = without_inside(renderer)
+        if normals:
+            renderer = with_normals(renderer)
         return replace(self, renderer=renderer)

@@ -7,15 +7,26 @@ import pytest
 import torch
 
 import nerfro
+from nerfro.core.types import FieldValues, Samples
 from nerfro.core.variants import variant
 from nerfro.evaluation.results import read_metrics_json
 from nerfro.files import lat_long
 from nerfro.samplers.paths.snell import Snell
+from nerfro.samplers.subdivision import Subdivision
 from nerfro.viewing.changes import with_changed_scene
+from nerfro.viewing.layers import LAYERS
 from nerfro.viewing.trained_scene import TrainedScene
 from tests.closed_forms import ball_exits
 from tests.conftest import refused
 from tests.viewing.conftest import INSIDE_CENTRE, INSIDE_RADIUS, IOR, RADIUS, SolidBall, colour, sky_of
+
+
+class SmoothBall(SolidBall):
+    """A ball whose density grows from its surface."""
+
+    def forward(self, samples: Samples) -> FieldValues:
+        radius = (samples.positions - torch.tensor(INSIDE_CENTRE)).norm(dim=-1)
+        return FieldValues(10_000 * (INSIDE_RADIUS - radius).clamp(min=0), colour(samples.positions))
 
 
 def rays_of(scene: TrainedScene) -> tuple[torch.Tensor, torch.Tensor]:
@@ -65,6 +76,23 @@ def test_content_without_glass_lies_on_straight_rays(scene: TrainedScene) -> Non
     places = origins + depth[:, None] * directions
     torch.testing.assert_close(rendered.radiance[0].view(-1, 3)[hit], colour(places)[hit], atol=spacing, rtol=0)
     assert not rendered.normals.any()
+
+
+def test_normals_of_the_content_are_those_of_a_ball(scene: TrainedScene) -> None:
+    fields = torch.nn.ModuleList([SmoothBall()])
+    ball = replace(scene, renderer=with_changed_scene(scene.renderer, fields=fields))
+    origins, directions = rays_of(scene)
+    offset = origins - torch.tensor(INSIDE_CENTRE)
+    towards = -(offset * directions).sum(-1)
+    impact = (offset + towards[:, None] * directions).norm(dim=-1)
+    first = offset + (towards - (INSIDE_RADIUS**2 - impact**2).clamp(min=0).sqrt())[:, None] * directions
+    layer = LAYERS["content_normals"]
+    rendered = layer.of(ball.with_(glass=False)).render(scene.cameras().select([0]), Subdivision())
+    normals, hit = layer.values(rendered)[0].view(-1, 3), impact < 0.7 * INSIDE_RADIUS
+    torch.testing.assert_close(normals[hit], (first / INSIDE_RADIUS)[hit], atol=0.1, rtol=0)
+    assert not normals[impact > 1.3 * INSIDE_RADIUS].any()
+    through_glass = layer.of(ball).render(scene.cameras().select([0]), Subdivision())
+    assert (layer.values(through_glass).norm(dim=-1) > 0.5).any()
 
 
 def test_changed_scene_does_not_change_the_original(scene: TrainedScene) -> None:
