@@ -1,13 +1,17 @@
-"""Progress bars for long work; a log file receives one line per minute instead of a bar."""
+"""Progress bars for long work, with one line per minute in log files, and durations as text."""
 
 from __future__ import annotations
 
+import math
+import re
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
 from tqdm import tqdm
+
+from nerfro.core.errors import NerfroError
 
 Item = TypeVar("Item")
 
@@ -74,3 +78,21 @@ def fraction_bar(description: str) -> Iterator[Callable[[float], None]]:
     """Show a progress bar; the yielded function sets the completed fraction in [0, 1]."""
     with progress_bar(description, 1.0) as progress:
         yield lambda done: progress.update(done - progress.n)
+
+
+def clock_time(duration: object) -> object:
+    """Convert a duration with a unit, such as `90s`, `5m`, `1.5h` or `2d`, to the form DD:HH:MM:SS.
+
+    Args:
+        duration: `trainer.max_time`. None, and mappings, from which Lightning builds a `timedelta`, are returned as is.
+
+    Raises:
+        NerfroError: the text or number is not a duration.
+    """
+    if duration is None or isinstance(duration, Mapping) or re.fullmatch(r"\d+:\d\d:\d\d:\d\d", str(duration)):
+        return duration
+    match = re.fullmatch(r"(\d{1,6}(?:\.\d+)?)([smhd])", str(duration))
+    if match is None:
+        raise NerfroError(f"trainer.max_time={duration} is not a duration; write 90s, 5m, 1h, 2d or DD:HH:MM:SS")
+    seconds = math.ceil(float(match[1]) * {"s": 1, "m": 60, "h": 3600, "d": 86400}[match[2]])
+    return f"{seconds // 86400:02d}:{seconds // 3600 % 24:02d}:{seconds // 60 % 60:02d}:{seconds % 60:02d}"

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 from nerfro.cli.overrides import as_overrides, command_line
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import CONF_DIR, resolve_path, scene_name
+from nerfro.core.progress import clock_time
 from nerfro.data.base import DataSource
 from nerfro.data.validation_views import WithValidationViews
 from nerfro.evaluation.results import Region
@@ -334,24 +333,6 @@ def check_run(config: DictConfig) -> None:
         raise NerfroError("the run would never end; set trainer.max_time, such as 5m, trainer.max_steps, or both")
 
 
-def clock_time(duration: object) -> object:
-    """Convert a duration with a unit, such as `90s`, `5m`, `1.5h` or `2d`, to the form DD:HH:MM:SS.
-
-    Args:
-        duration: `trainer.max_time`. None, and mappings, from which Lightning builds a `timedelta`, are returned as is.
-
-    Raises:
-        NerfroError: the text or number is not a duration.
-    """
-    if duration is None or isinstance(duration, Mapping) or re.fullmatch(r"\d+:\d\d:\d\d:\d\d", str(duration)):
-        return duration
-    match = re.fullmatch(r"(\d{1,6}(?:\.\d+)?)([smhd])", str(duration))
-    if match is None:
-        raise NerfroError(f"trainer.max_time={duration} is not a duration; write 90s, 5m, 1h, 2d or DD:HH:MM:SS")
-    seconds = math.ceil(float(match[1]) * {"s": 1, "m": 60, "h": 3600, "d": 86400}[match[2]])
-    return f"{seconds // 86400:02d}:{seconds // 3600 % 24:02d}:{seconds // 60 % 60:02d}:{seconds % 60:02d}"
-
-
 def resolve_trainer_options(config: DictConfig) -> DictConfig:
     """Convert `max_time`, and shorten the run to a few steps and one scored view for `debug` or `fast_dev_run`."""
     values: dict[str, Any] = {"trainer.max_time": clock_time(config.trainer.max_time)}
@@ -368,8 +349,7 @@ def resolve_trainer_options(config: DictConfig) -> DictConfig:
 
 def training_device(config: DictConfig) -> str:
     """Return the kind of device that a run trains on, `cpu`, `cuda` or `mps`; `auto` means the CPU."""
-    gpu = find_gpu()
-    return "cpu" if gpu is None or config.trainer.accelerator in ("auto", "cpu") else gpu.type
+    return "cpu" if (gpu := find_gpu()) is None or config.trainer.accelerator in ("auto", "cpu") else gpu.type
 
 
 def require_accelerator(config: DictConfig) -> None:

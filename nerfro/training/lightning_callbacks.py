@@ -29,14 +29,9 @@ def device_stats_monitor(cpu_stats: bool | None = None) -> object:
 
 @register("callbacks", "early_stopping")
 def early_stopping(
-    monitor: str,
-    min_delta: float = 0.0,
-    patience: Natural = 3,
-    mode: Mode | None = None,
-    check_finite: bool = True,
-    stopping_threshold: float | None = None,
-    divergence_threshold: float | None = None,
-) -> object:
+    monitor: str, min_delta: float = 0.0, patience: Natural = 3, mode: Mode | None = None, check_finite: bool = True,
+    stopping_threshold: float | None = None, divergence_threshold: float | None = None,
+) -> object:  # fmt: skip
     """Stop the training when a logged value stops improving.
 
     Args:
@@ -51,40 +46,29 @@ def early_stopping(
     from lightning.pytorch.callbacks import EarlyStopping
 
     return EarlyStopping(
-        monitor,
-        min_delta,
-        patience,
-        mode=mode or _mode(monitor),
-        check_finite=check_finite,
-        stopping_threshold=stopping_threshold,
-        divergence_threshold=divergence_threshold,
-    )
+        monitor, min_delta, patience, mode=mode or _mode(monitor), check_finite=check_finite,
+        stopping_threshold=stopping_threshold, divergence_threshold=divergence_threshold,
+    )  # fmt: skip
 
 
 @register("callbacks", "learning_rate_monitor")
-def learning_rate_monitor(
-    logging_interval: Literal["step", "epoch"] | None = None, log_momentum: bool = False, log_weight_decay: bool = False
-) -> object:
+def learning_rate_monitor(log_momentum: bool = False, log_weight_decay: bool = False) -> object:
     """Log the learning rate of each group of parameters.
 
     Args:
-        logging_interval: when the rates are logged; None for the interval of the schedule.
         log_momentum: whether the momentum is logged as well.
         log_weight_decay: whether the weight decay is logged as well.
     """
     from lightning.pytorch.callbacks import LearningRateMonitor
 
-    return LearningRateMonitor(logging_interval, log_momentum, log_weight_decay)
+    return LearningRateMonitor(None, log_momentum, log_weight_decay)
 
 
 @register("callbacks", "model_checkpoint")
 def model_checkpoint(
-    monitor: str | None = None,
-    mode: Mode | None = None,
-    save_top_k: int = 1,
-    filename: str = "step{step:06d}",
-    dirpath: str | None = None,
-) -> object:
+    monitor: str | None = None, mode: Mode | None = None, save_top_k: int = 1,
+    filename: str = "step{step:06d}", dirpath: str | None = None,
+) -> object:  # fmt: skip
     """Save the best checkpoints of a run after validations, beside `checkpoints/last.ckpt`, which every run has.
 
     Args:
@@ -98,8 +82,7 @@ def model_checkpoint(
 
     if monitor is None and save_top_k not in (-1, 0, 1):
         raise NerfroError(
-            f"callbacks.model_checkpoint.save_top_k={save_top_k} needs a value that ranks the checkpoints; add "
-            "callbacks.model_checkpoint.monitor=val/psnr"
+            f"callbacks.model_checkpoint.save_top_k={save_top_k} needs callbacks.model_checkpoint.monitor=val/psnr"
         )
     if filename == "last":
         raise NerfroError("callbacks.model_checkpoint.filename=last is the checkpoint of the run; take another name")

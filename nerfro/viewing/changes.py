@@ -106,8 +106,9 @@ def with_normals(renderer: Renderer) -> Renderer:
     scene, colours = renderer.scene, ColourSpace.LINEAR
     if scene.medium.absorption is not None:
         renderer = with_absorption(renderer, torch.zeros(len(scene.medium.indices), 3))
-    fields, black = nn.ModuleList(map(NormalsField, scene.fields)), ConstantBackground().to(scene.device)
-    return with_changed_scene(renderer, fields=fields.eval(), background=black, colour_space=colours)
+    fields = nn.ModuleList(NormalsField(field) for field in scene.fields).eval()  # type: ignore[arg-type]
+    black = ConstantBackground().to(scene.device)
+    return with_changed_scene(renderer, fields=fields, background=black, colour_space=colours)
 
 
 def _of_bodies(values: Tensor, current: Tensor, name: str) -> Tensor:

@@ -16,11 +16,12 @@ from lightning.pytorch.callbacks import Timer
 from omegaconf import OmegaConf
 
 import nerfro.training.trainer
+from nerfro.core.progress import clock_time
 from nerfro.registry.allowed import Refused, plain, untyped, validate
 from nerfro.registry.registration import build, find, register
 from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.testing import check
-from nerfro.training.config import TrainConfig, TrainerConfig, clock_time, resolve_trainer_options
+from nerfro.training.config import TrainConfig, TrainerConfig, resolve_trainer_options
 from nerfro.training.pixel_batches import PixelBatches
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
 from nerfro.training.trainer import _OWN
