@@ -91,10 +91,13 @@ def test_cfg_refuses_missing_data_and_devices_after_the_configuration(
     monkeypatch.setenv("DATA", str(tmp_path / "gone"))
     printed = train("trainer.max_steps=1", "data.root=${oc.env:DATA}", "--cfg", "job", code=1)
     assert "root: ${oc.env:DATA}" in printed.out
-    assert printed.error == f"data.root={tmp_path / 'gone'} is not a folder; give the folder of the data set"
+    assert (
+        printed.error
+        == f"nerfro: error: data.root={tmp_path / 'gone'} is not a folder; give the folder of the data set"
+    )
     monkeypatch.setattr("nerfro.training.config.find_gpu", lambda: None)
     refused_gpu = train("trainer.max_steps=1", "trainer.accelerator=gpu", "--cfg", "job", code=1)
-    assert refused_gpu.error.startswith("trainer.accelerator=gpu needs a device")
+    assert refused_gpu.error.startswith("nerfro: error: trainer.accelerator=gpu needs a device")
 
 
 @pytest.mark.parametrize("name", REFUSED)
