@@ -14,7 +14,7 @@ import torch
 from annotated_types import Ge
 from jaxtyping import Float
 
-from nerfro.core.cameras import Cameras, central_window
+from nerfro.core.cameras import Cameras, central_window, room_rotations
 from nerfro.core.errors import NerfroError, first_of
 from nerfro.core.paths import refuse_root, resolve_path
 from nerfro.data.base import SPLITS, DataSource, Frame, Views
@@ -46,6 +46,7 @@ class FrameSet:
         depths: depth images, one per frame; empty if there are none, see `nerfro.data.depths`.
         depth_unit: world units per level of the depth images.
         points: 3-D points that each frame has observed, world units, which give depths; empty if there are none.
+        turntable: the option of the same name of `PosedImages`, where it is left open.
     """
 
     frames: Sequence[Frame]
@@ -58,6 +59,7 @@ class FrameSet:
     depths: Sequence[Path | None] = ()
     depth_unit: float = 1.0
     points: Sequence[Float[np.ndarray, "_ 3"]] = ()
+    turntable: bool | list[float] = False
 
 
 @validated("data")
@@ -73,6 +75,9 @@ class PosedImages(DataSource):
         alpha: `drop` ignores transparency; `white` and `black` composite the images over this colour.
         mask_labels: labels of the object in the masks, as indices of palette images or as grey levels; None to use all
             labels but the background.
+        turntable: whether the object turns before a camera that stands still, and the poses are relative to the object;
+            for a camera at several heights, the axis [x, y, z] of rotation in the world, upwards. None for the value of
+            the data set, which is false unless a transforms file has the key `turntable`.
 
     Raises:
         NerfroError: an option is out of range.
@@ -86,8 +91,10 @@ class PosedImages(DataSource):
         downscale: Factor = 1,
         alpha: Alpha = "drop",
         mask_labels: list[int] | None = None,
+        turntable: bool | list[float] | None = None,
     ) -> None:
         _check_bounds(near, far)
+        self.turntable = turntable
         self.root = resolve_path(root)
         self.near, self.far, self.downscale, self.alpha, self.mask_labels = near, far, downscale, alpha, mask_labels
         self._images_of_masks: dict[Path, Path] = {}
@@ -153,7 +160,11 @@ class PosedImages(DataSource):
         intrinsics, distortion = lens_tensors(read.lenses)
         scale = torch.tensor([width / stored[0], height / stored[1]], dtype=torch.float64).repeat(2)
         fx, fy, cx, cy = (intrinsics * scale).float().unbind(-1)
-        cameras = Cameras(torch.from_numpy(poses).float(), fx, fy, cx, cy, width, height, near, far, distortion)
+        turntable = _checked_turntable(read.turntable if self.turntable is None else self.turntable)
+        cameras = Cameras(
+            torch.from_numpy(poses).float(), fx, fy, cx, cy, width, height, near, far, distortion, turntable
+        )
+        room_rotations(cameras.camera_to_world, turntable)  # refuses cameras without an azimuth
         usable = find_usable(files, read.usable, self.downscale, stored) if any(read.usable) else None
         maps = {DEPTH: read_depths(read.depths, read.depth_unit, cameras)} if any(read.depths) else {}
         if read.points:
@@ -188,6 +199,13 @@ class PosedImages(DataSource):
                     f"mask {frame.mask} is found for {image} and for {frame.image}; put masks into the same folders "
                     "below masks/ as the images, or name each mask in the data set (mask_path)"
                 )
+
+
+def _checked_turntable(value: bool | Sequence[float]) -> bool | tuple[float, ...]:
+    """Return the value of `turntable` for cameras; an axis has three numbers that are not all zero."""
+    if isinstance(value, bool) or (len(value) == 3 and any(value)):
+        return value if isinstance(value, bool) else tuple(value)
+    raise NerfroError(f"data.turntable={list(value)} is no axis; give true, or a direction such as [0,0,1]")
 
 
 def _check_bounds(near: float | None, far: float | None) -> None:

@@ -49,6 +49,13 @@ class Manifest:
         check(f"{self.path}: ", {key: float}, {key: value})
         return default if value is None else value
 
+    @property
+    def turntable(self) -> bool | list[float]:
+        """The key `turntable` of the file, see `PosedImages`; false without the key."""
+        value: Any = self.document.get("turntable")
+        check(f"{self.path}: ", {"turntable": bool | list[float]}, {"turntable": value})
+        return value or False
+
     def lenses(self, indices: Sequence[int] | None = None) -> list[Lens]:
         """Read the lenses of all frames, or of those at `indices`, for the size of their images; see `read_lens`."""
         entries: Any = self.document["frames"]
