@@ -83,7 +83,7 @@ def room_rotations(
     across = right - (right * up).sum(-1, keepdim=True) * up
     if bool((across.norm(dim=-1) < 0.1).any()):
         raise NerfroError(
-            f"data.turntable={turntable}: the horizontal axis of an image is parallel to the axis of rotation; "
+            f"data.turntable_axis={turntable}: the horizontal axis of an image is parallel to the axis of rotation; "
             "rotate the photographs, or take data.turntable=true for a camera that stands still"
         )
     right = torch.nn.functional.normalize(across, dim=-1)

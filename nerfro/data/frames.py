@@ -46,7 +46,7 @@ class FrameSet:
         depths: depth images, one per frame; empty if there are none, see `nerfro.data.depths`.
         depth_unit: world units per level of the depth images.
         points: 3-D points that each frame has observed, world units, which give depths; empty if there are none.
-        turntable: the option of the same name of `PosedImages`, where it is left open.
+        turntable: whether the object turns, or its axis, where the options leave this open; see `turntable_of`.
     """
 
     frames: Sequence[Frame]
@@ -59,7 +59,7 @@ class FrameSet:
     depths: Sequence[Path | None] = ()
     depth_unit: float = 1.0
     points: Sequence[Float[np.ndarray, "_ 3"]] = ()
-    turntable: bool | list[float] = False
+    turntable: bool | tuple[float, ...] = False
 
 
 @validated("data")
@@ -75,9 +75,10 @@ class PosedImages(DataSource):
         alpha: `drop` ignores transparency; `white` and `black` composite the images over this colour.
         mask_labels: labels of the object in the masks, as indices of palette images or as grey levels; None to use all
             labels but the background.
-        turntable: whether the object turns before a camera that stands still, and the poses are relative to the object;
-            for a camera at several heights, the axis [x, y, z] of rotation in the world, upwards. None for the value of
-            the data set, which is false unless a transforms file has the key `turntable`.
+        turntable: whether the object turns before a camera that stands still, and the poses are relative to the object.
+            None for the key `turntable` of a transforms file, or false.
+        turntable_axis: axis of rotation in the world, upwards, of an object that turns before a camera at several
+            heights; None for the key `turntable_axis` of a transforms file, or one camera that stands still.
 
     Raises:
         NerfroError: an option is out of range.
@@ -91,10 +92,11 @@ class PosedImages(DataSource):
         downscale: Factor = 1,
         alpha: Alpha = "drop",
         mask_labels: list[int] | None = None,
-        turntable: bool | list[float] | None = None,
+        turntable: bool | None = None,
+        turntable_axis: list[float] | None = None,
     ) -> None:
         _check_bounds(near, far)
-        self.turntable = turntable
+        self._turntable = turntable_of("data.", turntable, turntable_axis)
         self.root = resolve_path(root)
         self.near, self.far, self.downscale, self.alpha, self.mask_labels = near, far, downscale, alpha, mask_labels
         self._images_of_masks: dict[Path, Path] = {}
@@ -160,7 +162,7 @@ class PosedImages(DataSource):
         intrinsics, distortion = lens_tensors(read.lenses)
         scale = torch.tensor([width / stored[0], height / stored[1]], dtype=torch.float64).repeat(2)
         fx, fy, cx, cy = (intrinsics * scale).float().unbind(-1)
-        turntable = _checked_turntable(read.turntable if self.turntable is None else self.turntable)
+        turntable = read.turntable if self._turntable is None else self._turntable
         cameras = Cameras(
             torch.from_numpy(poses).float(), fx, fy, cx, cy, width, height, near, far, distortion, turntable
         )
@@ -201,11 +203,11 @@ class PosedImages(DataSource):
                 )
 
 
-def _checked_turntable(value: bool | Sequence[float]) -> bool | tuple[float, ...]:
-    """Return the value of `turntable` for cameras; an axis has three numbers that are not all zero."""
-    if isinstance(value, bool) or (len(value) == 3 and any(value)):
-        return value if isinstance(value, bool) else tuple(value)
-    raise NerfroError(f"data.turntable={list(value)} is no axis; give true, or a direction such as [0,0,1]")
+def turntable_of(where: str, turntable: bool | None, axis: Sequence[float] | None) -> bool | tuple[float, ...] | None:
+    """Return `Cameras.turntable` of the settings `turntable` and `turntable_axis`; None if both are left open."""
+    if axis is not None and (len(axis) != 3 or not any(axis)):
+        raise NerfroError(f"{where}turntable_axis={list(axis)} is no axis; give a direction such as [0,0,1]")
+    return turntable if axis is None or turntable is False else tuple(axis)
 
 
 def _check_bounds(near: float | None, far: float | None) -> None:

@@ -201,7 +201,7 @@ class ViewSplits(DataSet):
             content = {"camera_angle_x": self.angle_x, "frames": frames}
             if self.options.turntable:
                 # With an axis, cameras at several heights see the same room.
-                content["turntable"] = True if self.options.cameras == "ring" else [0.0, 0.0, 1.0]
+                content |= {"turntable": True} if self.options.cameras == "ring" else {"turntable_axis": [0, 0, 1]}
             write_json(self.folder / f"transforms_{split}.json", content)
 
     def next_command(self) -> str:

@@ -147,7 +147,8 @@ def transforms_document(
         pose[:, 3] += origin
         frames.append({**entry, "transform_matrix": [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]]})
     model = "FULL_OPENCV" if rational else "OPENCV"
-    turntable = {"turntable": cameras.turntable} if cameras.turntable else {}
+    axis = cameras.turntable
+    turntable = {} if axis is False else {"turntable": True} if axis is True else {"turntable_axis": axis}
     return {"camera_model": model, "w": cameras.width, "h": cameras.height, **turntable, "frames": frames}
 
 
