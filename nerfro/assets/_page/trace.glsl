@@ -17,6 +17,7 @@ uniform int stride;
 uniform ivec2 first, corner;
 uniform float height;
 uniform mat3 axes;
+uniform mat3 room;  // axes of the room in which the background stands still
 uniform vec3 eye;
 uniform float near;
 
@@ -255,8 +256,9 @@ void march(vec3 x, vec3 d, float start, float end, vec3 bodyAbsorption, inout ve
   throughput *= transmittance * exp(-bodyAbsorption * (min(end, FAR) - start));
 }
 
-// Returns the background radiance from a direction.
-vec3 backgroundRadiance(vec3 d) {
+// Returns the background radiance from a direction of the world.
+vec3 backgroundRadiance(vec3 direction) {
+  vec3 d = direction * room;
   const float PI = 3.14159265358979;
   if (skyIsPicture) {
     return textureLod(picture, vec2(0.5 - atan(d.y, d.x) / (2.0 * PI), acos(clamp(d.z, -1.0, 1.0)) / PI), 0.0).rgb;
