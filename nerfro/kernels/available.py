@@ -77,6 +77,16 @@ def find_gpu() -> torch.device | None:
     return torch.device("mps") if torch.backends.mps.is_available() else None
 
 
+def require_accelerator(name: str) -> None:
+    """Refuse the accelerator `gpu`, `cuda` or `mps` on a machine without such a device."""
+    gpu = find_gpu()
+    if name not in ("auto", "cpu") and (gpu is None or name not in ("gpu", gpu.type)):
+        raise NerfroError(
+            f"trainer.accelerator={name} needs a device that PyTorch {torch.__version__} does not find here; take auto "
+            "or cpu, or install a driver and a version of PyTorch for the device"
+        )
+
+
 def gpu_name(gpu: torch.device) -> str:
     """Return the name of a GPU, such as "NVIDIA H200"."""
     return torch.cuda.get_device_name(gpu) if gpu.type == "cuda" else "Apple GPU"

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast, get_args
 
-import torch
 from annotated_types import Ge, Gt, Le
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -21,7 +20,7 @@ from nerfro.data.base import DataSource
 from nerfro.data.validation_views import WithValidationViews
 from nerfro.evaluation.results import Region
 from nerfro.geometry.box import corners_of_box
-from nerfro.kernels.available import find_gpu
+from nerfro.kernels.available import find_gpu, require_accelerator
 from nerfro.media.analytic import Vacuum
 from nerfro.media.base import Medium
 from nerfro.media.body_settings import origin_of
@@ -352,16 +351,6 @@ def training_device(config: DictConfig) -> str:
     return "cpu" if (gpu := find_gpu()) is None or config.trainer.accelerator in ("auto", "cpu") else gpu.type
 
 
-def require_accelerator(config: DictConfig) -> None:
-    """Refuse `trainer.accelerator=gpu`, `cuda` or `mps` on a machine without such a device."""
-    name, gpu = config.trainer.accelerator, find_gpu()
-    if name not in ("auto", "cpu") and (gpu is None or name not in ("gpu", gpu.type)):
-        raise NerfroError(
-            f"trainer.accelerator={name} needs a device that PyTorch {torch.__version__} does not find here; take auto "
-            "or cpu, or install a driver and a version of PyTorch for the device"
-        )
-
-
 def require_data(config: DictConfig) -> None:
     """Refuse the missing data of a synthetic scene; the message names the command that renders the scene."""
     scene, root = scene_name(config.data.root), resolve_path(config.data.root)
@@ -377,7 +366,7 @@ def require_inputs(config: DictConfig) -> None:
     Raises:
         NerfroError: there is no such device, or the folder of the data lacks a file or has a damaged one.
     """
-    require_accelerator(config)
+    require_accelerator(config.trainer.accelerator)
     require_data(config)
     build_data(config).load("train")
 

@@ -19,13 +19,13 @@ from nerfro.evaluation.run_page import write_run_page
 from nerfro.evaluation.scoring import score_split
 from nerfro.evaluation.tables import write_scores
 from nerfro.fields.networks import compile_networks
+from nerfro.kernels.available import require_accelerator
 from nerfro.rendering.scene_file import SceneFile
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.silhouettes.mesh_match import require_match
 from nerfro.training.accelerator import choose_accelerator
 from nerfro.training.build import Training, check_before_training, composed_training
 from nerfro.training.callbacks import StopOnSignal, Throughput, steps_by_phase
-from nerfro.training.config import require_accelerator
 from nerfro.training.effects import warn_without_effect
 from nerfro.training.run_folder import LAST_CHECKPOINT, begin, lock_run, next_steps, require_same_run
 from nerfro.training.settings import with_values
@@ -88,7 +88,7 @@ def run_training(composition: Composition) -> Run:
 def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetrics | None:
     """Train and evaluate; everything that can be refused is refused before training starts."""
     quieten_lightning()
-    require_accelerator(config)
+    require_accelerator(config.trainer.accelerator)
     training = Training.start(config)
     accelerator = choose_accelerator(training.config, training.module, training.data)
     config, split = with_values(training.config, {"trainer.accelerator": accelerator}), config.evaluation.split

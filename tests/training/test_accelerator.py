@@ -16,7 +16,7 @@ from nerfro.kernels import available
 from nerfro.kernels.available import fast_bfloat16
 from nerfro.kernels.constants import constant
 from nerfro.kernels.operators import REFERENCES
-from nerfro.training import accelerator, config
+from nerfro.training import accelerator
 from nerfro.training.accelerator import choose_accelerator, compare
 from nerfro.training.build import Training
 from nerfro.training.settings import with_values
@@ -135,7 +135,7 @@ def test_steps_are_timed_on_both_devices(
 def test_missing_gpu_is_refused_before_data_are_read(
     name: str, run_here: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(config, "find_gpu", lambda: None)
+    monkeypatch.setattr(available, "find_gpu", lambda: None)
     options = [f"trainer.accelerator={name}", f"hydra.run.dir={tmp_path / 'run'}"]
     error = run_here("train", *options, code=1).error
     assert error.startswith(f"nerfro: error: trainer.accelerator={name} needs a device that PyTorch")

@@ -95,7 +95,7 @@ def test_cfg_refuses_missing_data_and_devices_after_the_configuration(
         printed.error
         == f"nerfro: error: data.root={tmp_path / 'gone'} is not a folder; give the folder of the data set"
     )
-    monkeypatch.setattr("nerfro.training.config.find_gpu", lambda: None)
+    monkeypatch.setattr("nerfro.kernels.available.find_gpu", lambda: None)
     refused_gpu = train("trainer.max_steps=1", "trainer.accelerator=gpu", "--cfg", "job", code=1)
     assert refused_gpu.error.startswith("nerfro: error: trainer.accelerator=gpu needs a device")
 
