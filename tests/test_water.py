@@ -33,7 +33,7 @@ def test_point_in_a_pool_is_seen_at_its_apparent_place() -> None:
 
 
 def test_pane_shifts_rays_without_turning_them_up_to_its_edges() -> None:
-    medium = make_bodies(bodies=MEDIA["pane"], cache=False)
+    medium = make_bodies(bodies=MEDIA["pane"], resolution=192, cache=False)
     angle = np.radians(40)
     direction = np.array([0, np.cos(angle), np.sin(angle)])
     shift = 0.008 * np.sin(angle) * (1 - np.cos(angle) / np.sqrt(1.52**2 - np.sin(angle) ** 2))
@@ -72,7 +72,7 @@ def test_media_of_the_guide_train(name: str, tiny_default_run: list[str], train_
     bodies = str(enlarged(MEDIA[name])).replace("'", "")
     box = ["content.box_min=[-0.8,-0.8,-0.8]", "content.box_max=[0.8,0.8,0.8]"]
     interface = "sampler.path.interface=mesh"
-    train_here(
-        *tiny_default_run, f"bodies={bodies}", *box, interface, "trainer.max_steps=2", f"hydra.run.dir={tmp_path}"
-    )
+    grid = "medium.resolution=192" if name == "pane" else "medium.resolution=32"
+    options = f"bodies={bodies}", *box, interface, grid, "trainer.max_steps=2", f"hydra.run.dir={tmp_path}"
+    train_here(*tiny_default_run, *options)
     assert (tmp_path / "metrics.json").is_file()
