@@ -12,6 +12,7 @@ from torch import Tensor
 
 from nerfro.backgrounds.envmap import EnvironmentMap, Observed
 from nerfro.core.errors import warn
+from nerfro.core.light import saturated
 from nerfro.core.provenance import AlgorithmSettings
 from nerfro.core.rays import Rays
 from nerfro.core.types import Exits
@@ -169,7 +170,7 @@ def _observe_through_object(run: TrainingRun, pixels: Int[Tensor, "Q"], min_back
     difference = _photographed(run, rgb, view) - rendering.radiance
     radiance = scene.background(Exits(exits)) + difference / fraction.clamp(min=min_background)
     widths = widths / batches.cameras.fx[view]
-    observed = Observed(exits, radiance, rgb >= 1, fraction.square().mean(-1), widths)
+    observed = Observed(exits, radiance, saturated(rgb), fraction.square().mean(-1), widths)
     return observed[fraction.amin(-1) >= min_background]
 
 
@@ -180,7 +181,7 @@ def _observe_beside_object(run: TrainingRun, pixels: Int[Tensor, "Q"], rays: Ray
     if exposure is not None and fits_gains:
         exposure.fit(view, scene.background(Exits.unbent(rays)), scene.colour_space.to_radiance(rgb))
     widths = 1 / batches.cameras.fx[view]
-    return Observed(rays.directions, _photographed(run, rgb, view), rgb >= 1, torch.ones_like(widths), widths)
+    return Observed(rays.directions, _photographed(run, rgb, view), saturated(rgb), torch.ones_like(widths), widths)
 
 
 def _rays(run: TrainingRun, pixels: Int[Tensor, "Q"]) -> Rays:
