@@ -180,7 +180,9 @@ def downscaled(size: tuple[int, int], factor: float) -> tuple[int, int]:
     return first, second
 
 
-def downscaled_levels(levels: Levels, size: tuple[int, int]) -> Levels:
+def downscaled_levels(
+    levels: Levels, size: tuple[int, int]
+) -> UInt16[np.ndarray, "h w *C"] | Float32[np.ndarray, "h w *C"]:
     """Downscale an image by `area_mean`: integers in sRGB, photographs in linear light in linear light."""
     if levels.dtype == np.float32:
         return encode_photograph(area_mean(to_linear(levels), size))

@@ -53,10 +53,8 @@ class ImageMetrics(nn.Module):
             NerfroError: the sizes differ, or a value is not finite.
         """
         require_images(prediction, target, coverage)
-        target, prediction = (
-            target.clamp(0, 1),
-            round_to_8bit(prediction),
-        )  # raises an error for values that are not finite
+        target = target.clamp(0, 1)
+        prediction = round_to_8bit(prediction)  # raises an error for values that are not finite
         regions: dict[Region, dict[str, Score]] = {}
         inside = None if coverage is None else object_pixels(coverage)
         if inside is not None and not inside.any():

@@ -45,6 +45,7 @@ class SynthesizeConfig:
         seed: seed of viewpoints and sampler.
         sky: lat-long image of the surroundings (.hdr, .exr, .png, .jpg), in place of those of the scene.
         cameras: poses for a glTF file: those of the file, an orbit around the bodies, or the upper half of the orbit.
+        format: format of the images: png (8-bit sRGB, clipped), or exr (linear radiance).
         sky_height: rows of sky.png.
         extras: whether to write interior.ply and sky.exr, which training does not need.
         variant: variant of Mitsuba: auto, llvm_ad_rgb, cuda_ad_rgb or scalar_rgb.
@@ -65,6 +66,7 @@ class SynthesizeConfig:
     seed: Natural = 0
     sky: str | None = None
     cameras: Literal["orbit", "above", "file"] = "orbit"
+    format: Literal["png", "exr"] = "png"
     sky_height: Annotated[int, Ge(16), Le(16384)] = 1024
     extras: bool = True
     variant: str = "auto"
