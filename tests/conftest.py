@@ -60,7 +60,8 @@ class SkippedTests:
 
 def pytest_configure(config: pytest.Config) -> None:
     worker = hasattr(config, "workerinput")  # of pytest-xdist
-    if not worker and not config.option.collectonly and config.cache is not None:
+    has_cache = config.pluginmanager.hasplugin("cacheprovider")
+    if not worker and not config.option.collectonly and has_cache and config.cache is not None:
         config.pluginmanager.register(SkippedTests(config.cache))
 
 

@@ -313,7 +313,7 @@ class _Search:
         values = values.clip(self.settings.lowest, self.settings.highest)
         medium = self._achromatic.with_indices(torch.from_numpy(values))
         trace = self._sampler.trace(pixels.rays, medium)
-        radiance, known = self._surroundings.radiance(trace.path.exits())
+        radiance, known = self._surroundings.radiance(trace.path.in_room_of(pixels.rays).exits())
         return radiance - pixels.radiance, known & ~trace.exceeded
 
     def errors(

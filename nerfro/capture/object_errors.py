@@ -155,7 +155,7 @@ class ObjectErrors:
 
     def of(self, body: Medium) -> Float[np.ndarray, "V"]:
         """Sum the robust errors over the pixels of each view."""
-        path = self._sampler(self._pixels.rays, body)
+        path = self._sampler(self._pixels.rays, body).in_room_of(self._pixels.rays)
         radiance = path.sum_polylines(self._surroundings.background(path.exits())).clamp(max=1)
         error = geman_mcclure(radiance - self._pixels.radiance, self._scale).double()
         self._advance()

@@ -335,7 +335,7 @@ class _Descent:
         pixels = self.training[torch.randint(len(self.training), (settings.num_pixels,), generator=self.generator)]
         path, usable = self._traced(pixels, medium)
         rays = pixels.rays[usable]
-        path = self.sampler.replay(path[usable], rays, medium)
+        path = self.sampler.replay(path[usable], rays, medium).in_room_of(rays)
         residual = self.blurred(path.exits()).clamp(max=1) - pixels.radiance[usable]
         photometric = geman_mcclure(residual, settings.robust_scale).sum() / max(1, len(rays))
         rims = self.rims[torch.randint(len(self.rims), (settings.num_contour_points,), generator=self.generator)]
@@ -381,7 +381,7 @@ class _Descent:
     def _validation_errors(self, medium: Bodies) -> tuple[Float[Tensor, "Q"], Bool[Tensor, "Q"]]:
         """Compute the robust errors of the validation pixels, and whether their surroundings are known."""
         trace = self.sampler.trace(self.validation.rays, medium)
-        radiance, known = self.problem.surroundings.radiance(trace.path.exits())
+        radiance, known = self.problem.surroundings.radiance(trace.path.in_room_of(self.validation.rays).exits())
         errors = geman_mcclure(radiance - self.validation.radiance, self.settings.robust_scale)
         return errors, known & ~trace.exceeded & trace.path.refracted
 
@@ -389,7 +389,8 @@ class _Descent:
     def _traced(self, pixels: Pixels, medium: Bodies) -> tuple[Path, Tensor]:
         """Trace pixels, and select refracted paths with known surroundings and reliable derivatives."""
         trace = self.sampler.trace(pixels.rays, medium)
-        usable = self.problem.surroundings.known(trace.path.exits()) & ~trace.exceeded & trace.path.refracted
+        known = self.problem.surroundings.known(trace.path.in_room_of(pixels.rays).exits())
+        usable = known & ~trace.exceeded & trace.path.refracted
         return trace.path, usable & self.sampler.steady(trace.path, medium)
 
 

@@ -193,6 +193,9 @@ def learn_surroundings(
         settings: steps and limits.
     """
     settings.use()
+    if near:
+        beside.cameras.refuse_turntable("room=true makes surroundings a part of the object", "leave room out")
+    near = False if beside.cameras.turntable else near
     training, validation = beside.split()
     validation = validation.some(settings.sky_pixels)
     sky = None
@@ -202,7 +205,7 @@ def learn_surroundings(
         levels = [4 * 2**level for level in range(16) if 4 * 2**level <= max(16, side)]
         n = max(1, min(settings.seen_texels, int(math.sqrt(len(training) / (6 * settings.seen_pixels)))))
         seen = torch.zeros(6, n, n, dtype=torch.bool)
-        seen.view(-1)[cube_map.nearest_texel(training.rays.directions, n)] = True
+        seen.view(-1)[cube_map.nearest_texel(Exits.unbent(training.rays).directions, n)] = True
         size = settings.sky_steps, settings.sky_pixels
         sky = _learned(EnvironmentMap(levels), seen, training, validation, size, settings.rates)
         if near is False or sky.unexplained <= settings.max_sky_residual:

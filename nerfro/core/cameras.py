@@ -15,7 +15,7 @@ from torch import Tensor
 from nerfro.core.draws import Draws
 from nerfro.core.errors import NerfroError
 from nerfro.core.lens import distort_without_fold, undistort
-from nerfro.core.rays import Rays
+from nerfro.core.rays import Rays, in_room
 
 # The up direction is an axis of the world if the mean up direction of the photographs is closer than this to the axis.
 _MIN_AXIS_COSINE = math.cos(math.radians(15))
@@ -62,6 +62,34 @@ def central_window(height: int, width: int, fraction: float) -> Window:
     return Window(height // 2 - half_height, width // 2 - half_width, 2 * half_height, 2 * half_width)
 
 
+def room_rotations(
+    camera_to_world: Float[Tensor, "*V 3 columns"], turntable: bool | tuple[float, ...]
+) -> Float[Tensor, "*V 3 3"]:
+    """Return the rotation from the world of an object on a turntable to the room, for each camera.
+
+    The x axis of the room points from the object to the camera, y to the right in the image and z up. With an axis of
+    rotation, z is this axis, so that cameras in one vertical plane see the room alike.
+
+    Args:
+        camera_to_world: poses relative to the object, OpenGL axes.
+        turntable: axis of rotation in the world, upwards; True for the vertical direction of each image.
+
+    Raises:
+        NerfroError: a camera is turned on its side with respect to the axis, so that its azimuth is unknown.
+    """
+    right, up = camera_to_world[..., 0], camera_to_world[..., 1]
+    if not isinstance(turntable, bool):
+        up = torch.nn.functional.normalize(right.new_tensor(turntable), dim=0).expand_as(right)
+    across = right - (right * up).sum(-1, keepdim=True) * up
+    if bool((across.norm(dim=-1) < 0.1).any()):
+        raise NerfroError(
+            f"data.turntable_axis={turntable}: the horizontal axis of an image is parallel to the axis of rotation; "
+            "rotate the photographs, or take data.turntable=true for a camera that stands still"
+        )
+    right = torch.nn.functional.normalize(across, dim=-1)
+    return torch.stack([torch.linalg.cross(right, up), right, up], -2)
+
+
 @dataclass(frozen=True)
 class Cameras:
     """Pinhole cameras of one resolution.
@@ -76,6 +104,8 @@ class Cameras:
         width, height: resolution, pixels.
         near, far: arc length from the camera's centre at which rays begin and end, world units.
         distortion: lens distortion, see `nerfro.core.lens.coefficients`; None for an ideal lens.
+        turntable: whether the object turns before a camera that stands still, so that the background depends on
+            directions relative to the camera; for cameras at several heights, the axis of rotation in the world.
     """
 
     camera_to_world: Float[Tensor, "V 3 4"]
@@ -88,6 +118,7 @@ class Cameras:
     near: float
     far: float
     distortion: Float[Tensor, "V 9"] | None = None
+    turntable: bool | tuple[float, ...] = False
 
     def __len__(self) -> int:
         return self.camera_to_world.shape[0]
@@ -109,6 +140,11 @@ class Cameras:
         poses = self.camera_to_world.double()
         poses[:, :, 3] -= torch.from_numpy(origin).to(poses)
         return replace(self, camera_to_world=poses.to(self.camera_to_world))
+
+    def refuse_turntable(self, reason: str, advice: str) -> None:
+        """Refuse cameras of a turntable, with a reason and what to do instead."""
+        if self.turntable:
+            raise NerfroError(f"{reason}, but the object turns on a turntable (data.turntable); {advice}")
 
     @classmethod
     def joined(cls, parts: Sequence[Cameras]) -> Cameras:
@@ -178,6 +214,7 @@ class Cameras:
             radii=2 / math.sqrt(12) * width / length,
             near=torch.full_like(x, self.near),
             far=torch.full_like(x, self.far),
+            room=room_rotations(self.camera_to_world, self.turntable)[view] if self.turntable else None,
         )
 
     def project(
@@ -208,7 +245,7 @@ class Cameras:
         return self._window_rays(view, Window(0, 0, self.height, self.width))
 
     def tile(self, size: int, draws: Draws) -> Float[Tensor, "T T 3"]:
-        """Make unit viewing directions, in world space, of a random window of a random view.
+        """Make unit viewing directions, towards the background, of a random window of a random view.
 
         Args:
             size: side of the window in pixels, at most the shorter side of the image.
@@ -219,7 +256,8 @@ class Cameras:
         words = draws.words(torch.zeros(1, dtype=torch.long), 3, "tile")[0].tolist()
         counts = len(self), self.height - side + 1, self.width - side + 1
         view, top, left = (word * count >> 32 for word, count in zip(words, counts, strict=True))
-        return self._window_rays(view, Window(top, left, side, side)).directions.reshape(side, side, 3)
+        rays = self._window_rays(view, Window(top, left, side, side))
+        return in_room(rays.directions, rays.room).reshape(side, side, 3)
 
     def _window_rays(self, view: int, window: Window) -> Rays:
         row, column = torch.meshgrid(

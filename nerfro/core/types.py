@@ -30,7 +30,7 @@ from torch import Tensor
 
 from nerfro.core.cameras import Cameras
 from nerfro.core.draws import Draws
-from nerfro.core.rays import Rays
+from nerfro.core.rays import Rays, in_room
 
 __all__ = [
     "WORLD_ORIGIN",
@@ -89,7 +89,7 @@ class OpticalRecord:
 
 
 # Fields with a row for each polyline, of `Path` and of its record, and those that have a column for each vertex.
-_OF_PATHS = ("positions", "directions", "s", "refracted", "radii", "ray", "throughput")
+_OF_PATHS = ("positions", "directions", "s", "refracted", "radii", "ray", "throughput", "room")
 _OF_ROWS = ("body", "surface_body", "far_side", "triangle", "band")
 _OF_VERTICES = ("positions", "directions", "s", "body", "surface_body", "far_side", "triangle")
 
@@ -117,6 +117,7 @@ class Path:
         throughput: linear factor of the light of the polyline; the factors of a ray sum to at most 1.
         splits: whether rays may have several polylines. If not, `ray` counts from 0 and `throughput` is 1 everywhere.
         record: bodies and surfaces that the vertices meet; None in media without sharp surfaces.
+        room: rotation from the world to the room, see `Rays.room`; None if they are the same.
     """
 
     positions: Float[Tensor, "P S 3"]
@@ -128,6 +129,7 @@ class Path:
     throughput: Float[Tensor, "P 3"]
     splits: bool = False
     record: OpticalRecord | None = None
+    room: Float[Tensor, "P 3 3"] | None = None
 
     @classmethod
     def unbranched(
@@ -157,7 +159,8 @@ class Path:
             for part, names in ((path, _OF_PATHS), (path.record, _OF_ROWS)):
                 for name in names if part is not None else ():
                     values = getattr(part, name)
-                    columns[name].append(values[:, vertices] if name in _OF_VERTICES else values)
+                    if values is not None:
+                        columns[name].append(values[:, vertices] if name in _OF_VERTICES else values)
             columns["ray"][-1] = path.ray + num_rays
             num_rays += path.num_rays
         joined: dict[str, Any] = {name: torch.cat(values) for name, values in columns.items() if values}
@@ -215,12 +218,16 @@ class Path:
         return torch.exp(-depth)
 
     def exits(self, directions: Float[Tensor, "P 3"] | None = None) -> Exits:
-        """Return the last segment of each polyline, along which background radiance arrives."""
+        """Return the last segment of each polyline, along which background radiance arrives, in axes of the room."""
         turns = (self.directions[:, 1:] != self.directions[:, :-1]).any(-1)
         last = (turns * torch.arange(1, self.s.shape[1], device=self.s.device)).amax(-1)
         start = self.positions.gather(1, last[:, None, None].expand(-1, 1, 3))[:, 0]
         directions = self.exit_directions if directions is None else directions
-        return Exits(directions, start, self.radii)
+        return Exits(in_room(directions, self.room), start if self.room is None else None, self.radii)
+
+    def in_room_of(self, rays: Rays) -> Path:
+        """Return the path with the rotations to the room of its rays."""
+        return self if rays.room is None else replace(self, room=self.broadcast_to_polylines(rays.room))
 
     @property
     def near(self) -> Float[Tensor, "P"]:
@@ -242,7 +249,8 @@ class Path:
 
     def __getitem__(self, index: slice | Tensor) -> Path:
         """Select polylines; each becomes the only polyline of a new ray."""
-        rows = {name: getattr(self, name)[index] for name in _OF_PATHS}
+        columns = {name: getattr(self, name) for name in _OF_PATHS}
+        rows = {name: column[index] for name, column in columns.items() if column is not None}
         rows["ray"] = torch.arange(len(rows["s"]), device=self.s.device)
         return Path(**rows, splits=self.splits, record=None if self.record is None else self.record[index])
 
@@ -298,7 +306,7 @@ class Exits:
     Attributes:
         directions: unit directions away from the volume.
         positions: starts of the segments: the last event of the path, or the point at near. None for the centre of the
-            scene.
+            scene, and on a turntable, where the position in the room is unknown.
         radii: radius of the pixel cone at unit distance along the segment; 0 if unknown.
     """
 
@@ -309,7 +317,8 @@ class Exits:
     @classmethod
     def unbent(cls, rays: Rays) -> Exits:
         """Return the segments of straight rays."""
-        return cls(rays.directions, rays.origins + rays.near[:, None] * rays.directions, rays.radii)
+        starts = None if rays.room is not None else rays.origins + rays.near[:, None] * rays.directions
+        return cls(in_room(rays.directions, rays.room), starts, rays.radii)
 
 
 @dataclass(frozen=True)

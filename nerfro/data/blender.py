@@ -30,7 +30,7 @@ class BlenderData(PosedImages):
 
     def read(self, split: str) -> FrameSet:
         manifest = read_manifest(self.root, split)
-        return FrameSet(manifest.frames, manifest.lenses(), "opengl")
+        return FrameSet(manifest.frames, manifest.lenses(), "opengl", turntable=manifest.turntable)
 
 
 @register("data", "opencv")
@@ -65,4 +65,4 @@ class OpenCVData(PosedImages):
         manifest = read_manifest(self.root, split)
         crop = 1.0 if split == "train" else self.eval_crop
         near, far = (manifest.number(name, default) for name, default in (("near", 0.2), ("far", 12.0)))
-        return FrameSet(manifest.frames, manifest.lenses(), "opencv", near, far, crop)
+        return FrameSet(manifest.frames, manifest.lenses(), "opencv", near, far, crop, turntable=manifest.turntable)

@@ -14,7 +14,7 @@ import torch
 from annotated_types import Ge
 from jaxtyping import Float
 
-from nerfro.core.cameras import Cameras, central_window
+from nerfro.core.cameras import Cameras, central_window, room_rotations
 from nerfro.core.errors import NerfroError, first_of
 from nerfro.core.paths import refuse_root, resolve_path
 from nerfro.data.base import SPLITS, DataSource, Frame, Views
@@ -46,6 +46,7 @@ class FrameSet:
         depths: depth images, one per frame; empty if there are none, see `nerfro.data.depths`.
         depth_unit: world units per level of the depth images.
         points: 3-D points that each frame has observed, world units, which give depths; empty if there are none.
+        turntable: whether the object turns, or its axis, where the options leave this open; see `turntable_of`.
     """
 
     frames: Sequence[Frame]
@@ -58,6 +59,7 @@ class FrameSet:
     depths: Sequence[Path | None] = ()
     depth_unit: float = 1.0
     points: Sequence[Float[np.ndarray, "_ 3"]] = ()
+    turntable: bool | tuple[float, ...] = False
 
 
 @validated("data")
@@ -73,6 +75,10 @@ class PosedImages(DataSource):
         alpha: `drop` ignores transparency; `white` and `black` composite the images over this colour.
         mask_labels: labels of the object in the masks, as indices of palette images or as grey levels; None to use all
             labels but the background.
+        turntable: whether the object turns before a camera that stands still, and the poses are relative to the object.
+            None for the key `turntable` of a transforms file, or false.
+        turntable_axis: axis of rotation in the world, upwards, of an object that turns before a camera at several
+            heights; None for the key `turntable_axis` of a transforms file, or one camera that stands still.
 
     Raises:
         NerfroError: an option is out of range.
@@ -86,8 +92,11 @@ class PosedImages(DataSource):
         downscale: Factor = 1,
         alpha: Alpha = "drop",
         mask_labels: list[int] | None = None,
+        turntable: bool | None = None,
+        turntable_axis: list[float] | None = None,
     ) -> None:
         _check_bounds(near, far)
+        self._turntable = turntable_of("data.", turntable, turntable_axis)
         self.root = resolve_path(root)
         self.near, self.far, self.downscale, self.alpha, self.mask_labels = near, far, downscale, alpha, mask_labels
         self._images_of_masks: dict[Path, Path] = {}
@@ -153,7 +162,11 @@ class PosedImages(DataSource):
         intrinsics, distortion = lens_tensors(read.lenses)
         scale = torch.tensor([width / stored[0], height / stored[1]], dtype=torch.float64).repeat(2)
         fx, fy, cx, cy = (intrinsics * scale).float().unbind(-1)
-        cameras = Cameras(torch.from_numpy(poses).float(), fx, fy, cx, cy, width, height, near, far, distortion)
+        turntable = read.turntable if self._turntable is None else self._turntable
+        cameras = Cameras(
+            torch.from_numpy(poses).float(), fx, fy, cx, cy, width, height, near, far, distortion, turntable
+        )
+        room_rotations(cameras.camera_to_world, turntable)  # refuses cameras without an azimuth
         usable = find_usable(files, read.usable, self.downscale, stored) if any(read.usable) else None
         maps = {DEPTH: read_depths(read.depths, read.depth_unit, cameras)} if any(read.depths) else {}
         if read.points:
@@ -188,6 +201,13 @@ class PosedImages(DataSource):
                     f"mask {frame.mask} is found for {image} and for {frame.image}; put masks into the same folders "
                     "below masks/ as the images, or name each mask in the data set (mask_path)"
                 )
+
+
+def turntable_of(where: str, turntable: bool | None, axis: Sequence[float] | None) -> bool | tuple[float, ...] | None:
+    """Return `Cameras.turntable` of the settings `turntable` and `turntable_axis`; None if both are left open."""
+    if axis is not None and (len(axis) != 3 or not any(axis)):
+        raise NerfroError(f"{where}turntable_axis={list(axis)} is no axis; give a direction such as [0,0,1]")
+    return turntable if axis is None or turntable is False else tuple(axis)
 
 
 def _check_bounds(near: float | None, far: float | None) -> None:

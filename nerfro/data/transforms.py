@@ -11,7 +11,7 @@ from typing import Any
 
 from nerfro.core.errors import NerfroError, first_of, warn
 from nerfro.data.base import SPLITS, Frame
-from nerfro.data.frames import check_pose, require_root
+from nerfro.data.frames import check_pose, require_root, turntable_of
 from nerfro.data.image_files import VIEW_SUFFIXES, read_size, suffix_list
 from nerfro.data.lenses import Lens, read_lens
 from nerfro.data.masks import find_mask, mask_beside
@@ -48,6 +48,14 @@ class Manifest:
         value: Any = self.document.get(key)
         check(f"{self.path}: ", {key: float}, {key: value})
         return default if value is None else value
+
+    @property
+    def turntable(self) -> bool | tuple[float, ...]:
+        """Value of the keys `turntable` and `turntable_axis` of the file, see `PosedImages`; false without them."""
+        hints = {"turntable": bool, "turntable_axis": list[float]}
+        values: dict[str, Any] = {name: self.document.get(name) for name in hints}
+        check(f"{self.path}: ", hints, values)
+        return turntable_of(f"{self.path}: ", *values.values()) or False
 
     def lenses(self, indices: Sequence[int] | None = None) -> list[Lens]:
         """Read the lenses of all frames, or of those at `indices`, for the size of their images; see `read_lens`."""

@@ -50,6 +50,7 @@ def write_mitsuba(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
     Raises:
         NerfroError: bodies lie inside others or overlap.
     """
+    scene.cameras("train").refuse_turntable("what=mitsuba has one sky for all cameras", "take what=mesh and what=sky")
     glass, inside = glass_meshes(scene), inside_mesh(scene, options.resolution, options.half_depth)
     if len(glass) > 1:
         _require_apart(scene, glass)

@@ -13,7 +13,9 @@ def write_sky(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
     """Write the background radiance; `options.resolution` is the number of rows."""
     sky = scene.sky_of_height(options.resolution or scene.sky_height)
     save_lat_long(out, sky)
-    return f"the sky: {sky.shape[1]}x{sky.shape[0]} pixels, lat-long, z up"
+    turntable = scene.cameras("train").turntable
+    frame = ", in the room of the turntable, where the camera looks along -x" if turntable else ""
+    return f"the sky: {sky.shape[1]}x{sky.shape[0]} pixels, lat-long, z up{frame}"
 
 
 EXPORTS["sky"] = Export((".hdr", ".exr", ".png"), write_sky, unused=("half_depth",))

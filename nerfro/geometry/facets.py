@@ -2,20 +2,41 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from nerfro.core.provenance import AlgorithmSettings
 from nerfro.geometry.orientation import area_vectors
 
-# Edges with larger angles between their faces stay sharp, in degrees; 30 is a common default of modelling programs.
-CREASE_DEGREES = 30.0
-_COPLANAR = 0.1  # degrees between triangles of one flat face
-_LEAST_SHARE = 0.05  # of the area of the mesh; smaller regions stay smooth
-_MIXED = 0.25  # share of the edges, by length, at which neither two triangles nor two quadrilaterals meet
-# Angles between faces, in degrees: cylinders of modelling programs have 30 or more sides.
-_LEAST_TURN, _DOUBTFUL_TURN, _FACETED_TURN = 2.0, 8.0, 12.5
+
+@dataclass(frozen=True)
+class FacetSettings(AlgorithmSettings):
+    """Settings of the decision which faces are facets (`facets_of`).
+
+    Attributes:
+        crease_degrees: angle between faces above which edges are sharp; 30 is a common default of modelling programs.
+        coplanar_degrees: angle between triangles of one flat face.
+        least_share: share of the area of a mesh below which a region stays smooth.
+        small: area of a face, relative to the typical face of its region, below which it belongs to a rounded edge.
+        mixed: share of the edges, by length, at which neither two triangles nor two quadrilaterals meet, above which
+            faces are cut.
+        open: share of the edges, by length, above which a region ends at sharp edges.
+        least_turn, doubtful_turn, faceted_turn: angles between faces, in degrees, above which faces differ, may be
+            facets, and are facets. Cylinders of modelling programs have 30 or more sides.
+    """
+
+    crease_degrees: float = 30.0
+    coplanar_degrees: float = 0.1
+    least_share: float = 0.05
+    small: float = 0.05
+    mixed: float = 0.25
+    open: float = 0.1
+    least_turn: float = 2.0
+    doubtful_turn: float = 8.0
+    faceted_turn: float = 12.5
 
 
 class Facets(NamedTuple):
@@ -43,7 +64,7 @@ class _Edges(NamedTuple):
 
 
 def facets_of(
-    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "F 3"], crease_degrees: float = CREASE_DEGREES
+    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "F 3"], settings: FacetSettings = FacetSettings()
 ) -> Facets:
     """Decide which faces of a mesh are facets with sharp edges, where the angles alone do not decide.
 
@@ -57,19 +78,20 @@ def facets_of(
     Args:
         vertices: world units; equal positions must be merged.
         faces: vertex indices of each triangle, outward faces counter-clockwise.
-        crease_degrees: angle above which edges are sharp anyway.
+        settings: tuned numbers of the decision.
     """
+    settings.use()
     edges = _edges(vertices, faces)
-    face = _flat_faces(vertices, faces, edges)
-    regions = _regions_of(vertices, faces, face, edges, crease_degrees)
+    face = _flat_faces(vertices, faces, edges, settings.coplanar_degrees)
+    regions = _regions_of(vertices, faces, face, edges, settings)
     turn, ends = regions.turn, regions.ends
-    decided = (regions.area >= _LEAST_SHARE * regions.area.sum()) & (turn >= _LEAST_TURN)
+    decided = (regions.area >= settings.least_share * regions.area.sum()) & (turn >= settings.least_turn)
     is_polygonal = regions.is_strip | (regions.several >= 0.5)
-    is_cut = decided & (regions.several >= 0.5) & (regions.mixed >= _MIXED)
-    ambiguous = decided & ~is_cut & (is_polygonal | ends) & (turn >= _DOUBTFUL_TURN)
-    is_faceted = is_cut | (ambiguous & is_polygonal & ends & (turn >= _FACETED_TURN))
+    is_cut = decided & (regions.several >= 0.5) & (regions.mixed >= settings.mixed)
+    ambiguous = decided & ~is_cut & (is_polygonal | ends) & (turn >= settings.doubtful_turn)
+    is_faceted = is_cut | (ambiguous & is_polygonal & ends & (turn >= settings.faceted_turn))
     if is_faceted.any():  # a body that has facets has facets on all sides
-        is_faceted |= (turn >= _LEAST_TURN) & is_polygonal & ends
+        is_faceted |= (turn >= settings.least_turn) & is_polygonal & ends
     number = np.where(is_faceted[regions.number] & regions.is_large, np.arange(len(regions.number)), -1)[face]
     if not ambiguous.any():
         return Facets(number, "")
@@ -107,7 +129,7 @@ class _Regions(NamedTuple):
 
 def _regions_of(
     vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "F 3"], face: Int[np.ndarray, "F"],
-    edges: _Edges, crease_degrees: float,
+    edges: _Edges, settings: FacetSettings,
 ) -> _Regions:  # fmt: skip
     """Connect flat faces to regions, and measure the regions; `face` is the flat face of each triangle."""
     from trimesh.graph import connected_component_labels
@@ -116,11 +138,12 @@ def _regions_of(
     corners = _num_corners(faces, face)
     between = edges.subset(face[edges.first] != face[edges.second])
     between = between._replace(first=face[between.first], second=face[between.second])
-    sharp, soft = between.subset(between.angle >= crease_degrees), between.subset(between.angle < crease_degrees)
+    crease = settings.crease_degrees
+    sharp, soft = (between.subset(is_sharp) for is_sharp in (between.angle >= crease, between.angle < crease))
     region = connected_component_labels(np.stack([soft.first, soft.second], 1), len(area))
     region = np.unique(region, return_inverse=True)[1].reshape(-1)
     count = region.max() + 1
-    is_large = area >= _typical(region, area)[region] / 20  # smaller faces belong to rounded edges
+    is_large = area >= settings.small * _typical(region, area)[region]
     of_large = np.bincount(region, area * is_large, count)
     several = np.bincount(region, area * is_large * (np.bincount(face) > 1), count) / of_large
     soft = soft.subset(is_large[soft.first] & is_large[soft.second])
@@ -129,7 +152,7 @@ def _regions_of(
     alike = (corners[soft.first] == corners[soft.second]) & (corners[soft.first] <= 4)
     mixed = np.bincount(of_region, soft.length * ~alike, count) / length
     rim = sum(np.bincount(region[side], sharp.length, count) for side in (sharp.first, sharp.second))
-    ends = rim >= 0.1 * length
+    ends = rim >= settings.open * length
     return _Regions(region, is_large, np.bincount(region, area), several, mixed, *_turn(soft, region, length), ends)
 
 
@@ -147,18 +170,18 @@ def _edges(vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "F 
 
 
 def _flat_faces(
-    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "F 3"], edges: _Edges
+    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "F 3"], edges: _Edges, degrees: float
 ) -> Int[np.ndarray, "F"]:
-    """Number the sets of connected coplanar triangles."""
+    """Number the sets of connected triangles that lie in one plane up to `degrees`."""
     from trimesh.graph import connected_component_labels
 
-    flat = edges.angle < _COPLANAR
+    flat = edges.angle < degrees
     label = connected_component_labels(np.stack([edges.first[flat], edges.second[flat]], 1), len(faces))
     normals = area_vectors(vertices[faces])
     sums = np.stack([np.bincount(label, column) for column in normals.T], -1)[label]
     tilt = np.degrees(np.arctan2(np.linalg.norm(np.cross(normals, sums), axis=1), (normals * sums).sum(1)))
     # Triangles of a finely tessellated surface are coplanar with their neighbours, but not with one plane.
-    is_bent = np.bincount(label, tilt > 3 * _COPLANAR)[label] > 0
+    is_bent = np.bincount(label, tilt > 3 * degrees)[label] > 0
     label = np.where(is_bent, label.max() + 1 + np.arange(len(label)), label)
     return np.unique(label, return_inverse=True)[1].reshape(-1)
 

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from nerfro.core.errors import NerfroError
 from nerfro.files.atomic import write_atomically
 from nerfro.files.reading import reading
-from nerfro.geometry.facets import CREASE_DEGREES
+from nerfro.geometry.facets import FacetSettings
 from nerfro.geometry.file_normals import informative_normals
 from nerfro.geometry.gltf import Z_UP_TO_Y_UP, is_gltf, primitives_of, read_document, require_readable
 from nerfro.geometry.orientation import area_vectors, inward_faces
@@ -38,7 +38,7 @@ class TriangleMesh:
     faces: Int[np.ndarray, "F 3"]
     normals: Float[np.ndarray, "F 3 3"] | None = None
     facets: Int[np.ndarray, "F"] | None = None
-    crease_degrees: float = CREASE_DEGREES
+    crease_degrees: float = FacetSettings.crease_degrees
 
     @property
     def triangles(self) -> Float[np.ndarray, "F 3 3"]:

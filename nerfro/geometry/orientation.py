@@ -16,7 +16,8 @@ def inward_faces(vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarra
     The outer surface of a body should face outwards and the surface of a cavity should face the cavity. Triangles that
     share an edge of two triangles form a patch with one orientation. On lines through a patch, an even number of
     crossings in front of the patch means that the front of the patch is outside. Lines with an odd number of crossings
-    in total, for example through holes, have no vote.
+    in total, for example through holes, have no vote. Five triangles of each patch vote, spread over its area, because
+    the largest may lie inside another part of a surface that crosses itself.
 
     Args:
         vertices: world units; equal positions must be merged.
@@ -33,7 +34,8 @@ def inward_faces(vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarra
     centres, radii = (low + high) / 2, np.linalg.norm(high - low, axis=1) / 2
     for group in groups:
         votes = 0
-        some = group[:5]
+        upto = np.cumsum(areas[group])
+        some = group[np.searchsorted(upto, np.linspace(0.1, 0.9, 5) * upto[-1])]
         for face in some[areas[some] > 0]:
             line = crosses[face] / areas[face] + _DEVIATION
             point = _BARYCENTRIC @ triangles[face]

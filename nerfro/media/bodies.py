@@ -19,7 +19,7 @@ from nerfro.core.variants import variant
 from nerfro.geometry.box import corners_of_box
 from nerfro.geometry.intersection import LayeredIntersector, Triangles
 from nerfro.geometry.mesh import TriangleMesh, local_origin
-from nerfro.geometry.thickness import FEW, MIN_VOXELS, thickness
+from nerfro.geometry.thickness import WallSettings, thickness
 from nerfro.kernels.available import require_bytes
 from nerfro.kernels.constants import constant
 from nerfro.kernels.tolerances import MIN_COSINE, SAFE_SHARE, STEPS_PER_SHELL
@@ -95,12 +95,17 @@ class GridSettings:
         except NerfroError:  # without Embree
             return coarse
         spacing = float(np.ptp(coarse.box(surface), axis=0).max()) / (_RESOLUTION - 1)
-        thin = walls < MIN_VOXELS * spacing
-        if thin.mean() <= FEW:
+        thin = walls < WallSettings.voxels * spacing
+        if thin.mean() <= WallSettings.few:
             return coarse
         # The margin of air has a fixed number of voxels if the box follows the surface.
         air = 0 if self.box_min is not None else 2 * _AIR
-        finer = (_RESOLUTION - 1 - air) * MIN_VOXELS * spacing / float(np.quantile(walls, FEW, method="lower"))
+        finer = (
+            (_RESOLUTION - 1 - air)
+            * WallSettings.voxels
+            * spacing
+            / float(np.quantile(walls, WallSettings.few, method="lower"))
+        )
         most = int((self.max_gigabytes * 1e9 / BYTES_PER_VERTEX) ** (1 / 3))
         resolution = max(_RESOLUTION, min(math.ceil(finer) + 1 + air, most))
         print(

@@ -18,7 +18,7 @@ from nerfro.core.errors import NerfroError, warn
 from nerfro.core.paths import resolve_path
 from nerfro.files.cache import cached_arrays, content_hash
 from nerfro.geometry.bodies import require_separate, require_simple
-from nerfro.geometry.facets import CREASE_DEGREES, facets_of
+from nerfro.geometry.facets import facets_of
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.geometry.signed_distance import signed_distance_grid
 from nerfro.media.distance_grid import BAND, DistanceGrid
@@ -154,8 +154,9 @@ def _shaded(mesh: TriangleMesh, file: str, shading: Shading, crease_degrees: flo
                 "sharp; remove one of them"
             )
         return replace(mesh, normals=None, facets=np.arange(len(mesh.faces)))
-    mesh = replace(mesh, crease_degrees=CREASE_DEGREES if crease_degrees is None else crease_degrees)
-    if shading == "smooth" or crease_degrees is not None:
+    if crease_degrees is not None:
+        return replace(mesh, crease_degrees=crease_degrees)
+    if shading == "smooth":
         return mesh
     number, doubt = facets_of(mesh.vertices, mesh.faces)
     if mesh.normals is not None:

@@ -188,7 +188,7 @@ class Renderer(Component, nn.Module, ABC):
         medium = self.scene.medium
         path = self.path_sampler(rays, medium) if path is None else path
         learns = self.paths_learn and torch.is_grad_enabled()
-        return medium.with_absorption(self._replayed(path, rays) if learns else path)
+        return medium.with_absorption(self._replayed(path, rays) if learns else path).in_room_of(rays)
 
     @torch.no_grad()
     def exit_directions(self, rays: Rays) -> Float[Tensor, "R 3"]:

@@ -28,10 +28,11 @@ from nerfro.files.images import save_image
 from nerfro.files.reading import read_json
 from nerfro.synthetic.path_tracer import Pinhole
 from nerfro.synthetic.scene import SyntheticScene, lat_long_texture
-from nerfro.synthetic.viewpoints import directions_on_sphere, look_at_origin
+from nerfro.synthetic.viewpoints import directions_on_ring, directions_on_sphere, look_at_origin
 
 CAMERA_ANGLE_X = 0.6911112070083618  # field of view of the NeRF synthetic scenes and of the paper's scenes
 CAMERA_DISTANCE = 4.03
+_RING = 25.0  # elevation of the cameras of a ring, degrees
 
 
 @dataclass(frozen=True)
@@ -149,7 +150,10 @@ class ViewSplits(DataSet):
         *("mesh.ply", "interior.ply", "sky.png", "sky.exr", META),
     )
     FACTS: ClassVar[dict[str, Any]] = {"box": ((-1.5, -1.5, -1.5), (1.5, 1.5, 1.5)), "near": 2.0, "far": 6.0}
-    OPTIONS: ClassVar[tuple[str, ...]] = ("resolution", "spp", "test_spp", "views", "fresnel", "seed", "format")
+    OPTIONS: ClassVar[tuple[str, ...]] = (
+        *("resolution", "spp", "test_spp", "views", "fresnel", "seed", "format"),
+        *("cameras", "turntable"),
+    )
     NOUN = "views"
     WIDTH = CAMERA_DISTANCE * CAMERA_ANGLE_X
 
@@ -166,7 +170,11 @@ class ViewSplits(DataSet):
         planned = []
         for number, split in enumerate(SPLITS):
             spp = self.options.test_spp if split == "test" else self.options.spp
-            directions = directions_on_sphere(getattr(self.options.views, split), self.options.seed, number)
+            drawn = getattr(self.options.views, split), self.options.seed, number
+            is_ring = self.options.cameras == "ring"
+            directions = directions_on_ring(*drawn, _RING) if is_ring else directions_on_sphere(*drawn)
+            if self.options.cameras == "above":
+                directions[:, 2] = np.abs(directions[:, 2])
             for index, direction in enumerate(directions):
                 pose = look_at_origin(CAMERA_DISTANCE * direction)
                 seed, name = (self.options.seed * 3 + number) * 100_000 + index, f"{split}/r_{index:03d}"
@@ -199,6 +207,9 @@ class ViewSplits(DataSet):
                 if view.image_path.startswith(f"{split}/")
             ]
             content = {"camera_angle_x": self.angle_x, "frames": frames}
+            if self.options.turntable:
+                # With an axis, cameras at several heights see the same room.
+                content |= {"turntable": True} if self.options.cameras == "ring" else {"turntable_axis": [0, 0, 1]}
             write_json(self.folder / f"transforms_{split}.json", content)
 
     def next_command(self) -> str:

@@ -49,7 +49,6 @@ class GltfViews(ViewSplits):
 
     FILES = (*ViewSplits.FILES, "bodies/*.ply", SCENE)
     FACTS: ClassVar[dict[str, Any]] = {}
-    OPTIONS = (*ViewSplits.OPTIONS, "cameras")
 
     @cached_property
     def _cameras(self) -> list[tuple[Mapping[str, Any], np.ndarray]]:
@@ -90,11 +89,8 @@ class GltfViews(ViewSplits):
 
     def _moved(self, pose: np.ndarray) -> np.ndarray:
         """Move a camera from the orbit of the built-in scenes to that around the bodies."""
-        direction = pose[:3, 2].copy()
-        if self.options.cameras == "above":
-            direction[2] = abs(direction[2])
         half = 0.5 * np.linalg.norm(np.ptp(self.scene.glass.vertices, axis=0))
-        moved = look_at_origin(_DISTANCE * half * direction)
+        moved = look_at_origin(_DISTANCE * half * pose[:3, 2])
         moved[:3, 3] += self.scene.aim
         return moved
 

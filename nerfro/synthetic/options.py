@@ -44,7 +44,10 @@ class SynthesizeConfig:
         ior: refractive index of the glass; by default that of the scene.
         seed: seed of viewpoints and sampler.
         sky: lat-long image of the surroundings (.hdr, .exr, .png, .jpg), in place of those of the scene.
-        cameras: poses for a glTF file: those of the file, an orbit around the bodies, or the upper half of the orbit.
+        cameras: poses: an orbit on all sides of the object, the upper half of the orbit, a ring at 25 degrees above the
+            horizon, or for a glTF file those of the file.
+        turntable: whether the object turns before the camera, and the surroundings stand still. In a ring, the camera
+            stands still, too; otherwise it also moves up and down.
         format: format of the images: png (8-bit sRGB, clipped), or exr (linear radiance).
         sky_height: rows of sky.png.
         extras: whether to write interior.ply and sky.exr, which training does not need.
@@ -65,7 +68,8 @@ class SynthesizeConfig:
     ior: Positive | None = None
     seed: Natural = 0
     sky: str | None = None
-    cameras: Literal["orbit", "above", "file"] = "orbit"
+    cameras: Literal["orbit", "above", "ring", "file"] = "orbit"
+    turntable: bool = False
     format: Literal["png", "exr"] = "png"
     sky_height: Annotated[int, Ge(16), Le(16384)] = 1024
     extras: bool = True

@@ -106,6 +106,7 @@ class PathTracer:
             upright = mi.ScalarTransform4f().rotate([1, 0, 0], 90)
             texture = mi.Bitmap(envmap_texture(scene.sky, height, np.asarray(upright.matrix)[:3, :3]))
             surroundings["sky"] = {"type": "envmap", "bitmap": texture, "to_world": upright}
+            self._sky_frame = np.asarray(upright.matrix)
         glass, content = _part_shapes(mi, scene, fresnel) if scene.parts else _shapes(mi, scene, fresnel)
         self.glass = mi.load_dict({"type": "scene", **glass})
         self.scene = mi.load_dict(
@@ -117,6 +118,14 @@ class PathTracer:
                 **content,
             }
         )
+
+    def turn_sky(self, rotation: np.ndarray) -> None:
+        """Rotate the sky; a rotation of sky and camera about an object is the opposite rotation of the object."""
+        frame = self._sky_frame.copy()
+        frame[:3, :3] = rotation @ frame[:3, :3]
+        parameters = self.mitsuba.traverse(self.scene)
+        parameters["sky.to_world"] = self.mitsuba.Transform4f(frame.tolist())
+        parameters.update()
 
     def render(self, pose: np.ndarray, spp: int, seed: int) -> np.ndarray:
         """Return linear radiance [H, W, 3], averaged over each pixel with a box filter.

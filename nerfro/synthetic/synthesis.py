@@ -9,6 +9,7 @@ from types import ModuleType
 import numpy as np
 import torch
 
+from nerfro.core.cameras import room_rotations
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import user_path
 from nerfro.core.progress import progress_bar
@@ -69,6 +70,8 @@ def synthesize(options: SynthesizeConfig) -> DataSet:
         scene = scene.with_glass(options.ior, tuple(options.absorption))
         if sky is not None:
             scene = replace(scene, sky=sky)
+        if options.turntable and scene.sky is None:
+            raise NerfroError(f"turntable=true needs a sky, and scene={options.scene} has a room; choose another scene")
         mitsuba = load_mitsuba(options.variant)  # a missing Mitsuba is reported before files are removed
         data = data_type(options, scene, folder)
         data.prepare(mitsuba)
@@ -80,6 +83,9 @@ def synthesize(options: SynthesizeConfig) -> DataSet:
             # The remaining time is estimated from samples, because test views have more samples.
             with progress_bar("render", sum(image.spp for image in waiting)) as bar:
                 for image in waiting:
+                    if options.turntable:
+                        pose = torch.from_numpy(image.pose[:3])
+                        tracer.turn_sky(room_rotations(pose, (0.0, 0.0, 1.0)).numpy().T)
                     radiance = tracer.render(image.pose, image.spp, image.seed)
                     data.write(image, radiance, tracer.silhouette(image.pose))
                     bar.update(image.spp)

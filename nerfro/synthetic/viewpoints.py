@@ -24,6 +24,13 @@ def directions_on_sphere(count: int, seed: int, split: int) -> np.ndarray:
     return generator.permutation(jittered)
 
 
+def directions_on_ring(count: int, seed: int, split: int, elevation: float) -> np.ndarray:
+    """Return evenly spaced unit directions [count, 3] at an elevation in degrees, from a random azimuth per split."""
+    turn = np.random.default_rng([seed, split]).random()
+    phi, theta = 2 * np.pi * (np.arange(count) + turn) / count, np.radians(elevation)
+    return np.stack([np.cos(theta) * np.cos(phi), np.cos(theta) * np.sin(phi), np.full(count, np.sin(theta))], -1)
+
+
 def look_at_origin(position: np.ndarray) -> np.ndarray:
     """Return the camera-to-world matrix [4, 4] (OpenGL axes: x right, y up, looks along -z) of a camera at `position`.
 

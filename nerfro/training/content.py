@@ -83,6 +83,8 @@ def content_settings(config: DictConfig, medium: Medium, cameras: Cameras) -> di
             no common point.
     """
     content = config.content
+    if content.space == "all":
+        cameras.refuse_turntable("content.space=all makes surroundings a part of the object", "take content.space=box")
     if (content.box_min is None) != (content.box_max is None):
         raise NerfroError(
             "content.box_min and content.box_max belong together; give both, or neither for the object's bounds"

@@ -43,7 +43,8 @@ def inputs_of(config: DictConfig, views: Views | None) -> dict[str, Any]:
     if views is None:
         return described
     cameras = views.cameras
-    image = {"width": cameras.width, "height": cameras.height, "near": float(cameras.near), "far": float(cameras.far)}
+    bounds = {"near": float(cameras.near), "far": float(cameras.far), "turntable": cameras.turntable}
+    image = {"width": cameras.width, "height": cameras.height, **bounds}
     return described | {"cameras": _tensors(cameras), "image": image, "photographs": _hash_of_photographs(views)}
 
 
@@ -65,7 +66,8 @@ def recorded_cameras(checkpoint: Mapping[str, Any]) -> Cameras | None:
         return None
     distortion = values.pop("distortion")
     return Cameras(**values, width=sides[0], height=sides[1], near=near, far=far,
-                   distortion=distortion if distortion.any() else None)  # fmt: skip
+                   distortion=distortion if distortion.any() else None,
+                   turntable=image.get("turntable", False))  # fmt: skip
 
 
 def copy_files(folder: Path, config: DictConfig) -> None:

@@ -230,8 +230,7 @@ class TrainingModule(LightningModule):
         return {"view": view, "prediction": prediction, "target": target, "depth": depth, "opacity": opacity}
 
     def test_step(self, batch: int, batch_index: int) -> None:
-        views = self.trainer.datamodule.test  # type: ignore[attr-defined]
-        target = views.images[batch].to(self.device).clamp(0, 1)
+        target = self.trainer.datamodule.test.images[batch].to(self.device).clamp(0, 1)  # type: ignore[attr-defined]
         error = (self.predict_step(batch, batch_index) - target).square().mean()
         self.log("test/psnr", -10 * torch.log10(error), batch_size=1)
 

@@ -102,10 +102,12 @@ def read_cameras(file: Path, geometry: CaptureGeometry, origin: Float[np.ndarray
     fx, fy, cx, cy = intrinsics.float().unbind(-1)
     pose = np.stack(poses)
     pose[:, :, 3] -= origin
-    near, far = geometry.camera.near, geometry.camera.far
     return geometry.with_ray_bounds(
-        Cameras(torch.from_numpy(pose).float(), fx, fy, cx, cy, width, height, near, far, distortion)
-    )
+        replace(
+            geometry.camera, camera_to_world=torch.from_numpy(pose).float(), fx=fx, fy=fy, cx=cx, cy=cy,
+            width=width, height=height, distortion=distortion,
+        )
+    )  # fmt: skip
 
 
 def write_cameras(file: Path, camera: CameraModel, views: Views, origin: Float[np.ndarray, "3"] = WORLD_ORIGIN) -> None:
@@ -145,7 +147,9 @@ def transforms_document(
         pose[:, 3] += origin
         frames.append({**entry, "transform_matrix": [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]]})
     model = "FULL_OPENCV" if rational else "OPENCV"
-    return {"camera_model": model, "w": cameras.width, "h": cameras.height, "frames": frames}
+    axis = cameras.turntable
+    turntable = {} if axis is False else {"turntable": True} if axis is True else {"turntable_axis": axis}
+    return {"camera_model": model, "w": cameras.width, "h": cameras.height, **turntable, "frames": frames}
 
 
 def _lens_of_path(document: Mapping[str, Any], entry: Mapping[str, Any], size: tuple[int, int], where: str) -> Lens:

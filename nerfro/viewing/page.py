@@ -114,6 +114,7 @@ def static_parts(
         "linear": renderer.scene.colour_space is not ColourSpace.SRGB,
         "origin": scene.source.origin.tolist(),
         "reflection": renderer.path_sampler.branching.max_split_events > 0,
+        "turntable": cameras.turntable,
         "orbit": {
             "target": box.mean(0).tolist(),
             "radius": float((box[1] - box[0]).norm() / 2),

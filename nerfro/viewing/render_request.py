@@ -139,6 +139,8 @@ def find_shots(options: RenderConfig, scene: TrainedScene) -> Shots:
     """Return the selected cameras with their resolution and field of view."""
     shots = _views(options.views, scene) if options.views is not None else _free_cameras(options, scene)
     cameras = shots.cameras
+    if cameras.turntable:
+        print("turntable: the object turns before the camera; the room behind it stands still")
     if options.fov is not None:
         cameras = _with_field_of_view(cameras, options.fov)
     cameras = _resized(cameras, *_size(options, cameras.width, cameras.height))

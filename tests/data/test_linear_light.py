@@ -199,21 +199,20 @@ def in_linear_light(scene: Path, root: Path, change: Callable[[np.ndarray], np.n
 
 
 def test_views_know_linear_light_and_components_with_bounded_radiance_refuse_it(
-    tiny_scene: Path, tiny_run: list[str], train_here: Runner, tmp_path: Path
+    tiny_scene: Path, tiny_run: list[str], tiny_default_run: list[str], train_here: Runner, tmp_path: Path
 ) -> None:
     root = in_linear_light(tiny_scene, tmp_path / "hdr", lambda radiance: 20 * radiance)
     views, usual = (BlenderData(str(folder)).load("train") for folder in (root, tiny_scene))
     assert views.in_linear_light
     assert not usual.in_linear_light
     torch.testing.assert_close(to_linear(views.images[0]), 20 * to_linear(usual.images[0]))
-    for option in ("field=nerf", "background=skybox", "model.colour=srgb"):
-        options = [f"data.root={root}", "field=hash_grid", "background=envmap", "loss.smoothness.weight=0", option]
-        changed = ("field", "background.", "background=", "data.root")
-        kept = [value for value in tiny_run if not value.startswith(changed)]
-        error = train_here(*kept, *options, "trainer.max_steps=1", code=1).error
+    default = [value for value in tiny_default_run if not value.startswith("background.")]
+    for options in (tiny_run, [*default, "model.colour=srgb"], [*default, "background=skybox"]):
+        error = train_here(*options, f"data.root={root}", "trainer.max_steps=1", code=1).error
         assert "the photographs are in linear light and may exceed 1" in error
 
 
+@pytest.mark.slow
 def test_training_in_linear_light_shows_and_scores_highlights(
     tiny_default_run: list[str],
     tiny_scene: Path,

@@ -98,6 +98,10 @@ def test_surface_that_crosses_itself_is_refused(tmp_path: Path) -> None:
     make_bodies(str(tmp_path / "300.ply"), resolution=16, cache=False)
     for medium in (make_bodies, VoxelGrid):
         refused("the surface of the mesh crosses itself", medium, str(tmp_path / "400.ply"), **BOX)
+    # The largest triangles lie inside the other end of the tube; the second mesh has its front inside.
+    fine = _coil(400, 160, 48)
+    for faces in (fine.faces, fine.faces[:, ::-1]):
+        refused("crosses itself", require_simple, mesh_of(trimesh.Trimesh(fine.vertices, faces)))
 
 
 def test_nested_and_touching_surfaces_do_not_cross_themselves(tmp_path: Path) -> None:

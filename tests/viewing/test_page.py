@@ -215,7 +215,7 @@ def test_controls_change_index_glass_reflection_tint_and_sky(scene: TrainedScene
       {SHOT}
       const shots = {{ start: shot(0, 32) }};
       set("ior0", 1.6); shots.index = shot(0, 32); const said = $("ior0-value").value; set("ior0", {IOR});
-      set("glass", false); shots.glass = shot(0, 32); set("glass", true);
+      set("straight", 0.5); shots.half = shot(0, 32); set("straight", 1); shots.glass = shot(0, 32); set("straight", 0);
       set("reflection", true); shots.reflection = shot(0, 32); set("reflection", false);
       set("tint", 1); set("tint-colour", "#804000"); shots.tint = shot(0, 32); set("tint", 0);
       const bytes = Uint8Array.from(atob("{hdr}"), (character) => character.charCodeAt(0));
@@ -237,6 +237,8 @@ def test_controls_change_index_glass_reflection_tint_and_sky(scene: TrainedScene
     assert not agrees("index", scene)
     assert found["said"] == "1.60"
     assert agrees("glass", scene.with_(glass=False))
+    torch.testing.assert_close(shots["half"][:, :16], shots["glass"][:, :16])
+    torch.testing.assert_close(shots["half"][:, 16:], shots["start"][:, 16:])
     assert agrees("sky", scene.with_(sky=lamp))
     torch.testing.assert_close(shots["end"], shots["start"])
     _check_reflection(scene, to_linear(shots["start"]), to_linear(shots["reflection"]))

@@ -110,6 +110,26 @@ def test_test_camera_is_selected_with_the_keyboard_and_left_by_dragging(browser:
     assert browser.evaluate("$('photograph').hidden")
 
 
+def test_view_is_compared_with_its_photograph(browser: Browser) -> None:
+    grey = """((level) => { const canvas = new OffscreenCanvas(8, 8), context = canvas.getContext("2d");
+      context.fillStyle = `rgb(${level},${level},${level})`; context.fillRect(0, 0, 8, 8);
+      return Object.assign(canvas, { naturalWidth: 8, naturalHeight: 8 }); })"""
+    assert browser.evaluate(f"psnr({grey}(100), {grey}(110))") == pytest.approx(20 * math.log10(25.5), abs=1e-4)
+    assert browser.evaluate("$('difference').disabled")
+    browser.evaluate("page.show(1)")
+    browser.wait_for("/PSNR [1-9][0-9]?\\.[0-9] dB/.test($('rendering').textContent)")
+    browser.evaluate("$('difference').click()")
+    corners = "(({ left, top, width, height }) => [left, top, width, height])"
+    rendering, photograph = (
+        browser.evaluate(f"{corners}($('{name}').getBoundingClientRect())") for name in ("canvas", "photograph")
+    )
+    assert rendering == pytest.approx(photograph, abs=1)
+    blend = "getComputedStyle($('photograph').parentElement).mixBlendMode"
+    assert browser.evaluate(blend) == "difference"
+    browser.evaluate("page.show(null)")
+    assert browser.evaluate(f"[{blend}, $('difference').getAttribute('aria-pressed')]") == ["normal", "false"]
+
+
 def test_overview_shows_the_whole_object_from_any_view(browser: Browser) -> None:
     browser.evaluate("page.show(1)")
     browser.evaluate("$('reset').click()")
@@ -128,7 +148,7 @@ def test_address_restores_view_and_settings(page: str, tmp_path: Path) -> None:
         browser.evaluate("""(() => {
           page.orbit.turn(0.3, 0.1);
           page.show(2);
-          $("glass").checked = false;
+          $("straight").value = 0.25;
           $("ior0").value = 1.75;
           $("ior0").dispatchEvent(new Event("input", { bubbles: true }));
         })()""")
@@ -139,8 +159,8 @@ def test_address_restores_view_and_settings(page: str, tmp_path: Path) -> None:
         assert after.pop("target") == pytest.approx(before.pop("target"), abs=1e-5)
         assert after == pytest.approx(before, rel=1e-5)
         assert after["camera"] == 2
-        assert browser.evaluate("[$('glass').checked, $('ior0').value, $('ior0-value').value]") == [
-            False,
+        assert browser.evaluate("[$('straight').value, $('ior0').value, $('ior0-value').value]") == [
+            "0.25",
             "1.75",
             "1.75",
         ]

@@ -12,6 +12,16 @@ const viewOf = (camera) => ({
   eye: camera.eye, axes: camera.axes, focal: camera.focal, principal: camera.principal, size: camera.size, near: camera.near,
 });
 
+// Return the axes of the room in which the background stands still, in the world of the object: those of the world, or on
+// a turntable those of the camera, with the axis of rotation up if it is known (see core/cameras.py).
+function roomAxes(axes, turntable) {
+  if (!turntable) return [1, 0, 0, 0, 1, 0, 0, 0, 1];
+  const up = turntable === true ? axes.slice(3, 6) : unit(turntable);
+  const right = axes.slice(0, 3);
+  const across = unit(addScaled(right, -dot(right, up), up));
+  return [...cross(across, up), ...across, ...up];
+}
+
 // A camera on a sphere around a target, which it looks at. Its state is target, radius, azimuth and elevation.
 class Orbit {
   constructor({ up, target, radius, near }) {

@@ -109,6 +109,8 @@ class Page {
     const shown = { stride, done: this.rays > 0 ? stride ** 2 : this.pass };
     this.draw([width, height], columns * (rows[1] - rows[0]), options, this.row === 0 ? shown : null);
     if (this.row === 0) this.showStatus([width, height]);
+    const isComplete = this.row === 0 && this.pass === 0;
+    if (isComplete && (this.rays & (this.rays - 1)) === 0) this.showPsnr(); // after 1, 2, 4, ... rays per pixel
   }
 
   // Trace a part of the image, and show the complete parts (`shown`, see Tracer.show), or none.
@@ -128,7 +130,7 @@ class Page {
     let [width, height] = [stage.width, stage.height];
     if (this.camera !== null) {
       const [w, h] = this.scene.cameras[this.camera].size;
-      const count = $("photograph").hidden ? 1 : 2;
+      const count = $("photograph").hidden || this.isDifference ? 1 : 2;
       const [columns, rows] = stage.width > stage.height ? [count, 1] : [1, count];
       const scale = Math.min(width / (columns * w), height / (rows * h));
       [width, height] = [w * scale, h * scale];
@@ -158,13 +160,32 @@ class Page {
     $("frame").textContent = `${width} x ${height} pixels, ${quality}`;
   }
 
+  // Show the PSNR of the rendering, reduced to the size of the photograph beside it.
+  showPsnr() {
+    if ($("photograph").hidden) return;
+    this.tracer.show(); // the browser clears the canvas between frames
+    $("rendering").textContent = `rendering, PSNR ${psnr(this.tracer.canvas, $("photograph")).toFixed(1)} dB`;
+  }
+
+  // Show the difference between photograph and rendering, or both beside each other.
+  setDifference(isDifference) {
+    this.isDifference = isDifference;
+    $("stage").classList.toggle("difference", isDifference);
+    $("difference").setAttribute("aria-pressed", isDifference);
+    this.layOut();
+    this.changed();
+  }
+
   // Show the view of a camera of the data set beside its photograph, or (null) the orbit, which starts at the present eye.
   show(camera) {
     if (camera === null && this.camera !== null) this.orbit.follow(this.view);
     this.camera = camera;
+    if (camera === null && this.isDifference) this.setDifference(false);
     const photograph = camera === null ? undefined : this.scene.cameras[camera].photograph;
     $("photograph").hidden = !photograph;
     $("stage").classList.toggle("compared", Boolean(photograph));
+    $("difference").disabled = !photograph;
+    $("rendering").textContent = "rendering";
     if (photograph) $("photograph").src = photograph;
     $("photograph").alt = photograph ? `photograph ${this.scene.cameras[camera].name}` : "";
     for (const button of document.querySelectorAll("#cameras button")) {
@@ -185,6 +206,20 @@ function jitter(number) {
   return number === 0 ? [0, 0] : [radicalInverse(number, 2) - 0.5, radicalInverse(number, 3) - 0.5];
 }
 
+// Return the PSNR between two pictures at the size of the second, in dB.
+function psnr(picture, reference) {
+  const [width, height] = [reference.naturalWidth, reference.naturalHeight];
+  const [a, b] = [picture, reference].map((source) => {
+    const context = new OffscreenCanvas(width, height).getContext("2d");
+    context.imageSmoothingQuality = "high";
+    context.drawImage(source, 0, 0, width, height);
+    return context.getImageData(0, 0, width, height).data;
+  });
+  let sum = 0;
+  a.forEach((value, i) => (sum += i % 4 < 3 ? (value - b[i]) ** 2 : 0));
+  return 10 * Math.log10((3 * width * height * 255 ** 2) / sum);
+}
+
 // Return the settings of the controls.
 function readSettings(scene) {
   const iors = scene.surface.iors.map((ior, body) => Number($(`ior${body}`)?.value ?? ior));
@@ -195,7 +230,7 @@ function readSettings(scene) {
   const isAir = (body) => scene.surface.nested && scene.surface.iors[body] === 1;
   const absorption = scene.surface.absorption.map((coefficients, body) =>
     coefficients.map((value, i) => value + (isAir(body) ? 0 : tint[i])));
-  return { iors, absorption, glass: $("glass").checked, reflection: $("reflection").checked };
+  return { iors, absorption, straight: Number($("straight")?.value ?? 0), reflection: $("reflection").checked };
 }
 
 function initControls(page) {
@@ -208,6 +243,7 @@ function initControls(page) {
     showValue(`ior${body}`);
   });
   showValue("tint");
+  if ($("straight")) showValue("straight");
   $("reflection").checked = scene.reflection;
   $("controls").addEventListener("input", (event) => {
     if (event.target.type === "range") showValue(event.target.id);
@@ -216,6 +252,7 @@ function initControls(page) {
   $("cameras").addEventListener("click", (event) => {
     if (event.target.matches("button")) page.show(event.target.value === "" ? null : Number(event.target.value));
   });
+  $("difference").addEventListener("click", () => page.setDifference(!page.isDifference));
   $("reset").addEventListener("click", () => {
     page.show(null);
     page.orbit.reset();

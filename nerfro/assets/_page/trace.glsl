@@ -17,6 +17,7 @@ uniform int stride;
 uniform ivec2 first, corner;
 uniform float height;
 uniform mat3 axes;
+uniform mat3 room;  // axes of the room in which the background stands still
 uniform vec3 eye;
 uniform float near;
 
@@ -31,6 +32,7 @@ uniform float clearanceUnit[MAX_BODIES];  // distance that one unit of the clear
 uniform float blockCells;  // cells per side of a block
 uniform float minStep;  // shortest step of the search for a surface
 uniform int numBodies, maxEvents;
+uniform float wipe;  // column of the image, in pixels; rays of the pixels left of it are straight
 uniform bool nested;  // whether a body exists only inside all previous bodies; a clear body of index 1 is then air
 uniform int insideAtEye;  // bodies that contain the eye, one bit each
 uniform float index[MAX_BODIES + 1];  // refractive index of air and of each body
@@ -52,6 +54,8 @@ uniform sampler2D picture;  // lat-long, z up, +x in the middle
 uniform bool skyIsPicture;
 
 out vec4 colour;
+
+int bodies;  // that bend the ray of this pixel
 
 const int MAX_SEARCH_STEPS = 512;
 const int MAX_SEGMENTS = 64;
@@ -105,7 +109,7 @@ float clearanceAt(vec3 x) {
   ivec3 blocks = textureSize(clearance, 0);
   blocks.z /= numBodies;
   float free = FAR;
-  for (int body = 0; body < numBodies; ++body) {
+  for (int body = 0; body < bodies; ++body) {
     vec3 nearest = clamp(x, gridLow[body], gridHigh[body]);
     ivec3 block = min(ivec3((nearest - gridLow[body]) * cellsPerUnit(body) / blockCells), blocks - 1);
     float units = float(texelFetch(clearance, block + ivec3(0, 0, body * blocks.z), 0).r);
@@ -117,7 +121,7 @@ float clearanceAt(vec3 x) {
 // Returns the number of the body that decides at a point, from 1; 0 in air (media/bodies.py).
 int decidingBody(int inside) {
   int number = 0;
-  for (int body = 0; body < numBodies; ++body) {
+  for (int body = 0; body < bodies; ++body) {
     if ((inside >> body & 1) == 1) number = body + 1;
     else if (nested) break;
   }
@@ -136,7 +140,7 @@ Hit firstSurface(vec3 x, vec3 d, int inside) {
   Hit hit = Hit(-1, 0.0, 0.0, vec3(0.0));
   vec2 span = boxSpan(boxLow, boxHigh, x, d);
   float t = max(span.x, 0.0), leave = span.y;
-  if (numBodies == 0 || t >= leave) return hit;
+  if (bodies == 0 || t >= leave) return hit;
   float before = t, after = FAR, ownSide = 1.0, otherSide = 0.0;
   float tolerance = 1e-7 * (leave - t) + 2e-7 * t;
   for (int search = 0; search < MAX_SEARCH_STEPS; ++search) {
@@ -154,7 +158,7 @@ Hit firstSurface(vec3 x, vec3 d, int inside) {
     // Signed distance to the nearest surface, positive on the side of the surface where the line begins.
     vec4 nearest = vec4(FAR);
     int body = 0;
-    for (int b = 0; b < numBodies; ++b) {
+    for (int b = 0; b < bodies; ++b) {
       vec4 phi = signedDistance(b, p) * ((inside >> b & 1) == 1 ? -1.0 : 1.0);
       if (phi.w < nearest.w) {
         nearest = phi;
@@ -252,8 +256,9 @@ void march(vec3 x, vec3 d, float start, float end, vec3 bodyAbsorption, inout ve
   throughput *= transmittance * exp(-bodyAbsorption * (min(end, FAR) - start));
 }
 
-// Returns the background radiance from a direction.
-vec3 backgroundRadiance(vec3 d) {
+// Returns the background radiance from a direction of the world.
+vec3 backgroundRadiance(vec3 direction) {
+  vec3 d = direction * room;
   const float PI = 3.14159265358979;
   if (skyIsPicture) {
     return textureLod(picture, vec2(0.5 - atan(d.y, d.x) / (2.0 * PI), acos(clamp(d.z, -1.0, 1.0)) / PI), 0.0).rgb;
@@ -266,7 +271,7 @@ vec3 backgroundRadiance(vec3 d) {
 vec3 pathRadiance(vec3 x, vec3 d) {
   vec3 radiance = vec3(0.0), throughput = vec3(1.0);
   vec3 pendingPosition = vec3(0.0), pendingDirection = vec3(0.0), pendingThroughput = vec3(0.0);
-  int inside = insideAtEye, pendingInside = 0;
+  int inside = bodies == 0 ? 0 : insideAtEye, pendingInside = 0;
   float start = near;
   int numEvents = 0;
   for (int branch = 0; branch < 2; ++branch) {
@@ -279,7 +284,7 @@ vec3 pathRadiance(vec3 x, vec3 d) {
         if (bodyAfter == 0 && bodyBefore > 0) {  // a gap of air thinner than the shortest step counts as closed
           vec3 behind = x + (hit.after + minStep) * d;
           int crossed = 0;
-          for (int b = 0; b < numBodies; ++b) {
+          for (int b = 0; b < bodies; ++b) {
             bool isInside = (insideAfter >> b & 1) == 1;
             if (b != hit.body && (signedDistance(b, behind).w < 0.0) != isInside) crossed |= 1 << b;
           }
@@ -340,6 +345,7 @@ vec3 pathRadiance(vec3 x, vec3 d) {
 void main() {
   vec2 centre = vec2(stride * (ivec2(gl_FragCoord.xy) - corner) + first) + 0.5;
   vec2 pixel = vec2(centre.x, height - centre.y) + jitter;
+  bodies = centre.x < wipe ? 0 : numBodies;
   vec3 direction = vec3((pixel.x - principal.x) / focal.x, (principal.y - pixel.y) / focal.y, -1.0);
   // The largest half-precision number is 65504.
   colour = vec4(min(pathRadiance(eye, normalize(axes * direction)), 6e4), 1.0);

@@ -97,15 +97,15 @@ class Tracer {
     });
     const scale = [width / view.size[0], height / view.size[1]];
     const { surface, volume } = this.scene;
-    const numBodies = settings.glass ? surface.iors.length : 0;
+    const numBodies = surface.iors.length;
     this.setUniforms("trace", {
       focal: [view.focal[0] * scale[0], view.focal[1] * scale[1]],
       principal: [view.principal[0] * scale[0], view.principal[1] * scale[1]],
-      jitter, stride, first, corner, height, axes: view.axes, eye: view.eye, near: view.near,
+      jitter, stride, first, corner, height, axes: view.axes, room: roomAxes(view.axes, this.scene.turntable), eye: view.eye, near: view.near,
       numVertices: surface.numVertices, gridLow: surface.low.flat(), gridHigh: surface.high.flat(),
       boxLow: alongAxes(Math.min, surface.low), boxHigh: alongAxes(Math.max, surface.high),
       distanceUnit: surface.distanceUnits, clearanceUnit: surface.clearanceUnits, blockCells: surface.blockCells,
-      minStep: surface.minStep, numBodies, nested: surface.nested, maxEvents: surface.maxEvents,
+      minStep: surface.minStep, numBodies, wipe: settings.straight * width, nested: surface.nested, maxEvents: surface.maxEvents,
       insideAtEye: numBodies ? this.bodiesAt(view.eye) : 0,
       absorption: [0, 0, 0, ...settings.absorption.flat()],
       reflection: settings.reflection,

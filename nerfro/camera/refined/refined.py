@@ -67,6 +67,8 @@ class RefinedCamera(PerView, CameraModel):
 
     def begin(self, cameras: Cameras) -> None:
         super().begin(cameras)
+        # The derivatives of the refinement assume a background that is fixed in the world.
+        cameras.refuse_turntable("camera=refined needs a fixed background", "take camera=given")
         poses = cameras.camera_to_world.double().cpu()
         pixels = pixel_motions(cameras, object_distances(cameras))
         weights = even_weights(pixels)

@@ -83,8 +83,11 @@ class NerfstudioData(PosedImages):
         frames, stated = [manifest.frames[i] for i in indices], [entries[i].get("mask_path") for i in indices]
         usable = [path and find_mask(self.root, frame.image, path) for path, frame in zip(stated, frames, strict=True)]
         depths = [] if self.depth_unit is None else [self._depth_file(manifest, entries[i]) for i in indices]
-        lenses, unit = manifest.lenses(indices), self.depth_unit or 1.0
-        return FrameSet(frames, lenses, "opengl", *self._bounds, usable=usable, depths=depths, depth_unit=unit)
+        lenses, unit, turntable = manifest.lenses(indices), self.depth_unit or 1.0, manifest.turntable
+        return FrameSet(
+            frames, lenses, "opengl", *self._bounds,
+            usable=usable, depths=depths, depth_unit=unit, turntable=turntable,
+        )  # fmt: skip
 
     def _depth_file(self, manifest: Manifest, entry: Mapping[str, Any]) -> Path:
         stated = entry.get("depth_file_path")

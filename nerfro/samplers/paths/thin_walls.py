@@ -9,20 +9,15 @@ import torch
 
 from nerfro.core.errors import NerfroError, warn
 from nerfro.geometry.bodies import points_below
-from nerfro.geometry.thickness import FEW, MIN_VOXELS, thickness
+from nerfro.geometry.thickness import WallSettings, thickness
 from nerfro.media.base import Medium
 from nerfro.media.bodies import Bodies
 from nerfro.samplers.base import PathSampler
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.paths.traced_file import make_rays
 
-_NUM_RAYS = 512
-# Median error of exit directions, in degrees, below which walls may be thin; a pixel of 400 covers about 0.1 degrees.
-_LEAST_ERROR = 0.1
-_MAX_VERTICES = 512  # largest resolution that the warning recommends
 
-
-def warn_of_thin_walls(sampler: PathSampler, medium: Medium) -> None:
+def warn_of_thin_walls(sampler: PathSampler, medium: Medium, settings: WallSettings = WallSettings()) -> None:
     """Print a warning for each body with walls that are too thin for its grid, unless the sampler traces triangles."""
     bodies = medium.bodies
     if sampler.traces_triangles or not sampler.needs_medium or bodies is None:
@@ -32,34 +27,34 @@ def warn_of_thin_walls(sampler: PathSampler, medium: Medium) -> None:
         if not mesh.is_closed:
             continue
         try:
-            voxels = thickness(mesh) / float(grid.spacing.max())
+            voxels = thickness(mesh, settings=settings) / float(grid.spacing.max())
         except NerfroError:  # without Embree
             return
-        thin = voxels < MIN_VOXELS
-        if thin.mean() <= FEW:
+        thin = voxels < settings.voxels
+        if thin.mean() <= settings.few:
             continue
         if error is None:
-            error = _median_error(bodies)
-        if error < _LEAST_ERROR:
+            error = _median_error(bodies, settings.num_rays)
+        if error < settings.least_error:
             return
-        factor = MIN_VOXELS / float(np.quantile(voxels, FEW))
+        factor = settings.voxels / float(np.quantile(voxels, settings.few))
         resolution = math.ceil((len(grid.distances) - 1) * factor) + 1
-        finer = f"raise the resolution of the grid to {resolution}, " if resolution <= _MAX_VERTICES else ""
+        finer = f"raise the resolution of the grid to {resolution}, " if resolution <= settings.most_vertices else ""
         warn(
             f"{thin.mean():.0%} of the surface of {name} bounds walls of about {np.median(voxels[thin]):.1f} voxels, "
-            f"which bend rays in wrong directions below {MIN_VOXELS:.0f} voxels; {finer}trace triangles "
+            f"which bend rays in wrong directions below {settings.voxels:.0f} voxels; {finer}trace triangles "
             "(sampler/path=snell sampler.path.interface=mesh), or describe a cavity as a body of index 1"
         )
 
 
-def _median_error(bodies: Bodies) -> float:
+def _median_error(bodies: Bodies, num_rays: int) -> float:
     """Return the median angle between exit directions behind the grids and behind the triangles, degrees.
 
     Rays start in all directions around the bodies and aim at random points of the first surface.
     """
     mesh, medium = bodies.meshes[0], bodies.achromatic()
-    target, _ = points_below(mesh, _NUM_RAYS)
-    start = torch.randn(_NUM_RAYS, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    target, _ = points_below(mesh, num_rays)
+    start = torch.randn(num_rays, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     size = torch.linalg.vector_norm(medium.box[1] - medium.box[0]).double().cpu()
     start = target.mean(0) + 2 * size * torch.nn.functional.normalize(start, dim=-1)
     towards = torch.nn.functional.normalize(target - start, dim=-1)

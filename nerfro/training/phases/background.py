@@ -165,12 +165,11 @@ def _observe_through_object(run: TrainingRun, pixels: Int[Tensor, "Q"], min_back
     steady = (widths < DIVERGENT).nonzero()[:, 0]
     path, pixels, view, widths = path.select_rays(steady), pixels[steady], view[steady], widths[steady]
     rendering = renderer.render_path(path)[-1]
-    fraction, exits = path.main_polyline(rendering.background_fraction), main_exits(path)
+    fraction, exits = path.main_polyline(rendering.background_fraction), path.main_polyline(path.exits().directions)
     rgb = batches.photographed(pixels)
     difference = _photographed(run, rgb, view) - rendering.radiance
     radiance = scene.background(Exits(exits)) + difference / fraction.clamp(min=min_background)
-    widths = widths / batches.cameras.fx[view]
-    observed = Observed(exits, radiance, saturated(rgb), fraction.square().mean(-1), widths)
+    observed = Observed(exits, radiance, saturated(rgb), fraction.square().mean(-1), widths / batches.cameras.fx[view])
     return observed[fraction.amin(-1) >= min_background]
 
 
@@ -181,7 +180,8 @@ def _observe_beside_object(run: TrainingRun, pixels: Int[Tensor, "Q"], rays: Ray
     if exposure is not None and fits_gains:
         exposure.fit(view, scene.background(Exits.unbent(rays)), scene.colour_space.to_radiance(rgb))
     widths = 1 / batches.cameras.fx[view]
-    return Observed(rays.directions, _photographed(run, rgb, view), saturated(rgb), torch.ones_like(widths), widths)
+    seen = Exits.unbent(rays).directions
+    return Observed(seen, _photographed(run, rgb, view), saturated(rgb), torch.ones_like(widths), widths)
 
 
 def _rays(run: TrainingRun, pixels: Int[Tensor, "Q"]) -> Rays:
