@@ -49,10 +49,10 @@ class ViewConfig:
 def main(options: ViewConfig) -> None:
     """Serve the page until Ctrl-C."""
     server = PageServer(options.host, options.port)
+    scene = load(options.checkpoint, options.device, options.root)
     print(f"nerfro: {options.checkpoint} on {server.url}; Ctrl-C ends it", flush=True)
     if options.open:
         open_page(server.url)  # the browser starts while the page is made
-    scene = load(options.checkpoint, options.device, options.root)
     server.open(make_page(scene, options.resolution))
     signal.pause()
 

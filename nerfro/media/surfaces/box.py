@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import trimesh
 from jaxtyping import Float
 
 from nerfro.core.errors import NerfroError
+from nerfro.geometry.mesh import TriangleMesh
 from nerfro.media.surface import Grid, Surface, vector
 from nerfro.registry.allowed import Coordinate, NotNegative, Positive
 from nerfro.registry.registration import register
@@ -15,7 +17,7 @@ from nerfro.registry.registration import register
 
 @register("surface", "box")
 class BoxSurface(Surface):
-    """A box with sides along the axes of the world; with one short side, a slab.
+    """A box with sides along the axes of the world; with one short side, a pane. Sharp edges have triangles.
 
     Args:
         sides: lengths along x, y and z, world units.
@@ -30,6 +32,9 @@ class BoxSurface(Surface):
         if rounding > self._half.min():
             raise NerfroError(f"surface.rounding={rounding} is not allowed; give at most half of the shortest side")
         self.bounds = np.stack([self._centre - self._half, self._centre + self._half])
+        if not rounding:
+            box = trimesh.creation.box(bounds=self.bounds)
+            self.mesh = TriangleMesh(np.array(box.vertices), np.array(box.faces), facets=np.arange(len(box.faces)))
 
     def distances(self, grid: Grid) -> Float[np.ndarray, "X Y Z"]:
         excess = np.abs(grid.points - self._centre) - self._half + self._rounding
