@@ -5,14 +5,16 @@ import shlex
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from torch.nn.functional import max_pool2d
 
 from nerfro.backgrounds.envmap import EnvironmentMap
-from nerfro.core.light import to_srgb
+from nerfro.core.light import to_linear, to_srgb
 from nerfro.core.paths import ASSETS_DIR
 from nerfro.core.types import Exits
 from nerfro.data.blender import BlenderData
+from nerfro.files import lat_long
 from nerfro.geometry.mesh import load_mesh
 from nerfro.registry.allowed import validate
 from nerfro.synthetic.dataset import ViewSplits
@@ -119,3 +121,18 @@ def test_folder_with_other_content_is_not_changed(tmp_path, name, content):
     (tmp_path / name).write_text(content)
     refused("it is no data set of nerfro", synthesize, small(tmp_path, overwrite=True))
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, content)]
+
+
+def test_linear_images_have_the_radiance_that_8_bits_clip(mitsuba, tmp_path):
+    lat_long.save_lat_long(tmp_path / "sky.exr", torch.full((16, 32, 3), 3.0))
+    options = {"scene": "torus", "sky": str(tmp_path / "sky.exr"), "resolution": 8}
+    for form in ("png", "exr"):
+        synthesize(small(tmp_path / form, format=form, **options))
+    linear, clipped = (BlenderData(str(tmp_path / form)).load("train") for form in ("exr", "png"))
+    assert to_linear(linear.images[0])[0, 0].tolist() == pytest.approx([3.0] * 3, rel=1e-3)
+    torch.testing.assert_close(linear.images[:].clamp(0, 1), clipped.images[:], rtol=0, atol=0.51 / 255)
+    refused(
+        "scene=dolphin_capture has photographs of 8 bits",
+        synthesize,
+        small(tmp_path / "d", scene="dolphin_capture", format="exr"),
+    )

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from omegaconf import DictConfig
 from torch import Tensor, nn
@@ -17,6 +16,7 @@ from torch import Tensor, nn
 from nerfro.backgrounds import cube_map
 from nerfro.backgrounds.base import Background
 from nerfro.core.errors import NerfroError
+from nerfro.core.light import GREY, unbounded_radiance
 from nerfro.core.types import Exits
 from nerfro.data.base import Views
 from nerfro.files import lat_long
@@ -24,8 +24,6 @@ from nerfro.geometry.space import Space
 from nerfro.registry.allowed import Count
 from nerfro.registry.registration import register
 
-# Softplus of 0 is log 2.
-_GREY = 0.5 / math.log(2)
 _BLACK = 1e-3
 # Smallest radiance that `fit` tells apart from black: the step of 8-bit images.
 _DARKEST = 1 / 255 / 12.92
@@ -144,7 +142,7 @@ class EnvironmentMap(Background):
 
     def forward(self, exits: Exits) -> Float[Tensor, "*batch 3"]:
         face, coordinates = cube_map.project(exits.directions.float().reshape(-1, 3))
-        return _radiance(self._raw_at(face, coordinates)).view(exits.directions.shape)
+        return unbounded_radiance(self._raw_at(face, coordinates)).view(exits.directions.shape)
 
     @property
     def face_resolution(self) -> int:
@@ -226,12 +224,7 @@ class EnvironmentMap(Background):
         self.texels_of_levels()[-1][0].copy_(_raw(radiance))
 
 
-def _radiance(raw: Float[Tensor, "rows 3"]) -> Float[Tensor, "rows 3"]:
-    """Map raw values to linear radiance, by the square of a softplus that is 0.5 at 0 (see `networks.radiance`)."""
-    return (F.softplus(raw.float()) * _GREY).square()
-
-
 def _raw(radiance: Float[Tensor, "rows 3"]) -> Float[Tensor, "rows 3"]:
-    """Invert `_radiance`; the darkest value is slightly above black."""
-    y = (radiance.sqrt() / _GREY).clamp(min=_BLACK)
+    """Invert `unbounded_radiance`; the darkest value is slightly above black."""
+    y = (radiance.sqrt() / GREY).clamp(min=_BLACK)
     return y + torch.log(-torch.expm1(-y))

@@ -9,6 +9,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from nerfro.core.light import saturated
+
 
 class PerView(nn.Module):
     """Module whose tensors are empty until `begin` or the loading of a checkpoint sets the number of views."""
@@ -51,7 +53,7 @@ class Exposure(PerView):
             radiance: predicted linear radiance without gain.
             photographed: linear radiance in the photograph; saturated values are ignored.
         """
-        unsaturated = photographed < 1
+        unsaturated = ~saturated(photographed)
         products = torch.stack([photographed * radiance, radiance * radiance]) * unsaturated
         sums = products.new_zeros(2, *self.log_gain.shape).index_add(1, view, products)
         # A black photograph has no gain.
@@ -71,7 +73,7 @@ def fit_gain(
     Args:
         encode: conversion from linear radiance to the colour space of the photograph.
         radiance: rendered linear radiance of each pixel.
-        target: colours of the photograph in [0, 1].
+        target: colours of the photograph.
     """
     with torch.inference_mode(False), torch.enable_grad():
         radiance, target = radiance.double().clone(), target.double().clone()
@@ -81,8 +83,8 @@ def fit_gain(
             shown = encode(log_gains.exp() * radiance)
             (slope,) = torch.autograd.grad(shown.sum(), log_gains)
             # Pixels that are saturated in both images carry no information.
-            error = torch.where((target >= 1) & (shown > 1), 0.0, shown.detach() - target)
-            slope = torch.where((target >= 1) & (shown > 1), 0.0, slope)
+            clipped = saturated(target) & (shown > 1)
+            error, slope = (value.masked_fill(clipped, 0) for value in (shown.detach() - target, slope))
             step = (slope * error).sum(0) / slope.square().sum(0).clamp(min=1e-12)
             logarithm = logarithm - step.clamp(-1, 1)
     return logarithm.exp().float()

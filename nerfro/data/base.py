@@ -49,7 +49,7 @@ class Views:
 
     Attributes:
         cameras: one camera per image; all images have the same resolution.
-        images: RGB colours [H, W, 3], sRGB in [0, 1].
+        images: RGB colours [H, W, 3], sRGB in [0, 1], which continues beyond 1 for photographs in linear light.
         masks: coverage of each pixel [H, W] by the refractive object in [0, 1], or None if the data set has no masks.
         names: names of the images in the data set.
         usable: pixels [H, W] that training may use (1 or True), or None if all pixels are usable.
@@ -86,6 +86,20 @@ class Views:
 
     def __len__(self) -> int:
         return len(self.names)
+
+    @property
+    def in_linear_light(self) -> bool:
+        """Whether the photographs are in linear light (.exr, .hdr, TIFF in floating point, raw), and may exceed 1."""
+        images = self.images
+        return images.dtype == np.float32 if isinstance(images, LazyImages) else bool((images > 1).any())
+
+    def refuse_linear_light(self, component: str) -> None:
+        """Refuse photographs in linear light for a component whose radiance is at most 1."""
+        if self.in_linear_light:
+            raise NerfroError(
+                f"the photographs are in linear light and may exceed 1, but the radiance of {component} may not; take "
+                "model.colour=hdr field=hash_grid background=envmap, or convert the photographs to PNG"
+            )
 
     def select(self, views: Sequence[int]) -> Views:
         """Return the views with the given indices, in this order."""

@@ -19,7 +19,7 @@ from nerfro.core.errors import NerfroError, first_of
 from nerfro.core.paths import refuse_root, resolve_path
 from nerfro.data.base import SPLITS, DataSource, Frame, Views
 from nerfro.data.depths import DEPTH, depths_of_points, read_depths
-from nerfro.data.image_files import IMAGE_SUFFIXES, Alpha, read_rgb
+from nerfro.data.image_files import VIEW_SUFFIXES, Alpha, read_rgb, suffix_list
 from nerfro.data.lazy_images import LazyImages
 from nerfro.data.lenses import Lens, check_lenses, lens_tensors
 from nerfro.data.masks import find_mask, find_masks, find_usable, require_used, unused_masks
@@ -216,7 +216,7 @@ def _check_bounds(near: float | None, far: float | None) -> None:
         raise NerfroError(f"data.near={near} and data.far={far} are not an interval; take 0 <= near < far")
 
 
-def list_images(folder: Path, suffixes: Sequence[str] = IMAGE_SUFFIXES) -> list[Path]:
+def list_images(folder: Path, suffixes: Sequence[str] = VIEW_SUFFIXES) -> list[Path]:
     """List the image files of a folder by name, without masks (`mask_*`) and hidden files.
 
     Raises:
@@ -230,7 +230,7 @@ def list_images(folder: Path, suffixes: Sequence[str] = IMAGE_SUFFIXES) -> list[
         others = sorted({path.suffix.lower() for path in files if path.suffix})
         raise NerfroError(
             f"{folder} holds no image{f', but {first_of(others)} files' if others else ''}; allowed are "
-            f"{', '.join(suffixes)}. nerfro.reconstruct also reads HEIC photographs and, with video=FILE, videos"
+            f"{suffix_list(suffixes)}. nerfro.reconstruct also reads HEIC photographs and, with video=FILE, videos"
         )
     return sorted(images)
 

@@ -1,29 +1,34 @@
-"""Readers of image and mask files with 8 or 16 bits per channel."""
+"""Readers of image and mask files: 8 or 16 bits per channel in sRGB, and floating point or raw in linear light."""
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, UInt8, UInt16
+from jaxtyping import Float, Float32, UInt8, UInt16
 from PIL import Image
 from scipy.sparse import csr_array
 
 from nerfro.core.errors import NerfroError
-from nerfro.files.deep_images import read_16bit
-from nerfro.files.reading import open_image
+from nerfro.core.light import encode_photograph, to_linear
+from nerfro.files.deep_images import is_float_tiff, radiance_size, read_16bit, read_radiance
+from nerfro.files.raw_photographs import RAW_SUFFIXES, raw_size, read_raw
+from nerfro.files.reading import open_image, reading
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".jfif", ".webp", ".bmp", ".tif", ".tiff")
+VIEW_SUFFIXES = (*IMAGE_SUFFIXES, ".exr", ".hdr", *RAW_SUFFIXES)  # of photographs, but not of masks
 Alpha = Literal["drop", "white", "black"]
 
-Levels = UInt8[np.ndarray, "H W *C"] | UInt16[np.ndarray, "H W *C"]
+# Integers of sRGB, or sRGB in floating point, which continues beyond 1 for photographs in linear light.
+Levels = UInt8[np.ndarray, "H W *C"] | UInt16[np.ndarray, "H W *C"] | Float32[np.ndarray, "H W *C"]
 
 
 def to_unit(levels: Levels) -> Float[np.ndarray, "H W *C"]:
-    """Convert integer levels of 8 or 16 bits to numbers in [0, 1]."""
-    return levels.astype(np.float32) / np.iinfo(levels.dtype).max
+    """Convert integer levels of 8 or 16 bits to numbers in [0, 1]; numbers in floating point are kept."""
+    return levels if levels.dtype == np.float32 else levels.astype(np.float32) / np.iinfo(levels.dtype).max
 
 
 def to_levels(values: Float[np.ndarray, "H W *C"]) -> UInt16[np.ndarray, "H W *C"]:
@@ -41,8 +46,22 @@ def _decode(path: Path, image: Image.Image, bits: int) -> Levels:
     return _read_16bit(path, image) if bits > 8 else _read_8bit(image, bits)
 
 
+def suffix_list(suffixes: Sequence[str]) -> str:
+    """List suffixes for a message, without those of raw files, which are many."""
+    names = ", ".join(suffix for suffix in suffixes if suffix not in RAW_SUFFIXES)
+    return f"{names} and raw files" if RAW_SUFFIXES[0] in suffixes else names
+
+
+def is_linear(path: Path) -> bool:
+    """Return whether a photograph is in linear light: an .exr, .hdr or raw file, or a TIFF file in floating point."""
+    return path.suffix.lower() in VIEW_SUFFIXES[len(IMAGE_SUFFIXES) :] or is_float_tiff(path)
+
+
 def read_size(path: Path) -> tuple[int, int, int]:
-    """Read width, height and bits per channel from the header of an image file."""
+    """Read width, height and bits per channel from the header of an image file; 32 bits for linear light."""
+    if is_linear(path):
+        with _reading(path):
+            return *(raw_size(path) if path.suffix.lower() in RAW_SUFFIXES else radiance_size(path)), 32
     with open_image(path) as (image, bits):
         return *image.size, bits
 
@@ -75,8 +94,11 @@ def read_rgb(path: Path, alpha: Alpha) -> Levels:
     """Read the colours of an image. `drop` ignores transparency; `white` and `black` composite over this colour.
 
     Returns:
-        Levels [H, W, 3]: 16 bits if the image was composited, otherwise the bits of the file.
+        Levels [H, W, 3]: 16 bits if the image was composited, otherwise the bits of the file; floating point for
+        photographs in linear light, see `encode_photograph`.
     """
+    if is_linear(path):
+        return encode_photograph(_read_radiance(path, alpha))
     levels = read_levels(path)
     num_colours = 1 if levels.shape[-1] < 3 else 3
     rgb = levels[..., :num_colours]
@@ -84,6 +106,22 @@ def read_rgb(path: Path, alpha: Alpha) -> Levels:
         opacity = to_unit(levels[..., num_colours:])
         rgb = to_levels(to_unit(rgb) * opacity + (1 - opacity) * (1.0 if alpha == "white" else 0.0))
     return np.broadcast_to(rgb, (*rgb.shape[:2], 3))
+
+
+def _read_radiance(path: Path, alpha: Alpha) -> Float[np.ndarray, "H W 3"]:
+    """Read a photograph in linear light; transparency is composited in linear light."""
+    with _reading(path):
+        radiance = read_raw(path) if path.suffix.lower() in RAW_SUFFIXES else read_radiance(path)
+        if not np.isfinite(radiance).all():
+            raise OSError("some of its values are not finite")
+    colours, opacity = radiance[..., :3], radiance[..., 3:]
+    if alpha == "drop" or opacity.shape[-1] == 0:
+        return colours
+    return colours * opacity + (1 - opacity) * (1.0 if alpha == "white" else 0.0)
+
+
+def _reading(path: Path) -> contextlib.AbstractContextManager[None]:
+    return reading(path, "image ", missing="restore it or remove its frame")
 
 
 def read_mask(path: Path, labels: Sequence[int] | None = None) -> Levels:
@@ -142,6 +180,15 @@ def downscaled(size: tuple[int, int], factor: float) -> tuple[int, int]:
     return first, second
 
 
+def downscaled_levels(
+    levels: Levels, size: tuple[int, int]
+) -> UInt16[np.ndarray, "h w *C"] | Float32[np.ndarray, "h w *C"]:
+    """Downscale an image by `area_mean`: integers in sRGB, photographs in linear light in linear light."""
+    if levels.dtype == np.float32:
+        return encode_photograph(area_mean(to_linear(levels), size))
+    return to_levels(area_mean(to_unit(levels), size))
+
+
 def area_mean(values: Float[np.ndarray, "H W *C"], size: tuple[int, int]) -> Float[np.ndarray, "h w *C"]:
     """Downscale an image to a size (height, width); each pixel becomes the mean of the area that it covers."""
     height, width = values.shape[:2]
@@ -154,7 +201,7 @@ def area_mean(values: Float[np.ndarray, "H W *C"], size: tuple[int, int]) -> Flo
     rows = (_coverage(height, size[0]) @ values.reshape(height, -1)).reshape(size[0], width, -1)
     columns = _coverage(width, size[1]) @ rows.swapaxes(0, 1).reshape(width, -1)
     mean = columns.reshape(size[1], size[0], *channels).swapaxes(0, 1)
-    return mean.clip(0, 1).astype(np.float32)
+    return mean.clip(values.min(), values.max()).astype(np.float32)
 
 
 def _coverage(count: int, fewer: int) -> csr_array:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from nerfro.core.cameras import Window
 from nerfro.core.errors import NerfroError
-from nerfro.data.image_files import Levels, area_mean, downscaled, read_size, to_levels, to_unit
+from nerfro.data.image_files import Levels, downscaled, downscaled_levels, read_size, to_unit
 
 _decoded: dict[Hashable, Levels] | None = None
 
@@ -37,13 +37,16 @@ def decoded_once() -> Iterator[None]:
 class LazyImages:
     """Image files of one size. `images[i]` or `images[:2]` decodes files and returns values in [0, 1].
 
+    Values of photographs in linear light may be below 0 and above 1, see `encode_photograph`.
+
     The result has shape [H, W, 3], or [H, W] for masks. Create an instance with `LazyImages.of`.
 
     Attributes:
         files: one file per image.
         read: function that reads one file; called from several threads.
         size: stored height and width in pixels.
-        dtype: uint16 if a file has 16 bits or if reading averages or composites levels, otherwise uint8.
+        dtype: float32 if a file is in linear light, uint16 if a file has 16 bits or if reading averages or composites
+            levels, otherwise uint8.
         downscale: downscaling factor, 1 or more.
         recipe: text that identifies the conversion by `read`. It is part of the cache key of decoded pixels.
         window: region of the downscaled image that is kept, or None for the whole image.
@@ -92,7 +95,8 @@ class LazyImages:
                     f"image {path} has {size[0]}x{size[1]} pixels but {files[0]} has {width}x{height}; {advice}"
                 )
             bits = max(bits, depth)
-        dtype = np.dtype(np.uint16 if deep or bits > 8 or downscale > 1 else np.uint8)
+        integer = np.uint16 if deep or bits > 8 or downscale > 1 else np.uint8
+        dtype = np.dtype(np.float32 if bits > 16 else integer)
         return cls(files, read, (height, width), dtype, downscale, recipe)
 
     @property
@@ -114,7 +118,7 @@ class LazyImages:
         return (self[index] for index in range(len(self)))
 
     def levels(self, index: int) -> Levels:
-        """Return one image as integer levels of type `dtype`."""
+        """Return one image as levels of type `dtype`."""
         if _decoded is None or not self.recipe:
             return self._decode(index)
         file = self.files[index]
@@ -132,8 +136,10 @@ class LazyImages:
         if levels.shape[:2] != self.size:
             raise NerfroError(f"the size of image {self.files[index]} has changed during the run; start it again")
         if self.downscale > 1:
-            levels = to_levels(area_mean(to_unit(levels), downscaled(self.size, self.downscale)))
-        if levels.dtype != self.dtype:
+            levels = downscaled_levels(levels, downscaled(self.size, self.downscale))
+        if self.dtype == np.float32:
+            levels = to_unit(levels)
+        elif levels.dtype != self.dtype:
             levels = levels.astype(np.uint16) * 257  # maps 255 to 65535, and therefore keeps every level's fraction
         if self.window is None:
             return levels

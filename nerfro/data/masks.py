@@ -15,7 +15,7 @@ from PIL import Image
 
 from nerfro.core.errors import NerfroError, first_of, warn
 from nerfro.data.base import SPLITS, DataSource, Views
-from nerfro.data.image_files import IMAGE_SUFFIXES, Levels, read_levels, read_mask, read_size
+from nerfro.data.image_files import IMAGE_SUFFIXES, Levels, is_linear, read_levels, read_mask, read_size
 from nerfro.data.lazy_images import LazyImages
 from nerfro.files.reading import open_image
 
@@ -251,6 +251,8 @@ def _any_is_transparent(images: Sequence[Path]) -> bool:
     """Return whether any image has pixels that are not opaque; only files that may have such pixels are decoded."""
     files = []
     for path in images:
+        if is_linear(path):
+            continue
         with open_image(path) as (image, _):
             if image.has_transparency_data:
                 files.append(path)

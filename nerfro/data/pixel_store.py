@@ -1,4 +1,4 @@
-"""Colours of all training pixels, stored in 8 or 16 bits per channel."""
+"""Colours of all training pixels, stored in 8 or 16 bits per channel; those in linear light in floating point."""
 
 from __future__ import annotations
 

@@ -12,13 +12,13 @@ from typing import Any
 from nerfro.core.errors import NerfroError, first_of, warn
 from nerfro.data.base import SPLITS, Frame
 from nerfro.data.frames import check_pose, require_root, turntable_of
-from nerfro.data.image_files import IMAGE_SUFFIXES, read_size
+from nerfro.data.image_files import VIEW_SUFFIXES, read_size, suffix_list
 from nerfro.data.lenses import Lens, read_lens
 from nerfro.data.masks import find_mask, mask_beside
 from nerfro.files.reading import parse_matrix, read_json
 from nerfro.registry.allowed import check
 
-_OTHER_TYPES = (".exr", ".hdr", ".heic", ".heif", ".avif", ".dng", ".npy")  # of photographs that are not read
+_OTHER_TYPES = (".heic", ".heif", ".avif", ".npy")  # of photographs that are not read
 # Files and folders of other data formats, for a message.
 _OTHER_FORMATS = {
     "transforms.json": "nerfstudio", "sparse": "colmap", "colmap": "colmap", "poses_bounds.npy": "llff",
@@ -164,15 +164,15 @@ def _refuse_other_type(path: Path, name: str) -> None:
         raise NerfroError(
             f"{path} names {file}, and images with the ending {file.suffix or '(none)'} are not read; convert the "
             "images to PNG (8 or 16 bits, sRGB) or JPEG, and correct the names in the file. Allowed are "
-            f"{', '.join(IMAGE_SUFFIXES)}"
+            f"{suffix_list(VIEW_SUFFIXES)}"
         )
 
 
 def _candidates(root: Path, name: str) -> list[Path]:
     """List the possible image files of a `file_path` with a missing extension, or with one in upper or lower case."""
     suffix = PurePosixPath(name).suffix
-    suffixes: tuple[str, ...] = IMAGE_SUFFIXES
-    if suffix.lower() in IMAGE_SUFFIXES:
+    suffixes: tuple[str, ...] = VIEW_SUFFIXES
+    if suffix.lower() in VIEW_SUFFIXES:
         name, suffixes = name.removesuffix(suffix), (suffix, suffix.lower())
     return [root / f"{name}{end}" for end in (*suffixes, *(end.upper() for end in suffixes))]
 

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.core.errors import NerfroError
-from nerfro.data.image_files import IMAGE_SUFFIXES, Alpha, read_rgb, to_unit
+from nerfro.data.image_files import VIEW_SUFFIXES, Alpha, read_rgb, suffix_list, to_unit
 from nerfro.data.masks import find_mask, find_masks, require_used
 
 
@@ -115,13 +115,13 @@ def _list_images(folder: Path, option: str) -> dict[str, Path]:
         raise NerfroError(f"{option}={folder} is not a folder; give a folder of images")
     images: dict[str, Path] = {}
     for path in sorted(folder.iterdir()):
-        if path.suffix.lower() not in IMAGE_SUFFIXES or path.name.startswith("."):
+        if path.suffix.lower() not in VIEW_SUFFIXES or path.name.startswith("."):
             continue
         if path.stem in images:
             raise NerfroError(f"{images[path.stem]} and {path} have the same name; keep one in {option}={folder}")
         images[path.stem] = path
     if not images:
-        raise NerfroError(f"{option}={folder} holds no images; allowed are {', '.join(IMAGE_SUFFIXES)}")
+        raise NerfroError(f"{option}={folder} holds no images; allowed are {suffix_list(VIEW_SUFFIXES)}")
     return images
 
 

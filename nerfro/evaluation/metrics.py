@@ -39,12 +39,13 @@ class ImageMetrics(nn.Module):
     ) -> ViewScores:
         """Score one view.
 
-        The prediction is clipped and rounded to 8 bits, so that the scores can be computed from the written image.
+        The prediction is clipped and rounded to 8 bits, so that the scores can be computed from the written image. The
+        reference is clipped.
 
         Args:
             name: name of the view.
             prediction: rendered image, sRGB.
-            target: reference image, sRGB in [0, 1].
+            target: reference image, sRGB.
             coverage: coverage of each pixel by the object in [0, 1]. Without it, or if the object is not visible, only
                 the full image has scores.
 
@@ -52,6 +53,7 @@ class ImageMetrics(nn.Module):
             NerfroError: the sizes differ, or a value is not finite.
         """
         require_images(prediction, target, coverage)
+        target = target.clamp(0, 1)
         prediction = round_to_8bit(prediction)  # raises an error for values that are not finite
         regions: dict[Region, dict[str, Score]] = {}
         inside = None if coverage is None else object_pixels(coverage)

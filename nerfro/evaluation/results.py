@@ -26,8 +26,8 @@ Region = Literal["full", "mask", "crop"]  # see nerfro/evaluation/regions.py
 FULL: Region = "full"
 OBJECT: Region = "mask"
 # Scores with the given cameras and exposure, and with exposures that are fitted to the left halves of the photographs,
-# which belong to the right halves; docs/reference/metrics.md.
-AS_GIVEN, EXPOSED = "as given", "exposed"
+# which belong to the right halves, and of tone-mapped images; docs/reference/metrics.md.
+AS_GIVEN, EXPOSED, TONE_MAPPED = "as given", "exposed", "tone_mapped"
 OBJECT_REGIONS: tuple[Region, ...] = (OBJECT, "crop")  # regions that require a mask of the object
 
 
@@ -106,7 +106,8 @@ class RunMetrics:
         steps: number of optimizer steps; None for images of another program.
         train_seconds: wall-clock time of training in seconds, without evaluation; None without training.
         rays_per_second: training throughput; None without training.
-        treatments: scores of the same views with corrected cameras or exposures; see `nerfro.evaluation.scoring`.
+        treatments: scores of the same views with corrected cameras or exposures, or another tone curve; see
+            `nerfro.evaluation.scoring`.
         steps_by_phase: number of steps of each phase of the training, such as `background` and `scene`.
     """
 

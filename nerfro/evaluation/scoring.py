@@ -14,16 +14,17 @@ from pathlib import Path
 import torch
 
 from nerfro.camera.exposure import fit_gain
+from nerfro.core.light import to_linear, tone_mapped
 from nerfro.core.progress import track
 from nerfro.data.base import Views
-from nerfro.data.image_files import Alpha
+from nerfro.data.image_files import Alpha, is_linear
 from nerfro.evaluation.error_sheets import write_error_sheet
 from nerfro.evaluation.folders import ImagePair
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.render_view import render_view
-from nerfro.evaluation.results import AS_GIVEN, EXPOSED, EvaluationResult, ViewScores
+from nerfro.evaluation.results import AS_GIVEN, EXPOSED, TONE_MAPPED, EvaluationResult, ViewScores
 from nerfro.files.images import save_png
-from nerfro.rendering import Renderer
+from nerfro.rendering import ColourSpace, Renderer
 from nerfro.samplers.subdivision import Subdivision
 
 
@@ -38,6 +39,9 @@ def score_split(
       and use the estimated lens.
     - `exposed`: in addition, each view and channel has a gain. Gains are fitted on the left halves of the photographs,
       and the right halves are scored.
+
+    For photographs in linear light, `tone_mapped` scores the views as given after the curve `tone_mapped`, which
+    distinguishes highlights. All other images are sRGB, clipped to [0, 1].
 
     The images are 8-bit sRGB, `folder/images/<prefix>_NNN.png` and `folder/images_<treatment>/<prefix>_NNN.png`.
 
@@ -54,6 +58,8 @@ def score_split(
     """
     scene, results, treatments = renderer.scene, dict[str, EvaluationResult](), [AS_GIVEN]
     settings = metrics, folder, subdivision, prefix
+    if scene.colour_space is ColourSpace.HDR:
+        treatments.append(TONE_MAPPED)
     if scene.camera.moves:
         results = _score_views(renderer, views, *settings, treatments)
         views, treatments = replace(views, cameras=scene.camera.aligned(views.cameras)), ["aligned"]
@@ -88,11 +94,13 @@ def _score_views(
             if treatment == EXPOSED:
                 to_srgb, shown = scene.colour_space.to_srgb, radiance[:, left].flatten(0, 1)
                 gain = fit_gain(to_srgb, shown, target[:, left].flatten(0, 1))
-            rgb = scene.colour_space.to_display(radiance, gain)
+            rgb, reference = scene.colour_space.to_display(radiance, gain), target
+            if treatment == TONE_MAPPED:
+                rgb, reference = tone_mapped(radiance), tone_mapped(to_linear(target))
             save_png(folder / ("images" if treatment == AS_GIVEN else f"images_{treatment}") / f"{name}.png", rgb)
             part = slice(width // 2, None) if treatment == EXPOSED else slice(None)
             coverage = None if mask is None else mask[:, part].contiguous()
-            scored.append(metrics.score(name, rgb[:, part].contiguous(), target[:, part].contiguous(), coverage))
+            scored.append(metrics.score(name, rgb[:, part].contiguous(), reference[:, part].contiguous(), coverage))
     return {treatment: metrics.result(scored) for treatment, scored in scores.items()}
 
 
@@ -102,13 +110,16 @@ def score_folders(
     metrics: ImageMetrics,
     folder: Path,
     device: torch.device,
-) -> EvaluationResult:
-    """Score each prediction on a device, and write error maps to `folder/errors`."""
-    metrics, scores = metrics.to(device), []
+) -> tuple[EvaluationResult, dict[str, EvaluationResult]]:
+    """Score each prediction on a device, and write error maps to `folder/errors`; the result is as of `score_split`."""
+    metrics, scores, mapped = metrics.to(device), list[ViewScores](), list[ViewScores]()
     for pair in track("evaluate", pairs):
         prediction, reference, coverage = pair.load(alpha)
         prediction, reference = prediction.to(device), reference.to(device)
         coverage = None if coverage is None else coverage.to(device)
         scores.append(metrics.score(pair.name, prediction, reference, coverage))
         write_error_sheet(folder, pair.name, prediction, reference, metrics.metrics)
-    return metrics.result(scores)
+        if is_linear(pair.reference):
+            prediction, reference = (tone_mapped(to_linear(image)) for image in (prediction, reference))
+            mapped.append(metrics.score(pair.name, prediction, reference, coverage))
+    return metrics.result(scores), {TONE_MAPPED: metrics.result(mapped)} if len(mapped) == len(scores) else {}

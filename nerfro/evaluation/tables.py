@@ -204,7 +204,8 @@ def write_scores(metrics: RunMetrics, title: str, folder: Path, brief: bool = Fa
     if brief or len(result.regions) > 1:
         rich.print(to_rich(regions_table(result, f"mean of {len(result.views)} view{'s' * (len(result.views) > 1)}")))
     if metrics.treatments:
-        rich.print(to_rich(treatments_table(metrics, "with fitted exposures or cameras; compare rows of equal pixels")))
+        title = "other cameras, exposures or tone curves; compare rows of equal pixels"
+        rich.print(to_rich(treatments_table(metrics, title)))
 
 
 def write_table(table: Table, stem: Path) -> None:

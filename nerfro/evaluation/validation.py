@@ -81,4 +81,4 @@ class ValidationPixels:
 
 
 def _psnr(prediction: Float[Tensor, "Q 3"], target: Float[Tensor, "Q 3"]) -> Float[Tensor, ""]:
-    return -10 * torch.log10((prediction - target).square().mean())
+    return -10 * torch.log10((prediction - target.clamp(0, 1)).square().mean())

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from nerfro.core.cameras import Cameras
+from nerfro.core.light import unbounded_radiance
 from nerfro.core.results import require_results
 from nerfro.core.types import FieldValues, Samples
 from nerfro.data.component import Component
@@ -93,14 +94,15 @@ def evaluate_selected(decoder: Decoder, samples: Samples, selected: Bool[Tensor,
     return FieldValues(all_density.view(selected.shape), all_radiance.view(*selected.shape, 3))
 
 
-def radiance(raw: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """Convert raw outputs to linear radiance in [0, 1] by a squared sigmoid.
+def radiance(raw: Float[Tensor, "*batch"], unbounded: bool = False) -> Float[Tensor, "*batch"]:
+    """Convert raw outputs to linear radiance: in [0, 1] by a squared sigmoid, or unbounded by a squared softplus.
 
     The square approximates sRGB, which stores about the root of radiance. Early in training, black explains thin fog in
     front of a bright sky best, and the gradient of a saturated sigmoid would vanish. Therefore gradients that would
     decrease values below `_BLACK`, the smallest pixel value above 0, are blocked.
     """
-    return torch.sigmoid(_ClampBlack.apply(raw.float())).square()
+    raw = _ClampBlack.apply(raw.float())
+    return unbounded_radiance(raw) if unbounded else torch.sigmoid(raw).square()
 
 
 class _ClampBlack(torch.autograd.Function):

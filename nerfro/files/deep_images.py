@@ -28,8 +28,43 @@ def read_16bit(path: Path) -> UInt16[np.ndarray, "H W C"]:
     return levels
 
 
-def read_radiance(path: Path) -> Float[np.ndarray, "H W 3"]:
-    """Read linear RGB radiance from an OpenEXR (.exr) or Radiance (.hdr) file.
+def is_float_tiff(path: Path) -> bool:
+    """Return whether a file is a TIFF image of floating-point numbers, by convention linear light."""
+    import OpenImageIO
+
+    if path.suffix.lower() not in (".tif", ".tiff") or not path.is_file():
+        return False
+    image = OpenImageIO.ImageInput.open(str(path))
+    if image is None:
+        OpenImageIO.geterror()  # otherwise reported at the end of the program
+        return False
+    return image.spec().format.basetype in (OpenImageIO.HALF, OpenImageIO.FLOAT, OpenImageIO.DOUBLE)
+
+
+def radiance_size(path: Path) -> tuple[int, int]:
+    """Read width and height from the header of a file of `read_radiance`.
+
+    Raises:
+        OSError: the file is corrupt, shows a part of its frame, or is to be turned for display.
+    """
+    import OpenImageIO
+
+    image = OpenImageIO.ImageInput.open(str(path))
+    if image is None:
+        raise OSError(OpenImageIO.geterror().partition("\n")[0])
+    spec = image.spec()
+    if path.suffix.lower() == ".exr" and spec.roi != spec.roi_full:
+        raise OSError("its data window differs from its display window; save the whole frame")
+    if spec.get_int_attribute("Orientation", 1) != 1:
+        raise OSError(f"it has orientation {spec.get_int_attribute('Orientation')}; save it with upright pixels")
+    return spec.width, spec.height
+
+
+def read_radiance(path: Path) -> Float[np.ndarray, "H W C"]:
+    """Read linear RGB radiance from an OpenEXR (.exr), Radiance (.hdr) or floating-point TIFF file.
+
+    Returns:
+        Radiance, and alpha if the file has it, by which the radiance is not multiplied.
 
     Raises:
         OSError: the file is truncated or corrupt, or has no channels R, G and B.
@@ -37,7 +72,7 @@ def read_radiance(path: Path) -> Float[np.ndarray, "H W 3"]:
     pixels, names = _read(path)
     if names[:3] != ("R", "G", "B"):
         raise OSError(f"it has the channels {', '.join(names)}, but R, G and B are needed")
-    radiance = pixels[..., :3].astype(np.float32)
+    radiance = pixels[..., : 4 if names[3:4] == ("A",) else 3].astype(np.float32)
     if path.suffix.lower() != ".hdr":
         return radiance
     # A mantissa m of 8 bits stands for the interval from m to m + 1 (Ward, Real Pixels, Graphics Gems II, 1991).
@@ -88,4 +123,7 @@ def _read(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
     if pixels.dtype == np.uint16 and alpha >= 0 and is_associated:
         colours = 65535 * pixels[..., :alpha].astype(np.float64) / pixels[..., alpha:].clip(1)
         pixels[..., :alpha] = np.rint(colours).clip(0, 65535)  # TIFF files may hold colours multiplied by alpha
+    elif pixels.dtype.kind == "f" and alpha == 3 and is_associated:
+        opacity = pixels[..., 3:4]
+        pixels[..., :3] /= np.where(opacity > 0, opacity, 1)
     return pixels, tuple(image.spec().channelnames)

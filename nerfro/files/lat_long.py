@@ -56,7 +56,7 @@ def load_lat_long(path: Path | str) -> Float[Tensor, "H 2*H 3"]:
     suffix = _format(path)
     with reading(path, "the sky ", advice="write or copy it again", missing="correct background.image"):
         if suffix in (".hdr", ".exr"):
-            radiance = read_radiance(path)
+            radiance = read_radiance(path)[..., :3]
         else:
             with open_image(path) as (image, bits):
                 levels = read_16bit(path) / 65535 if bits > 8 else np.array(image.convert("RGB")) / 255

@@ -75,7 +75,8 @@ def find_backdrop(images: LazyImages | Float[Tensor, "V H W 3"]) -> list[float] 
     colour = torch.stack([of_one.median(0).values for of_one in borders]).median(0).values
     cut_out = torch.tensor([float(shows(of_one, colour).double().mean()) >= _OF_BORDER for of_one in borders])
     share = torch.stack([shows(image, colour).double().mean() for image in examined]).median()
-    return colour.tolist() if cut_out.double().mean() >= _OF_IMAGES and share >= _OF_PIXELS else None
+    is_shown = float(colour.min()) >= 0 and float(colour.max()) <= 1  # photographs in linear light may exceed 1
+    return colour.tolist() if is_shown and cut_out.double().mean() >= _OF_IMAGES and share >= _OF_PIXELS else None
 
 
 def _border(height: int, width: int) -> Bool[Tensor, "H W"]:

@@ -101,4 +101,4 @@ class Objective(nn.Module):
                 "(loss.photometric.weight=1), or start a loss earlier"
             )
         shown = scene.colour_space.to_display(batch.per_pixel(renderings[-1].radiance.detach()))
-        return ObjectiveValue(total, weights, values, (shown - batch.rgb).square().mean())
+        return ObjectiveValue(total, weights, values, (shown - batch.rgb.clamp(0, 1)).square().mean())

@@ -22,7 +22,7 @@ from nerfro.data.base import DataSource, Frame
 from nerfro.data.image_files import read_mask, read_size, to_unit
 from nerfro.data.masks import METHOD, POLYGON, TRACKED, checksum, method_of, without_masks
 from nerfro.files.drawing import sheet
-from nerfro.files.images import save_image
+from nerfro.files.images import save_image, to_8bit
 from nerfro.files.reading import read_json
 from nerfro.masks.masking import Segmentation, box_region, check_tracked, grab_cut, polygon_mask, propagate
 from nerfro.masks.outline_hull import AGREES, MIN_VIEWS
@@ -80,7 +80,7 @@ def load_all(source: DataSource) -> tuple[Cameras, list[UInt8[np.ndarray, "H W 3
         loaded = {frame.image for frame in frames}
         fresh = [i for i, frame in enumerate(views.frames) if frame.image not in loaded]
         parts += [views.cameras.select(fresh)] if fresh else []  # a split without new images may have another size
-        images += [np.uint8(np.rint(255 * views.images[i].numpy())) for i in fresh]
+        images += [to_8bit(views.images[i]).numpy() for i in fresh]
         frames += [views.frames[i] for i in fresh]
     sizes = {(part.width, part.height) for part in parts}
     if len(sizes) > 1:

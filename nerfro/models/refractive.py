@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
+from omegaconf import DictConfig
+
+from nerfro.core.light import Colour
 from nerfro.core.types import Batch, Path, Rendering
+from nerfro.data.base import Views
+from nerfro.geometry.space import Space
 from nerfro.registry.registration import register
 from nerfro.rendering import Components, Renderer, composite
 
@@ -16,8 +21,9 @@ class RefractiveModel(Renderer):
     Args:
         background_direction: direction of the background radiance: the `exit` direction of the path, or that of the
             `last_coarse` sample, as in the authors' code.
-        colour: colour space in which fields and background return radiance and rays sum radiance: `linear`, or `srgb`
-            as in the authors' code.
+        colour: colour space in which fields and background return radiance and rays sum radiance: `linear`, `hdr` for
+            photographs in linear light (see `ColourSpace`), or `srgb` as in the authors' code. None derives `linear` or
+            `hdr` from the photographs.
     """
 
     empty_shows_background = True
@@ -26,10 +32,16 @@ class RefractiveModel(Renderer):
         self,
         components: Components,
         background_direction: Literal["exit", "last_coarse"] = "exit",
-        colour: Literal["linear", "srgb"] = "linear",
+        colour: Colour | None = None,
     ) -> None:
         super().__init__(components, components.point_sampler.num_levels, colour)
         self.background_direction = background_direction
+
+    @classmethod
+    def derive(cls, settings: DictConfig, views: Views, space: Space) -> dict[str, Any]:
+        if settings.model.get("colour") == "srgb":
+            views.refuse_linear_light("model.colour=srgb")
+        return {"colour": "hdr" if views.in_linear_light else "linear"}
 
     def render_path(self, path: Path, batch: Batch | None = None) -> list[Rendering]:
         samples = self.sample(path, None, batch)

@@ -57,6 +57,7 @@ class EncodedField(Field):
 
     @classmethod
     def derive(cls, settings: DictConfig, views: Views, space: Space) -> dict[str, Any]:
+        views.refuse_linear_light("the networks of NeRF and mip-NeRF")
         return {"unit": (views.cameras.far - views.cameras.near) / _RANGE_OF_RAYS}
 
     @property

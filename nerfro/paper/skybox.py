@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from jaxtyping import Float
+from omegaconf import DictConfig
 from torch import Tensor
 
 from nerfro.backgrounds.base import Background
 from nerfro.core.types import Exits
+from nerfro.data.base import Views
+from nerfro.geometry.space import Space
 from nerfro.paper.encoding import DIRECTION_DEGREE, positional_encoding
 from nerfro.paper.mlp import SkipMLP, glorot_linear, padded_sigmoid
 from nerfro.registry.allowed import Depth, Width
@@ -29,6 +34,11 @@ class Skybox(Background):
         super().__init__()
         self.trunk = SkipMLP(3 * (1 + 2 * DIRECTION_DEGREE), width, depth, skip)
         self.rgb = glorot_linear(self.trunk.num_outputs, 3)
+
+    @classmethod
+    def derive(cls, settings: DictConfig, views: Views, space: Space) -> dict[str, Any]:
+        views.refuse_linear_light("background=skybox")
+        return {}
 
     def forward(self, exits: Exits) -> Float[Tensor, "*batch 3"]:
         return padded_sigmoid(self.rgb(self.trunk(positional_encoding(exits.directions, DIRECTION_DEGREE))))

@@ -86,7 +86,8 @@ def _evaluate_folder(options: EvaluateConfig, predictions: Path, references: Pat
     with own_folder(options, predictions / "scores") as folder:
         metrics = ImageMetrics()
         record(folder, options)
-        scores = RunMetrics(score_folders(pairs, alpha, metrics, folder, device))
+        result, treated = score_folders(pairs, alpha, metrics, folder, device)
+        scores = RunMetrics(result, treatments=treated)
         write_scores(scores, f"{predictions} against {references}", folder)
     print(f"images and tables: {folder}")
     return scores

@@ -54,7 +54,7 @@ def collect_photographs(config: DictConfig, out: Path) -> list[Path]:
                 f"out={out} has poses of the frames of another video than video={video}; choose another out=FOLDER"
             )
     link_photographs(photographs, None if config.masks is None else user_path(config.masks), out)
-    return list_images(out / "images")
+    return list_images(out / "images", IMAGE_SUFFIXES)
 
 
 def link_photographs(photographs: Path, masks: Path | None, out: Path) -> None:
@@ -100,7 +100,7 @@ def _warn_of_others(given: Sequence[Path], folder: Path) -> None:
     """Warn of photographs in a folder that are not given, or are older than a given photograph of the same name."""
     originals = {file.stem: file for file in given}
     others, outdated = [], []
-    for file in list_images(folder):
+    for file in list_images(folder, IMAGE_SUFFIXES):
         original = originals.get(file.stem)
         if original is None:
             others.append(file.name)

@@ -26,7 +26,7 @@ def list_photographs(folder: Path) -> tuple[list[Path], tuple[int, int]]:
 
     A warning names photographs in HEIC format, which are left out.
     """
-    images = list_images(folder)
+    images = list_images(folder, IMAGE_SUFFIXES)
     require_one_of_each_name(images)
     # Other photographs in HEIC format have a converted copy.
     left_out = [file.name for file in one_of_each_pair(list_images(folder, PHOTOGRAPH_SUFFIXES)) if file not in images]

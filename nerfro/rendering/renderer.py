@@ -6,7 +6,7 @@ import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar, Literal, TypeVar
+from typing import ClassVar, TypeVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -16,7 +16,7 @@ from torch.func import functional_call
 from nerfro.backgrounds.base import Background
 from nerfro.camera.base import CameraModel
 from nerfro.camera.given import GivenCamera
-from nerfro.core.light import ColourSpace
+from nerfro.core.light import Colour, ColourSpace
 from nerfro.core.rays import Rays
 from nerfro.core.types import Batch, Exits, FieldValues, Path, Rendering, Samples
 from nerfro.data.component import Component
@@ -85,8 +85,9 @@ class Renderer(Component, nn.Module, ABC):
     Args:
         components: components of the model.
         num_fields: number of radiance fields: one for each sampling level, or one for all.
-        colour: colour space in which fields and background return radiance and rays sum radiance: `linear`, or `srgb`
-            as in the authors' code.
+        colour: colour space in which fields and background return radiance and rays sum radiance: `linear`, `hdr` for
+            photographs in linear light (see `ColourSpace`), or `srgb` as in the authors' code. None derives `linear` or
+            `hdr` from the photographs.
 
     Attributes:
         scene: everything learned about the world.
@@ -99,11 +100,11 @@ class Renderer(Component, nn.Module, ABC):
     # Whether every step has gradients of all parameters, as data-parallel training requires.
     trains_in_parallel: ClassVar[bool] = True
 
-    def __init__(self, components: Components, num_fields: int, colour: Literal["linear", "srgb"] = "linear") -> None:
+    def __init__(self, components: Components, num_fields: int, colour: Colour | None = None) -> None:
         super().__init__()
         fields = [components.make_field() for _ in range(num_fields)]
         medium, background, camera = components.medium, components.background, components.camera
-        self.scene = Scene(medium, fields, background, camera, ColourSpace(colour), components.space)
+        self.scene = Scene(medium, fields, background, camera, ColourSpace(colour or "linear"), components.space)
         self.path_sampler, self.point_sampler = components.path_sampler, components.point_sampler
         self.chunk_size = components.chunk_size
 

@@ -135,7 +135,8 @@ def _score(run: EvaluatedRun, view: int, selection: Selection) -> Score:
 def _view(
     index: int, references: Views, runs: Mapping[int, EvaluatedRun], titles: Mapping[int, str], selection: Selection
 ) -> View:
-    metric, name, reference = image_metrics()[selection.metric], references.names[index], references.images[index]
+    metric, name = image_metrics()[selection.metric], references.names[index]
+    reference = references.images[index].clamp(0, 1)
     predictions, errors = {}, {}
     for number, run in runs.items():
         image = load_png(run.scores / "images" / f"{run.metrics.result.views[index].name}.png")

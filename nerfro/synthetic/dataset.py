@@ -22,6 +22,7 @@ from nerfro.core.light import to_srgb
 from nerfro.data.base import SPLITS
 from nerfro.files import lat_long
 from nerfro.files.atomic import write_atomically
+from nerfro.files.deep_images import write_radiance
 from nerfro.files.folder_lock import require_only
 from nerfro.files.images import save_image
 from nerfro.files.reading import read_json
@@ -144,12 +145,13 @@ class ViewSplits(DataSet):
     META = "meta.json"
     FILES: ClassVar[tuple[str, ...]] = (
         *(f"transforms_{split}.json" for split in SPLITS),
-        *(f"{folder}{split}/r_*.png" for split in SPLITS for folder in ("", "masks/")),
+        *(f"{split}/r_*.{suffix}" for split in SPLITS for suffix in ("png", "exr")),
+        *(f"masks/{split}/r_*.png" for split in SPLITS),
         *("mesh.ply", "interior.ply", "sky.png", "sky.exr", META),
     )
     FACTS: ClassVar[dict[str, Any]] = {"box": ((-1.5, -1.5, -1.5), (1.5, 1.5, 1.5)), "near": 2.0, "far": 6.0}
     OPTIONS: ClassVar[tuple[str, ...]] = (
-        *("resolution", "spp", "test_spp", "views", "fresnel", "seed"),
+        *("resolution", "spp", "test_spp", "views", "fresnel", "seed", "format"),
         *("cameras", "turntable"),
     )
     NOUN = "views"
@@ -175,13 +177,19 @@ class ViewSplits(DataSet):
                 directions[:, 2] = np.abs(directions[:, 2])
             for index, direction in enumerate(directions):
                 pose = look_at_origin(CAMERA_DISTANCE * direction)
-                seed, name = (self.options.seed * 3 + number) * 100_000 + index, f"{split}/r_{index:03d}.png"
-                planned.append(PlannedImage(name, f"masks/{name}", pose, spp, seed))
+                seed, name = (self.options.seed * 3 + number) * 100_000 + index, f"{split}/r_{index:03d}"
+                planned.append(self._planned(name, pose, spp, seed))
         return planned
+
+    def _planned(self, name: str, pose: np.ndarray, spp: int, seed: int) -> PlannedImage:
+        return PlannedImage(f"{name}.{self.options.format}", f"masks/{name}.png", pose, spp, seed)
 
     def write(self, image: PlannedImage, radiance: np.ndarray, coverage: np.ndarray) -> None:
         write_image(self.folder / image.mask_path, coverage)
-        write_image(self.folder / image.image_path, to_srgb(radiance))
+        if self.options.format == "exr":
+            write_radiance(self.folder / image.image_path, radiance)
+        else:
+            write_image(self.folder / image.image_path, to_srgb(radiance))
 
     def finish(self, planned: list[PlannedImage]) -> None:
         assert self.scene.sky is not None

@@ -84,8 +84,7 @@ class GltfViews(ViewSplits):
         for number, (_, pose) in enumerate(self._cameras):
             split = _SPLIT_OF[number % len(_SPLIT_OF)] if len(self._cameras) > 1 else "train"
             spp = self.options.test_spp if split == "test" else self.options.spp
-            name = f"{split}/r_{number:03d}.png"
-            planned.append(PlannedImage(name, f"masks/{name}", pose, spp, self.options.seed * 300_000 + number))
+            planned.append(self._planned(f"{split}/r_{number:03d}", pose, spp, self.options.seed * 300_000 + number))
         return planned
 
     def _moved(self, pose: np.ndarray) -> np.ndarray:

@@ -48,6 +48,7 @@ class SynthesizeConfig:
             horizon, or for a glTF file those of the file.
         turntable: whether the object turns before the camera, and the surroundings stand still. In a ring, the camera
             stands still, too; otherwise it also moves up and down.
+        format: format of the images: png (8-bit sRGB, clipped), or exr (linear radiance).
         sky_height: rows of sky.png.
         extras: whether to write interior.ply and sky.exr, which training does not need.
         variant: variant of Mitsuba: auto, llvm_ad_rgb, cuda_ad_rgb or scalar_rgb.
@@ -69,6 +70,7 @@ class SynthesizeConfig:
     sky: str | None = None
     cameras: Literal["orbit", "above", "ring", "file"] = "orbit"
     turntable: bool = False
+    format: Literal["png", "exr"] = "png"
     sky_height: Annotated[int, Ge(16), Le(16384)] = 1024
     extras: bool = True
     variant: str = "auto"

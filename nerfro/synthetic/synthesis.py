@@ -63,6 +63,8 @@ def synthesize(options: SynthesizeConfig) -> DataSet:
     module, sky = find_scene(options.scene), None if options.sky is None else load_sky(user_path(options.sky))
     with lock_folder(folder, "out"):
         data_type: type[DataSet] = getattr(module, "DATA_SET", ViewSplits)
+        if options.format != "png" and "format" not in data_type.OPTIONS:
+            raise NerfroError(f"scene={options.scene} has photographs of 8 bits; take format=png, or another scene")
         # Colours have a resolution of half a pixel of the images.
         scene: SyntheticScene = module.build(spacing=max(0.5 * data_type.WIDTH / options.resolution, 0.0025))
         scene = scene.with_glass(options.ior, tuple(options.absorption))

@@ -223,15 +223,15 @@ class TrainingModule(LightningModule):
         self.log("val/psnr", psnr, prog_bar=True, batch_size=1, rank_zero_only=True)
         if rays is None:
             return None
-        target = views.images[view].to(self.device)
+        target = views.images[view].to(self.device).clamp(0, 1)
         rendered = self.renderer.render(rays)
         prediction = self.scene.colour_space.to_display(rendered.radiance).reshape(target.shape)
         depth, opacity = (m.reshape(target.shape[:2]) for m in (rendered.depth / views.cameras.far, rendered.opacity))
         return {"view": view, "prediction": prediction, "target": target, "depth": depth, "opacity": opacity}
 
     def test_step(self, batch: int, batch_index: int) -> None:
-        views = self.trainer.datamodule.test  # type: ignore[attr-defined]
-        error = (self.predict_step(batch, batch_index) - views.images[batch].to(self.device)).square().mean()
+        target = self.trainer.datamodule.test.images[batch].to(self.device).clamp(0, 1)  # type: ignore[attr-defined]
+        error = (self.predict_step(batch, batch_index) - target).square().mean()
         self.log("test/psnr", -10 * torch.log10(error), batch_size=1)
 
     def predict_step(self, batch: int, batch_index: int) -> Float[Tensor, "H W 3"]:

@@ -19,7 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 from nerfro.cli.failures import in_one_line
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import resolve_path, scene_name
-from nerfro.data.image_files import IMAGE_SUFFIXES
+from nerfro.data.image_files import VIEW_SUFFIXES
 from nerfro.evaluation.results import RunMetrics, read_metrics_json
 from nerfro.files.atomic import write_atomically
 from nerfro.files.folder_lock import lock_folder
@@ -113,7 +113,7 @@ def _hash_of_files(root: Path, sweep: Path | None) -> str:
     for file in sorted(_visible_files(root, sweep)):
         num_bytes = file.stat().st_size
         digest.update(f"{file.relative_to(root).as_posix()}:{num_bytes};".encode())
-        if file.suffix.lower() not in IMAGE_SUFFIXES and num_bytes <= _MAX_HASHED:
+        if file.suffix.lower() not in VIEW_SUFFIXES and num_bytes <= _MAX_HASHED:
             digest.update(file.read_bytes())
     return digest.hexdigest()[:16]
 

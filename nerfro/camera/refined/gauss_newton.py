@@ -166,7 +166,7 @@ def gauss_newton_step(
         priors: prior information about the cameras.
     """
     view = cameras.view_of(pixels)
-    initial, target = pixel_rays(cameras, pixels), photographed(pixels)
+    initial, target = pixel_rays(cameras, pixels), photographed(pixels).clamp(0, 1)
     rays = camera(initial, view)
     angle = step.difference_pixels / cameras.fx[view]
     distances = object_distances(cameras).to(angle)[view]

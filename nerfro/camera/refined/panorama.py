@@ -156,7 +156,7 @@ def _downscaled_roots(
     pixels = torch.arange(height * width, device=cameras.device)
     images = []
     for view in range(len(cameras)):
-        image = photographed(view * height * width + pixels).view(1, height, width, 3).permute(0, 3, 1, 2)
+        image = photographed(view * height * width + pixels).clamp(0, 1).view(1, height, width, 3).permute(0, 3, 1, 2)
         images.append(F.interpolate(to_linear(image.float()), size, mode="area").sqrt())
     return torch.cat(images)
 

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from nerfro.backgrounds.envmap import EnvironmentMap, Observed
 from nerfro.core.errors import warn
+from nerfro.core.light import saturated
 from nerfro.core.provenance import AlgorithmSettings
 from nerfro.core.rays import Rays
 from nerfro.core.types import Exits
@@ -168,8 +169,7 @@ def _observe_through_object(run: TrainingRun, pixels: Int[Tensor, "Q"], min_back
     rgb = batches.photographed(pixels)
     difference = _photographed(run, rgb, view) - rendering.radiance
     radiance = scene.background(Exits(exits)) + difference / fraction.clamp(min=min_background)
-    widths = widths / batches.cameras.fx[view]
-    observed = Observed(exits, radiance, rgb >= 1, fraction.square().mean(-1), widths)
+    observed = Observed(exits, radiance, saturated(rgb), fraction.square().mean(-1), widths / batches.cameras.fx[view])
     return observed[fraction.amin(-1) >= min_background]
 
 
@@ -181,7 +181,7 @@ def _observe_beside_object(run: TrainingRun, pixels: Int[Tensor, "Q"], rays: Ray
         exposure.fit(view, scene.background(Exits.unbent(rays)), scene.colour_space.to_radiance(rgb))
     widths = 1 / batches.cameras.fx[view]
     seen = Exits.unbent(rays).directions
-    return Observed(seen, _photographed(run, rgb, view), rgb >= 1, torch.ones_like(widths), widths)
+    return Observed(seen, _photographed(run, rgb, view), saturated(rgb), torch.ones_like(widths), widths)
 
 
 def _rays(run: TrainingRun, pixels: Int[Tensor, "Q"]) -> Rays:
