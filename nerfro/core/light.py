@@ -15,7 +15,6 @@ from torch.nn.functional import softplus
 Colour = Literal["linear", "hdr", "srgb"]  # see `ColourSpace`
 Values = TypeVar("Values", Tensor, np.ndarray)  # of any shape
 GREY = 0.5 / math.log(2)  # Softplus of 0 is log 2.
-_ROUNDING = 1e-6  # relative error of a mean of saturated values
 # The slope of `_LOG_SLOPE` log(c + `_LOG_OFFSET`) is that of sRGB, 12.92 at black and 0.44 at white.
 _LOG_SLOPE, _LOG_OFFSET = 0.455, 0.0352
 
@@ -47,7 +46,8 @@ def encode_photograph(radiance: Values) -> Values:
     """
     if isinstance(radiance, np.ndarray):
         return encode_photograph(_tensor(radiance)).numpy()
-    return torch.where((radiance - 1).abs() < _ROUNDING, 1.0, to_srgb(radiance))
+    is_saturated = torch.isclose(radiance, torch.ones_like(radiance), rtol=1e-6, atol=0)  # also a mean of ones
+    return torch.where(is_saturated, 1.0, to_srgb(radiance))
 
 
 def saturated(photograph: Float[Tensor, "*batch"]) -> Bool[Tensor, "*batch"]:

@@ -32,7 +32,6 @@ from nerfro.synthetic.viewpoints import directions_on_ring, directions_on_sphere
 
 CAMERA_ANGLE_X = 0.6911112070083618  # field of view of the NeRF synthetic scenes and of the paper's scenes
 CAMERA_DISTANCE = 4.03
-_RING = 25.0  # elevation of the cameras of a ring, degrees
 
 
 @dataclass(frozen=True)
@@ -172,7 +171,7 @@ class ViewSplits(DataSet):
             spp = self.options.test_spp if split == "test" else self.options.spp
             drawn = getattr(self.options.views, split), self.options.seed, number
             is_ring = self.options.cameras == "ring"
-            directions = directions_on_ring(*drawn, _RING) if is_ring else directions_on_sphere(*drawn)
+            directions = directions_on_ring(*drawn) if is_ring else directions_on_sphere(*drawn)
             if self.options.cameras == "above":
                 directions[:, 2] = np.abs(directions[:, 2])
             for index, direction in enumerate(directions):

@@ -24,7 +24,7 @@ def directions_on_sphere(count: int, seed: int, split: int) -> np.ndarray:
     return generator.permutation(jittered)
 
 
-def directions_on_ring(count: int, seed: int, split: int, elevation: float) -> np.ndarray:
+def directions_on_ring(count: int, seed: int, split: int, elevation: float = 25.0) -> np.ndarray:
     """Return evenly spaced unit directions [count, 3] at an elevation in degrees, from a random azimuth per split."""
     turn = np.random.default_rng([seed, split]).random()
     phi, theta = 2 * np.pi * (np.arange(count) + turn) / count, np.radians(elevation)
