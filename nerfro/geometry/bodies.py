@@ -50,10 +50,11 @@ def require_separate(mesh: TriangleMesh) -> None:
 
 
 def require_simple(mesh: TriangleMesh) -> None:
-    """Raise an error if a part of a closed surface lies inside the same surface, where it would act as a cavity.
+    """Raise an error if a closed surface crosses itself.
 
-    At such points the winding number is 2 or more. Points on both sides of the surface are tested, because the front of
-    a surface that crosses itself is doubtful. Without Embree, nothing is checked.
+    A part that is inside twice would act as a cavity, and has a winding number of 2 or more. A part that sticks out
+    with the inside turned outwards has -1. Points on both sides of the surface are tested, because the front of a
+    surface that crosses itself is doubtful. Without Embree, nothing is checked.
 
     Args:
         mesh: world units; the outer surface faces outwards, and the surface of a cavity faces the cavity.
@@ -65,17 +66,20 @@ def require_simple(mesh: TriangleMesh) -> None:
     except NerfroError:  # without Embree
         return
     points = (points - torch.from_numpy(mesh.bounds.mean(0))) / extent
-    buried = torch.zeros(len(points), dtype=torch.bool)
-    for side in (points, points - 6 * _TOUCHING * inwards):
-        # Where faces of two bodies coincide, Embree finds one of them; the line in the other direction avoids them.
-        windings = torch.stack([crossings(triangles, side, sign * inwards)[1] for sign in (1, -1)])
-        buried |= (windings.abs() >= 2).all(0)
-    share = buried.double().mean().item()
+    sides = (points, points - 6 * _TOUCHING * inwards)
+    # Where faces of two bodies coincide, Embree finds one of them; the line in the other direction avoids them.
+    lines = [[crossings(triangles, side, sign * inwards)[1] for sign in (1, -1)] for side in sides]
+    windings = torch.stack([torch.stack(line) for line in lines])
+    total = windings.sum()
+    if total.abs() < len(points):  # a surface without an interior is refused elsewhere
+        return
+    windings = windings * total.sign()  # the front of most of the surface may be inside
+    share = ((windings < 0) | (windings > 1)).all(1).any(0).double().mean().item()
     if share > _MOST_BURIED:
         raise NerfroError(
             f"the surface of the mesh crosses itself: {share:.1%} of the surface bounds a part that is inside twice, "
-            "which would act as a cavity; unite the parts (boolean union, or voxel remesh in Blender), or give the "
-            "parts as bodies={NAME: {mesh: FILE, ior: 1.5}, ...}"
+            "which would act as a cavity, or inside out; unite the parts (boolean union, or voxel remesh in Blender), "
+            "or give the parts as bodies={NAME: {mesh: FILE, ior: 1.5}, ...}"
         )
 
 

@@ -102,6 +102,11 @@ def test_surface_that_crosses_itself_is_refused(tmp_path: Path) -> None:
     fine = _coil(400, 160, 48)
     for faces in (fine.faces, fine.faces[:, ::-1]):
         refused("crosses itself", require_simple, mesh_of(trimesh.Trimesh(fine.vertices, faces)))
+    # A dent of a ball that sticks out on the other side.
+    dented = ball(1.0)
+    top = dented.vertices[:, 2] > 0.9
+    dented.vertices[top, 2] -= 26 * (dented.vertices[top, 2] - 0.9)
+    refused("crosses itself", require_simple, mesh_of(dented))
 
 
 def test_nested_and_touching_surfaces_do_not_cross_themselves(tmp_path: Path) -> None:
