@@ -15,8 +15,9 @@ from nerfro.core.types import Exits
 from nerfro.data.blender import BlenderData
 from nerfro.samplers.paths.straight import straight_path
 from nerfro.synthetic.viewpoints import look_at_origin
+from nerfro.training.inputs import INPUTS, inputs_of, recorded_cameras, require_same_inputs
 from tests.cameras_at import cameras_at
-from tests.conftest import Runner, refused, train_in
+from tests.conftest import Runner, composed, refused, train_in
 
 AXIS = np.array([0.3, -0.2, 0.9]) / np.linalg.norm([0.3, -0.2, 0.9])
 
@@ -83,6 +84,24 @@ def test_files_and_setting_state_the_turntable(turntable_data: Path) -> None:
     poses = BlenderData(root).load("train").cameras.camera_to_world
     sideways = poses[0, :, 0].tolist()
     refused("parallel to the axis", BlenderData(root, turntable_axis=sideways).load, "train")
+
+
+def test_splits_that_disagree_are_refused(turntable_data: Path) -> None:
+    file = turntable_data / "transforms_test.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"turntable_axis": [0, 1, 0]}))
+    refused("have other values of turntable or turntable_axis", BlenderData(str(turntable_data)).load, "train")
+
+
+@pytest.mark.parametrize("turntable", [True, False, (0.0, 0.0, 1.0)])
+def test_checkpoint_knows_the_turntable(turntable_data: Path, turntable, tmp_path: Path) -> None:
+    config = composed()
+    views = BlenderData(str(turntable_data), turntable=False).load("train")
+    views = replace(views, cameras=replace(views.cameras, turntable=turntable))
+    checkpoint = {INPUTS: inputs_of(config, views)}
+    assert recorded_cameras(checkpoint).turntable == turntable
+    require_same_inputs(checkpoint, tmp_path, config, views)
+    changed = replace(views, cameras=replace(views.cameras, turntable=(1.0, 0.0, 0.0)))
+    refused("other photographs or cameras", require_same_inputs, checkpoint, tmp_path, config, changed)
 
 
 @pytest.mark.slow

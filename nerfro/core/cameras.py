@@ -84,7 +84,7 @@ def room_rotations(
     if bool((across.norm(dim=-1) < 0.1).any()):
         raise NerfroError(
             f"data.turntable_axis={turntable}: the horizontal axis of an image is parallel to the axis of rotation; "
-            "rotate the photographs, or take data.turntable=true for a camera that stands still"
+            "turn the camera upright, or take data.turntable=true for a camera that stands still"
         )
     right = torch.nn.functional.normalize(across, dim=-1)
     return torch.stack([torch.linalg.cross(right, up), right, up], -2)

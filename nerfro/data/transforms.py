@@ -55,6 +55,12 @@ class Manifest:
         hints = {"turntable": bool, "turntable_axis": list[float]}
         values: dict[str, Any] = {name: self.document.get(name) for name in hints}
         check(f"{self.path}: ", hints, values)
+        for other in find_splits(self.path.parent).values() if self.path.name != "transforms.json" else ():
+            document: Any = read_json(other, "check its permissions")
+            if isinstance(document, dict) and any(document.get(name) != value for name, value in values.items()):
+                raise NerfroError(
+                    f"{self.path} and {other} have other values of turntable or turntable_axis; make them equal"
+                )
         return turntable_of(f"{self.path}: ", *values.values()) or False
 
     def lenses(self, indices: Sequence[int] | None = None) -> list[Lens]:

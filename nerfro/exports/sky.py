@@ -14,7 +14,7 @@ def write_sky(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
     sky = scene.sky_of_height(options.resolution or scene.sky_height)
     save_lat_long(out, sky)
     turntable = scene.cameras("train").turntable
-    frame = ", in the room of the turntable, where the camera looks along -x" if turntable else ""
+    frame = ", in the room of the turntable, where the camera looks towards -x" if turntable else ""
     return f"the sky: {sky.shape[1]}x{sky.shape[0]} pixels, lat-long, z up{frame}"
 
 

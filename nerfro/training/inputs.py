@@ -56,18 +56,19 @@ def recorded_cameras(checkpoint: Mapping[str, Any]) -> Cameras | None:
         num_views = len(values["fx"])
         shapes = {"camera_to_world": (num_views, 3, 4), "distortion": (num_views, 9)}
         sides = int(image["width"]), int(image["height"])
-        near, far = float(image["near"]), float(image["far"])
+        near, far, turntable = float(image["near"]), float(image["far"]), image["turntable"]
     except (TypeError, KeyError, ValueError, OverflowError, RuntimeError):
         return None
     right = all(
         value.shape == shapes.get(name, (num_views,)) and value.isfinite().all() for name, value in values.items()
     )
-    if not right or num_views == 0 or min(sides) < 1 or not 0 <= near < far < math.inf:
+    right &= isinstance(turntable, bool | tuple) and num_views > 0
+    if not right or min(sides) < 1 or not 0 <= near < far < math.inf:
         return None
     distortion = values.pop("distortion")
     return Cameras(**values, width=sides[0], height=sides[1], near=near, far=far,
                    distortion=distortion if distortion.any() else None,
-                   turntable=image.get("turntable", False))  # fmt: skip
+                   turntable=turntable)  # fmt: skip
 
 
 def copy_files(folder: Path, config: DictConfig) -> None:
@@ -194,7 +195,9 @@ def require_same_inputs(checkpoint: Mapping[str, Any], path: Path, config: DictC
     if name is not None:
         raise NerfroError(f"{path} was trained with another content of the file {name}; {advice}")
     cameras, photographs = (_recorded(checkpoint, entry) for entry in ("cameras", "photographs"))
+    image = _recorded(checkpoint, "image")
     other_cameras = isinstance(cameras, Mapping) and not _equal(cameras, _tensors(views.cameras))
+    other_cameras |= isinstance(image, Mapping) and image.get("turntable", False) != views.cameras.turntable
     if other_cameras or (isinstance(photographs, str) and photographs != _hash_of_photographs(views)):
         raise NerfroError(f"{path} was trained on other photographs or cameras than {config.data.root} has; {advice}")
 

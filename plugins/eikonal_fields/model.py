@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from enum import IntEnum
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 from annotated_types import Ge
 from jaxtyping import Bool, Float
+from omegaconf import DictConfig
 from torch import Tensor
 
 from nerfro.core.errors import NerfroError
 from nerfro.core.types import Batch, FieldValues, Path, Rays, Rendering, Samples
+from nerfro.data.base import Views
 from nerfro.fields.base import Field
-from nerfro.geometry.space import inside_box
+from nerfro.geometry.space import Space, inside_box
 from nerfro.registry.allowed import Count, Positive, Share
 from nerfro.registry.registration import register
 from nerfro.rendering import Components, Renderer, composite
@@ -120,6 +122,12 @@ class EikonalFields(Renderer):
             )
         if self._blurred is None or level != self._level:
             self._level, self._blurred = level, self._sharp.blurred(self.blur / 2**level)
+
+    @classmethod
+    def derive(cls, settings: DictConfig, views: Views, space: Space) -> dict[str, Any]:
+        views.refuse_linear_light("model=eikonal_fields")
+        views.cameras.refuse_turntable("model=eikonal_fields also represents the room", "take another model")
+        return {}
 
     def trace(self, rays: Rays, path: Path | None = None) -> Path:
         """Trace rays according to the current stage, because the medium changes during training."""
