@@ -136,7 +136,8 @@ def divide_pixels(
     silhouettes = None if views.masks is not None else mesh_silhouettes(mesh, cameras, 1).float()
     parts: list[list[tuple[Tensor, Tensor]]] = [[], []]
     for view in range(len(views)):
-        radiance = blocks.mean(to_linear(views.images[view])).view(-1, 3)
+        # Predictions are clipped as well, also for photographs in linear light.
+        radiance = blocks.mean(to_linear(views.images[view].clamp(0, 1))).view(-1, 3)
         coverage = blocks.mean(views.masks[view]) if silhouettes is None else silhouettes[view]  # type: ignore[index]
         # Largest fractions of the object and of the background in a neighbourhood of 3x3 pixels.
         covered, uncovered = (functional.max_pool2d(x[None, None], 3, 1, 1)[0, 0] for x in (coverage, 1 - coverage))

@@ -261,6 +261,9 @@ def _any_is_transparent(images: Sequence[Path]) -> bool:
 
 
 def _read_alpha(image: Path) -> Levels:
+    if is_linear(image):  # its transparency is no mask
+        width, height, _ = read_size(image)
+        return np.full((height, width), 255, np.uint8)
     levels = read_levels(image)
     if levels.shape[-1] in (2, 4):
         return levels[..., -1]

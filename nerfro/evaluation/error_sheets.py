@@ -44,7 +44,7 @@ def write_error_sheet(
 
     Images are enlarged by a whole factor without smoothing, so that single pixels remain visible.
     """
-    reference = reference.clamp(0, 1)
+    prediction, reference = prediction.clamp(0, 1), reference.clamp(0, 1)
     maps = error_maps(prediction, reference, metrics)
     images = [prediction, reference, *(error.colours() for error in maps)]
     captions = ["prediction", "reference", *(f"{error.title}, 0 to {error.limit:g}" for error in maps)]

@@ -111,7 +111,7 @@ def score_folders(
     folder: Path,
     device: torch.device,
 ) -> tuple[EvaluationResult, dict[str, EvaluationResult]]:
-    """Score each prediction on a device, and write error maps to `folder/errors`; the result is as of `score_split`."""
+    """Score each prediction, and write error maps to `folder/errors`; return scores as `score_split` does."""
     metrics, scores, mapped = metrics.to(device), list[ViewScores](), list[ViewScores]()
     for pair in track("evaluate", pairs):
         prediction, reference, coverage = pair.load(alpha)

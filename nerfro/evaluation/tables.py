@@ -204,8 +204,8 @@ def write_scores(metrics: RunMetrics, title: str, folder: Path, brief: bool = Fa
     if brief or len(result.regions) > 1:
         rich.print(to_rich(regions_table(result, f"mean of {len(result.views)} view{'s' * (len(result.views) > 1)}")))
     if metrics.treatments:
-        title = "other cameras, exposures or tone curves; compare rows of equal pixels"
-        rich.print(to_rich(treatments_table(metrics, title)))
+        heading = "other cameras, exposures or tone curves; compare rows of equal pixels"
+        rich.print(to_rich(treatments_table(metrics, heading)))
 
 
 def write_table(table: Table, stem: Path) -> None:

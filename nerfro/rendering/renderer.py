@@ -86,8 +86,7 @@ class Renderer(Component, nn.Module, ABC):
         components: components of the model.
         num_fields: number of radiance fields: one for each sampling level, or one for all.
         colour: colour space in which fields and background return radiance and rays sum radiance: `linear`, `hdr` for
-            photographs in linear light (see `ColourSpace`), or `srgb` as in the authors' code. None derives `linear` or
-            `hdr` from the photographs.
+            photographs in linear light (see `ColourSpace`), or `srgb` as in the authors' code; None for `linear`.
 
     Attributes:
         scene: everything learned about the world.

@@ -4,6 +4,7 @@ import json
 import math
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,14 +17,18 @@ import torch
 from PIL import Image
 
 from nerfro.camera.exposure import fit_gain
+from nerfro.capture.surroundings import divide_pixels
 from nerfro.core.light import ColourSpace, encode_photograph, saturated, to_linear, to_srgb, tone_mapped
+from nerfro.core.paths import resolve_path
 from nerfro.data.blender import BlenderData
 from nerfro.data.image_files import read_mask, read_rgb, read_size
 from nerfro.data.lazy_images import LazyImages
 from nerfro.data.pixel_store import PixelStore
+from nerfro.evaluation.error_sheets import write_error_sheet
 from nerfro.evaluation.image_metrics import psnr
 from nerfro.files.deep_images import write_radiance
 from nerfro.files.images import round_to_8bit
+from nerfro.geometry.mesh import load_mesh
 from nerfro.poses.photographs import list_photographs
 from tests.conftest import Runner, refused
 
@@ -246,6 +251,21 @@ def test_training_in_linear_light_shows_and_scores_highlights(
     for name, treatment in (("psnr", scored["treatments"]["tone_mapped"]), ("clipped", scored)):
         same = metrics["treatments"]["tone_mapped"] if name == "psnr" else metrics
         assert treatment["test"]["psnr"] == pytest.approx(same["test"]["psnr"], abs=0.02)
+
+
+def test_error_maps_agree_with_scores_of_clipped_images(tmp_path: Path) -> None:
+    bright, white = torch.full((32, 32, 3), 3.0), torch.ones(32, 32, 3)
+    for name, prediction in (("bright", bright), ("white", white)):
+        write_error_sheet(tmp_path, name, prediction, bright, {})
+    sheets = [(tmp_path / "errors" / f"{name}.png").read_bytes() for name in ("bright", "white")]
+    assert sheets[0] == sheets[1]
+
+
+def test_surroundings_of_the_object_are_clipped_like_their_model(tmp_path: Path) -> None:
+    views = BlenderData("embedded:torus", downscale=4).load("test")
+    images = views.images[:] * 3  # a display value of 3 is a radiance of 11
+    pixels = divide_pixels(replace(views, images=images), load_mesh(resolve_path("embedded:torus/mesh.ply")))
+    assert all(float(part.radiance.max()) == 1 for part in pixels)
 
 
 def test_unusable_files_are_refused_in_one_line(tmp_path: Path) -> None:
