@@ -111,6 +111,7 @@ def static_parts(
     if len(cameras) > _MAX_PHOTOGRAPHS:
         with_photograph = {i * len(cameras) // _MAX_PHOTOGRAPHS for i in range(_MAX_PHOTOGRAPHS)}
     return {
+        "pinhole": cameras.distortion is None,
         "linear": renderer.scene.colour_space is not ColourSpace.SRGB,
         "origin": scene.source.origin.tolist(),
         "reflection": renderer.path_sampler.branching.max_split_events > 0,

@@ -162,7 +162,7 @@ class Page {
 
   // Show the PSNR of the rendering, reduced to the size of the photograph beside it.
   showPsnr() {
-    if ($("photograph").hidden) return;
+    if ($("photograph").hidden || !this.scene.pinhole) return;
     this.tracer.show(); // the browser clears the canvas between frames
     $("rendering").textContent = `rendering, PSNR ${psnr(this.tracer.canvas, $("photograph")).toFixed(1)} dB`;
   }
@@ -184,7 +184,7 @@ class Page {
     const photograph = camera === null ? undefined : this.scene.cameras[camera].photograph;
     $("photograph").hidden = !photograph;
     $("stage").classList.toggle("compared", Boolean(photograph));
-    $("difference").disabled = !photograph;
+    $("difference").disabled = !photograph || !this.scene.pinhole;
     $("rendering").textContent = "rendering";
     if (photograph) $("photograph").src = photograph;
     $("photograph").alt = photograph ? `photograph ${this.scene.cameras[camera].name}` : "";
