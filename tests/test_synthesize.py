@@ -131,8 +131,9 @@ def test_linear_images_have_the_radiance_that_8_bits_clip(mitsuba, tmp_path):
     linear, clipped = (BlenderData(str(tmp_path / form)).load("train") for form in ("exr", "png"))
     assert to_linear(linear.images[0])[0, 0].tolist() == pytest.approx([3.0] * 3, rel=1e-3)
     torch.testing.assert_close(linear.images[:].clamp(0, 1), clipped.images[:], rtol=0, atol=0.51 / 255)
-    refused(
-        "scene=dolphin_capture has photographs of 8 bits",
-        synthesize,
-        small(tmp_path / "d", scene="dolphin_capture", format="exr"),
-    )
+    for options, message in (
+        ({"scene": "dolphin_capture", "format": "exr"}, "scene=dolphin_capture has no option format"),
+        ({"scene": "dolphin_capture", "cameras": "ring"}, "has no option cameras"),
+        ({"cameras": "file"}, "cameras=file takes the cameras of a glTF file"),
+    ):
+        refused(message, synthesize, small(tmp_path / "d", **options))

@@ -80,10 +80,10 @@ class Composer:
                 self.check(config)
         return settings
 
-    def check_printed(self, hydra: Hydra) -> str:
-        """Check the data and the device of the configuration that Hydra has printed, and say what is not checked."""
+    def check_printed(self, hydra: Hydra, part: str) -> str:
+        """Check the data and the device if Hydra has printed the part `job`, and say what is not checked."""
         job = getattr(hydra.config_loader, "job", None)
-        if self.check_inputs is None or job is None:
+        if self.check_inputs is None or job is None or part != "job":
             return "the data, the device and the memory"
         self.check_inputs(job)
         return "the pixels, the object and the memory"

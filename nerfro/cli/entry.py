@@ -101,7 +101,7 @@ def _run_by_hydra(composer: Composer, task: Task, flags: Namespace, parser: Argu
             hydra.hydra_help(name, args_parser=parser, args=flags)
         elif flags.cfg:
             hydra.show_cfg(name, overrides, flags.cfg, flags.package, flags.resolve)
-            unchecked = composer.check_printed(hydra)
+            unchecked = composer.check_printed(hydra, flags.cfg)
             print(f"nerfro: not checked: {unchecked}, which {command} checks", file=sys.stderr)
         elif flags.info:
             hydra.show_info(flags.info, name, overrides)

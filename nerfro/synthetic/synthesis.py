@@ -63,8 +63,11 @@ def synthesize(options: SynthesizeConfig) -> DataSet:
     module, sky = find_scene(options.scene), None if options.sky is None else load_sky(user_path(options.sky))
     with lock_folder(folder, "out"):
         data_type: type[DataSet] = getattr(module, "DATA_SET", ViewSplits)
-        if options.format != "png" and "format" not in data_type.OPTIONS:
-            raise NerfroError(f"scene={options.scene} has photographs of 8 bits; take format=png, or another scene")
+        for name, default in (("format", "png"), ("cameras", "orbit"), ("turntable", False)):
+            if getattr(options, name) != default and name not in data_type.OPTIONS:
+                raise NerfroError(f"scene={options.scene} has no option {name}; leave it out, or take another scene")
+        if options.cameras == "file" and not options.scene.lower().endswith((".glb", ".gltf")):
+            raise NerfroError("cameras=file takes the cameras of a glTF file; choose orbit, above or ring")
         # Colours have a resolution of half a pixel of the images.
         scene: SyntheticScene = module.build(spacing=max(0.5 * data_type.WIDTH / options.resolution, 0.0025))
         scene = scene.with_glass(options.ior, tuple(options.absorption))
