@@ -54,7 +54,7 @@ def require_simple(mesh: TriangleMesh) -> None:
 
     A part that is inside twice would act as a cavity, and has a winding number of 2 or more. A part that sticks out
     with the inside turned outwards has -1. Points on both sides of the surface are tested, because the front of a
-    surface that crosses itself is doubtful. Without Embree, nothing is checked.
+    surface that crosses itself may be inside. Without Embree, nothing is checked.
 
     Args:
         mesh: world units; the outer surface faces outwards, and the surface of a cavity faces the cavity.
