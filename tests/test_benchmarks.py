@@ -206,6 +206,12 @@ def test_vessel_prints_two_errors_of_every_simpler_medium(run: Run) -> None:
     assert all(rows)
 
 
+@pytest.mark.slow
+def test_water_benchmark_prints_a_row_for_each_scene(run: Run) -> None:
+    rows = table_rows(run("water", "--rays", 8))
+    assert [row.split("|")[1].strip() for row in rows] == ["tank", "pool", "case", "jar"]
+
+
 def test_hull_benchmark_finds_no_error_in_the_true_surface(run: Run, tiny_scene: Path) -> None:
     measured = figures(run("hull", tiny_scene, tiny_scene / "mesh.ply"))
     assert len(measured) == 5

@@ -32,8 +32,8 @@ ADAPTIVE = ["sampler.path.integrator=adaptive", "sampler.path.max_steps=60", "sa
 # A constant is copied to the device once. Fields are asked for samples in the object alone, whose number must be known.
 ONCE = "kernels/constants.py: constant (tensor)"
 # Triangles are met on the CPU in a replay as well. Some rays are traced again with more vertices.
-TO_CPU = {"core/rays.py: <genexpr> (to)", "samplers/paths/replay.py: indices_of (to)"}
-AGAIN = "core/rays.py: __getitem__ (__getitem__)"
+TO_CPU = {"core/rays.py: <lambda> (to)", "samplers/paths/replay.py: indices_of (to)"}
+AGAIN = "core/rays.py: <lambda> (__getitem__)"
 SELECTED = "fields/base.py: evaluate_selected (nonzero)"
 
 
