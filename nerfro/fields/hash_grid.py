@@ -58,7 +58,7 @@ class HashGridField(Field):
         shortcut: whether to add three features of the density network to the colour before the sigmoid. In images of
             mostly one colour, all units of the colour network can become inactive where another colour is needed, and
             without the shortcut no gradient would reach these places.
-        unbounded: whether radiance may exceed 1. None takes True for photographs in linear light.
+        unbounded: whether radiance may exceed 1, for bright content in photographs in linear light.
         precision: number format of the MLPs' matrix products. None selects bfloat16 if the machine has units for
             bfloat16, else float32.
     """
@@ -76,14 +76,14 @@ class HashGridField(Field):
         direction_bands: Annotated[int, Ge(1), Le(MAX_BANDS)] = 4,
         initial_depth: Positive = 0.1,
         shortcut: bool = True,
-        unbounded: bool | None = None,
+        unbounded: bool = False,
         precision: Literal["bfloat16", "float32"] | None = None,
     ) -> None:
         super().__init__()
         self.space = space
         self.register_buffer("observed", space.observed())
         self.initial_density = initial_depth / space.side
-        self.direction_bands, self.shortcut, self.unbounded = direction_bands, shortcut, bool(unbounded)
+        self.direction_bands, self.shortcut, self.unbounded = direction_bands, shortcut, unbounded
         finest_resolution = 256 if finest_resolution is None else finest_resolution
         self.levels = hash_encoding.grid_levels(num_levels, _COARSEST_RESOLUTION, finest_resolution, log2_table_size)
         self.table = nn.Parameter(torch.empty(self.levels.num_entries, hash_encoding.NUM_FEATURES))
@@ -98,8 +98,7 @@ class HashGridField(Field):
         distances = (cameras.camera_to_world[:, :, 3].double() - space.centre).norm(dim=-1)
         pixel = float((distances / cameras.fx.double()).quantile(0.5))
         cells = math.ceil(_CELLS_PER_PIXEL * space.side / pixel)
-        finest = min(max(cells, _MIN_CELLS), _MAX_CELLS)
-        return {"finest_resolution": finest, "unbounded": views.in_linear_light}
+        return {"finest_resolution": min(max(cells, _MIN_CELLS), _MAX_CELLS)}
 
     @property
     def bounds(self) -> Float[Tensor, "2 3"] | None:
