@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
@@ -16,7 +15,7 @@ from nerfro.core.errors import NerfroError
 from nerfro.core.light import encode_photograph, to_linear
 from nerfro.files.deep_images import is_float_tiff, radiance_size, read_16bit, read_radiance
 from nerfro.files.raw_photographs import RAW_SUFFIXES, raw_size, read_raw
-from nerfro.files.reading import open_image, reading
+from nerfro.files.reading import open_image, reading_image
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".jfif", ".webp", ".bmp", ".tif", ".tiff")
 VIEW_SUFFIXES = (*IMAGE_SUFFIXES, ".exr", ".hdr", *RAW_SUFFIXES)  # of photographs, but not of masks
@@ -60,7 +59,7 @@ def is_linear(path: Path) -> bool:
 def read_size(path: Path) -> tuple[int, int, int]:
     """Read width, height and bits per channel from the header of an image file; 32 bits for linear light."""
     if is_linear(path):
-        with _reading(path):
+        with reading_image(path):
             return *(raw_size(path) if path.suffix.lower() in RAW_SUFFIXES else radiance_size(path)), 32
     with open_image(path) as (image, bits):
         return *image.size, bits
@@ -110,7 +109,7 @@ def read_rgb(path: Path, alpha: Alpha) -> Levels:
 
 def _read_radiance(path: Path, alpha: Alpha) -> Float[np.ndarray, "H W 3"]:
     """Read a photograph in linear light; transparency is composited in linear light."""
-    with _reading(path):
+    with reading_image(path):
         radiance = read_raw(path) if path.suffix.lower() in RAW_SUFFIXES else read_radiance(path)
         if not np.isfinite(radiance).all():
             raise OSError("some of its values are not finite")
@@ -118,10 +117,6 @@ def _read_radiance(path: Path, alpha: Alpha) -> Float[np.ndarray, "H W 3"]:
     if alpha == "drop" or opacity.shape[-1] == 0:
         return colours
     return colours * opacity + (1 - opacity) * (1.0 if alpha == "white" else 0.0)
-
-
-def _reading(path: Path) -> contextlib.AbstractContextManager[None]:
-    return reading(path, "image ", missing="restore it or remove its frame")
 
 
 def read_mask(path: Path, labels: Sequence[int] | None = None) -> Levels:

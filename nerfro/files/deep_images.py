@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, UInt16
@@ -11,6 +12,9 @@ from jaxtyping import Float, UInt16
 from nerfro.core.errors import NerfroError
 from nerfro.files.atomic import write_atomically
 from nerfro.files.reading import MAX_PIXELS
+
+if TYPE_CHECKING:
+    import OpenImageIO
 
 
 def read_16bit(path: Path) -> UInt16[np.ndarray, "H W C"]:
@@ -30,13 +34,13 @@ def read_16bit(path: Path) -> UInt16[np.ndarray, "H W C"]:
 
 def is_float_tiff(path: Path) -> bool:
     """Return whether a file is a TIFF image of floating-point numbers, by convention linear light."""
-    import OpenImageIO
-
     if path.suffix.lower() not in (".tif", ".tiff") or not path.is_file():
         return False
-    image = OpenImageIO.ImageInput.open(str(path))
-    if image is None:
-        OpenImageIO.geterror()  # otherwise reported at the end of the program
+    import OpenImageIO
+
+    try:
+        image = _open(path)
+    except OSError:
         return False
     return image.spec().format.basetype in (OpenImageIO.HALF, OpenImageIO.FLOAT, OpenImageIO.DOUBLE)
 
@@ -47,12 +51,7 @@ def radiance_size(path: Path) -> tuple[int, int]:
     Raises:
         OSError: the file is corrupt, shows a part of its frame, or is to be turned for display.
     """
-    import OpenImageIO
-
-    image = OpenImageIO.ImageInput.open(str(path))
-    if image is None:
-        raise OSError(OpenImageIO.geterror().partition("\n")[0])
-    spec = image.spec()
+    spec = _open(path).spec()
     if path.suffix.lower() == ".exr" and spec.roi != spec.roi_full:
         raise OSError("its data window differs from its display window; save the whole frame")
     if spec.get_int_attribute("Orientation", 1) != 1:
@@ -102,15 +101,21 @@ def write_radiance(path: Path, values: Float[np.ndarray, "H W C"]) -> None:
         write_atomically(path, file.read_bytes())
 
 
-def _read(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return the pixels [H, W, C] in the type of the file, and the names of the channels."""
+def _open(path: Path) -> OpenImageIO.ImageInput:
+    """Open a file, whose pixels will not be multiplied by alpha."""
     import OpenImageIO
 
     configuration = OpenImageIO.ImageSpec()
-    configuration.attribute("oiio:UnassociatedAlpha", 1)  # Otherwise, OpenImageIO multiplies colours by alpha.
+    configuration.attribute("oiio:UnassociatedAlpha", 1)
     image = OpenImageIO.ImageInput.open(str(path), configuration)
     if image is None:
-        raise OSError(OpenImageIO.geterror().partition("\n")[0])
+        raise OSError(OpenImageIO.geterror().partition("\n")[0])  # an error that is not retrieved is printed at the end
+    return image
+
+
+def _read(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return the pixels [H, W, C] in the type of the file, and the names of the channels."""
+    image = _open(path)
     if image.spec().width * image.spec().height > MAX_PIXELS:
         raise OSError(f"it has more than {MAX_PIXELS / 1e6:.0f} million pixels")
     pixels, error = image.read_image(format=image.spec().format), image.geterror()

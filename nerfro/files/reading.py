@@ -67,6 +67,11 @@ def reading(
         raise NerfroError(f"{what}{path} {trouble} ({reason}); {advice}") from error
 
 
+def reading_image(path: Path) -> contextlib.AbstractContextManager[None]:
+    """Return the context `reading` for a photograph or a mask."""
+    return reading(path, "image ", missing="restore it or remove its frame")
+
+
 @contextlib.contextmanager
 def open_image(path: Path, upright: bool = True) -> Iterator[tuple[Image.Image, int]]:
     """Open an image file, and yield it with the bits per channel of the file, of which Pillow silently keeps 8.
@@ -78,7 +83,7 @@ def open_image(path: Path, upright: bool = True) -> Iterator[tuple[Image.Image, 
     Raises:
         NerfroError: the file is missing or damaged, has more than `MAX_PIXELS` pixels, or has an EXIF orientation.
     """
-    with reading(path, "image ", missing="restore it or remove its frame"), path.open("rb") as file:
+    with reading_image(path), path.open("rb") as file:
         with _filters, warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # `MAX_PIXELS` is stricter
             try:
