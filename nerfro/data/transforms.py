@@ -24,6 +24,7 @@ _OTHER_FORMATS = {
     "transforms.json": "nerfstudio", "sparse": "colmap", "colmap": "colmap", "poses_bounds.npy": "llff",
     "cameras_sphere.npz": "idr",
 }  # fmt: skip
+_TURNTABLE: dict[str, Any] = {"turntable": bool, "turntable_axis": list[float]}
 _PATHS = dict.fromkeys(("file_path", "mask_path", "mask_file_path", "object_mask_path"), str)
 
 
@@ -52,15 +53,8 @@ class Manifest:
     @property
     def turntable(self) -> bool | tuple[float, ...]:
         """Value of the keys `turntable` and `turntable_axis` of the file, see `PosedImages`; false without them."""
-        hints = {"turntable": bool, "turntable_axis": list[float]}
-        values: dict[str, Any] = {name: self.document.get(name) for name in hints}
-        check(f"{self.path}: ", hints, values)
-        for other in find_splits(self.path.parent).values() if self.path.name != "transforms.json" else ():
-            document: Any = read_json(other, "check its permissions")
-            if isinstance(document, dict) and any(document.get(name) != value for name, value in values.items()):
-                raise NerfroError(
-                    f"{self.path} and {other} have other values of turntable or turntable_axis; make them equal"
-                )
+        values: dict[str, Any] = {key: self.document.get(key) for key in _TURNTABLE}
+        check(f"{self.path}: ", _TURNTABLE, values)
         return turntable_of(f"{self.path}: ", *values.values()) or False
 
     def lenses(self, indices: Sequence[int] | None = None) -> list[Lens]:
@@ -90,8 +84,20 @@ def find_splits(root: Path) -> dict[str, Path]:
 
 
 def read_manifest(root: Path, split: str, mask_key: str = "mask_path", skip_missing: bool = False) -> Manifest:
-    """Read and check the transforms file of an existing split; see `parse_manifest`."""
-    return parse_manifest(find_splits(root)[split], mask_key, skip_missing)
+    """Read and check the transforms file of an existing split, which states the same turntable as the other splits.
+
+    See `parse_manifest`.
+    """
+    splits = find_splits(root)
+    manifest = parse_manifest(splits.pop(split), mask_key, skip_missing)
+    stated = [manifest.document.get(key) for key in _TURNTABLE]
+    for other in splits.values():
+        document: Any = read_json(other, "check its permissions")
+        if isinstance(document, dict) and [document.get(key) for key in _TURNTABLE] != stated:
+            raise NerfroError(
+                f"{manifest.path} and {other} have other values of {' or '.join(_TURNTABLE)}; make them equal"
+            )
+    return manifest
 
 
 def parse_manifest(path: Path, mask_key: str = "mask_path", skip_missing: bool = False) -> Manifest:
