@@ -60,8 +60,7 @@ class SkippedTests:
 
 def pytest_configure(config: pytest.Config) -> None:
     worker = hasattr(config, "workerinput")  # of pytest-xdist
-    has_cache = config.pluginmanager.hasplugin("cacheprovider")
-    if not worker and not config.option.collectonly and has_cache and config.cache is not None:
+    if not worker and not config.option.collectonly and config.pluginmanager.hasplugin("cacheprovider"):
         config.pluginmanager.register(SkippedTests(config.cache))
 
 

@@ -100,12 +100,8 @@ class GridSettings:
             return coarse
         # The margin of air has a fixed number of voxels if the box follows the surface.
         air = 0 if self.box_min is not None else 2 * _AIR
-        finer = (
-            (_RESOLUTION - 1 - air)
-            * WallSettings.voxels
-            * spacing
-            / float(np.quantile(walls, WallSettings.few, method="lower"))
-        )
+        thickest = float(np.quantile(walls, WallSettings.few, method="lower"))  # of the walls that may stay thin
+        finer = (_RESOLUTION - 1 - air) * WallSettings.voxels * spacing / thickest
         most = int((self.max_gigabytes * 1e9 / BYTES_PER_VERTEX) ** (1 / 3))
         resolution = max(_RESOLUTION, min(math.ceil(finer) + 1 + air, most))
         print(

@@ -101,7 +101,8 @@ class Tracer {
     this.setUniforms("trace", {
       focal: [view.focal[0] * scale[0], view.focal[1] * scale[1]],
       principal: [view.principal[0] * scale[0], view.principal[1] * scale[1]],
-      jitter, stride, first, corner, height, axes: view.axes, room: roomAxes(view.axes, this.scene.turntable), eye: view.eye, near: view.near,
+      jitter, stride, first, corner, height, axes: view.axes, eye: view.eye, near: view.near,
+      room: roomAxes(view.axes, this.scene.turntable),
       numVertices: surface.numVertices, gridLow: surface.low.flat(), gridHigh: surface.high.flat(),
       boxLow: alongAxes(Math.min, surface.low), boxHigh: alongAxes(Math.max, surface.high),
       distanceUnit: surface.distanceUnits, clearanceUnit: surface.clearanceUnits, blockCells: surface.blockCells,
