@@ -142,7 +142,7 @@ class Renderer(Component, nn.Module, ABC):
     def render_batch(self, batch: Batch) -> list[Rendering]:
         """Render the rays of a training step, with the exposures of their photographs."""
         renderings = self.render_path(self.trace(batch.rays, batch.path), batch)
-        gains = self.scene.camera.gains(batch.ray_view)
+        gains = self.scene.camera.gains(batch.ray_view, batch.rays)
         return renderings if gains is None else [rendering.exposed(gains) for rendering in renderings]
 
     def sample(self, path: Path, previous: Rendering | None = None, batch: Batch | None = None) -> Samples:
