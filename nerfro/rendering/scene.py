@@ -48,7 +48,7 @@ class Scene(nn.Module):
         self.medium, self.fields, self.background = medium, nn.ModuleList(fields), background
         self.colour_space = colour_space
         if colour_space is ColourSpace.SRGB and self.camera.exposure is not None:
-            raise NerfroError("camera.exposure=true and camera.appearance need linear radiance; take model.colour=linear")
+            raise NerfroError("camera.exposure and camera.appearance need linear radiance; take model.colour=linear")
         self.register_buffer("_on_device", torch.empty(0), persistent=False)  # a scene may have no other tensor
 
     def __repr__(self) -> str:

@@ -164,7 +164,8 @@ def _observe_through_object(run: TrainingRun, pixels: Int[Tensor, "Q"], min_back
     neighbours = renderer.exit_directions(scene.camera(neighbour_rays(batches.cameras, pixels), view))
     widths = divergence(batches.cameras, pixels, main_exits(path), neighbours)
     steady = (widths < DIVERGENT).nonzero()[:, 0]
-    path, rays, pixels, view, widths = path.select_rays(steady), *(p[steady] for p in (rays, pixels, view, widths))
+    path, rays = path.select_rays(steady), rays[steady]
+    pixels, view, widths = pixels[steady], view[steady], widths[steady]
     rendering = renderer.render_path(path)[-1]
     fraction, exits = path.main_polyline(rendering.background_fraction), path.main_polyline(path.exits().directions)
     rgb = batches.photographed(pixels)
