@@ -106,7 +106,8 @@ class Appearance(PerView):
 
     def begin(self, cameras: Cameras) -> None:
         """Initialize the embeddings with zero, which means a gain of 1."""
-        self.embedding.data = self.embedding.new_zeros(len(cameras), self.embedding.shape[1])
+        parameter = self.embedding
+        parameter.data = parameter.new_zeros(len(cameras), parameter.shape[1])
         ones = torch.ones_like(cameras.fx)
         scales = torch.stack([2 * cameras.fx / cameras.width, 2 * cameras.fy / cameras.height, ones], -1)
         self.axes = scales[..., None] * cameras.camera_to_world[..., :3].mT.to(scales)
