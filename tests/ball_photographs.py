@@ -82,14 +82,19 @@ def photographs(iors: list[float], opaque: bool = False, inner: float = INNER) -
 
 
 def photographs_of(
-    medium: Bodies, opaque: bool = False, around: Callable[[Exits], Tensor] = lambda exits: sky(exits.directions)
+    medium: Bodies,
+    opaque: bool = False,
+    around: Callable[[Exits], Tensor] = lambda exits: sky(exits.directions),
+    sampler: Snell = Snell(),
 ) -> Views:
     """What a medium shows of what is around it, the sky."""
     taken, images = cameras(), []
     for view in range(NUM_VIEWS):
         rays = taken.image_rays(view)
-        path = Snell()(rays, medium)
+        path = medium.with_absorption(sampler(rays, medium))
         radiance = around(path.exits())
+        radiance = radiance * path.transmitted(path.far[:, None])[:, 0] if path.absorbs else radiance
+        radiance = path.sum_polylines(radiance)
         if opaque:  # painted, in every colour of the sky
             radiance = torch.where(path.refracted[:, None], sky(normalize(path.positions[:, 1], dim=-1)), radiance)
         images.append(to_srgb(radiance).view(SIZE, SIZE, 3))

@@ -1,7 +1,7 @@
 """A small data set and a trained run, commands that are run on them in this process, and what holds whatever they get.
 
-A command that is given anything ends within a minute of processor time: it either does what it was asked, or says in one line why not and
-has a status other than zero. It writes to its own folder only, and what existed stays as it was.
+A command that is given anything ends within a minute of processor time: it either does what it was asked, or says in
+one line why not and has a status other than zero. It writes to its own folder only, and what existed stays as it was.
 """
 
 import contextlib
