@@ -26,7 +26,7 @@ def main(config: DictConfig) -> None:
     request = Request(**vars(Composition.of_job(config)))
     scene, file = preprocess_composed(request), request.out / SCENE
     if scene.provenance.reflects is None:
-        print("for real glass, with reflection and absorption, add experiment=glass, or in a room experiment=glass_room")
+        print("reflection and absorption are unknown; add experiment=glass, or in a room experiment=glass_room")
     options: dict[str, object] = {"scene": file} | scene.training_options
     print_next("train on it", "train", as_overrides(options))
     if scene.vessel:

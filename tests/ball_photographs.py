@@ -26,6 +26,7 @@ from tests.closed_forms import grid_points, sampled
 SIZE, NUM_VIEWS, RADIUS, INNER = 40, 30, 0.7, 0.35
 SHARES = 5  # pixels of masks are divided by so many, each way
 BOX = torch.tensor([[-0.9] * 3, [0.9] * 3])
+TRANSMITTED = Snell()
 # Overrides with which a training on photographs of a ball of index 1.45 takes seconds.
 TRAINING = [
     "logger=none", "medium.cache=false", "medium.resolution=48", "medium.box_min=[-1,-1,-1]", "medium.box_max=[1,1,1]",
@@ -85,7 +86,7 @@ def photographs_of(
     medium: Bodies,
     opaque: bool = False,
     around: Callable[[Exits], Tensor] = lambda exits: sky(exits.directions),
-    sampler: Snell = Snell(),
+    sampler: Snell = TRANSMITTED,
 ) -> Views:
     """What a medium shows of what is around it, the sky."""
     taken, images = cameras(), []

@@ -171,7 +171,7 @@ class ObjectErrors:
         return self._sums(path.sum_polylines(light).clamp(max=1) - self._pixels.radiance)
 
     def of_absorption(
-        self, body: Bodies, shares: Float[np.ndarray, "candidates"]
+        self, body: Bodies, shares: Float[np.ndarray, " candidates"]
     ) -> tuple[Float[np.ndarray, "3 candidates V"], float]:
         """Sum the robust errors of red, green and blue for shares of the light that are absorbed along the mean path.
 

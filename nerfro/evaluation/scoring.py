@@ -37,6 +37,7 @@ from nerfro.files.images import save_png
 from nerfro.rendering import ColourSpace, Renderer
 from nerfro.samplers.subdivision import Subdivision
 
+
 def score_split(
     renderer: Renderer, views: Views, metrics: ImageMetrics, folder: Path, subdivision: Subdivision, prefix: str
 ) -> tuple[EvaluationResult, dict[str, EvaluationResult]]:

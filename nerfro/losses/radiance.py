@@ -55,8 +55,8 @@ class BackgroundRegularizer(Loss):
     the density of the finest level learns, because the colour of the background is detached. Channels are summed, and
     the sum over pixels is divided by the number of counted pixels plus one, as in the authors' code.
 
-    In absorbing media, C' includes the absorption, and dark fog in the body has the effect of a grey absorption. Therefore
-    |C'(d) - C| is added, from which only a learned absorption learns. Fog has no part in it.
+    In absorbing media, C' includes the absorption, and dark fog in the body has the effect of a grey absorption.
+    Therefore |C'(d) - C| is added, in which fog has no part, and from which only a learned absorption learns.
 
     Args:
         refracted_only: whether to count only rays that meet the medium.
