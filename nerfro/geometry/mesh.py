@@ -149,10 +149,10 @@ def make_mesh(
         raise NerfroError(f"{what} has no triangles; export a surface instead of a point cloud or an empty scene")
     if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
         raise NerfroError(f"{what} is not made of triangles of points with three coordinates; export it again")
-    turn = np.eye(3) if turn is None else turn
-    vertices = vertices @ turn
     if not np.isfinite(vertices).all():
         raise NerfroError(f"{what} has vertices that are not finite; export it again")
+    turn = np.eye(3) if turn is None else turn
+    vertices = vertices @ turn
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise NerfroError(f"{what} has triangles with indices of missing vertices; export it again")
     check(f"{what} reaches too far; scale it to about one unit: ", {"coordinate": Coordinate},

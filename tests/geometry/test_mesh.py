@@ -3,6 +3,7 @@
 import json
 import struct
 import sys
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -99,6 +100,18 @@ def test_files_without_triangles_or_with_nan_are_named(tmp_path: Path) -> None:
     refused(r"points\.obj", load_mesh, tmp_path / "points.obj")
     (tmp_path / "nan.obj").write_text("v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     refused(r"nan\.obj", load_mesh, tmp_path / "nan.obj")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_vertices_that_are_not_finite_are_refused_in_one_line(value: float, tmp_path: Path) -> None:
+    """No operation before the check warns."""
+    ball = trimesh.creation.icosphere(1)
+    ball.vertices[3, 0] = value
+    trimesh.Trimesh(ball.vertices, ball.faces, process=False).export(tmp_path / "ball.ply")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        refused("vertices that are not finite", load_mesh, tmp_path / "ball.ply")
+
 
 
 @pytest.mark.parametrize("index", [-1, 8, 2**31 - 1])
