@@ -85,10 +85,10 @@ def is_gltf(path: Path) -> bool:
 
 
 def require_readable(path: Path) -> None:
-    """Raise an error if a glTF file is compressed and cannot be decoded, and print once that its y axis is up.
+    """Raise an error if the shape of a glTF file cannot be read, and print once that its y axis is up.
 
     Raises:
-        NerfroError: the geometry is compressed.
+        NerfroError: the geometry is compressed, or has a property that changes its shape and is not read.
     """
     document = read_document(path)
     if not isinstance(document, dict):
@@ -102,7 +102,27 @@ def require_readable(path: Path) -> None:
                 f"mesh {path} is compressed by {compression} ({name}), which nerfro does not read; export it without "
                 f"compression (in Blender, without the option Compression), or as ply{decoder}"
             )
+    reason = _unread_shape(document, used)
+    if reason is not None:
+        raise NerfroError(
+            f"mesh {path} {reason}, which nerfro does not read; apply it in the program that wrote the file"
+        )
     _announce(path)
+
+
+def _unread_shape(document: Mapping[str, Any], used: list[str]) -> str | None:
+    """Name a property of a glTF file that changes its shape and that trimesh ignores; None if there is none."""
+    meshes, nodes = document.get("meshes") or [], document.get("nodes") or []
+    primitives = [primitive for mesh in meshes for primitive in mesh.get("primitives", [])]
+    read = {p.get("attributes", {}).get("POSITION") for p in primitives} | {p.get("indices") for p in primitives}
+    accessors = document.get("accessors") or []
+    properties = {
+        "has sparse accessors": any("sparse" in accessors[i] for i in read - {None} if i < len(accessors)),
+        "has shape keys (morph targets)": any(any(mesh.get("weights", [])) for mesh in (*meshes, *nodes)),
+        "is posed by a skeleton (skin)": any("skin" in node for node in nodes),
+        "has instances (EXT_mesh_gpu_instancing)": "EXT_mesh_gpu_instancing" in used,
+    }
+    return next((name for name, is_used in properties.items() if is_used), None)
 
 
 @cache

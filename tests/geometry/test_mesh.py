@@ -4,6 +4,7 @@ import json
 import struct
 import sys
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +70,26 @@ def test_compressed_gltf_is_refused(extension: str, name: str, tmp_path: Path, m
     )
 
 
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [
+        (lambda tree: tree["accessors"][0].update(sparse={"count": 1}), "sparse accessors"),
+        (lambda tree: tree["accessors"][1].update(sparse={"count": 1}), "sparse accessors"),
+        (lambda tree: tree["meshes"][0].update(weights=[0.0, 1.0]), "shape keys"),
+        (lambda tree: tree["nodes"][0].update(weights=[0.5]), "shape keys"),
+        (lambda tree: tree["nodes"][0].update(skin=0), "skeleton"),
+        (lambda tree: tree.update(extensionsUsed=["EXT_mesh_gpu_instancing"]), "instances"),
+    ],
+)
+def test_gltf_whose_shape_has_more_than_its_positions_is_refused(
+    change: Callable[[dict[str, Any]], None], name: str, tmp_path: Path
+) -> None:
+    """trimesh reads the positions alone, without a word."""
+    scene = trimesh.Scene(trimesh.creation.box())
+    (tmp_path / "a.glb").write_bytes(export_glb(scene, tree_postprocessor=change))
+    refused(rf"a\.glb .*{name}.*apply it in the program", load_mesh, tmp_path / "a.glb")
+
+
 def test_meshes_compressed_by_draco_are_decoded(tmp_path: Path) -> None:
     draco = pytest.importorskip("DracoPy")
     ball = trimesh.creation.icosphere(2, 0.7)
@@ -111,7 +132,6 @@ def test_vertices_that_are_not_finite_are_refused_in_one_line(value: float, tmp_
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         refused("vertices that are not finite", load_mesh, tmp_path / "ball.ply")
-
 
 
 @pytest.mark.parametrize("index", [-1, 8, 2**31 - 1])
