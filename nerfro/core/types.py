@@ -154,13 +154,14 @@ class Path:
         num_vertices, num_rays = max([path.s.shape[1] for path in paths]), 0
         columns: dict[str, list[Tensor]] = {name: [] for name in (*_OF_PATHS, *_OF_ROWS)}
         for path in paths:
-            # Short rows repeat their last vertex.
-            vertices = torch.arange(num_vertices, device=path.s.device).clamp(max=path.s.shape[1] - 1)
+            missing = num_vertices - path.s.shape[1]
             for part, names in ((path, _OF_PATHS), (path.record, _OF_ROWS)):
                 for name in names if part is not None else ():
                     values = getattr(part, name)
                     if values is not None:
-                        columns[name].append(values[:, vertices] if name in _OF_VERTICES else values)
+                        # Short rows repeat their last vertex.
+                        padding = [values[:, -1:]] * missing if name in _OF_VERTICES else []
+                        columns[name].append(torch.cat([values, *padding], dim=1) if padding else values)
             columns["ray"][-1] = path.ray + num_rays
             num_rays += path.num_rays
         joined: dict[str, Any] = {name: torch.cat(values) for name, values in columns.items() if values}

@@ -295,12 +295,14 @@ def _backward(positions, resolutions, sizes, gradient, division, table):
                 entries = table[first_entry:end_entry]
                 _locate(positions, start, size, resolutions[level], is_dense, cells, fractions, edges)
                 for p in range(size):
+                    # Read before entries are written, because the compiler cannot exclude that the arrays overlap.
+                    both = (gradient[start + p, 2 * level], gradient[start + p, 2 * level + 1])
+                    if both[0] == 0 and both[1] == 0:
+                        continue
                     i, x, y, z = cells[0, p], fractions[0, p], fractions[1, p], fractions[2, p]
                     w0, w1, w2, w3 = (_ONE - y) * (_ONE - z), y * (_ONE - z), (_ONE - y) * z, y * z
                     low_low, high_low, low_high, high_high = edges[0, p], edges[1, p], edges[2, p], edges[3, p]
                     a, b, c, d, e, f, g, h = _vertices(i, low_low, high_low, low_high, high_high, is_dense, mask)
-                    # Read before entries are written, because the compiler cannot exclude that the arrays overlap.
-                    both = (gradient[start + p, 2 * level], gradient[start + p, 2 * level + 1])
                     for n in range(2):
                         left, right = (_ONE - x) * both[n], x * both[n]
                         entries[a, n] += w0 * left

@@ -174,7 +174,7 @@ def share(task: Callable[[int], Result], number: int) -> list[Result]:
             for i in numbers:
                 results[i] = task(i)
 
-    begun = [thread.submit(work) for thread in HELPERS]
+    begun = [thread.submit(work) for thread in HELPERS[: number - 1]]
     try:
         work()
     finally:

@@ -36,6 +36,25 @@ def share_rows(task: Callable[[slice], Result], like: Tensor, size: int) -> list
         return share(lambda i: task(chunks[i]), len(chunks))
 
 
+def share_parts(task: Callable[[slice], Result], number_of_rows: int) -> list[Result]:
+    """Call a kernel for equal parts of rows, one for each helping thread, see `share`.
+
+    A thread that makes batches is a helping thread itself, and a machine with two cores has no other one.
+    """
+    size = max(1, -(-number_of_rows // max(1, len(HELPERS))))
+    parts = [slice(i, i + size) for i in range(0, max(number_of_rows, 1), size)]
+    return share(lambda i: task(parts[i]), len(parts))
+
+
+def start_helpers(number: int) -> list[ThreadPoolExecutor]:
+    """Start threads that help with `share` while they are idle; PyTorch uses one core in each of them."""
+    helpers = [ThreadPoolExecutor(1, "helper", lambda: torch.set_num_threads(1)) for _ in range(number)]
+    for helper in helpers:
+        helper.submit(torch.get_num_threads).result()  # starts the thread, which inherits a number of threads
+    HELPERS.extend(helpers)
+    return helpers
+
+
 @contextlib.contextmanager
 def helping_threads() -> Iterator[int]:
     """Let `share` use a thread for each core of PyTorch; PyTorch uses one core in each of them meanwhile.
@@ -46,10 +65,7 @@ def helping_threads() -> Iterator[int]:
         Number of threads that `share` uses, with the calling thread.
     """
     number = torch.get_num_threads()  # 1 within another such context
-    helpers = [ThreadPoolExecutor(1, "helper", lambda: torch.set_num_threads(1)) for _ in range(number - 1)]
-    for helper in helpers:
-        helper.submit(torch.get_num_threads).result()  # starts the thread, which inherits a number of threads
-    HELPERS.extend(helpers)
+    helpers = start_helpers(number - 1)
     torch.set_num_threads(1)
     try:
         yield 1 + len(HELPERS)

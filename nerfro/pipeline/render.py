@@ -53,6 +53,6 @@ def _render(options: RenderConfig, folder: Path) -> list[Path]:
     frames = render_frames(layer, scene, shots, folder, suffix, request, options.overwrite)
     print(f"{len(frames)} frames: {frames[0]}")
     for film in films:
-        write_film(film, frames, options.seconds)
+        write_film(film, frames, shots.seconds)
         print(f"film: {film}")
     return [*frames, *films]

@@ -6,7 +6,7 @@ import functools
 import itertools
 import os
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from typing import Any, Generic, TypeVar, cast
 
 import torch
@@ -18,6 +18,7 @@ from nerfro.core.types import Batch
 from nerfro.data.base import Views
 from nerfro.evaluation.validation import ValidationPixels
 from nerfro.kernels.compilation import HELPERS
+from nerfro.kernels.threads import start_helpers
 from nerfro.rendering import RayTracer, Renderer
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.training.module import TrainingModule
@@ -29,9 +30,6 @@ _VALIDATIONS_PER_IMAGE = 5
 _STEPS_OF_EPOCH = 100
 # Weights of linear layers; the default field has 9,000, the networks of the paper 1.2 million.
 _LARGE = 100_000
-# Threads of PyTorch beside the tracing thread, for networks without large layers. A step on 16 threads took 1.6 times
-# as long as on 8 (docs/lab/threads.md).
-_MAX_THREADS = 7
 
 
 class RayDataModule(LightningDataModule):
@@ -84,7 +82,7 @@ class RayDataModule(LightningDataModule):
         self.tracer = RayTracer(module.renderer, self.subdivision)
         self.end_thread()
         if can_prefetch(module.renderer):
-            self._ahead = Prefetcher(self._batch, spare_core=not multiplies_large_matrices(module.renderer))
+            self._ahead = Prefetcher(self._batch, spare_cores=not multiplies_large_matrices(module.renderer))
         # Lightning calls this method after restoring a checkpoint, so a resumed run continues with the next batch.
         trainer: Any = self.trainer
         if trainer.check_val_every_n_epoch is not None and isinstance(trainer.val_check_interval, float):
@@ -178,20 +176,20 @@ class Prefetcher(Generic[Made]):
 
     Args:
         make: function that makes the batch of a step.
-        spare_core: whether to reserve a core for the thread: PyTorch then uses one thread less, and at most
-            `_MAX_THREADS`.
+        spare_cores: whether threads of Python share each step and each batch, one for each core of PyTorch. PyTorch
+            then uses one core in each of them, because small operators divide badly (docs/lab/threads.md).
     """
 
-    def __init__(self, make: Callable[[int], Made], spare_core: bool = True) -> None:
+    def __init__(self, make: Callable[[int], Made], spare_cores: bool = True) -> None:
         self._make = torch.no_grad()(make)
         self._step, self._begun = -1, Future[Made]()
         # PyTorch has a number of threads per thread, and new threads inherit the last one.
         self._num_threads = torch.get_num_threads()
-        self._thread = ThreadPoolExecutor(1, "paths", lambda: torch.set_num_threads(1))
-        self._thread.submit(torch.get_num_threads).result()
-        HELPERS.append(self._thread)
-        if spare_core:
-            torch.set_num_threads(min(max(1, self._num_threads - 1), _MAX_THREADS))
+        # The last helper makes the batches, because the others are asked first.
+        self._helpers = start_helpers(max(1, self._num_threads - 1) if spare_cores else 1)
+        self._thread = self._helpers[-1]
+        if spare_cores:
+            torch.set_num_threads(1)
 
     def __call__(self, step: int) -> Made:
         """Return the batch of a step; errors of the thread are raised here."""
@@ -207,9 +205,10 @@ class Prefetcher(Generic[Made]):
         self._step, self._begun = step, self._thread.submit(self._make, step)
 
     def close(self) -> None:
-        """End the thread, and return its core to PyTorch."""
-        HELPERS.remove(self._thread)
-        self._thread.shutdown(cancel_futures=True)
+        """End the threads, and return their cores to PyTorch."""
+        for helper in self._helpers:
+            HELPERS.remove(helper)
+            helper.shutdown(cancel_futures=True)
         torch.set_num_threads(self._num_threads)
 
 

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import time
 from typing import Any
 
 from lightning.pytorch import Callback, LightningModule, Trainer
 from omegaconf import DictConfig
 
-from nerfro.core.types import Batch
 from nerfro.data.base import DataSource, Views
 from nerfro.training.module import TrainingModule
 from nerfro.viewing.baking import bake_surface
@@ -32,7 +30,6 @@ class Viewer(Callback):
         self._config, self._source, self._views = config, source, views
         self._server: PageServer | None = None
         self._live: LivePage | None = None
-        self._last_loss_time = 0.0
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         # Errors of the page and of its port are raised before the first step.
@@ -50,15 +47,18 @@ class Viewer(Callback):
         print(f"nerfro: the model as it learns: {self._server.url}", flush=True)
 
     def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Batch, batch_idx: int
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, *_: Any, **__: Any
     ) -> None:
-        if self._server is None or self._live is None:
+        if self._live is None:
             return
-        # The loss curve has a point each second; on a GPU, each point waits for the step.
-        if time.monotonic() - self._last_loss_time > 1.0:
-            self._last_loss_time = time.monotonic()
-            self._server.add_loss(trainer.global_step, float(outputs["loss"]))
+        self._live.record(trainer.global_step, outputs["loss"], trainer.callback_metrics)
         self._live.update()
+
+    def on_validation_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, *_: Any, **__: Any
+    ) -> None:
+        if self._live is not None and outputs:
+            self._live.show_validation(trainer.global_step, outputs["prediction"], outputs["target"])
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if self._live is not None:

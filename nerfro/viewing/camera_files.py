@@ -110,6 +110,13 @@ def read_cameras(file: Path, geometry: CaptureGeometry, origin: Float[np.ndarray
     )  # fmt: skip
 
 
+def stated_seconds(file: Path) -> float | None:
+    """Return the duration of a film, as the camera paths of nerfstudio and of the page state it; None without one."""
+    document = read_json(file, "check the path")
+    seconds = document.get("seconds") if isinstance(document, dict) else None
+    return float(seconds) if is_number(seconds) and seconds > 0 else None
+
+
 def write_cameras(file: Path, camera: CameraModel, views: Views, origin: Float[np.ndarray, "3"] = WORLD_ORIGIN) -> None:
     """Write the estimated training cameras as a `transforms.json` for `data=nerfstudio`, if cameras are optimized.
 

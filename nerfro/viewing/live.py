@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
+import math
+import re
 import time
+from collections.abc import Mapping
+
+from jaxtyping import Float
+from torch import Tensor
 
 from nerfro.data.base import Views
+from nerfro.evaluation.error_maps import triptych
+from nerfro.files.images import data_uri, to_8bit
 from nerfro.viewing.baking import Baked
 from nerfro.viewing.page import assemble_page, bake_parts, static_parts
 from nerfro.viewing.server import PageServer
@@ -30,7 +38,27 @@ class LivePage:
         self._resolution = resolution
         static = {**static_parts(scene, views.cameras, views.images, split), "version": 0}
         server.open(assemble_page(scene, static, self._bake(surface=True), live=True))
-        self._next = time.monotonic()
+        self._next, self._next_point = time.monotonic(), -math.inf
+
+    def record(self, step: int, loss: Tensor, logged: Mapping[str, Tensor]) -> None:
+        """Add a point to the training curves once a second, because on a GPU each point waits for the step.
+
+        Args:
+            step: number of the step.
+            loss: training loss of the step.
+            logged: latest values of the log, of which the page shows losses and PSNR.
+        """
+        if time.monotonic() < self._next_point:
+            return
+        self._next_point = time.monotonic() + 1.0
+        shown = {name: value for name, value in logged.items() if re.fullmatch("loss/(?!total).*|.*/psnr", name)}
+        losses = {"training loss": loss, **shown}
+        self._server.add_losses(step, {name: float(value) for name, value in losses.items()})
+
+    def show_validation(self, step: int, rendering: Float[Tensor, "H W 3"], photograph: Float[Tensor, "H W 3"]) -> None:
+        """Show the rendering of a validation view, its photograph, and the error."""
+        picture = to_8bit(triptych(rendering, photograph)).cpu().numpy()
+        self._server.show_validation(step, data_uri(picture, "JPEG", quality=85))
 
     def update(self) -> None:
         """Call `show` if an update is due and a browser shows the page."""

@@ -23,7 +23,7 @@ from nerfro.core.variants import variant
 from nerfro.data.lenses import Lens, check_lenses
 from nerfro.registry.allowed import Count, Positive, refuse_unused
 from nerfro.samplers.subdivision import SubdivisionChanges
-from nerfro.viewing.camera_files import cameras_of_file
+from nerfro.viewing.camera_files import cameras_of_file, stated_seconds
 from nerfro.viewing.camera_paths import PATHS, CaptureGeometry, OrbitPosition, path_cameras
 from nerfro.viewing.trained_scene import TrainedScene
 
@@ -40,7 +40,7 @@ class RenderConfig:
         checkpoint: run folder or a checkpoint in it.
         path: path around the object: orbit, spiral, arc or dolly; or FILE.json of cameras.
         frames: number of frames of the film.
-        seconds: duration of the film.
+        seconds: duration of the film; by default that of the file of cameras (`seconds`), or 5.
         azimuth: start of the path, degrees around the object.
         elevation: start of the path, degrees above the object.
         distance: distance from the centre of the object at the start, world units; by default that of the
@@ -68,7 +68,7 @@ class RenderConfig:
     checkpoint: str = MISSING
     path: str | None = None
     frames: Count = 120
-    seconds: Positive = 5.0
+    seconds: Positive | None = None
     azimuth: float = 0.0
     elevation: Annotated[float, Ge(-90), Le(90)] = 10.0
     distance: Positive | None = None
@@ -97,11 +97,13 @@ class Shots:
         cameras: camera of each frame.
         names: file name of each frame, without suffix.
         film: whether the frames form a sequence in time.
+        seconds: duration of the film.
     """
 
     cameras: Cameras
     names: list[str]
     film: bool
+    seconds: float = 5.0
 
 
 def check_request(options: RenderConfig) -> None:
@@ -152,7 +154,7 @@ def find_shots(options: RenderConfig, scene: TrainedScene) -> Shots:
 
 def _free_cameras(options: RenderConfig, scene: TrainedScene) -> Shots:
     """Make the camera of a still image, of a path around the object, or of a file."""
-    geometry = CaptureGeometry.of(scene.cameras("train"), scene.bounds)
+    geometry, seconds = CaptureGeometry.of(scene.cameras("train"), scene.bounds), None
     if options.position is not None:
         target = geometry.centre if options.target is None else _local(options.target, scene)
         cameras = geometry.look_at(_local(options.position, scene)[None], target)
@@ -160,8 +162,10 @@ def _free_cameras(options: RenderConfig, scene: TrainedScene) -> Shots:
         start = OrbitPosition(options.azimuth, options.elevation, options.distance or geometry.distance)
         cameras = path_cameras(geometry, options.path, start, options.frames)
     else:
-        cameras = cameras_of_file(user_path(str(options.path)), geometry, scene.source)
-    return Shots(cameras, _numbered("frame", len(cameras), 4), len(cameras) > 1)
+        file = user_path(str(options.path))
+        cameras, seconds = cameras_of_file(file, geometry, scene.source), stated_seconds(file)
+    seconds = options.seconds or seconds or Shots.seconds
+    return Shots(cameras, _numbered("frame", len(cameras), 4), len(cameras) > 1, seconds)
 
 
 def _local(point: Sequence[float], scene: TrainedScene) -> Float[Tensor, "3"]:

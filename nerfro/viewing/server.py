@@ -72,9 +72,10 @@ class PageServer:
         self._to_answer, self.ends, self.ended = answer, False, threading.Event()
         self.outcome: str | None = None
         self.outcome_sent = threading.Event()
-        self._page, self._update, self._version = _PLACEHOLDER, b"null", 0
-        self._is_final = False
-        self._losses: list[tuple[int, float]] = []
+        self._page, self._version, self._is_final = _PLACEHOLDER, 0, False
+        # Versions and contents, as JSON.
+        self._update, self._picture = (0, b"null"), (0, b"null")
+        self._losses: list[tuple[int, dict[str, float]]] = []
         self._last_request = -_WATCHED_SECONDS
         threading.Thread(target=self._server.serve_forever, daemon=True, name="page server").start()
 
@@ -96,12 +97,18 @@ class PageServer:
         """Send changed numbers and arrays to the browsers that show the page."""
         with self._lock:
             self._version += 1
-            self._update = json.dumps({"scene": {**scene, "version": self._version}, "arrays": arrays}).encode()
+            self._update = self._version, json.dumps({"scene": scene, "arrays": arrays}).encode()
 
-    def add_loss(self, step: int, loss: float) -> None:
-        """Append a point to the training curve."""
+    def add_losses(self, step: int, losses: dict[str, float]) -> None:
+        """Append a point to the training curves, which have names."""
         with self._lock:
-            self._losses.append((step, loss))
+            self._losses.append((step, losses))
+
+    def show_validation(self, step: int, uri: str) -> None:
+        """Show a picture of a validation view."""
+        with self._lock:
+            self._version += 1
+            self._picture = self._version, json.dumps({"step": step, "uri": uri}).encode()
 
     def complete(self, outcome: str) -> None:
         """Tell the browsers that the training has ended, and wait a few seconds until one that watches knows."""
@@ -114,16 +121,16 @@ class PageServer:
         return self._page
 
     def state(self, after: int) -> bytes:
-        """Return the training curve, its outcome, and the update for a page of version `after`, as JSON."""
+        """Return training curves, outcome, and the changes for a page of version `after`, as JSON."""
         self._last_request = time.monotonic()
         with self._lock:
             # The curve has at most 500 points.
             every = -(-len(self._losses) // 500) or 1
             # Counted from the end, because the page states the last loss.
             losses = json.dumps(self._losses[::-every][::-1]).encode()
-            update = self._update if self._version > after else b"null"
-            end = json.dumps({"outcome": self.outcome, "final": self._is_final}).encode()
-        return end[:-1] + b', "losses": ' + losses + b', "update": ' + update + b"}"
+            update, picture = (content if at > after else b"null" for at, content in (self._update, self._picture))
+            end = json.dumps({"outcome": self.outcome, "final": self._is_final, "version": self._version}).encode()
+        return end[:-1] + b', "losses": ' + losses + b', "update": ' + update + b', "picture": ' + picture + b"}"
 
     def answer(self, request: bytes) -> tuple[HTTPStatus, bytes]:
         """Answer a request of the page; requests are answered one after the other."""

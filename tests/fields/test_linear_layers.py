@@ -65,6 +65,29 @@ def test_blocks_equal_sequential_with_one_and_two_threads(monkeypatch: pytest.Mo
     assert all(torch.equal(mine, theirs) for mine, theirs in zip(alone, helped, strict=True))
 
 
+@pytest.mark.parametrize("share", [0.2, 0.9])
+def test_gradients_of_points_that_do_not_matter_are_left_out(share: float) -> None:
+    mlp, inputs = layers(6, 8, 3), torch.randn(20_000, 6, requires_grad=True)
+    gradient, tiny = torch.randn(20_000, 3), torch.rand(20_000) < share
+    gradient[tiny] *= 1e-5
+    learned = [inputs, *weights(mlp)]
+    of_points, *of_weights = torch.autograd.grad(relu_mlp([inputs], weights(mlp), False), learned, gradient)
+    expected = torch.autograd.grad(mlp(inputs), learned, gradient)
+    for mine, theirs in zip(of_weights, expected[1:], strict=True):
+        assert (mine - theirs).abs().sum() < 1e-3 * theirs.abs().sum()
+    torch.testing.assert_close(of_points[~tiny], expected[0][~tiny])
+    assert (of_points[tiny].count_nonzero() == 0) == (share == 0.9)
+
+
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_gradient_that_is_not_finite_is_never_left_out(value: float) -> None:
+    mlp = layers(6, 8, 3)
+    gradient = torch.full((5000, 3), 1e-9)
+    gradient[7, 0], gradient[8] = value, 1.0
+    of_weights = torch.autograd.grad(relu_mlp([torch.randn(5000, 6)], weights(mlp), False), weights(mlp), gradient)
+    assert not any(of_layer.isfinite().all() for of_layer in of_weights)
+
+
 @pytest.mark.parametrize("batch", [(1024,), (2, 1024), (700,), (0,)])
 def test_values_and_gradients_equal_a_layer_of_torch_on_concatenated_inputs(batch: tuple[int, ...]) -> None:
     layer = Linear(8, 7)

@@ -12,14 +12,17 @@ import pytest
 import torch
 from lightning.pytorch import Trainer
 
+from nerfro.core.draws import Draws
 from nerfro.core.types import Batch
 from nerfro.data.blender import BlenderData
 from nerfro.data.pixel_store import PixelStore
+from nerfro.kernels import compilation
 from nerfro.media.bodies import Bodies
 from nerfro.paper.eikonal import Eikonal
 from nerfro.rendering import RayTracer, Renderer, Scene
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.points.density_grid import DensityGridSampler
+from nerfro.testing import example_space
 from nerfro.training.data_module import Prefetcher, RayDataModule, can_prefetch, multiplies_large_matrices
 from nerfro.training.module import TrainingModule
 from nerfro.training.pixel_batches import PixelBatches
@@ -36,7 +39,7 @@ def ball() -> Bodies:
 
 
 def running() -> list[str]:
-    return [thread.name for thread in threading.enumerate() if thread.name.startswith("paths")]
+    return [thread.name for thread in threading.enumerate() if thread.name.startswith("helper")]
 
 
 @pytest.fixture
@@ -87,21 +90,37 @@ def test_prefetcher_reraises_errors_of_its_thread(ahead) -> None:
         one(2)
 
 
-@pytest.mark.parametrize(("width", "available", "expected"), [(8, 3, 2), (512, 3, 3), (8, 16, 7), (512, 16, 16)])
-def test_prefetcher_limits_the_threads_of_torch_unless_matrices_are_large(
-    width: int, available: int, expected: int
-) -> None:
+@pytest.mark.parametrize(("width", "helpers", "of_torch"), [(8, 2, 1), (512, 1, 3)])
+def test_threads_share_a_step_unless_matrices_are_large(width: int, helpers: int, of_torch: int) -> None:
     threads, renderer = torch.get_num_threads(), Mock(spec=Renderer, modules=lambda: [torch.nn.Linear(width, width)])
     try:
-        torch.set_num_threads(available)
+        torch.set_num_threads(3)
         prefetcher = Prefetcher(
             lambda step: (torch.get_num_threads(), torch.is_grad_enabled()),
-            spare_core=not multiplies_large_matrices(renderer),
+            spare_cores=not multiplies_large_matrices(renderer),
         )
         assert prefetcher(0) == (1, False)
-        assert torch.get_num_threads() == expected
+        assert (len(compilation.HELPERS), torch.get_num_threads()) == (helpers, of_torch)
         prefetcher.close()
-        assert torch.get_num_threads() == available
+        assert (len(compilation.HELPERS), torch.get_num_threads()) == (0, 3)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def test_batches_do_not_depend_on_the_number_of_threads(ahead, ball: Bodies) -> None:
+    """Parts of rays and of polylines are traced and sampled in different threads."""
+    rays, sampler = random_rays(301, 1.6, 0, 6.0), Snell(branches="all", least_weight=0.02)
+    points = DensityGridSampler(example_space())
+
+    def batch(step: int) -> tuple[torch.Tensor, ...]:
+        path = sampler(rays, ball)
+        samples = points.choose_ahead(path, Draws(7, step, torch.arange(len(rays))))
+        return path.positions, path.s, path.throughput, samples.positions, samples.edges
+
+    alone, threads = batch(0), torch.get_num_threads()
+    try:
+        torch.set_num_threads(4)
+        assert all(map(torch.equal, ahead(batch)(0), alone))
     finally:
         torch.set_num_threads(threads)
 

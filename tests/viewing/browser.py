@@ -97,6 +97,22 @@ class Browser:
             assert time.monotonic() < deadline, condition
             time.sleep(0.05)
 
+    def findings(self) -> list[str]:
+        """Return the problems of accessibility that axe-core finds, each as one line; the worst ones are `critical`.
+
+        Source:
+            https://github.com/dequelabs/axe-core
+        """
+        folders = map(Path, os.environ.get("NODE_PATH", "").split(os.pathsep))
+        axe = next(
+            (file for file in (folder / "axe-core" / "axe.min.js" for folder in folders) if file.is_file()), None
+        )
+        if axe is None:
+            pytest.skip("axe-core is not installed: npm install axe-core, and set NODE_PATH")
+        self.evaluate(axe.read_text(encoding="utf-8") + "\n0")
+        return self.evaluate("""axe.run().then(({ violations }) => violations.flatMap(({ id, impact, nodes }) =>
+          nodes.map(({ target, any }) => `${impact} ${id}: ${target} ${any[0]?.message ?? ""}`)))""")
+
     def drag(self, start: tuple[float, float], end: tuple[float, float], button: str = "left") -> None:
         """Press a button, move, and release the button."""
         buttons = {"left": 1, "right": 2}[button]

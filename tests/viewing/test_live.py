@@ -6,6 +6,7 @@ import time
 from pathlib import Path
 
 import pytest
+import torch
 
 from nerfro.viewing import live
 from nerfro.viewing.live import LivePage
@@ -34,8 +35,7 @@ def test_bakes_take_a_bounded_share_of_the_time(scene: TrainedScene, server: Pag
     page = LivePage(server, scene, scene.views(), "test", resolution=24)
 
     def version() -> int:
-        update = json.loads(server.state(0))["update"]
-        return update["scene"]["version"] if update else 0
+        return json.loads(server.state(0))["version"]
 
     page.update()
     assert version() == 0, "nobody looks"
@@ -56,19 +56,29 @@ def test_bakes_keep_training_mode_and_weights(scene: TrainedScene, server: PageS
     page = LivePage(server, scene, scene.views(), "test", resolution=8)
     page.show()
     assert scene.renderer.training
-    assert set(json.loads(server.state(0))["update"]["scene"]) == {"volume", "sky", "version"}, "the surface stays"
+    assert set(json.loads(server.state(0))["update"]["scene"]) == {"volume", "sky"}, "the surface stays"
 
 
 @pytest.mark.slow
 @needs_chromium
 def test_browser_shows_updates_and_losses(scene: TrainedScene, server: PageServer, tmp_path: Path) -> None:
     page = LivePage(server, scene, scene.views(), "test", resolution=8)
-    server.add_loss(3, 0.5)
-    server.add_loss(7, 0.25)
+    server.add_losses(3, {"training loss": 0.5})
+    server.add_losses(7, {"training loss": 0.25, "val/psnr": 21.5})
     page.show()
+    page.show_validation(7, torch.zeros(8, 8, 3), torch.ones(8, 8, 3))
     with Browser(server.url, tmp_path) as browser:
         browser.wait_for("document.body.textContent.includes('step 7, training loss 0.250')")
         browser.wait_for("document.querySelector('polyline[points^=\"428\"]') !== null")
+        assert browser.evaluate("[$('high'), $('low'), $('end')].map((label) => label.textContent)") == [
+            "0.500",
+            "0.250",
+            "step 7",
+        ]
+        # Rendering, photograph and error, beside each other.
+        browser.wait_for("$('validation').naturalWidth === 24")
+        browser.evaluate("$('curve').value = 'val/psnr', $('curve').dispatchEvent(new Event('change'))")
+        browser.wait_for("$('losses').textContent === 'step 7, val/psnr 21.5'")
     assert server.watched
 
 
@@ -77,7 +87,7 @@ def test_browser_tells_the_outcome_and_opens_the_final_page(
     scene: TrainedScene, server: PageServer, tmp_path: Path
 ) -> None:
     page = LivePage(server, scene, scene.views(), "test", resolution=8)
-    server.add_loss(3, 0.5)
+    server.add_losses(3, {"training loss": 0.5})
     with Browser(server.url, tmp_path) as browser:
         browser.wait_for("document.body.textContent.includes('step 3')")
         page.finish()

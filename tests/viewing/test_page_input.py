@@ -3,11 +3,13 @@
 import html
 import json
 import math
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 
 from nerfro.evaluation.image_metrics import psnr
 from nerfro.files import lat_long
@@ -15,6 +17,7 @@ from nerfro.viewing.camera_files import read_cameras
 from nerfro.viewing.camera_paths import CaptureGeometry
 from nerfro.viewing.page import make_page
 from nerfro.viewing.trained_scene import TrainedScene
+from tests.conftest import Runner
 from tests.viewing.browser import Browser, needs_chromium
 from tests.viewing.conftest import make_scene
 from tests.viewing.test_page import SHOT, one_ray, picture
@@ -94,6 +97,13 @@ def test_keys_turn_zoom_and_go_back(browser: Browser) -> None:
     back = browser.evaluate(VIEW)
     assert back["azimuth"] == pytest.approx(start["azimuth"])
     assert back["radius"] == pytest.approx(start["radius"])
+    browser.evaluate(
+        """$('canvas').dispatchEvent(new KeyboardEvent("keydown", { key: "ArrowRight", shiftKey: true }))"""
+    )
+    moved = browser.evaluate(VIEW)
+    assert moved["azimuth"] == pytest.approx(start["azimuth"])
+    shift = torch.dist(torch.tensor(moved["target"]), torch.tensor(start["target"]))
+    assert shift == pytest.approx(0.05 * start["radius"], rel=1e-4)
     browser.press("0")
     assert browser.evaluate("page.orbit.azimuth") == 0.6
 
@@ -148,6 +158,8 @@ def test_address_restores_view_and_settings(page: str, tmp_path: Path) -> None:
         browser.evaluate("""(() => {
           page.orbit.turn(0.3, 0.1);
           page.show(2);
+          page.setDifference(true);
+          page.film.setKeys([page.orbit.numbers(), [1, 0.5, 4, 0, 0, 0, 0.7]]);
           $("straight").value = 0.25;
           $("ior0").value = 1.75;
           $("ior0").dispatchEvent(new Event("input", { bubbles: true }));
@@ -159,6 +171,8 @@ def test_address_restores_view_and_settings(page: str, tmp_path: Path) -> None:
         assert after.pop("target") == pytest.approx(before.pop("target"), abs=1e-5)
         assert after == pytest.approx(before, rel=1e-5)
         assert after["camera"] == 2
+        assert browser.evaluate("page.isDifference && $('keys').children.length") == 2
+        assert browser.evaluate("page.film.keys[1]") == [1, 0.5, 4, 0, 0, 0, 0.7]
         assert browser.evaluate("[$('straight').value, $('ior0').value, $('ior0-value').value]") == [
             "0.25",
             "1.75",
@@ -170,7 +184,7 @@ def test_saved_view_is_rendered_by_nerfro(browser: Browser, scene: TrainedScene,
     script = f"""(() => {{ {SHOT}
       page.orbit.turn(0.5, 0.2);
       const saved = shot(null, 40);
-      return [saved, cameraFile(page.view, page.scene.origin)];
+      return [saved, cameraFile([page.view], page.scene.origin)];
     }})()"""
     shot, document = browser.evaluate(script)
     (tmp_path / "view.json").write_text(json.dumps(document))
@@ -184,6 +198,104 @@ def test_saved_view_is_rendered_by_nerfro(browser: Browser, scene: TrainedScene,
     })""")
         == "picture.png"
     )
+
+
+def save(browser: Browser, button: str, file: Path) -> None:
+    """Press a button that downloads a file."""
+    browser.call("Page.setDownloadBehavior", behavior="allow", downloadPath=str(file.parent))
+    browser.evaluate(f"$('{button}').click()")
+    deadline = time.monotonic() + 20
+    while not file.is_file():
+        assert time.monotonic() < deadline, file
+        time.sleep(0.05)
+
+
+@pytest.mark.slow
+def test_film_of_key_views_is_played_saved_and_rendered(
+    page: str, scene: TrainedScene, run_here: Runner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("nerfro.pipeline.render.load", lambda run, device, root: scene)
+    (tmp_path / "a.ckpt").write_bytes(b"scene")
+    monkeypatch.chdir(tmp_path)
+    with Browser(page, tmp_path, size=(400, 300)) as browser:
+        assert browser.evaluate("[$('play').disabled, $('save-film').disabled, $('time').disabled]") == [True] * 3
+        # A view of the data set, then a turn of more than a full circle, whose shorter way is taken.
+        browser.evaluate("page.show(1), $('add-key').click()")
+        first = browser.evaluate("page.orbit.numbers()")
+        browser.evaluate("page.orbit.turn(-2 * Math.PI - 0.5, 0.2), page.orbit.zoom(0.8), $('add-key').click()")
+        keys = browser.evaluate("page.film.keys")
+        assert keys[1][0] - keys[0][0] == pytest.approx(0.5)
+        browser.evaluate("$('keys').children[0].click()")
+        assert browser.evaluate("page.orbit.numbers()") == pytest.approx(first)
+        # The film goes on from the selected time, and stops at the last key view.
+        browser.evaluate("page.film.seek(1.5), $('play').click()")
+        browser.wait_for("$('time').value > 1.5 && $('play').ariaPressed === 'true'")
+        browser.wait_for("$('time').value === '2' && $('play').ariaPressed === 'false' && page.motion === null")
+        assert browser.evaluate("page.orbit.numbers()") == pytest.approx(keys[1])
+        save(browser, "save-film", tmp_path / "film.json")
+        shown = browser.evaluate("page.view")
+    options = [
+        "checkpoint=a.ckpt",
+        f"path={tmp_path / 'film.json'}",
+        "resolution=8",
+        "film=[gif]",
+        "subdivision.side=1",
+    ]
+    run_here("render", *options, f"out={tmp_path / 'O'}")
+    with Image.open(tmp_path / "O" / "film.gif") as gif:
+        assert gif.n_frames == len(list((tmp_path / "O").glob("frame_*.png"))) == 49
+        assert gif.info["duration"] == 40, "two seconds, as the file states"
+    cameras = read_cameras(tmp_path / "film.json", CaptureGeometry.of(scene.cameras("train"), scene.bounds))
+    assert cameras.camera_to_world[-1, :, 3].tolist() == pytest.approx(shown["eye"], abs=1e-5)
+    assert float(cameras.fy[-1]) == pytest.approx(shown["focal"][1], rel=1e-5)
+    step = torch.linalg.vector_norm(cameras.camera_to_world[..., 3].diff(dim=0), dim=-1)
+    assert step.max() < 2 * step.mean(), "the camera moves evenly"
+
+
+def test_splines_pass_through_the_key_views_and_stay_possible(browser: Browser) -> None:
+    views = [
+        [0, 1.5, 10, 0, 0, 0, 0.9],
+        [1, 1.55, 0.5, 1, 0, 0, 0.1],
+        [2, 1.55, 0.5, 1, 0, 0, 0.1],
+        [3, 0, 9, 0, 0, 0, 1],
+    ]
+    browser.evaluate(f"page.film.setKeys({json.dumps(views)})")
+    for number, view in enumerate(views):
+        assert browser.evaluate(f"page.film.at({2 * number})") == pytest.approx(view)
+    between = browser.evaluate("Array.from({ length: 60 }, (_, i) => page.film.at(i / 10))")
+    assert all(abs(view[1]) <= 1.55 and view[2] > 0.2 and view[6] > 0.05 for view in between)
+
+
+def test_turntable_turns_until_the_view_is_dragged(browser: Browser) -> None:
+    start = browser.evaluate(VIEW)
+    browser.evaluate("$('turn').focus()")
+    browser.press(" ")
+    browser.wait_for(f"page.orbit.azimuth > {start['azimuth']} + 0.05")
+    assert browser.evaluate("$('turn').ariaPressed") == "true"
+    browser.evaluate("page.writeAddress()")
+    assert "turn=1" in browser.evaluate("location.hash")
+    x, y = middle(browser)
+    browser.drag((x, y), (x + 20, y))
+    turned = browser.evaluate(VIEW)
+    assert turned["elevation"] == start["elevation"]
+    assert browser.evaluate("page.motion === null && $('turn').ariaPressed === 'false'")
+    browser.wait_for("page.rays > 0")
+    assert browser.evaluate(VIEW) == turned
+
+
+def test_embed_code_shows_the_page_in_its_state(browser: Browser) -> None:
+    script = """(async () => {
+      page.orbit.turn(0.25, 0);
+      const copied = new Promise((done) => { navigator.clipboard.writeText = async (code) => done(code); });
+      $("copy-code").click();
+      return await copied;
+    })()"""
+    code = browser.evaluate(script)
+    azimuth = browser.evaluate("page.orbit.azimuth.toPrecision(6)")
+    assert code.startswith('<iframe src="page.html#view=')
+    assert f"#view={float(azimuth):g}," in code
+    assert 'title="Scene | nerfro"' in code
+    browser.wait_for("$('notice').textContent.includes('clipboard')")
 
 
 def test_page_in_a_frame_waits_for_a_click_and_leaves_the_wheel(page: str, tmp_path: Path) -> None:
@@ -207,7 +319,7 @@ def test_page_in_a_frame_waits_for_a_click_and_leaves_the_wheel(page: str, tmp_p
 def test_narrow_window_begins_with_a_closed_panel_and_large_targets(page: str, tmp_path: Path) -> None:
     with Browser(page, tmp_path, size=(500, 600)) as browser:
         assert not browser.evaluate("$('controls').open")
-        browser.evaluate("$('controls').open = true")
+        browser.evaluate("$('controls').open = $('more').open = true, $('add-key').click()")
         small = """[...document.querySelectorAll("button, input:not([type=file]), summary")].filter((e) => {
           const { width, height } = e.getBoundingClientRect();
           return width && (width < 24 || height < 24);

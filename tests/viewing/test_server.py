@@ -26,15 +26,18 @@ def test_page_and_its_updates_are_served(server: PageServer) -> None:
     assert get(server, "/") == (200, "<p>page")
     assert not server.watched
     assert json.loads(get(server, "/state?after=0")[1]) == {
-        "outcome": None, "final": False, "losses": [], "update": None,
+        "outcome": None, "final": False, "version": 0, "losses": [], "update": None, "picture": None,
     }  # fmt: skip
     assert server.watched
-    server.add_loss(3, 0.5)
+    server.add_losses(3, {"loss": 0.5})
     server.publish({"volume": {"step": 1}}, {"sky": "data:,"})
     state = json.loads(get(server, "/state?after=0")[1])
-    assert state["losses"] == [[3, 0.5]]
-    assert state["update"] == {"scene": {"volume": {"step": 1}, "version": 1}, "arrays": {"sky": "data:,"}}
-    assert json.loads(get(server, "/state?after=1")[1])["update"] is None
+    assert state["losses"] == [[3, {"loss": 0.5}]]
+    assert state["update"] == {"scene": {"volume": {"step": 1}}, "arrays": {"sky": "data:,"}}
+    server.show_validation(3, "data:,")
+    state = json.loads(get(server, f"/state?after={state['version']}")[1])
+    assert (state["update"], state["picture"], state["version"]) == (None, {"step": 3, "uri": "data:,"}, 2)
+    assert json.loads(get(server, "/state?after=2")[1])["picture"] is None
 
 
 def test_end_of_a_training_waits_until_a_browser_knows(server: PageServer) -> None:

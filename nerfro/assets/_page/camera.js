@@ -5,6 +5,7 @@ const cross = ([a, b, c], [x, y, z]) => [b * z - c * y, c * x - a * z, a * y - b
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const addScaled = (a, s, b) => a.map((x, i) => x + s * b[i]);
 const unit = (a) => a.map((x) => x / Math.hypot(...a));
+const MAX_ELEVATION = 1.55; // radians; an orbit has no direction up above its target
 const clamp = (x, low, high) => Math.min(Math.max(x, low), high);
 
 // Return the view of a camera of the data set.
@@ -63,7 +64,7 @@ class Orbit {
 
   turn(right, up) {
     this.azimuth -= right;
-    this.elevation = clamp(this.elevation + up, -1.55, 1.55);
+    this.elevation = clamp(this.elevation + up, -MAX_ELEVATION, MAX_ELEVATION);
   }
 
   zoom(factor) {

@@ -16,9 +16,11 @@ async function fetchUpdate(page) {
   try {
     const answer = await fetch(`state?after=${page.scene.version}`, { cache: "no-store" });
     if (!answer.ok) throw new Error(`${answer.status} ${answer.statusText}`);
-    const { losses, update, outcome, final } = await answer.json();
+    const { losses, update, picture, version, outcome, final } = await answer.json();
     showLosses(losses);
+    if (picture) showValidation(picture);
     if (update) await applyUpdate(page, update);
+    page.scene.version = version;
     $("message").textContent = "";
     if (outcome) showOutcome(outcome, final);
   } catch (error) {
@@ -30,8 +32,9 @@ async function fetchUpdate(page) {
 // Show how the training has ended, and a link to the final page if the server has one.
 function showOutcome(outcome, final) {
   hasEnded = true;
-  $("outcome").textContent = `${outcome} `;
-  if (!final) return;
+  // An unchanged text is not set again, because it would be read aloud again.
+  if ($("outcome").firstChild?.data !== `${outcome} `) $("outcome").textContent = `${outcome} `;
+  if (!final || $("outcome").querySelector("a")) return;
   const link = Object.assign(document.createElement("a"), { href: location.pathname, textContent: "Open the final page" });
   $("outcome").append(link);
 }
@@ -60,14 +63,35 @@ function updateIndices(before, after) {
   });
 }
 
+function showValidation({ step, uri }) {
+  $("validation").hidden = false;
+  $("validation").src = uri;
+  $("validation").title = `validation view at step ${step}: rendering, photograph and error`;
+}
+
+let shownLosses = []; // the last answer of the server
+
+// Draw the selected curve: PSNR (dB) on a linear scale, losses on a logarithmic one.
 function showLosses(losses) {
-  const last = losses.at(-1);
-  if (!last) return;
+  shownLosses = losses;
+  if (!losses.length) return;
   $("progress").hidden = false;
-  $("losses").textContent = `step ${last[0]}, training loss ${last[1].toPrecision(3)}`;
-  const logs = losses.map(([, loss]) => Math.log(Math.max(loss, 1e-9)));
-  const [low, high] = [Math.min(...logs), Math.max(...logs)];
-  const points = losses.map(([step], i) =>
-    `${(1000 * step) / Math.max(last[0], 1)},${100 - (96 * (logs[i] - low)) / Math.max(high - low, 1e-9) - 2}`);
+  for (const name of new Set(losses.flatMap(([, values]) => Object.keys(values)))) {
+    if (![...$("curve").options].some(({ value }) => value === name)) $("curve").add(new Option(name));
+  }
+  $("curve").onchange = () => showLosses(shownLosses);
+  const name = $("curve").value;
+  const curve = losses.filter(([, values]) => name in values).map(([step, values]) => [step, values[name]]);
+  const [lastStep, last] = curve.at(-1);
+  const isPsnr = name.endsWith("psnr");
+  const format = (value) => value.toPrecision(3);
+  const heights = curve.map(([, value]) => (isPsnr ? value : Math.log(Math.max(value, 1e-9))));
+  const [low, high] = [Math.min(...heights), Math.max(...heights)];
+  const points = curve.map(([step], i) =>
+    `${(1000 * step) / Math.max(lastStep, 1)},${100 - (96 * (heights[i] - low)) / Math.max(high - low, 1e-9) - 2}`);
   document.querySelector("#progress polyline").setAttribute("points", points.join(" "));
+  $("losses").textContent = `step ${lastStep}, ${name} ${format(last)}`;
+  $("high").textContent = format(isPsnr ? high : Math.exp(high));
+  $("low").textContent = format(isPsnr ? low : Math.exp(low));
+  $("end").textContent = `step ${lastStep}`;
 }

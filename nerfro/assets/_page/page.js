@@ -15,6 +15,7 @@ class Page {
     this.orbit = new Orbit(scene.orbit);
     this.camera = null; // index of the shown camera of the data set; null for the orbit
     this.maxRays = MAX_RAYS;
+    this.motion = null; // of the orbit, see setMotion
     this.lastChange = -Infinity; // time, milliseconds
     this.pixelDuration = 5e-3; // milliseconds per pixel, a running mean; the initial value is that of a slow machine
     this.sync = null; // fence of the frame that the GPU is drawing
@@ -55,11 +56,30 @@ class Page {
     });
   }
 
+  // Move the orbit at every frame by `step` of a motion, a function of the seconds since its start that returns whether it
+  // goes on. The button of its name is pressed meanwhile. Null stops.
+  setMotion(motion) {
+    for (const { button } of [this.motion, motion].filter(Boolean)) $(button).setAttribute("aria-pressed", button === motion?.button);
+    const hasStopped = this.motion && !motion;
+    if (motion && this.camera !== null) this.show(null);
+    this.motion = motion && { ...motion, start: performance.now() };
+    if (hasStopped) this.changed();
+    if (motion) this.onChange?.();
+    this.requestFrame();
+  }
+
+  move(now) {
+    const goesOn = this.motion.step(Math.max(now - this.motion.start, 0) / 1000);
+    this.restart();
+    if (!goesOn) this.setMotion(null);
+  }
+
   // Draw the next part of the image: first a draft of low resolution, then, when the view does not change, a few rows of a
   // pass at a time, so that the page never waits long for the graphics driver.
   step(now) {
     if (this.isBusy()) return this.requestFrame();
     this.resizeCanvas();
+    if (this.motion) this.move(now);
     if (!this.drafted) this.drawDraft();
     else if (now - this.lastChange >= 250) {
       if (this.rays >= this.maxRays) return;
@@ -178,6 +198,7 @@ class Page {
 
   // Show the view of a camera of the data set beside its photograph, or (null) the orbit, which starts at the present eye.
   show(camera) {
+    this.setMotion(null);
     if (camera === null && this.camera !== null) this.orbit.follow(this.view);
     this.camera = camera;
     if (camera === null && this.isDifference) this.setDifference(false);
@@ -188,7 +209,7 @@ class Page {
     $("rendering").textContent = "rendering";
     if (photograph) $("photograph").src = photograph;
     $("photograph").alt = photograph ? `photograph ${this.scene.cameras[camera].name}` : "";
-    for (const button of document.querySelectorAll("#cameras button")) {
+    for (const button of document.querySelectorAll("#cameras button[value]")) {
       button.setAttribute("aria-pressed", button.value === String(camera ?? ""));
     }
     this.layOut(); // immediately, because the pointer may act on the canvas before the next frame
@@ -246,11 +267,12 @@ function initControls(page) {
   if ($("straight")) showValue("straight");
   $("reflection").checked = scene.reflection;
   $("controls").addEventListener("input", (event) => {
-    if (event.target.type === "range") showValue(event.target.id);
+    if (event.target.type === "range" && event.target.id !== "time") showValue(event.target.id);
     page.changed();
   });
   $("cameras").addEventListener("click", (event) => {
-    if (event.target.matches("button")) page.show(event.target.value === "" ? null : Number(event.target.value));
+    const button = event.target.closest("button[value]");
+    if (button) page.show(button.value === "" ? null : Number(button.value));
   });
   $("difference").addEventListener("click", () => page.setDifference(!page.isDifference));
   $("reset").addEventListener("click", () => {
@@ -306,6 +328,7 @@ function initCanvasInput(page) {
     return { x, y, spread: all.length > 1 ? Math.hypot(all[0].x - all[1].x, all[0].y - all[1].y) : 0 };
   };
   const changeOrbit = (change) => {
+    page.setMotion(null);
     if (page.camera !== null) page.show(null);
     change(page.orbit);
     page.changed();
@@ -340,16 +363,16 @@ function initCanvasInput(page) {
     },
     { passive: false },
   );
+  const arrow = (right, up) => (orbit, shift) => (shift ? orbit.pan(-0.05 * right, 0.05 * up) : orbit.turn(0.1 * right, 0.1 * up));
   const keys = {
-    ArrowLeft: (orbit) => orbit.turn(0.1, 0), ArrowRight: (orbit) => orbit.turn(-0.1, 0),
-    ArrowUp: (orbit) => orbit.turn(0, 0.1), ArrowDown: (orbit) => orbit.turn(0, -0.1),
+    ArrowLeft: arrow(1, 0), ArrowRight: arrow(-1, 0), ArrowUp: arrow(0, 1), ArrowDown: arrow(0, -1),
     "+": (orbit) => orbit.zoom(0.9), "=": (orbit) => orbit.zoom(0.9), "-": (orbit) => orbit.zoom(1 / 0.9),
     0: (orbit) => orbit.reset(),
   };
   canvas.addEventListener("keydown", (event) => {
     if (!keys[event.key] || event.ctrlKey || event.metaKey || event.altKey) return;
     event.preventDefault();
-    changeOrbit(keys[event.key]);
+    changeOrbit((orbit) => keys[event.key](orbit, event.shiftKey));
   });
   canvas.addEventListener("webglcontextlost", () => {
     $("message").textContent = "The graphics driver has stopped this page, perhaps because a frame took too long. Reload the page.";
@@ -393,6 +416,7 @@ async function start() {
   if (!showOneCamera(page)) {
     initSkyInput(page);
     initCanvasInput(page);
+    initFilm(page);
     initState(page);
     initSaving(page);
     new ResizeObserver(() => page.changed()).observe($("stage"));

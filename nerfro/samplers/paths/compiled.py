@@ -12,6 +12,7 @@ from torch import Tensor
 from nerfro.core.types import OpticalRecord, Path, Rays
 from nerfro.kernels.lookup import Solids
 from nerfro.kernels.operators import arrays, cpu_operator
+from nerfro.kernels.threads import share_parts
 from nerfro.samplers.paths.branching import Branching
 from nerfro.samplers.paths.polylines import SnellTrace, split
 from nerfro.samplers.paths.snell_cpu import TracedRows, polylines_of_width, trace_snell
@@ -79,20 +80,47 @@ def _trace(
     packed = Solids(**of_bodies, nested=nested, shell=shell)
     settings = max_events, max_split_events, least_weight, main_only
     max_polylines = _MAX_POLYLINES if max_split_events and not main_only else 1
-    rows, counts = trace_snell(*rays, packed, settings, _MAX_VERTICES, max_polylines)
+    rows, counts = _traced(rays, packed, settings, _MAX_VERTICES, max_polylines)
     kept, needed = (counts <= (max_polylines, _MAX_VERTICES)).all(1), counts.max(0, initial=1)
     width = max(int(needed[1]), 2)
     columns = _polylines(rows, np.where(kept, counts[:, 0], 0), width)
     if not kept.all():
         rest = (~kept).nonzero()[0]
         few = ray_arrays(origins[rest], directions[rest], near[rest], far[rest])
-        rows, counts = trace_snell(*few, packed, settings, width, int(needed[0]))
+        rows, counts = _traced(few, packed, settings, width, int(needed[0]))
         again = _polylines(rows, counts[:, 0], width)
         pairs = zip(columns, [rest[again[0]], *again[1:]], strict=True)
         joined = [np.concatenate(pair) for pair in pairs]
         order = np.argsort(joined[0], kind="stable")
         columns = [column[order] for column in joined]
     return (*map(torch.from_numpy, columns),)
+
+
+def _traced(
+    rays: tuple[np.ndarray, ...], solids: Solids, settings: tuple[int, int, float, bool],
+    max_vertices: int, max_polylines: int,
+) -> tuple[TracedRows, Int[np.ndarray, "R 2"]]:  # fmt: skip
+    """Return the polylines of rays with memory for S vertices and P polylines each, and their counts.
+
+    Returns:
+        rows: `TracedRows` of all rays, with a leading axis R, in the precision of the rays. Entries after the last
+            vertex of a polyline are undefined.
+        counts: number of polylines of each ray, and largest number of vertices, which may exceed P and S.
+    """
+    polylines, dtype = (len(rays[0]), max_polylines), rays[0].dtype
+    rows = TracedRows(
+        np.empty((*polylines, max_vertices, 7), dtype), np.empty((*polylines, max_vertices, 3), np.int8),
+        np.empty(polylines, dtype), np.empty((*polylines, 3), np.int64),
+    )  # fmt: skip
+    counts = np.empty((len(rays[0]), 2), np.int64)
+
+    def trace(part: slice) -> None:
+        of_part = TracedRows(*(values[part] for values in rows))
+        origins, directions, near, far = (values[part] for values in rays)
+        trace_snell(origins, directions, near, far, solids, settings, of_part, counts[part])
+
+    share_parts(trace, len(counts))
+    return rows, counts
 
 
 def ray_arrays(

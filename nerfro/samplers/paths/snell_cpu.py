@@ -303,28 +303,16 @@ def _trace_ray(solids, line, near, far, settings, scratch, rows):
 
 
 @compiled_parallel
-def trace_snell(origins, directions, near, far, solids, settings, max_vertices, max_polylines):
+def trace_snell(origins, directions, near, far, solids, settings, rows, counts):
     """Trace the polylines of all rays, which may split at their first events (`samplers.paths.branching`).
 
     Args:
         origins, directions, near, far: rays [R, ...].
         solids: bodies, a `kernels.lookup.Solids`.
         settings: largest number of events of a polyline, and the fields of a `Branching`.
-        max_vertices: largest number of vertices of a polyline, S.
-        max_polylines: largest number of polylines of a ray, P.
-
-    Returns:
-        rows: `TracedRows` of all rays, with a leading axis R, in the precision of the rays. Entries after the last
-            vertex of a polyline are undefined.
-        counts [R, 2]: number of polylines of each ray, and largest number of vertices, which may exceed P and S.
+        rows, counts: memory for the results, see `samplers.paths.compiled._traced`.
     """
-    num_rays, dtype = origins.shape[0], origins.dtype
-    num_bodies, num_pending, polylines = len(solids.low), settings[1], (num_rays, max_polylines)
-    rows = TracedRows(
-        np.empty((*polylines, max_vertices, 7), dtype), np.empty((*polylines, max_vertices, 3), np.int8),
-        np.empty(polylines, dtype), np.empty((*polylines, 3), np.int64),
-    )  # fmt: skip
-    counts = np.empty((num_rays, 2), np.int64)
+    num_rays, num_bodies, num_pending = origins.shape[0], len(solids.low), settings[1]
     for block in prange((num_rays + _BLOCK - 1) // _BLOCK):
         scratch = Scratch(
             np.empty(num_bodies, np.bool_), np.empty(num_bodies), np.empty((num_pending, 8)),
@@ -339,7 +327,6 @@ def trace_snell(origins, directions, near, far, solids, settings, max_vertices, 
             row = TracedRows(rows.vertices[ray], rows.crossed[ray], rows.weight[ray], rows.numbers[ray])
             start, end = np.float64(near[ray]), np.float64(far[ray])
             counts[ray] = _trace_ray(solids, line, start, end, settings, scratch, row)
-    return rows, counts
 
 
 @compiled_parallel
@@ -347,7 +334,7 @@ def polylines_of_width(rows, ray, place, width):
     """Select polylines with S vertices each; shorter polylines repeat their last vertex.
 
     Args:
-        rows: polylines of all rays, from `trace_snell`.
+        rows: polylines of all rays, see `trace_snell`.
         ray, place: ray of each selected polyline, and its place among the polylines of the ray.
         width: number of vertices, S.
 

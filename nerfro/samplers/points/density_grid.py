@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Annotated
 
+import numpy as np
 import torch
 from annotated_types import Ge, Gt, Le
 from jaxtyping import Bool, Float, Int
@@ -17,6 +18,7 @@ from nerfro.core.types import Path, Rendering, Samples
 from nerfro.fields.base import Field
 from nerfro.geometry.space import Space
 from nerfro.kernels.operators import arrays, select
+from nerfro.kernels.threads import share_parts
 from nerfro.registry.allowed import Count, Share
 from nerfro.registry.registration import register
 from nerfro.samplers.base import PointSampler
@@ -152,10 +154,17 @@ class DensityGridSampler(PointSampler):
         settings = Settings(
             self.num_bins, self._floor, self.max_bin_alpha, _EMPTY, self.space.radius, self.space.near or 0.0
         )
-        paths, box = tuple(arrays(path.positions, path.directions, path.s)), tuple(arrays(*self.space.box))
-        [density], random = arrays(self.density), (*arrays(*of_path), key)
-        drawn = draw(paths, box, density, random, num_samples, settings)
-        edges, s, positions, directions, occupied, *contracted = (torch.from_numpy(array) for array in drawn)
+        paths, box = arrays(path.positions, path.directions, path.s), tuple(arrays(*self.space.box))
+        [density], random = arrays(self.density), arrays(*of_path)
+
+        def draw_part(part: slice) -> tuple[np.ndarray, ...]:
+            of_part = tuple(values[part] for values in paths), (*(values[part] for values in random), key)
+            return draw(of_part[0], box, density, of_part[1], num_samples, settings)
+
+        fields = zip(*share_parts(draw_part, len(path.s)), strict=True)
+        edges, s, positions, directions, occupied, *contracted = (
+            torch.from_numpy(parts[0] if len(parts) == 1 else np.concatenate(parts)) for parts in fields
+        )
         return self._samples(Samples(positions, directions, s, edges, path.radii, occupied), *contracted)
 
     @property
