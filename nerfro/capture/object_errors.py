@@ -248,28 +248,19 @@ def unsupported_bodies(
     return sorted((name for name in bodies if name not in supported), key=gains.__getitem__, reverse=True)
 
 
-@dataclass(frozen=True)
-class LightLoss:
-    """Light that a body takes from the surroundings behind it.
-
-    Attributes:
-        absorbed: share of red, green and blue light that is absorbed along the mean path; 0 if none is significant.
-        reflects: whether partial reflection explains the pixels better than none.
-    """
-
-    absorbed: list[float]
-    reflects: bool
-
-
 def light_loss(
     observations: Observations, body: Bodies, settings: ObjectErrorSettings = ObjectErrorSettings()
-) -> LightLoss:
+) -> tuple[list[float], bool]:
     """Measure absorption and reflection of a body by the colours of its pixels against the surroundings.
 
     Args:
         observations: observations of the object and its surroundings.
         body: bodies with known indices.
         settings: number of pixels, candidates and limits.
+
+    Returns:
+        Share of red, green and blue light that is absorbed along the mean path, 0 if none is significant; and whether
+        partial reflection explains the pixels better than none.
     """
     through, both = (ObjectErrors(observations, settings=settings, branches=branches) for branches in ("none", "all"))
     shares, absorbed = np.linspace(0, 0.95, settings.num_shares), list[float]()
@@ -281,7 +272,7 @@ def light_loss(
         absorbed.append(round(share, 2) if is_significant else 0.0)
     coefficients = -torch.log1p(-torch.tensor(absorbed)) / length
     body = body.with_absorption_coefficients(coefficients.expand(len(body.iors), 3))
-    return LightLoss(absorbed, both.decreases(through.of(body), both.of(body), settings.num_errors))
+    return absorbed, both.decreases(through.of(body), both.of(body), settings.num_errors)
 
 
 def _with_index(solid: Bodies, ior: float) -> Bodies:

@@ -102,10 +102,10 @@ def _with_light_loss(request: Request, observations: Observations, indexed: Foun
     bodies, origin = indexed.medium.bodies, indexed.provenance
     if bodies is None or not request.searches_index or origin.doubts:
         return origin
-    loss = light_loss(observations, bodies)
-    shares = ", ".join(f"{share:.0%} of {name}" for share, name in zip(loss.absorbed, COLOURS, strict=True))
-    print(f"absorbed along the mean path: {shares} light; partial reflection is {'' if loss.reflects else 'not '}seen")
-    return replace(origin, absorbed=loss.absorbed, reflects=loss.reflects)
+    absorbed, reflects = light_loss(observations, bodies)
+    shares = ", ".join(f"{share:.0%} of {name}" for share, name in zip(absorbed, COLOURS, strict=True))
+    print(f"absorbed along the mean path: {shares} light; partial reflection is {'' if reflects else 'not '}seen")
+    return replace(origin, absorbed=absorbed, reflects=reflects)
 
 
 def _fit_surface(request: Request, views: Views, mesh: TriangleMesh | None) -> tuple[TriangleMesh, Views, Silhouettes]:

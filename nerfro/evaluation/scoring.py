@@ -24,15 +24,7 @@ from nerfro.evaluation.error_sheets import write_error_sheet
 from nerfro.evaluation.folders import ImagePair
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.render_view import render_view
-from nerfro.evaluation.results import (
-    AS_GIVEN,
-    EXPOSED,
-    OF_HALVES,
-    TONE_MAPPED,
-    UNEXPOSED,
-    EvaluationResult,
-    ViewScores,
-)
+from nerfro.evaluation.results import AS_GIVEN, EXPOSED, OF_HALVES, TONE_MAPPED, UNEXPOSED, EvaluationResult, ViewScores
 from nerfro.files.images import save_png
 from nerfro.rendering import ColourSpace, Renderer
 from nerfro.samplers.subdivision import Subdivision

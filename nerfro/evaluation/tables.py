@@ -18,15 +18,7 @@ import rich.text
 from rich.cells import cell_len
 
 from nerfro.evaluation.image_metrics import image_metrics
-from nerfro.evaluation.results import (
-    FULL,
-    OF_HALVES,
-    EvaluationResult,
-    Region,
-    RunMetrics,
-    Score,
-    write_metrics_json,
-)
+from nerfro.evaluation.results import FULL, OF_HALVES, EvaluationResult, Region, RunMetrics, Score, write_metrics_json
 from nerfro.files.atomic import write_atomically
 
 MISSING = "n/a"

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import os
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 from jaxtyping import Float
@@ -25,6 +28,8 @@ _COMPRESSIONS = {
     "KHR_meshopt_compression": "meshopt",
     "KHR_mesh_quantization": "quantized positions",
 }
+# Extensions that do not change the shape.
+_APPEARANCE = re.compile("material|texture|light|animation|xmp|audio")
 _MODES = range(6)  # points, lines and triangles as trimesh reads them, in order of the file
 
 
@@ -102,12 +107,27 @@ def require_readable(path: Path) -> None:
                 f"mesh {path} is compressed by {compression} ({name}), which nerfro does not read; export it without "
                 f"compression (in Blender, without the option Compression), or as ply{decoder}"
             )
-    reason = _unread_shape(document, used)
+    required = set(document.get("extensionsRequired") or ()) - decoded
+    unknown = [name for name in sorted(required) if _APPEARANCE.search(name) is None]
+    reason = f"requires {unknown[0]}" if unknown else _unread_shape(document, used)
     if reason is not None:
         raise NerfroError(
-            f"mesh {path} {reason}, which nerfro does not read; apply it in the program that wrote the file"
+            f"mesh {path} {reason}, which nerfro does not read; apply it in the program that wrote the file, or "
+            "export as ply"
         )
     _announce(path)
+
+
+def files_beside(path: Path) -> Any:
+    """Return the reader of files that a glTF file names; their names may be percent-encoded."""
+    from trimesh.resolvers import FilePathResolver
+
+    class Resolver(FilePathResolver):
+        def get(self, name: str) -> bytes:
+            exists = os.path.isfile(path.parent / name)
+            return super().get(name if exists else unquote(name))  # type: ignore[no-any-return]
+
+    return Resolver(str(path))
 
 
 def _unread_shape(document: Mapping[str, Any], used: list[str]) -> str | None:

@@ -15,7 +15,7 @@ from nerfro.files.atomic import write_atomically
 from nerfro.files.reading import reading
 from nerfro.geometry.facets import FacetSettings
 from nerfro.geometry.file_normals import informative_normals
-from nerfro.geometry.gltf import Z_UP_TO_Y_UP, is_gltf, primitives_of, read_document, require_readable
+from nerfro.geometry.gltf import Z_UP_TO_Y_UP, files_beside, is_gltf, primitives_of, read_document, require_readable
 from nerfro.geometry.orientation import area_vectors, inward_faces
 from nerfro.registry.allowed import Coordinate, check
 
@@ -214,7 +214,7 @@ def _parse(path: Path) -> Any:
 
     if is_gltf(path):
         require_readable(path)
-    loaded: Any = trimesh.load(path, process=False)
+    loaded: Any = trimesh.load(path, process=False, resolver=files_beside(path) if is_gltf(path) else None)
     if not isinstance(loaded, trimesh.Scene):
         return loaded
     if is_gltf(path):

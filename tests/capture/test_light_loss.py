@@ -21,11 +21,11 @@ def test_absorbed_light_and_reflection_are_measured(absorption: tuple[float, ...
     observations = Observations(views, mesh(), False)
     colours = sky(observations.through.rays.directions)
     observations.surroundings = Surroundings(lambda exits: sky(exits.directions), None, 0.0, colours)
-    loss = light_loss(observations, body)
-    assert loss.reflects == (branches == "all")
+    absorbed, reflects = light_loss(observations, body)
+    assert reflects == (branches == "all")
     # A parallel beam crosses 2 R sqrt(1 - (b / n)^2), with a mean of 2 R (1 - (1 - 1 / n^2)^1.5) n^2 2 / 3.
     length = 2 * RADIUS * (1 - (1 - 1 / 1.5**2) ** 1.5) * 1.5**2 * 2 / 3
-    for share, coefficient in zip(loss.absorbed, absorption, strict=True):
+    for share, coefficient in zip(absorbed, absorption, strict=True):
         assert share == pytest.approx(1 - math.exp(-coefficient * length), abs=0.04)
 
 

@@ -79,6 +79,7 @@ def test_compressed_gltf_is_refused(extension: str, name: str, tmp_path: Path, m
         (lambda tree: tree["nodes"][0].update(weights=[0.5]), "shape keys"),
         (lambda tree: tree["nodes"][0].update(skin=0), "skeleton"),
         (lambda tree: tree.update(extensionsUsed=["EXT_mesh_gpu_instancing"]), "instances"),
+        (lambda tree: tree.update(extensionsRequired=["ACME_curves"]), "requires ACME_curves"),
     ],
 )
 def test_gltf_whose_shape_has_more_than_its_positions_is_refused(
@@ -88,6 +89,17 @@ def test_gltf_whose_shape_has_more_than_its_positions_is_refused(
     scene = trimesh.Scene(trimesh.creation.box())
     (tmp_path / "a.glb").write_bytes(export_glb(scene, tree_postprocessor=change))
     refused(rf"a\.glb .*{name}.*apply it in the program", load_mesh, tmp_path / "a.glb")
+
+
+def test_gltf_finds_files_whose_names_are_percent_encoded(tmp_path: Path) -> None:
+    """Blender writes a space as %20, as the specification demands."""
+    written = trimesh.Scene(trimesh.creation.box()).export(file_type="gltf")
+    (name,) = set(written) - {"model.gltf"}
+    document = json.loads(written["model.gltf"])
+    document["buffers"][0]["uri"] = "glass%20(1)%C3%BC.bin"
+    (tmp_path / "glass (1)ü.bin").write_bytes(written[name])
+    (tmp_path / "glass (1).gltf").write_text(json.dumps(document))
+    assert load_mesh(tmp_path / "glass (1).gltf").is_closed
 
 
 def test_meshes_compressed_by_draco_are_decoded(tmp_path: Path) -> None:
