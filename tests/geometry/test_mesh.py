@@ -94,10 +94,10 @@ def test_gltf_whose_shape_has_more_than_its_positions_is_refused(
 def test_gltf_finds_files_whose_names_are_percent_encoded(tmp_path: Path) -> None:
     """Blender writes a space as %20, as the specification demands."""
     written = trimesh.Scene(trimesh.creation.box()).export(file_type="gltf")
-    (name,) = set(written) - {"model.gltf"}
     document = json.loads(written["model.gltf"])
-    document["buffers"][0]["uri"] = "glass%20(1)%C3%BC.bin"
-    (tmp_path / "glass (1)ü.bin").write_bytes(written[name])
+    for number, buffer in enumerate(document["buffers"]):
+        (tmp_path / f"glass ({number})ü.bin").write_bytes(written[buffer["uri"]])
+        buffer["uri"] = f"glass%20({number})%C3%BC.bin"
     (tmp_path / "glass (1).gltf").write_text(json.dumps(document))
     assert load_mesh(tmp_path / "glass (1).gltf").is_closed
 
