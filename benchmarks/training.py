@@ -34,7 +34,6 @@ import torch
 from omegaconf import OmegaConf
 from PIL import Image
 from torch.profiler import ProfilerActivity, profile, record_function
-from torch.utils.flop_counter import FlopCounterMode
 
 import nerfro
 from nerfro.core.paths import ASSETS_DIR
@@ -271,31 +270,32 @@ def parts_of_step(training: Training, steps: int, limits: Limits) -> dict[str, t
     model = training.renderer
     data = TracedInStep(training.batches, subdivision=training.data.subdivision)
     training.run(3, data)
-    with FlopCounterMode(display=False) as counter:
-        training.run(1, data)
     whole = float(np.median(training.run(steps + 1, data).processor[1:]))
     with ExitStack() as stack:
         label(stack, RayTracer, "through", "tracing")
         label(stack, model.point_sampler, "choose_ahead", "samples")
         label(stack, model.point_sampler, "forward", "samples")
-        with profile(activities=[ProfilerActivity.CPU], record_shapes=True) as measured:
+        with profile(activities=[ProfilerActivity.CPU], record_shapes=True, with_flops=True) as measured:
             training.run(steps, data)
     events = measured.key_averages(group_by_input_shape=True)
 
     def seconds(*names: str) -> float:
         return sum(event.cpu_time_total for event in events if event.key in names) / 1e6 / steps
 
-    def of_function(name: str) -> float:
-        return seconds(name, f"{name}Backward")
+    def of_kernel(name: str) -> list[Any]:
+        kernels = f"nerfro::{name}_forward", f"nerfro::{name}_gradient"
+        return [event for event in events if event.key.startswith(kernels)]
 
-    def reads(function: str, for_each: int) -> float:
-        """Return the number of reads of a function and its gradient, given the number for each row."""
-        names = (function, f"{function}Backward")
-        return for_each * sum(event.count * event.input_shapes[0][0] for event in events if event.key in names) / steps
+    def seconds_of_kernel(name: str) -> float:
+        return sum(event.cpu_time_total for event in of_kernel(name)) / 1e6 / steps
+
+    def reads(name: str, for_each: int) -> float:
+        """Return the number of reads of a kernel and its gradients, given the number for each point."""
+        return for_each * sum(event.count * max(event.input_shapes[0]) for event in of_kernel(name)) / steps
 
     products = ("aten::mm", "aten::addmm", "aten::bmm", "mkldnn::_linear_pointwise")
     (field, *_), sky = model.scene.fields, model.scene.background
-    hashed, sky_levels = (len(getattr(part, "levels", ())) for part in (field, sky))
+    hashed, sky_levels = (len(part.levels.resolutions) if hasattr(part, "levels") else 0 for part in (field, sky))
     rounds = isinstance(field, HashGridField) and fast_bfloat16("cpu")
     rounds = rounds or training.config.trainer.precision != "32-true"
     num_parameters = sum(own.numel() for own in training.module.parameters())
@@ -303,10 +303,10 @@ def parts_of_step(training: Training, steps: int, limits: Limits) -> dict[str, t
     batch = training.batch(0)
     parts = {
         "tracing": (seconds("tracing"), len(batch.rays) * seconds_per_ray(training, batch.rays)),
-        "matrix products": (seconds(*products), counter.get_total_flops() / rate),
-        "hash encoding": (of_function("_HashEncode"), limits.read * reads("_HashEncode", 8 * hashed)),
+        "matrix products": (seconds(*products), sum(event.flops for event in events) / steps / rate),
+        "hash encoding": (seconds_of_kernel("hash_encode"), limits.read * reads("hash_encode", 8 * hashed)),
         "samples": (seconds("samples"), limits.read * getattr(model.point_sampler, "num_bins", 0) * len(batch.path.s)),
-        "background": (of_function("_Lookup"), limits.read * reads("_Lookup", 4 * sky_levels)),
+        "background": (seconds_of_kernel("cube_lookup"), limits.read * reads("cube_lookup", 4 * sky_levels)),
         "Adam": (seconds("aten::_fused_adam_"), 28 * num_parameters / limits.bytes),
     }
     rest = whole - sum(busy for busy, _ in parts.values())

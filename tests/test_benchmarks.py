@@ -105,7 +105,7 @@ def test_all_benchmarks_are_run_by_a_test() -> None:
     [
         (("step", "--turns", 1, "--options", *PAPER), 4),
         (("curve", "--steps", 2, "--rays", 4, "--options", *PAPER), 5),
-        (("profile", "paper_fast", "--steps", 2, "--pixels", 16, "--options", *PAPER), 14),
+        (("profile", "refractive", "--steps", 2, "--pixels", 16), 14),
         (("paths", "--turns", 1, "--steps", 2, "--options", *SMALL), 4),
         (("branches", "--turns", 1, "--steps", 2, "--options", *SMALL), 5),
     ],

@@ -49,12 +49,14 @@ def few(mitsuba: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return photograph(tmp_path_factory.mktemp("few"), resolution=400, photographs=2, spp=4)
 
 
+@pytest.mark.slow
 def test_poses_are_written_only_to_the_truth(few: Path) -> None:
     beside = [path.relative_to(few).parts[0] for path in few.rglob("*") if path.is_file()]
     assert set(beside) == {"images", "masks", "truth", ".lock"}
     assert len(list((few / "images").iterdir())) == len(list((few / "masks").iterdir())) == 2
 
 
+@pytest.mark.slow
 def test_masks_match_the_true_surface_in_the_true_cameras(few: Path) -> None:
     views = OpenCVData(str(few / "truth")).load("train")
     assert min(overlaps_of_convex_body(views, load_mesh(few / "truth" / "mesh.ply").vertices)) > 0.99

@@ -93,6 +93,7 @@ def test_code_that_uses_a_run_executes(page: str, trained_run: Path, monkeypatch
     assert torch.allclose(torch.as_tensor(namespace["bent"].directions).norm(dim=-1), torch.tensor(1.0))
 
 
+@pytest.mark.slow
 def test_code_of_the_chain_executes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, unchecked: None) -> None:
     """On small photographs of a ball with poses, as each command on its own."""
     save_with_masks(tmp_path / "ball")

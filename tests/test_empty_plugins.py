@@ -29,6 +29,7 @@ def test_package_names_no_plugin() -> None:
     assert users == {"paths.py"}
 
 
+@pytest.mark.slow
 def test_package_without_plugins_trains(tmp_path: Path, tiny_default_run: list[str]) -> None:
     shutil.copytree(PACKAGE_DIR, tmp_path / "nerfro", copy_function=os.link)  # links, because assets are large
     shutil.rmtree(tmp_path / "nerfro" / "_project", ignore_errors=True)

@@ -110,5 +110,5 @@ def _write_lines(file: Path, lines: list[str]) -> None:
     write_atomically(file, "\n".join(lines) + "\n")
 
 
-EXPORTS["colmap"] = Export(("",), write_colmap, unused=("sky",))
-EXPORTS["cameras"] = Export(("",), write_transforms, unused=("sky",))
+EXPORTS["colmap"] = Export(("",), write_colmap, unused=("sky", "triangles"))
+EXPORTS["cameras"] = Export(("",), write_transforms, unused=("sky", "triangles"))

@@ -1,79 +1,151 @@
-"""Export of glass and dense content as meshes in glTF format, with glass materials."""
+"""Export of glass and dense content as meshes in glTF format, with glass materials and cameras."""
 
 from __future__ import annotations
 
+import importlib.util
+import json
+import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import trimesh
-from trimesh.exchange.gltf import export_glb
 
-from nerfro.core.errors import NerfroError
+from nerfro.core.cameras import Cameras
+from nerfro.core.errors import NerfroError, warn
 from nerfro.exports.meshes import glass_meshes, inside_mesh, one_mesh
 from nerfro.files.atomic import write_atomically
-from nerfro.geometry.gltf import Z_UP_TO_Y_UP
+from nerfro.files.lat_long import save_lat_long
+from nerfro.geometry.gltf import QUANTIZATION, Z_UP_TO_Y_UP
 from nerfro.media.material import Dispersion
 from nerfro.viewing.changes import absorption_of
 from nerfro.viewing.exports import EXPORTS, Export, ExportConfig
 from nerfro.viewing.trained_scene import TrainedScene
 
+_GLB_TRIANGLES = 20_000  # default limit of a .glb
+# Codes of glTF 2.0, sections 3.6.2.2 and 5.11: types of components, and targets of buffers.
+_CODES = {"<i2": 5122, "<u2": 5123, "<u4": 5125}
+_VERTICES, _INDICES = 34962, 34963
+
 
 def write_mesh(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
-    """Write the surfaces of the glass and of the dense content, as .glb with materials, or as one mesh (.ply, .obj)."""
-    suffix = out.suffix.lower()
-    glass, inside = glass_meshes(scene), inside_mesh(scene, options.resolution, options.half_depth)
+    """Write the surfaces of the glass and of the dense content, as .glb with materials, or as one mesh (.ply, .obj).
+
+    A .glb has the training cameras, and the sky beside it.
+    """
+    suffix, limit = out.suffix.lower(), options.triangles
+    if limit is None and suffix == ".glb":
+        limit = _GLB_TRIANGLES
+        if importlib.util.find_spec("fast_simplification") is None:
+            warn("the meshes keep all their triangles; pip install 'nerfro[gltf]', which reduces their number")
+            limit = None
+    glass = glass_meshes(scene, limit)
+    rest = None if limit is None else limit - sum(len(mesh.faces) for mesh in glass)
+    inside = inside_mesh(scene, options.resolution, options.half_depth, rest)
     if not glass and inside is None:
         raise NerfroError("the scene has neither glass nor dense content to write; raise half_depth")
-    write_atomically(out, _encode_glb(scene, glass, inside) if suffix == ".glb" else one_mesh(glass, inside, suffix))
+    if suffix == ".glb":
+        write_atomically(out, _encode_glb(scene, glass, inside))
+        save_lat_long(out.with_name(out.stem + "_sky.hdr"), scene.sky)
+    else:
+        write_atomically(out, one_mesh(glass, inside, suffix))
     content = "nothing solid inside" if inside is None else f"{len(inside.faces)} triangles inside"
     return f"{sum(len(mesh.faces) for mesh in glass)} triangles of glass, {content}"
 
 
-_VERTICES, _INDICES = 34962, 34963  # ARRAY_BUFFER and ELEMENT_ARRAY_BUFFER (glTF 2.0, section 5.11)
-
-
 def _encode_glb(scene: TrainedScene, glass: list[trimesh.Trimesh], inside: trimesh.Trimesh | None) -> bytes:
-    meshes, materials = {}, {}
+    document: dict[str, Any] = {
+        "asset": {"version": "2.0", "generator": "nerfro"}, "scene": 0, "scenes": [{}], "nodes": [], "meshes": [],
+        "materials": [], "cameras": [], "accessors": [], "bufferViews": [], "extensionsRequired": [QUANTIZATION],
+    }  # fmt: skip
+    content = bytearray()
     bodies = scene.renderer.scene.medium.bodies
-    bodies_materials = [] if bodies is None else bodies.materials
+    materials = [] if bodies is None else bodies.materials
     for number, (mesh, absorption) in enumerate(zip(glass, absorption_of(scene.renderer.scene), strict=True)):
-        meshes[f"glass_{number}"] = mesh
-        dispersion = bodies_materials[number].dispersion
-        materials[f"glass_{number}"] = _glass_material(mesh, float(scene.ior[number]), absorption.numpy(), dispersion)
+        material = _glass_material(mesh, float(scene.ior[number]), absorption.numpy(), materials[number].dispersion)
+        _add_mesh(document, content, f"glass_{number}", mesh, material)
     if inside is not None:
-        meshes["inside"] = inside
-        inside.vertex_attributes["radiance"] = np.clip(inside.vertex_attributes["radiance"], 0, 1)
         # The colours are radiance and not albedo, so lights of the other program must not shade them again.
-        materials["inside"] = {"extensions": {"KHR_materials_unlit": {}}}
+        _add_mesh(document, content, "inside", inside, {"extensions": {"KHR_materials_unlit": {}}})
+    _add_cameras(document, scene.cameras("train").to("cpu"))
+    document["scenes"][0]["nodes"] = list(range(len(document["nodes"])))
+    extensions = {name for material in document["materials"] for name in material["extensions"]}
+    document["extensionsUsed"] = sorted({QUANTIZATION, *extensions})
+    document["buffers"] = [{"byteLength": len(content)}]
+    text = json.dumps({key: value for key, value in document.items() if value != []}, separators=(",", ":")).encode()
+    chunks = [(b"JSON", text + b" " * (-len(text) % 4)), (b"BIN\0", bytes(content))]
+    body = b"".join(len(data).to_bytes(4, "little") + kind + data for kind, data in chunks)
+    return b"glTF" + (2).to_bytes(4, "little") + (12 + len(body)).to_bytes(4, "little") + body
 
-    def add_materials(document: dict[str, Any]) -> None:
-        """Add what trimesh does not write: extensions of materials, targets of buffers, and floating-point colours."""
-        document["materials"] = [{"name": name, **material} for name, material in materials.items()]
-        document["extensionsUsed"] = sorted(
-            {name for material in materials.values() for name in material["extensions"]}
-        )
-        for mesh in document["meshes"]:
-            (primitive,) = mesh["primitives"]
-            primitive["material"] = list(materials).index(mesh["name"])
-            if "_radiance" in primitive["attributes"]:
-                primitive["attributes"]["COLOR_0"] = primitive["attributes"].pop("_radiance")
-            for accessor in primitive["attributes"].values():
-                document["bufferViews"][document["accessors"][accessor]["bufferView"]]["target"] = _VERTICES
-            document["bufferViews"][document["accessors"][primitive["indices"]]["bufferView"]]["target"] = _INDICES
 
-    document, turn = trimesh.Scene(), np.eye(4)
-    turn[:3, :3] = Z_UP_TO_Y_UP
-    for name, mesh in meshes.items():
-        document.add_geometry(mesh, geom_name=name, node_name=name, transform=turn)
-    return export_glb(document, include_normals=True, tree_postprocessor=add_materials)
+def _step(mesh: trimesh.Trimesh) -> float:
+    """Return the unit of the quantized coordinates of a mesh."""
+    return float(mesh.extents.max()) / 65535
+
+
+def _add_mesh(
+    document: dict[str, Any], content: bytearray, name: str, mesh: trimesh.Trimesh, material: dict[str, Any]
+) -> None:
+    """Add a mesh with 16-bit positions, normals and colours; the matrix of its node restores the positions."""
+    values = {
+        "POSITION": ("<u2", (mesh.vertices - mesh.bounds[0]) / _step(mesh)),
+        "NORMAL": ("<i2", 32767 * mesh.vertex_normals),
+    }
+    if "radiance" in mesh.vertex_attributes:
+        values["COLOR_0"] = ("<u2", 65535 * np.clip(mesh.vertex_attributes["radiance"], 0, 1))
+    # Attributes begin at multiples of four bytes, so each has a fourth, unused component.
+    vertices = np.zeros(len(mesh.vertices), [(key, code, 4) for key, (code, _) in values.items()])
+    attributes = {}
+    for number, (key, (code, numbers)) in enumerate(values.items()):
+        vertices[key][:, :3] = np.rint(numbers)
+        attributes[key] = len(document["accessors"])
+        entry = {"type": "VEC3", "componentType": _CODES[code], "byteOffset": 8 * number, "count": len(vertices)}
+        if key == "POSITION":
+            corners = vertices[key][:, :3]
+            entry |= {"min": corners.min(0).tolist(), "max": corners.max(0).tolist()}
+        else:
+            entry["normalized"] = True
+        document["accessors"].append({"bufferView": len(document["bufferViews"]), **entry})
+    _add_view(document, content, vertices.tobytes(), target=_VERTICES, byteStride=vertices.itemsize)
+    code = "<u2" if len(vertices) < 65536 - 1 else "<u4"  # the largest number is reserved
+    entry = {"type": "SCALAR", "componentType": _CODES[code], "count": mesh.faces.size}
+    document["accessors"].append({"bufferView": len(document["bufferViews"]), **entry})
+    _add_view(document, content, mesh.faces.astype(code).tobytes(), target=_INDICES)
+    indices = len(document["accessors"]) - 1
+    primitive = {"attributes": attributes, "indices": indices, "material": len(document["materials"])}
+    matrix = np.eye(4)
+    matrix[:3] = Z_UP_TO_Y_UP @ np.hstack([_step(mesh) * np.eye(3), mesh.bounds[:1].T])
+    document["nodes"].append({"name": name, "mesh": len(document["meshes"]), "matrix": matrix.T.flatten().tolist()})
+    document["meshes"].append({"name": name, "primitives": [primitive]})
+    document["materials"].append({"name": name, **material})
+
+
+def _add_view(document: dict[str, Any], content: bytearray, data: bytes, **settings: int) -> None:
+    document["bufferViews"].append({"buffer": 0, "byteOffset": len(content), "byteLength": len(data), **settings})
+    content += data + bytes(-len(data) % 4)
+
+
+def _add_cameras(document: dict[str, Any], cameras: Cameras) -> None:
+    """Add pinhole cameras, whose axes are those of glTF; lens distortion and principal point are omitted."""
+    for view, pose in enumerate(cameras.camera_to_world.double().numpy()):
+        name, matrix = f"train_{view:03d}", np.eye(4)
+        matrix[:3] = Z_UP_TO_Y_UP @ pose
+        tangents = 0.5 * cameras.width / float(cameras.fx[view]), 0.5 * cameras.height / float(cameras.fy[view])
+        lens = {
+            "yfov": 2 * math.atan(tangents[1]),
+            "aspectRatio": tangents[0] / tangents[1],
+            "znear": max(float(cameras.near), 1e-3 * float(cameras.far)),
+        }
+        document["nodes"].append({"name": name, "camera": view, "matrix": matrix.T.flatten().tolist()})
+        document["cameras"].append({"name": name, "type": "perspective", "perspective": lens})
 
 
 def _glass_material(
     mesh: trimesh.Trimesh, ior: float, absorption: np.ndarray, dispersion: Dispersion | None
 ) -> dict[str, Any]:
     """Describe glass by the extensions KHR_materials_transmission, _ior, _volume and _dispersion (Khronos)."""
-    volume: dict[str, Any] = {"thicknessFactor": float(mesh.extents.min())}
+    # A thickness is in coordinates of the mesh, and a distance in those of the world.
+    volume: dict[str, Any] = {"thicknessFactor": float(mesh.extents.min()) / _step(mesh)}
     if absorption.any():
         # At a distance of 1 / max(absorption), no channel underflows, whatever the world unit.
         distance = 1 / float(absorption.max())
@@ -89,4 +161,4 @@ def _glass_material(
     return {"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.0}, "extensions": extensions}
 
 
-EXPORTS["mesh"] = Export((".glb", ".ply", ".obj"), write_mesh, unused=("sky",))
+EXPORTS["mesh"] = Export((".glb", ".ply", ".obj"), write_mesh, ("_sky.hdr",))

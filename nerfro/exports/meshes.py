@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -14,20 +15,51 @@ from trimesh.exchange.obj import export_obj
 from trimesh.exchange.ply import export_ply
 
 from nerfro.core.light import to_srgb
+from nerfro.core.optional import optional
 from nerfro.files.images import to_8bit
 from nerfro.geometry.bodies import bodies_of
 from nerfro.geometry.interpolation import trilinear
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.viewing.surface import level_set
+from nerfro.geometry.normals import corner_normals
+from nerfro.viewing.surface import level_set, surface_of
 from nerfro.viewing.trained_scene import TrainedScene
 from nerfro.viewing.volume import POINTS_AT_ONCE, RESOLUTION, sample_field
 
 
-def glass_meshes(scene: TrainedScene) -> list[trimesh.Trimesh]:
-    """Triangulate the surface of each body, with vertex normals; returns an empty list without bodies."""
-    if scene.renderer.scene.medium.bodies is None:
+def glass_meshes(scene: TrainedScene, triangles: int | None = None) -> list[trimesh.Trimesh]:
+    """Triangulate the surface of each body, with vertex normals; returns an empty list without bodies.
+
+    All surfaces together have at most half of `triangles`. The mesh that a single body was made of is written as it is,
+    if it has so few triangles; other surfaces are simplified.
+    """
+    bodies = scene.renderer.scene.medium.bodies
+    if bodies is None:
         return []
-    return [_with_vertex_normals(mesh) for mesh in scene.surface]
+    is_simple = triangles is not None and len(bodies.meshes) == 1 and len(bodies.meshes[0].faces) <= triangles // 2
+    surfaces = surface_of(bodies, triangles=True) if is_simple else scene.surface
+    total = sum(len(mesh.faces) for mesh in surfaces)
+    if triangles is not None and total > triangles // 2:
+        surfaces = [simplified(mesh, triangles // 2 * len(mesh.faces) // total) for mesh in surfaces]
+        # Large flat triangles need the normal of their side, also where they meet a rounded edge.
+        surfaces = [replace(mesh, normals=corner_normals(mesh)) for mesh in surfaces]
+    return [_with_vertex_normals(mesh) for mesh in surfaces]
+
+
+def simplified(mesh: TriangleMesh, triangles: int) -> TriangleMesh:
+    """Reduce a mesh to a number of triangles, by edge collapses of the smallest quadric error; normals are dropped.
+
+    Source:
+        M. Garland and P. Heckbert, "Surface Simplification Using Quadric Error Metrics", SIGGRAPH 1997; package
+        fast-simplification.
+    """
+    if len(mesh.faces) <= triangles:
+        return replace(mesh, normals=None)
+    simplification = optional("fast_simplification", "gltf", "triangles= needs fast-simplification")
+    vertices, faces, before = mesh.vertices, mesh.faces, len(mesh.faces) + 1
+    while triangles < len(faces) < before:  # on flat surfaces, one call stops early
+        before = len(faces)
+        vertices, faces = simplification.simplify(vertices, faces.astype(np.int32), target_count=triangles)
+    return TriangleMesh(vertices, faces.astype(np.int64))
 
 
 def _with_vertex_normals(mesh: TriangleMesh) -> trimesh.Trimesh:
@@ -39,7 +71,9 @@ def _with_vertex_normals(mesh: TriangleMesh) -> trimesh.Trimesh:
 
 
 @torch.inference_mode()
-def inside_mesh(scene: TrainedScene, resolution: int | None, half_depth: float | None) -> trimesh.Trimesh | None:
+def inside_mesh(
+    scene: TrainedScene, resolution: int | None, half_depth: float | None, triangles: int | None = None
+) -> trimesh.Trimesh | None:
     """Extract the surface of the dense content with marching cubes, with the radiance seen from outside.
 
     Small separate components are omitted.
@@ -49,6 +83,7 @@ def inside_mesh(scene: TrainedScene, resolution: int | None, half_depth: float |
         resolution: grid vertices along the longest side, `RESOLUTION` by default.
         half_depth: length within which the density of the surface absorbs half the light, world units; by default a
             hundredth of the object's longest side.
+        triangles: largest number of triangles; None keeps all.
 
     Returns:
         Mesh with vertex normals and the vertex attribute `radiance` (linear), or None if no content is dense enough.
@@ -63,6 +98,8 @@ def inside_mesh(scene: TrainedScene, resolution: int | None, half_depth: float |
     if not values.max() > math.log(level):
         return None
     mesh = largest_components(level_set(values, box, math.log(level)))
+    if triangles is not None:
+        mesh = simplified(mesh, triangles)
     vertices = torch.from_numpy(mesh.vertices).float()
     gradients = torch.stack(torch.gradient(values), -1) / spacing
     normals = -functional.normalize(trilinear(gradients, box, vertices), dim=-1)

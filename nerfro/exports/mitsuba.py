@@ -172,4 +172,4 @@ def _numbers(values: Iterable[float]) -> str:
     return " ".join(f"{value:.9g}" for value in values)
 
 
-EXPORTS["mitsuba"] = Export((".xml",), write_mitsuba, MITSUBA_FILES)
+EXPORTS["mitsuba"] = Export((".xml",), write_mitsuba, MITSUBA_FILES, unused=("triangles",))

@@ -18,4 +18,4 @@ def write_sky(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
     return f"the sky: {sky.shape[1]}x{sky.shape[0]} pixels, lat-long, z up{frame}"
 
 
-EXPORTS["sky"] = Export((".hdr", ".exr", ".png"), write_sky, unused=("half_depth",))
+EXPORTS["sky"] = Export((".hdr", ".exr", ".png"), write_sky, unused=("half_depth", "triangles"))

@@ -18,4 +18,4 @@ def write_volume(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
     return f"the inside: {'x'.join(map(str, volume.density.shape))} vertices with density and linear rgb"
 
 
-EXPORTS["volume"] = Export((".npz",), write_volume, unused=("half_depth", "sky"))
+EXPORTS["volume"] = Export((".npz",), write_volume, unused=("half_depth", "sky", "triangles"))

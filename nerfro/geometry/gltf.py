@@ -21,12 +21,13 @@ from nerfro.files.reading import MAX_JSON_BYTES, read_json, reading
 
 # The y axis is up in glTF (specification 2.0, section 3.4), and the z axis in nerfro: (x, y, z) becomes (x, z, -y).
 Z_UP_TO_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+QUANTIZATION = "KHR_mesh_quantization"
 _DRACO = "KHR_draco_mesh_compression"
 _COMPRESSIONS = {
     _DRACO: "Draco",
     "EXT_meshopt_compression": "meshopt",
     "KHR_meshopt_compression": "meshopt",
-    "KHR_mesh_quantization": "quantized positions",
+    QUANTIZATION: "normalized positions",
 }
 # Extensions that do not change the shape.
 _APPEARANCE = re.compile("material|texture|light|animation|xmp|audio")
@@ -100,6 +101,8 @@ def require_readable(path: Path) -> None:
         return  # trimesh describes the damage
     used = [name for key in ("extensionsRequired", "extensionsUsed") for name in document.get(key) or ()]
     decoded = {_DRACO} if importlib.util.find_spec("DracoPy") is not None else set()
+    if not _has_normalized_positions(document):
+        decoded.add(QUANTIZATION)
     for name, compression in _COMPRESSIONS.items():
         if name in used and name not in decoded:
             decoder = ", or pip install 'nerfro[gltf]', which decodes it" if name == _DRACO else ""
@@ -143,6 +146,13 @@ def _unread_shape(document: Mapping[str, Any], used: list[str]) -> str | None:
         "has instances (EXT_mesh_gpu_instancing)": "EXT_mesh_gpu_instancing" in used,
     }
     return next((name for name, is_used in properties.items() if is_used), None)
+
+
+def _has_normalized_positions(document: Mapping[str, Any]) -> bool:
+    """Return whether positions are fractions of the largest integer, which trimesh does not divide by it."""
+    primitives = [primitive for mesh in document.get("meshes", []) for primitive in mesh["primitives"]]
+    accessors = [primitive["attributes"]["POSITION"] for primitive in primitives]
+    return any(document["accessors"][accessor].get("normalized", False) for accessor in accessors)
 
 
 @cache

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+from annotated_types import Ge
 from omegaconf import MISSING
 
 from nerfro.core.errors import NerfroError
@@ -29,6 +30,8 @@ class ExportConfig:
             default as many as the background has, at least 512).
         half_depth: length, world units, within which dense content absorbs half the light; the surface is
             extracted at this density. By default a hundredth of the object's longest side.
+        triangles: largest number of triangles of a mesh, of which the glass has at most half. By default 20000 in a
+            .glb, and as many as the surfaces have in .ply and .obj.
         sky: lat-long image that replaces the sky (.hdr, .exr, .png, .jpg).
         root: folder of the data, if it has moved since training.
         device: `cpu` or `cuda`; `auto` means the CPU.
@@ -40,6 +43,7 @@ class ExportConfig:
     out: str = MISSING
     resolution: Count | None = None
     half_depth: Positive | None = None
+    triangles: Annotated[int, Ge(100)] | None = None
     sky: str | None = None
     root: str | None = None
     device: str = "auto"

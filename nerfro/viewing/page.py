@@ -185,4 +185,4 @@ def _write(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
     return f"an interactive page of {len(page) / 1e6:.1f} MB"
 
 
-EXPORTS["page"] = Export((".html",), _write, unused=("half_depth",))
+EXPORTS["page"] = Export((".html",), _write, unused=("half_depth", "triangles"))

@@ -55,13 +55,14 @@ def test_gltf_files_are_turned_from_y_up_to_z_up(
 @pytest.mark.parametrize(
     ("extension", "name"),
     [("KHR_draco_mesh_compression", "Draco"), ("EXT_meshopt_compression", "meshopt"),
-     ("KHR_mesh_quantization", "quantized positions")],
+     ("KHR_mesh_quantization", "normalized positions")],
 )  # fmt: skip
 def test_compressed_gltf_is_refused(extension: str, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "DracoPy", None)  # as if it were not installed
 
     def compressed(tree: dict[str, Any]) -> None:
         tree["extensionsUsed"] = tree["extensionsRequired"] = [extension]
+        tree["accessors"][tree["meshes"][0]["primitives"][0]["attributes"]["POSITION"]]["normalized"] = True
 
     scene = trimesh.Scene(trimesh.creation.box())
     (tmp_path / "a.glb").write_bytes(export_glb(scene, tree_postprocessor=compressed))

@@ -81,7 +81,7 @@ def test_transmittance_of_a_slab_sums_its_reflections(n: float) -> None:
 
 @pytest.mark.parametrize("iors", [[1.5, 1.2], [1.8, 1.8], [1.0, 1.8]])
 def test_compiled_branches_match_the_reference(iors: list[float], monkeypatch: pytest.MonkeyPatch) -> None:
-    medium, rays = _nested_grid(iors=iors, absorption=[1.0, 0.0, 2.0, 0.0, 3.0, 0.0]), _rays(400)
+    medium, rays = _nested_grid(iors=iors, absorption=[1.0, 0.0, 2.0, 0.0, 3.0, 0.0]), _rays(150)
     sampler = Snell(branches="all", least_weight=0.005)
     fast = sampler.trace(rays, medium)
     # The same with too little room for polylines and vertices at first.

@@ -20,6 +20,8 @@ from PIL import Image
 from nerfro.core.errors import NerfroError
 from nerfro.core.light import to_linear, to_srgb
 from nerfro.data.formats.colmap_model import lens_of, read_colmap
+from nerfro.files.lat_long import load_lat_long
+from nerfro.geometry.gltf import Z_UP_TO_Y_UP
 from nerfro.geometry.mesh import load_mesh
 from nerfro.geometry.space import Box
 from nerfro.media.body_settings import make_bodies
@@ -34,6 +36,19 @@ from nerfro.viewing.trained_scene import TrainedScene
 from tests.conftest import Runner, refused
 from tests.viewing.conftest import INSIDE_CENTRE, INSIDE_RADIUS, IOR, RADIUS, Photographs, colour, sky_of
 
+
+def document_of(file: Path) -> dict:
+    content = file.read_bytes()
+    return json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
+
+
+def objects_of(file: Path) -> dict[str, trimesh.Trimesh]:
+    """The objects of a .glb in world coordinates, z axis up."""
+    scene, turn = trimesh.load(file, process=False), np.eye(4)
+    turn[:3, :3] = Z_UP_TO_Y_UP.T
+    return {name: mesh.apply_transform(turn @ scene.graph.get(name)[0]) for name, mesh in scene.geometry.items()}
+
+
 CELL = 2.12 * RADIUS / 47  # of the box with its margin of air
 
 
@@ -45,32 +60,43 @@ def write(scene: TrainedScene, what: str, out: Path, **options: object) -> str:
 @pytest.mark.slow
 def test_glb_contains_glass_as_dielectric_and_the_content_as_emission(scene: TrainedScene, tmp_path: Path) -> None:
     write(scene, "mesh", tmp_path / "ball.glb")
-    loaded = trimesh.load(tmp_path / "ball.glb", process=False)
-    glass, inside = (loaded.geometry[name] for name in ("glass_0", "inside"))
-    np.testing.assert_allclose(np.linalg.norm(glass.vertices, axis=1), RADIUS, atol=1e-4)
+    glass, inside = (objects_of(tmp_path / "ball.glb")[name] for name in ("glass_0", "inside"))
+    np.testing.assert_allclose(np.linalg.norm(glass.vertices, axis=1), RADIUS, atol=3e-3)
     np.testing.assert_allclose(np.linalg.norm(inside.vertices - INSIDE_CENTRE, axis=1), INSIDE_RADIUS, atol=CELL)
     for mesh, centre, radius in ((glass, (0, 0, 0), RADIUS), (inside, INSIDE_CENTRE, INSIDE_RADIUS)):
         assert mesh.volume == pytest.approx(4 / 3 * math.pi * radius**3, rel=0.1), "faces point outwards"
         cosine = (mesh.vertex_normals * (mesh.vertices - centre)).sum(-1) / np.linalg.norm(mesh.vertices - centre)
         assert (cosine > 0).all(), "and so do normals"
     expected = colour(torch.from_numpy(np.asarray(inside.vertices)))
-    np.testing.assert_allclose(inside.visual.vertex_attributes["color"], expected, atol=1e-4)
+    np.testing.assert_allclose(inside.visual.vertex_attributes["color"] / 65535, expected, atol=1e-4)
     # The file is turned on import as on export, and content is no part of the body.
     again = load_mesh(tmp_path / "ball.glb", accept_open_mesh=True).vertices
-    np.testing.assert_array_equal(np.unique(again, axis=0), np.unique(glass.vertices, axis=0))
-    content = (tmp_path / "ball.glb").read_bytes()
-    document = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
+    np.testing.assert_allclose(np.linalg.norm(again, axis=1), RADIUS, atol=3e-3)
+    # The sky beside the file, and the cameras, which look at the origin.
+    assert load_lat_long(tmp_path / "ball_sky.hdr").shape[1] == 1024
+    nodes = [node for node in document_of(tmp_path / "ball.glb")["nodes"] if "camera" in node]
+    poses = np.stack([np.array(node["matrix"]).reshape(4, 4).T for node in nodes])
+    eyes = scene.cameras("train").camera_to_world[..., 3].numpy() @ Z_UP_TO_Y_UP.T
+    np.testing.assert_allclose(poses[:, :3, 3], eyes, atol=1e-6)
+    np.testing.assert_allclose(poses[:, :3, 2], eyes / np.linalg.norm(eyes, axis=1, keepdims=True), atol=1e-6)
+    document = document_of(tmp_path / "ball.glb")
     materials = {material["name"]: material for material in document["materials"]}
     extensions = materials["glass_0"]["extensions"]
     assert extensions["KHR_materials_transmission"] == {"transmissionFactor": 1.0}
     assert extensions["KHR_materials_ior"]["ior"] == pytest.approx(IOR)
-    assert extensions["KHR_materials_volume"]["thicknessFactor"] == pytest.approx(2 * RADIUS, rel=1e-3)
+    # A thickness is in coordinates of the mesh.
+    scale = np.linalg.norm(next(node for node in document["nodes"] if node["name"] == "glass_0")["matrix"][:3])
+    thickness = scale * extensions["KHR_materials_volume"]["thicknessFactor"]
+    assert thickness == pytest.approx(2 * RADIUS, rel=5e-3)
     assert "KHR_materials_unlit" in materials["inside"]["extensions"]
     for mesh in document["meshes"]:
         assert document["materials"][mesh["primitives"][0]["material"]]["name"] == mesh["name"]
     # The z axis is up in nerfro, and the y axis in the file.
-    lifted = loaded.graph.get("inside")[0][:3, :3] @ INSIDE_CENTRE
-    np.testing.assert_allclose(lifted, [INSIDE_CENTRE[0], INSIDE_CENTRE[2], -INSIDE_CENTRE[1]], atol=1e-6)
+    node = next(node for node in document["nodes"] if node["name"] == "inside")
+    accessor = document["accessors"][document["meshes"][node["mesh"]]["primitives"][0]["attributes"]["POSITION"]]
+    middle = np.mean([accessor["min"], accessor["max"]], axis=0)
+    lifted = np.array(node["matrix"]).reshape(4, 4).T @ [*middle, 1]
+    np.testing.assert_allclose(lifted[:3], [INSIDE_CENTRE[0], INSIDE_CENTRE[2], -INSIDE_CENTRE[1]], atol=CELL)
 
 
 @pytest.fixture
@@ -103,12 +129,11 @@ def test_one_mesh_contains_glass_and_content_in_world_coordinates(
 
 def test_glb_contains_each_body_with_its_material(two_bodies: TrainedScene, tmp_path: Path) -> None:
     write(two_bodies, "mesh", tmp_path / "two.glb")
-    loaded = trimesh.load(tmp_path / "two.glb", process=False)
+    loaded = objects_of(tmp_path / "two.glb")
     for number, x in enumerate((-0.7, 0.7)):
-        distances = np.linalg.norm(loaded.geometry[f"glass_{number}"].vertices - [x, 0, 0], axis=1)
+        distances = np.linalg.norm(loaded[f"glass_{number}"].vertices - [x, 0, 0], axis=1)
         np.testing.assert_allclose(distances, 0.4, atol=4e-3)
-    content = (tmp_path / "two.glb").read_bytes()
-    document = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
+    document = document_of(tmp_path / "two.glb")
     water, tinted = (material["extensions"] for material in document["materials"][:2])
     assert water["KHR_materials_dispersion"]["dispersion"] == pytest.approx(20 / 55.8, rel=2e-3)
     assert water["KHR_materials_ior"]["ior"] == pytest.approx(1.3334, abs=1e-4)
@@ -122,8 +147,7 @@ def test_glb_contains_each_body_with_its_material(two_bodies: TrainedScene, tmp_
 def test_glb_keeps_strong_absorption(scene: TrainedScene, tmp_path: Path) -> None:
     absorption = np.array([20.0, 120.0, 200.0])
     write(scene.with_(absorption=absorption.tolist()), "mesh", tmp_path / "dark.glb")
-    content = (tmp_path / "dark.glb").read_bytes()
-    document = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
+    document = document_of(tmp_path / "dark.glb")
     volume = document["materials"][0]["extensions"]["KHR_materials_volume"]
     transmitted = np.array(volume["attenuationColor"]) ** (0.01 / volume["attenuationDistance"])
     np.testing.assert_allclose(transmitted, np.exp(-0.01 * absorption), rtol=1e-5)
@@ -145,8 +169,36 @@ def test_export_and_import_bend_rays_equally(scene: TrainedScene, tmp_path: Path
         Snell("mesh")(make_rays(start, towards, m, 0.0, None), m).exit_directions.double() for m in (medium, again)
     )
     angle = torch.rad2deg(2 * torch.asin(0.5 * (first - second).norm(dim=-1)))
-    assert angle.median() < 1e-4
-    assert angle.quantile(0.98) < 1e-3
+    # The file has positions and normals of 16 bits.
+    assert angle.median() < 1e-2
+    assert angle.quantile(0.98) < 0.1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("shape", "median", "most"), [("cube", 2e-3, 0.02), ("ball", 0.2, 0.6)])
+def test_small_meshes_bend_rays_as_the_original(
+    scene: TrainedScene, shape: str, median: float, most: float, tmp_path: Path
+) -> None:
+    pytest.importorskip("fast_simplification", reason="install the extra gltf")
+    meshes = {"cube": trimesh.creation.box((1.2, 1.0, 0.8)), "ball": trimesh.creation.icosphere(5, 0.7)}
+    meshes[shape].apply_transform(trimesh.transformations.euler_matrix(0.3, 0.4, 0.5)).export(tmp_path / "body.ply")
+    medium = make_bodies(str(tmp_path / "body.ply"), 1.43, resolution=128, cache=False)
+    changed = replace(scene, renderer=with_changed_scene(scene.renderer, medium=medium))
+    assert len(changed.surface[0].faces) > 40_000
+    write(changed, "mesh", tmp_path / "scene.glb")
+    document = document_of(tmp_path / "scene.glb")
+    indices = [mesh["primitives"][0]["indices"] for mesh in document["meshes"]]
+    assert sum(document["accessors"][number]["count"] for number in indices) <= 3 * 20_000
+    again = make_bodies(str(tmp_path / "scene.glb"), resolution=32, cache=False)
+    generator = torch.Generator().manual_seed(0)
+    start = 3 * torch.nn.functional.normalize(torch.randn(2000, 3, generator=generator), dim=-1)
+    towards = torch.nn.functional.normalize(0.3 * torch.randn(2000, 3, generator=generator) - start, dim=-1)
+    first, second = (
+        Snell("mesh")(make_rays(start, towards, m, 0.0, None), m).exit_directions.double() for m in (medium, again)
+    )
+    angle = torch.rad2deg(2 * torch.asin(0.5 * (first - second).norm(dim=-1).clamp(max=2)))
+    assert angle.median() < median
+    assert angle.quantile(0.9) < most
 
 
 @pytest.mark.slow
@@ -345,7 +397,7 @@ def test_unknown_exports_and_endings_are_refused(what: str, name: str, message: 
 
 @pytest.mark.parametrize(
     ("what", "option"),
-    [("page", "half_depth=1"), ("sky", "half_depth=1"), ("volume", "sky=a.hdr"), ("mesh", "sky=a.hdr")],
+    [("page", "half_depth=1"), ("sky", "half_depth=1"), ("volume", "sky=a.hdr"), ("page", "triangles=500")],
 )
 def test_option_without_effect_on_an_export_is_refused(
     what: str, option: str, run_here: Runner, tmp_path: Path
