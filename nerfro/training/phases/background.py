@@ -81,7 +81,7 @@ class BackgroundSteps(Phase):
         self,
         steps: Annotated[Natural, _WITH_MAP, _WITH_BOX] = 10,
         time_share: Annotated[Share, _WITH_MAP, _WITH_BOX, OnlyWith("steps")] = 0.2,
-        start: Annotated[Count | None, _WITH_MAP, _WITH_BOX, OnlyWith("steps")] = 250,
+        start: Annotated[Count | None, _WITH_MAP, _WITH_BOX, OnlyWith("steps")] = 100,
     ) -> None:
         self.steps, self.time_share, self.start = steps, time_share, start
         self.settings.use()
