@@ -25,10 +25,12 @@ def main(config: DictConfig) -> None:
     """Reconstruct the surface, search the index, refine the surface if requested, and print the next command."""
     request = Request(**vars(Composition.of_job(config)))
     scene, file = preprocess_composed(request), request.out / SCENE
-    print("for photographs in a room, add experiment=glass_room; for straight rays, experiment=straight")
-    print_next("train on it", "train", as_overrides({"scene": file}))
+    if scene.provenance.reflects is None:
+        print("reflection and absorption are unknown; add experiment=glass, or in a room experiment=glass_room")
+    options: dict[str, object] = {"scene": file} | scene.training_options
+    print_next("train on it", "train", as_overrides(options))
     if scene.vessel:
-        print_next("train on the vessel", "train", as_overrides({"scene": file, "medium": "vessel"}))
+        print_next("train on the vessel", "train", as_overrides(options | {"medium": "vessel"}))
 
 
 if __name__ == "__main__":

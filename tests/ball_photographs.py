@@ -26,6 +26,7 @@ from tests.closed_forms import grid_points, sampled
 SIZE, NUM_VIEWS, RADIUS, INNER = 40, 30, 0.7, 0.35
 SHARES = 5  # pixels of masks are divided by so many, each way
 BOX = torch.tensor([[-0.9] * 3, [0.9] * 3])
+TRANSMITTED = Snell()
 # Overrides with which a training on photographs of a ball of index 1.45 takes seconds.
 TRAINING = [
     "logger=none", "medium.cache=false", "medium.resolution=48", "medium.box_min=[-1,-1,-1]", "medium.box_max=[1,1,1]",
@@ -82,14 +83,19 @@ def photographs(iors: list[float], opaque: bool = False, inner: float = INNER) -
 
 
 def photographs_of(
-    medium: Bodies, opaque: bool = False, around: Callable[[Exits], Tensor] = lambda exits: sky(exits.directions)
+    medium: Bodies,
+    opaque: bool = False,
+    around: Callable[[Exits], Tensor] = lambda exits: sky(exits.directions),
+    sampler: Snell = TRANSMITTED,
 ) -> Views:
     """What a medium shows of what is around it, the sky."""
     taken, images = cameras(), []
     for view in range(NUM_VIEWS):
         rays = taken.image_rays(view)
-        path = Snell()(rays, medium)
+        path = medium.with_absorption(sampler(rays, medium))
         radiance = around(path.exits())
+        radiance = radiance * path.transmitted(path.far[:, None])[:, 0] if path.absorbs else radiance
+        radiance = path.sum_polylines(radiance)
         if opaque:  # painted, in every colour of the sky
             radiance = torch.where(path.refracted[:, None], sky(normalize(path.positions[:, 1], dim=-1)), radiance)
         images.append(to_srgb(radiance).view(SIZE, SIZE, 3))

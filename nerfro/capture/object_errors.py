@@ -6,16 +6,20 @@ The errors of each candidate are summed by view, so that random samples of the v
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float, Num
+from torch import Tensor
 
 from nerfro.capture.surroundings import Observations, robust_scale
 from nerfro.core.provenance import AlgorithmSettings
 from nerfro.core.robust import geman_mcclure
+from nerfro.core.types import Path
 from nerfro.media.base import Medium
 from nerfro.media.bodies import Bodies
 from nerfro.samplers.paths.snell import Snell
@@ -119,23 +123,29 @@ class ObjectErrorSettings(AlgorithmSettings):
     Attributes:
         num_pixels: number of pixels.
         min_weight: smallest weight of a reflected or refracted path.
-        num_errors: a supported body decreases the error of straight rays by at least this number of standard errors.
+        num_errors: a supported body decreases the error of straight rays, and a reflection or absorption that of the
+            body, by at least this number of standard errors.
         min_gain: smallest decrease of a supported body, as a fraction of the decrease of the best body.
+        num_shares: number of shares of absorbed light, from 0 to 0.95, that are compared.
+        min_share: smallest share of absorbed light that is reported.
     """
 
     num_pixels: int = 6000
     min_weight: float = 0.02
     num_errors: float = 3.0
     min_gain: float = 0.75
+    num_shares: int = 20
+    min_share: float = 0.05
 
 
 class ObjectErrors:
-    """Errors of the surroundings in the exit directions of rays through pixels of the object, with all reflections.
+    """Errors of the surroundings in the exit directions of rays through pixels of the object.
 
     Args:
         observations: observations of the object and its surroundings.
         advance: called once for each body.
         settings: number of pixels, and smallest weight.
+        branches: reflections that are followed, see `Snell`.
     """
 
     def __init__(
@@ -143,23 +153,52 @@ class ObjectErrors:
         observations: Observations,
         advance: Callable[[], None] = lambda: None,
         settings: ObjectErrorSettings = ObjectErrorSettings(),
+        branches: Literal["none", "all"] = "all",
     ) -> None:
         settings.use()
         self._surroundings = observations.surroundings
         self._pixels = observations.through.some(settings.num_pixels)
         self._scale = robust_scale(self._surroundings)
-        self._sampler = Snell(branches="all", least_weight=settings.min_weight)
+        self._sampler = Snell(branches=branches, least_weight=settings.min_weight)
         self._advance = advance
         self.counts = np.bincount(self._pixels.view, minlength=len(self._pixels.cameras)).astype(np.float64)
         self.samples = bootstrap_weights(self.counts)
 
     def of(self, body: Medium) -> Float[np.ndarray, "V"]:
         """Sum the robust errors over the pixels of each view."""
-        path = self._sampler(self._pixels.rays, body).in_room_of(self._pixels.rays)
-        radiance = path.sum_polylines(self._surroundings.background(path.exits())).clamp(max=1)
-        error = geman_mcclure(radiance - self._pixels.radiance, self._scale).double()
+        light, path = self._light(body)
         self._advance()
-        return np.bincount(self._pixels.view, error, len(self.counts))
+        return self._sums(path.sum_polylines(light).clamp(max=1) - self._pixels.radiance)
+
+    def of_absorption(
+        self, body: Bodies, shares: Float[np.ndarray, " candidates"]
+    ) -> tuple[Float[np.ndarray, "3 candidates V"], float]:
+        """Sum the robust errors of red, green and blue for shares of the light that are absorbed along the mean path.
+
+        Returns:
+            Sums of the errors, and the mean length within the body of rays that cross it, world units.
+        """
+        light, path = self._light(body)  # the paths do not depend on the absorption
+        size = float((body.box[1] - body.box[0]).max())
+        unit = body.with_absorption_coefficients(torch.full((len(body.iors), 3), 1 / size))
+        lengths = -size * unit.with_absorption(path).transmitted(path.far[:, None])[:, 0].log()
+        main = path.main_polyline(lengths)
+        mean, errors = float(main[main > 0].mean()), []
+        for share in shares.tolist():
+            radiance = path.sum_polylines(light * torch.exp(math.log1p(-share) / mean * lengths)).clamp(max=1)
+            residuals = radiance - self._pixels.radiance
+            errors.append([self._sums(residuals[:, channel : channel + 1]) for channel in range(3)])
+        return np.array(errors).transpose(1, 0, 2), mean
+
+    def _light(self, body: Medium) -> tuple[Float[Tensor, "P 3"], Path]:
+        """Trace the pixels; returns the light of the surroundings along each polyline, and the path."""
+        path = body.with_absorption(self._sampler(self._pixels.rays, body).in_room_of(self._pixels.rays))
+        light = self._surroundings.background(path.exits())
+        return light * path.transmitted(path.far[:, None])[:, 0] if path.absorbs else light, path
+
+    def _sums(self, residuals: Float[Tensor, "Q C"]) -> Float[np.ndarray, "V"]:
+        """Sum the robust errors of residuals by view."""
+        return np.bincount(self._pixels.view, geman_mcclure(residuals, self._scale).double(), len(self.counts))
 
     def mean(self, errors: Float[np.ndarray, "V"]) -> float:
         """Average the errors of all views: 0 for exact colours, 1 for outliers."""
@@ -207,6 +246,33 @@ def unsupported_bodies(
     ]
     print(f"bodies that these pixels support: {', '.join(supported) or 'none'}")
     return sorted((name for name in bodies if name not in supported), key=gains.__getitem__, reverse=True)
+
+
+def light_loss(
+    observations: Observations, body: Bodies, settings: ObjectErrorSettings = ObjectErrorSettings()
+) -> tuple[list[float], bool]:
+    """Measure absorption and reflection of a body by the colours of its pixels against the surroundings.
+
+    Args:
+        observations: observations of the object and its surroundings.
+        body: bodies with known indices.
+        settings: number of pixels, candidates and limits.
+
+    Returns:
+        Share of red, green and blue light that is absorbed along the mean path, 0 if none is significant; and whether
+        partial reflection explains the pixels better than none.
+    """
+    through, both = (ObjectErrors(observations, settings=settings, branches=branches) for branches in ("none", "all"))
+    shares, absorbed = np.linspace(0, 0.95, settings.num_shares), list[float]()
+    by_colour, length = both.of_absorption(body, shares)
+    for errors in by_colour:
+        share = float(parabola_minimum(shares, mean_errors(errors, both.counts))[0])
+        best = errors[np.abs(shares - share).argmin()]
+        is_significant = share >= settings.min_share and both.decreases(errors[0], best, settings.num_errors)
+        absorbed.append(round(share, 2) if is_significant else 0.0)
+    coefficients = -torch.log1p(-torch.tensor(absorbed)) / length
+    body = body.with_absorption_coefficients(coefficients.expand(len(body.iors), 3))
+    return absorbed, both.decreases(through.of(body), both.of(body), settings.num_errors)
 
 
 def _with_index(solid: Bodies, ior: float) -> Bodies:

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import torch
 
-from nerfro.capture.index_search import find_medium, initial_medium
-from nerfro.capture.object_errors import unsupported_bodies
+from nerfro.capture.index_search import FoundMedium, find_medium, initial_medium
+from nerfro.capture.object_errors import light_loss, unsupported_bodies
 from nerfro.capture.preprocess_options import MESH, PreprocessConfig, Request, surface_settings, write_scene
 from nerfro.capture.refinement import refine
 from nerfro.capture.surroundings import Observations
@@ -22,7 +22,8 @@ from nerfro.data.capture import Capture
 from nerfro.data.masks import EVIDENCE, REVOLUTION, masked_views, method_of, with_other_splits
 from nerfro.files.folder_lock import lock_folder
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.rendering.scene_file import SceneFile, with_scene
+from nerfro.media.bodies import COLOURS
+from nerfro.rendering.scene_file import Provenance, SceneFile, with_scene
 from nerfro.silhouettes.agreement import choose_wrong_masks, report_overlaps, require_consistent_poses
 from nerfro.silhouettes.surface import make_mesh, read_silhouettes
 from nerfro.silhouettes.visual_hull import Silhouettes
@@ -91,9 +92,20 @@ def _preprocess(request: Request) -> SceneFile:
         vessel, fitted = find_vessel(solid, location, mesh, observations)
         unsupported = unsupported_bodies(observations, solid, bool(indexed.provenance.doubts), fitted)
     estimated = settings | {"mesh": location} | indexed.index_settings
-    origin = replace(indexed.provenance, unsupported=unsupported)
+    origin = replace(_with_light_loss(request, observations, indexed), unsupported=unsupported)
     scene = SceneFile(medium=estimated, vessel=vessel, surroundings=observations.distance, provenance=origin)
     return write_scene(request, scene, views.cameras, mesh)
+
+
+def _with_light_loss(request: Request, observations: Observations, indexed: FoundMedium) -> Provenance:
+    """Measure and print reflection and absorption, unless the index is given or doubtful, and record them."""
+    bodies, origin = indexed.medium.bodies, indexed.provenance
+    if bodies is None or not request.searches_index or origin.doubts:
+        return origin
+    absorbed, reflects = light_loss(observations, bodies)
+    shares = ", ".join(f"{share:.0%} of {name}" for share, name in zip(absorbed, COLOURS, strict=True))
+    print(f"absorbed along the mean path: {shares} light; partial reflection is {'' if reflects else 'not '}seen")
+    return replace(origin, absorbed=absorbed, reflects=reflects)
 
 
 def _fit_surface(request: Request, views: Views, mesh: TriangleMesh | None) -> tuple[TriangleMesh, Views, Silhouettes]:

@@ -117,6 +117,8 @@ def read_lens(file: Mapping[str, Any], frame: Mapping[str, Any], size: tuple[int
     calibrated = values.get("w", size[0]), values.get("h", size[1])
     fx, fy = _focal_lengths(levels[0], levels[1], calibrated, where)
     centre = values.get("cx", 0.5 * calibrated[0]), values.get("cy", 0.5 * calibrated[1])
+    if all(0 < value <= 1 for value in centre) and min(calibrated) >= 8:
+        raise NerfroError(f"{where}: cx={centre[0]:g} and cy={centre[1]:g} seem to be fractions; give pixels")
     groups = [[values.get(name, 0.0) for name in names] for names in _COEFFICIENTS]
     return Lens(fx, fy, *centre, coefficients(*groups)).resized(calibrated, size, where)
 

@@ -17,7 +17,7 @@ from nerfro.core.errors import NerfroError, first_of, warn
 from nerfro.data.base import SPLITS, DataSource, Views
 from nerfro.data.image_files import IMAGE_SUFFIXES, Levels, is_linear, read_levels, read_mask, read_size
 from nerfro.data.lazy_images import LazyImages
-from nerfro.files.reading import open_image
+from nerfro.files.reading import open_image, unicode_forms
 
 # Lossless format first. Cameras and networks write suffixes in lower or upper case.
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
@@ -75,7 +75,8 @@ def find_mask(root: Path, image: Path, stated: str | None = None) -> Path | None
         The file, or None if there is no silhouette.
     """
     if stated is not None:
-        mask = root / stated.replace("\\", "/")
+        files = [root / form for form in unicode_forms(stated.replace("\\", "/"))]
+        mask = next((file for file in files if os.path.isfile(file)), files[0])
         if not os.path.isfile(mask):  # False for a name that is too long
             raise NerfroError(f"mask {mask} of {image} does not exist; restore it or remove its path from the data set")
         return mask
@@ -84,7 +85,8 @@ def find_mask(root: Path, image: Path, stated: str | None = None) -> Path | None
     first, *rest = image.relative_to(root).parent.parts or ("",)
     folders = [Path(first, *rest)] if first in SPLITS else [Path(first, *rest), Path(*rest)]
     names = [*(f"{image.stem}{suffix}" for suffix in _SUFFIXES), f"{image.name}.png"]
-    candidates = (root / "masks" / folder / name for folder in folders for name in names)
+    masks = ((folder / name).as_posix() for folder in folders for name in names)
+    candidates = (root / "masks" / form for mask in masks for form in unicode_forms(mask))
     return next((path for path in candidates if path.is_file()), None)
 
 

@@ -15,7 +15,7 @@ from nerfro.data.frames import check_pose, require_root, turntable_of
 from nerfro.data.image_files import VIEW_SUFFIXES, read_size, suffix_list
 from nerfro.data.lenses import Lens, read_lens
 from nerfro.data.masks import find_mask, mask_beside
-from nerfro.files.reading import parse_matrix, read_json
+from nerfro.files.reading import parse_matrix, read_json, unicode_forms
 from nerfro.registry.allowed import check
 
 _OTHER_TYPES = (".heic", ".heif", ".avif", ".npy")  # of photographs that are not read
@@ -192,4 +192,5 @@ def _candidates(root: Path, name: str) -> list[Path]:
 def existing_image(root: Path, name: str) -> Path | None:
     """Find the image file of a `file_path`, whose extension may be missing; None if there is no such file."""
     # Unlike Path.is_file, this function returns False for a name that is too long.
-    return next((path for path in _candidates(root, name) if os.path.isfile(path)), None)
+    candidates = (path for form in unicode_forms(name) for path in _candidates(root, form))
+    return next((path for path in candidates if os.path.isfile(path)), None)

@@ -25,9 +25,10 @@ Score = float | None  # None if not available; the notes contain the reason
 Region = Literal["full", "mask", "crop"]  # see nerfro/evaluation/regions.py
 FULL: Region = "full"
 OBJECT: Region = "mask"
-# Scores with the given cameras and exposure, and with exposures that are fitted to the left halves of the photographs,
-# which belong to the right halves, and of tone-mapped images; docs/reference/metrics.md.
-AS_GIVEN, EXPOSED, TONE_MAPPED = "as given", "exposed", "tone_mapped"
+# Scores with the given cameras and exposure, of tone-mapped images, and of right halves without and with exposures that
+# are fitted to the left halves; docs/reference/metrics.md.
+AS_GIVEN, TONE_MAPPED, UNEXPOSED, EXPOSED = "as given", "tone_mapped", "unexposed", "exposed"
+OF_HALVES = UNEXPOSED, EXPOSED
 OBJECT_REGIONS: tuple[Region, ...] = (OBJECT, "crop")  # regions that require a mask of the object
 
 

@@ -7,6 +7,8 @@ data set.
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,14 +17,14 @@ import torch
 
 from nerfro.camera.exposure import fit_gain
 from nerfro.core.light import to_linear, tone_mapped
-from nerfro.core.progress import track
+from nerfro.core.progress import duration, track
 from nerfro.data.base import Views
 from nerfro.data.image_files import Alpha, is_linear
 from nerfro.evaluation.error_sheets import write_error_sheet
 from nerfro.evaluation.folders import ImagePair
 from nerfro.evaluation.metrics import ImageMetrics
-from nerfro.evaluation.render_view import render_view
-from nerfro.evaluation.results import AS_GIVEN, EXPOSED, TONE_MAPPED, EvaluationResult, ViewScores
+from nerfro.evaluation.render_view import maps_of, render_view
+from nerfro.evaluation.results import AS_GIVEN, EXPOSED, OF_HALVES, TONE_MAPPED, UNEXPOSED, EvaluationResult, ViewScores
 from nerfro.files.images import save_png
 from nerfro.rendering import ColourSpace, Renderer
 from nerfro.samplers.subdivision import Subdivision
@@ -38,7 +40,7 @@ def score_split(
     - `aligned`: test cameras are moved by the similarity transformation from the given to the refined training cameras,
       and use the estimated lens.
     - `exposed`: in addition, each view and channel has a gain. Gains are fitted on the left halves of the photographs,
-      and the right halves are scored.
+      and the right halves are scored. `unexposed` scores the same halves without gain.
 
     For photographs in linear light, `tone_mapped` scores the views as given after the curve `tone_mapped`, which
     distinguishes highlights. All other images are sRGB, clipped to [0, 1].
@@ -64,9 +66,45 @@ def score_split(
         results = _score_views(renderer, views, *settings, treatments)
         views, treatments = replace(views, cameras=scene.camera.aligned(views.cameras)), ["aligned"]
     if scene.camera.exposure is not None:
-        treatments = [*treatments, EXPOSED]
+        treatments = [*treatments, *OF_HALVES]
     results |= _score_views(renderer, views, *settings, treatments)
     return results.pop(AS_GIVEN), results
+
+
+def announce_scoring(
+    renderer: Renderer, views: Views, metrics: ImageMetrics, subdivision: Subdivision, num_pixels: int = 4096
+) -> None:
+    """Print the estimated time of `score_split` and how to shorten it, if it takes five seconds or more.
+
+    A small rendering of the first view and its scores are timed. An untrained model needs about as much time as a
+    trained one, because its number of samples is the same.
+
+    Args:
+        renderer: model, on the device of the scoring.
+        views: views to score.
+        metrics: metrics of an image.
+        subdivision: which pixels get several rays.
+        num_pixels: number of pixels of the small rendering.
+    """
+    scene, cameras = renderer.scene, views.cameras
+    reduction = max(1.0, math.sqrt(cameras.height * cameras.width / num_pixels))
+    width, height = (max(1, round(side / reduction)) for side in (cameras.width, cameras.height))
+    small, seconds = cameras.select([0]).resized(width, height).to(scene.device), 0.0
+    for _ in range(2):  # the first rendering compiles kernels
+        begun = time.perf_counter()
+        radiance = render_view(renderer, small, 0, subdivision).radiance.view(height, width, 3).cpu()
+        rgb = scene.colour_space.to_display(radiance)
+        metrics.score("", rgb, rgb, None if views.masks is None else torch.ones(height, width))
+        seconds = time.perf_counter() - begun
+    renderings = 2 if scene.camera.moves else 1  # see `aligned`
+    seconds *= renderings * len(views) * cameras.height * cameras.width / (height * width)
+    if seconds >= 5:
+        print(
+            f"after the training, the scores of {len(views)} views take about {duration(seconds)} more, which "
+            f"trainer.max_time does not include; trainer.limit_test_batches={-(-len(views) // 4)} scores fewer views, "
+            "evaluation=none none",
+            flush=True,
+        )
 
 
 def _score_views(
@@ -86,7 +124,8 @@ def _score_views(
     cameras, left = views.cameras.to(scene.device), slice(width // 2)
     scores: dict[str, list[ViewScores]] = {treatment: [] for treatment in treatments}
     for view in track("evaluate", range(len(views))):
-        radiance = render_view(renderer, cameras, view, subdivision).radiance.view(height, width, 3).cpu()
+        rendered = render_view(renderer, cameras, view, subdivision)
+        radiance, maps = rendered.radiance.view(height, width, 3).cpu(), maps_of(views, view, rendered)
         target, mask = views.images[view], None if views.masks is None else views.masks[view]
         name = f"{prefix}_{view:03d}"
         for treatment, scored in scores.items():
@@ -97,10 +136,12 @@ def _score_views(
             rgb, reference = scene.colour_space.to_display(radiance, gain), target
             if treatment == TONE_MAPPED:
                 rgb, reference = tone_mapped(radiance), tone_mapped(to_linear(target))
-            save_png(folder / ("images" if treatment == AS_GIVEN else f"images_{treatment}") / f"{name}.png", rgb)
-            part = slice(width // 2, None) if treatment == EXPOSED else slice(None)
-            coverage = None if mask is None else mask[:, part].contiguous()
-            scored.append(metrics.score(name, rgb[:, part].contiguous(), reference[:, part].contiguous(), coverage))
+            if treatment != UNEXPOSED:
+                save_png(folder / ("images" if treatment == AS_GIVEN else f"images_{treatment}") / f"{name}.png", rgb)
+            part = slice(None), slice(width // 2 if treatment in OF_HALVES else 0, None)
+            coverage = None if mask is None else mask[part].contiguous()
+            shown, reference = rgb[part].contiguous(), reference[part].contiguous()
+            scored.append(metrics.score(name, shown, reference, coverage, maps[part]))
     return {treatment: metrics.result(scored) for treatment, scored in scores.items()}
 
 

@@ -18,16 +18,7 @@ import rich.text
 from rich.cells import cell_len
 
 from nerfro.evaluation.image_metrics import image_metrics
-from nerfro.evaluation.results import (
-    AS_GIVEN,
-    EXPOSED,
-    FULL,
-    EvaluationResult,
-    Region,
-    RunMetrics,
-    Score,
-    write_metrics_json,
-)
+from nerfro.evaluation.results import FULL, OF_HALVES, EvaluationResult, Region, RunMetrics, Score, write_metrics_json
 from nerfro.files.atomic import write_atomically
 
 MISSING = "n/a"
@@ -164,19 +155,13 @@ def views_table(result: EvaluationResult, title: str, region: Region = FULL) -> 
     return _scores_table(title, "view", scores, _missing_notes(result, [region]), {"mean": result.means(region)})
 
 
-def regions_table(result: EvaluationResult, title: str) -> Table:
-    """Tabulate the mean scores of each region, with notes about missing scores."""
+def means_table(metrics: RunMetrics, title: str) -> Table:
+    """Tabulate the mean scores of each region and of each treatment (see `nerfro.evaluation.scoring`), with notes."""
+    result = metrics.result
     scores = {str(region): result.means(region) for region in result.regions}
-    return _scores_table(title, "region", scores, _missing_notes(result, result.regions))
-
-
-def treatments_table(metrics: RunMetrics, title: str) -> Table:
-    """Tabulate the mean scores of the views under each treatment (see `nerfro.evaluation.scoring`)."""
-    treated = {
-        f"{name}, right halves" if name == EXPOSED else name: result.means()
-        for name, result in metrics.treatments.items()
-    }
-    return _scores_table(title, "views", {AS_GIVEN: metrics.result.means()} | treated, [])
+    for name, treated in metrics.treatments.items():
+        scores[f"{name}, right halves" if name in OF_HALVES else name] = treated.means()
+    return _scores_table(title, "pixels", scores, _missing_notes(result, result.regions))
 
 
 def short(reason: str) -> str:
@@ -201,11 +186,9 @@ def write_scores(metrics: RunMetrics, title: str, folder: Path, brief: bool = Fa
     write_metrics_json(folder / "metrics.json", metrics)  # last, because sweeps take it as the end of the run
     if not brief:
         rich.print(to_rich(views_table(result, title)))
-    if brief or len(result.regions) > 1:
-        rich.print(to_rich(regions_table(result, f"mean of {len(result.views)} view{'s' * (len(result.views) > 1)}")))
-    if metrics.treatments:
-        heading = "other cameras, exposures or tone curves; compare rows of equal pixels"
-        rich.print(to_rich(treatments_table(metrics, heading)))
+    if brief or len(result.regions) > 1 or metrics.treatments:
+        heading = f"mean of {len(result.views)} view{'s' * (len(result.views) > 1)}"
+        rich.print(to_rich(means_table(metrics, heading)))
 
 
 def write_table(table: Table, stem: Path) -> None:

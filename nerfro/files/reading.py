@@ -13,6 +13,7 @@ import os
 import stat
 import struct
 import threading
+import unicodedata
 import warnings
 import zipfile
 from collections.abc import Iterator
@@ -225,6 +226,11 @@ def load_array(path: Path) -> np.ndarray:
         if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
             raise NerfroError(f"{path} is not a .npy of numbers; {_AGAIN}")
         return array.astype(np.float64)
+
+
+def unicode_forms(name: str) -> list[str]:
+    """List the spellings of a name: as stated, composed, and decomposed, as macOS writes letters with accents."""
+    return list(dict.fromkeys((name, *(unicodedata.normalize(form, name) for form in ("NFC", "NFD")))))
 
 
 def same_content(one: Path, other: Path) -> bool:

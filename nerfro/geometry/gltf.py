@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import os
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 from jaxtyping import Float
@@ -26,6 +29,8 @@ _COMPRESSIONS = {
     "KHR_meshopt_compression": "meshopt",
     QUANTIZATION: "normalized positions",
 }
+# Extensions that do not change the shape.
+_APPEARANCE = re.compile("material|texture|light|animation|xmp|audio")
 _MODES = range(6)  # points, lines and triangles as trimesh reads them, in order of the file
 
 
@@ -86,10 +91,10 @@ def is_gltf(path: Path) -> bool:
 
 
 def require_readable(path: Path) -> None:
-    """Raise an error if a glTF file is compressed and cannot be decoded, and print once that its y axis is up.
+    """Raise an error if the shape of a glTF file cannot be read, and print once that its y axis is up.
 
     Raises:
-        NerfroError: the geometry is compressed.
+        NerfroError: the geometry is compressed, or has a property that changes its shape and is not read.
     """
     document = read_document(path)
     if not isinstance(document, dict):
@@ -105,7 +110,42 @@ def require_readable(path: Path) -> None:
                 f"mesh {path} is compressed by {compression} ({name}), which nerfro does not read; export it without "
                 f"compression (in Blender, without the option Compression), or as ply{decoder}"
             )
+    required = set(document.get("extensionsRequired") or ()) - decoded
+    unknown = [name for name in sorted(required) if _APPEARANCE.search(name) is None]
+    reason = f"requires {unknown[0]}" if unknown else _unread_shape(document, used)
+    if reason is not None:
+        raise NerfroError(
+            f"mesh {path} {reason}, which nerfro does not read; apply it in the program that wrote the file, or "
+            "export as ply"
+        )
     _announce(path)
+
+
+def files_beside(path: Path) -> Any:
+    """Return the reader of files that a glTF file names; their names may be percent-encoded."""
+    from trimesh.resolvers import FilePathResolver
+
+    class Resolver(FilePathResolver):
+        def get(self, name: str) -> bytes:
+            exists = os.path.isfile(path.parent / name)
+            return super().get(name if exists else unquote(name))  # type: ignore[no-any-return]
+
+    return Resolver(str(path))
+
+
+def _unread_shape(document: Mapping[str, Any], used: list[str]) -> str | None:
+    """Name a property of a glTF file that changes its shape and that trimesh ignores; None if there is none."""
+    meshes, nodes = document.get("meshes") or [], document.get("nodes") or []
+    primitives = [primitive for mesh in meshes for primitive in mesh.get("primitives", [])]
+    read = {p.get("attributes", {}).get("POSITION") for p in primitives} | {p.get("indices") for p in primitives}
+    accessors = document.get("accessors") or []
+    properties = {
+        "has sparse accessors": any("sparse" in accessors[i] for i in read - {None} if i < len(accessors)),
+        "has shape keys (morph targets)": any(any(mesh.get("weights", [])) for mesh in (*meshes, *nodes)),
+        "is posed by a skeleton (skin)": any("skin" in node for node in nodes),
+        "has instances (EXT_mesh_gpu_instancing)": "EXT_mesh_gpu_instancing" in used,
+    }
+    return next((name for name, is_used in properties.items() if is_used), None)
 
 
 def _has_normalized_positions(document: Mapping[str, Any]) -> bool:

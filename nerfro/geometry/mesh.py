@@ -15,7 +15,7 @@ from nerfro.files.atomic import write_atomically
 from nerfro.files.reading import reading
 from nerfro.geometry.facets import FacetSettings
 from nerfro.geometry.file_normals import informative_normals
-from nerfro.geometry.gltf import Z_UP_TO_Y_UP, is_gltf, primitives_of, read_document, require_readable
+from nerfro.geometry.gltf import Z_UP_TO_Y_UP, files_beside, is_gltf, primitives_of, read_document, require_readable
 from nerfro.geometry.orientation import area_vectors, inward_faces
 from nerfro.registry.allowed import Coordinate, check
 
@@ -149,10 +149,10 @@ def make_mesh(
         raise NerfroError(f"{what} has no triangles; export a surface instead of a point cloud or an empty scene")
     if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
         raise NerfroError(f"{what} is not made of triangles of points with three coordinates; export it again")
-    turn = np.eye(3) if turn is None else turn
-    vertices = vertices @ turn
     if not np.isfinite(vertices).all():
         raise NerfroError(f"{what} has vertices that are not finite; export it again")
+    turn = np.eye(3) if turn is None else turn
+    vertices = vertices @ turn
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise NerfroError(f"{what} has triangles with indices of missing vertices; export it again")
     check(f"{what} reaches too far; scale it to about one unit: ", {"coordinate": Coordinate},
@@ -214,7 +214,7 @@ def _parse(path: Path) -> Any:
 
     if is_gltf(path):
         require_readable(path)
-    loaded: Any = trimesh.load(path, process=False)
+    loaded: Any = trimesh.load(path, process=False, resolver=files_beside(path) if is_gltf(path) else None)
     if not isinstance(loaded, trimesh.Scene):
         return loaded
     if is_gltf(path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Annotated
 
 import torch
@@ -54,6 +55,9 @@ class BackgroundRegularizer(Loss):
     the density of the finest level learns, because the colour of the background is detached. Channels are summed, and
     the sum over pixels is divided by the number of counted pixels plus one, as in the authors' code.
 
+    In absorbing media, C' includes the absorption, and dark fog in the body has the effect of a grey absorption.
+    Therefore |C'(d) - C| is added, in which fog has no part, and from which only a learned absorption learns.
+
     Args:
         refracted_only: whether to count only rays that meet the medium.
     """
@@ -71,11 +75,18 @@ class BackgroundRegularizer(Loss):
         counted = batch.per_pixel(path.sum_polylines(fine.transmittance.detach())) > 0.5
         if self.refracted_only:
             counted = counted & (batch.per_pixel(path.main_polyline(path.refracted).to(fine.radiance)) > 0.5)
-        background = path.sum_polylines(fine.transmittance[:, None] * fine.background_radiance.detach())
-        predicted, target = scene.colour_space.prediction_and_target(batch.per_pixel(background), batch.rgb)
-        error = (predicted - target).abs().sum(-1)
+        light = fine.background_radiance.detach()
+        error = self._error(path.sum_polylines(fine.transmittance[:, None] * light), batch, scene)
+        if path.record is not None and path.record.absorption.requires_grad:
+            fixed = replace(path, s=path.s.detach())
+            absorbed = fixed.transmitted(fixed.far[:, None])[:, 0]
+            error = error + self._error(path.sum_polylines(light * (absorbed / absorbed.detach())), batch, scene)
         # Gradients are averaged over processes, so each process multiplies its sum by the number of processes.
         return (error * counted).sum() * rank_and_size()[1] / (sum_over_processes(counted.sum()) + 1)
+
+    def _error(self, background: Float[Tensor, "R 3"], batch: Batch, scene: Scene) -> Float[Tensor, "Q"]:
+        predicted, target = scene.colour_space.prediction_and_target(batch.per_pixel(background), batch.rgb)
+        return (predicted - target).abs().sum(-1)
 
 
 @register("loss", "total_variation")

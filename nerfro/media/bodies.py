@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 _RESOLUTION = 128  # vertices along each side of a grid without thin walls
 _AIR = 4  # voxels around a body if the box of its grid is not given
-_COLOURS = ("red", "green", "blue")
+COLOURS = ("red", "green", "blue")
 # Paths record bodies as 8-bit integers.
 _MAX_BODIES = 127
 
@@ -342,7 +342,7 @@ class Bodies(Medium):
         for body, material in zip(self.names, self.materials, strict=True):
             for quantity in material.learned():
                 name, value = f"bodies.{body}.material.{quantity}", getattr(material, quantity).tolist()
-                by_colour = zip(_COLOURS, value, strict=True) if quantity == "absorption" else ()
+                by_colour = zip(COLOURS, value, strict=True) if quantity == "absorption" else ()
                 values |= {f"{name}.{colour}": coefficient for colour, coefficient in by_colour} or {name: value}
         return values
 

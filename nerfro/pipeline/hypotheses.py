@@ -73,7 +73,8 @@ def hypotheses(scene: SceneFile) -> list[Hypothesis]:
         return [straight, Hypothesis("bodies", [known_materials])]
     body = f"+experiment={'glass_room' if near else 'unknown'}"
     if not scene.provenance.doubts:
-        bodies = [Hypothesis(SOLID, [body])]
+        learned = ["medium.learn_absorption=true"] if any(scene.provenance.absorbed) else []
+        bodies = [Hypothesis(SOLID, [body, *learned])]
     else:
         doubt = "the photographs do not determine its index"
         bodies = [

@@ -36,6 +36,8 @@ class Provenance:
         doubts: reasons for doubt about the indices; empty for reliable indices.
         unsupported: names of bodies that do not explain the pixels of the object better than straight rays, the
             smallest error first.
+        absorbed: share of red, green and blue light that the object absorbs along the mean path; empty if unknown.
+        reflects: whether partial reflection is seen; None if unknown.
     """
 
     command: str = ""
@@ -44,6 +46,8 @@ class Provenance:
     standard_error: list[float | None] = field(default_factory=list)
     doubts: list[str] = field(default_factory=list)
     unsupported: list[str] = field(default_factory=list)
+    absorbed: list[float] = field(default_factory=list)
+    reflects: bool | None = None
 
 
 @dataclass
@@ -73,6 +77,14 @@ class SceneFile:
         """Settings of the medium for at most one body that has only mesh and index; None for other bodies."""
         settings = [_given(body) for body in self.bodies.values()] or [{}]
         return settings[0] if len(settings) == 1 and settings[0].keys() <= {"mesh", "ior"} else None
+
+    @property
+    def training_options(self) -> dict[str, object]:
+        """Experiment and settings of a training that follow from surroundings, reflection and absorption."""
+        absorbs = any(self.provenance.absorbed)
+        if self.surroundings == "near":
+            return {"experiment": "glass_room"} | ({"medium.learn_absorption": True} if absorbs else {})
+        return {"experiment": "glass"} if absorbs or self.provenance.reflects else {}
 
     def settings(self, *, data_type: str | None = None, medium: str | None = None) -> dict[str, object]:
         """Return the settings of the groups `data` and `medium` by their full names.

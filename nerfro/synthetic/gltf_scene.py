@@ -22,6 +22,7 @@ from nerfro.geometry.bodies import crossings
 from nerfro.geometry.gltf import (
     Z_UP_TO_Y_UP,
     Primitive,
+    files_beside,
     primitives_of,
     read_document,
     require_readable,
@@ -134,7 +135,7 @@ class GltfScene:
         with reading(path, "scene ", advice="export it again", missing="give a glTF file as scene=FILE.glb"):
             require_readable(path)
             document = read_document(path)
-            loaded: Any = trimesh.load(path, process=False, force="scene")
+            loaded: Any = trimesh.load(path, process=False, force="scene", resolver=files_beside(path))
             primitives = primitives_of(document, list(loaded.geometry))
             parts = [_part(primitive, loaded.geometry[primitive.geometry]) for primitive in primitives]
         for line in sorted(_not_modelled(document)):

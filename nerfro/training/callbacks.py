@@ -309,5 +309,4 @@ class OverfittingWarning(Callback):
         return {"num_gaps": self._num_gaps, "best": self._best}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self._num_gaps = state_dict["num_gaps"]
-        self._best = state_dict.get("best", self._best)  # checkpoints of earlier versions have none
+        self._num_gaps, self._best = state_dict["num_gaps"], state_dict["best"]

@@ -16,7 +16,7 @@ from nerfro.core.provenance import AlgorithmSettings
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.results import RunMetrics
 from nerfro.evaluation.run_page import write_run_page
-from nerfro.evaluation.scoring import score_split
+from nerfro.evaluation.scoring import announce_scoring, score_split
 from nerfro.evaluation.tables import write_scores
 from nerfro.fields.networks import compile_networks
 from nerfro.kernels.available import require_accelerator
@@ -97,7 +97,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetr
     metrics, renderer = ImageMetrics(), training.module.renderer
     optimizer = training.module.configure_optimizers()
     num_steps = require_same_run(folder, checkpoint, config, optimizer, training.views)
-    throughput, interruption = Throughput(), StopOnSignal()
+    throughput, interruption, subdivision = Throughput(), StopOnSignal(), Subdivision(**config.evaluation.subdivision)
     viewers = [Viewer(config, training.source, test)] if config.viewer else []
     trainer = make_trainer(config, folder, throughput, [interruption, *viewers], num_steps)
     require_match(renderer.scene.medium, training.views)
@@ -105,6 +105,8 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetr
     if trainer.is_global_zero:
         begin(folder, config, renderer, has_steps=not 0 <= trainer.max_steps <= num_steps)
         print(memory, flush=True)
+        if split is not None:
+            announce_scoring(renderer.to(trainer.strategy.root_device), test, metrics, subdivision)
     if config.compile is not None:
         compile_networks(renderer, config.compile)
     fit(trainer, training.module, training.data, checkpoint, throughput)
@@ -130,7 +132,6 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetr
     scores, logged, outcome = None, {}, f"Training is complete: {duration(costs[1])}."
     try:
         if split is not None:
-            subdivision = Subdivision(**config.evaluation.subdivision)
             result, treated = score_split(renderer, test, metrics, folder, subdivision, split)
             logged = {f"{split}/{name}": mean for name, mean in result.means().items()}
             scores = RunMetrics(result, *costs, treated, steps_by_phase(states, costs[0]))

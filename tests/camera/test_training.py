@@ -73,7 +73,7 @@ def test_test_view_treatments_are_reported_by_name(train: Runner, tmp_path: Path
     train(*options, *LEARNED_SKY, "trainer.max_steps=3")
     document = json.loads((tmp_path / "run" / "metrics.json").read_text("utf-8"))
     assert document["test_views"] == "as given"
-    assert list(document["treatments"]) == ["aligned", "exposed"]
+    assert list(document["treatments"]) == ["aligned", "unexposed", "exposed"]
     read = read_metrics_json(tmp_path / "run" / "metrics.json")
     for name in ("aligned", "exposed"):
         assert read.treatments[name].mean("psnr") == pytest.approx(document["treatments"][name]["test"]["psnr"])

@@ -100,6 +100,7 @@ def test_distortion_is_read_in_the_conventions_of_nerfstudio_and_opencv(file: di
         ({"fl_x": True}, "fl_x=True is not allowed"),
         ({"fl_x": "long"}, "fl_x='long' is not allowed"),
         ({"k1": math.nan}, "k1=nan is not allowed; take a finite number"),
+        ({"cx": 0.5, "cy": 0.52}, "cx=0.5 and cy=0.52 seem to be fractions; give pixels"),
         ({"k5": 0.1}, "k5 and k6 belong to OpenCV's rational model"),
         ({"cam_mat": CAM_MAT, "fl_x": 31}, "cam_mat and fl_x both state the lens; keep one"),
         ({"dist": [0.1, 0, 0, 0], "k1": 0.1}, "dist and k1 both state the lens"),

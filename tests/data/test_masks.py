@@ -1,6 +1,7 @@
 """Where silhouettes are looked for, and what they are read as."""
 
 import json
+import unicodedata
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from PIL import Image
 
 from nerfro.data.blender import BlenderData
 from nerfro.data.masks import find_mask, find_masks, with_other_splits
+from nerfro.data.transforms import existing_image
 from tests.conftest import refused
 
 
@@ -42,6 +44,17 @@ def test_explicit_mask_has_precedence_and_must_exist(tmp_path: Path) -> None:
     assert find_mask(tmp_path, image) == beside
     assert find_mask(tmp_path, image, "other\\b.png") == stated
     refused(r"mask .*no\.png of .*a\.png does not exist", find_mask, tmp_path, image, "no.png")
+
+
+@pytest.mark.parametrize(("stated", "stored"), [("NFC", "NFD"), ("NFD", "NFC")])
+def test_names_with_composed_and_decomposed_letters_are_the_same(stated: str, stored: str, tmp_path: Path) -> None:
+    """macOS decomposes letters with accents, and other systems compare names byte by byte."""
+    name, other = (unicodedata.normalize(form, "Glas_für_Öl") for form in (stated, stored))
+    image = _touch(tmp_path / "images" / f"{other}.png")
+    assert existing_image(tmp_path, f"images/{name}.png") == image
+    mask = _touch(tmp_path / "masks" / f"{name}.png")
+    assert find_mask(tmp_path, image) == mask
+    assert find_mask(tmp_path, image, f"masks/{other}.png") == mask
 
 
 def test_views_of_different_splits_never_share_a_mask(tmp_path: Path) -> None:

@@ -9,12 +9,12 @@ import rich.console
 from rich.cells import cell_len
 
 from nerfro.evaluation.image_metrics import image_metrics
-from nerfro.evaluation.results import EvaluationResult, ViewScores
+from nerfro.evaluation.results import EvaluationResult, RunMetrics, ViewScores
 from nerfro.evaluation.tables import (
     Column,
     Row,
     Table,
-    regions_table,
+    means_table,
     to_csv,
     to_latex,
     to_rich,
@@ -124,10 +124,14 @@ def test_views_table_has_a_row_for_each_view_and_their_mean() -> None:
     assert table.notes == ("LPIPS n/a: no network",)
 
 
-def test_regions_table_has_their_means_and_each_reason_once() -> None:
-    table = regions_table(REGIONS, "means")
+def test_one_table_has_the_means_of_regions_and_treatments_and_each_reason_once() -> None:
+    """Scores of right halves are two rows of the same pixels."""
+    table = means_table(RunMetrics(REGIONS), "means")
     assert table.rows == (line("full", 20.5), line("mask", 10.0), line("crop", 15.5))
     assert table.notes == ("SSIM n/a: crops too small", "LPIPS n/a: no network")
+    treated = dict.fromkeys(("aligned", "unexposed", "exposed"), FULL_ONLY)
+    labels = [row.label for row in means_table(RunMetrics(REGIONS, treatments=treated), "means").rows]
+    assert labels[3:] == ["aligned", "unexposed, right halves", "exposed, right halves"]
 
 
 @pytest.mark.parametrize("width", [40, 80])

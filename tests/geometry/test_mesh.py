@@ -3,6 +3,8 @@
 import json
 import struct
 import sys
+import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +71,38 @@ def test_compressed_gltf_is_refused(extension: str, name: str, tmp_path: Path, m
     )
 
 
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [
+        (lambda tree: tree["accessors"][0].update(sparse={"count": 1}), "sparse accessors"),
+        (lambda tree: tree["accessors"][1].update(sparse={"count": 1}), "sparse accessors"),
+        (lambda tree: tree["meshes"][0].update(weights=[0.0, 1.0]), "shape keys"),
+        (lambda tree: tree["nodes"][0].update(weights=[0.5]), "shape keys"),
+        (lambda tree: tree["nodes"][0].update(skin=0), "skeleton"),
+        (lambda tree: tree.update(extensionsUsed=["EXT_mesh_gpu_instancing"]), "instances"),
+        (lambda tree: tree.update(extensionsRequired=["ACME_curves"]), "requires ACME_curves"),
+    ],
+)
+def test_gltf_whose_shape_has_more_than_its_positions_is_refused(
+    change: Callable[[dict[str, Any]], None], name: str, tmp_path: Path
+) -> None:
+    """trimesh reads the positions alone, without a word."""
+    scene = trimesh.Scene(trimesh.creation.box())
+    (tmp_path / "a.glb").write_bytes(export_glb(scene, tree_postprocessor=change))
+    refused(rf"a\.glb .*{name}.*apply it in the program", load_mesh, tmp_path / "a.glb")
+
+
+def test_gltf_finds_files_whose_names_are_percent_encoded(tmp_path: Path) -> None:
+    """Blender writes a space as %20, as the specification demands."""
+    written = trimesh.Scene(trimesh.creation.box()).export(file_type="gltf")
+    document = json.loads(written["model.gltf"])
+    for number, buffer in enumerate(document["buffers"]):
+        (tmp_path / f"glass ({number})ü.bin").write_bytes(written[buffer["uri"]])
+        buffer["uri"] = f"glass%20({number})%C3%BC.bin"
+    (tmp_path / "glass (1).gltf").write_text(json.dumps(document))
+    assert load_mesh(tmp_path / "glass (1).gltf").is_closed
+
+
 def test_meshes_compressed_by_draco_are_decoded(tmp_path: Path) -> None:
     draco = pytest.importorskip("DracoPy")
     ball = trimesh.creation.icosphere(2, 0.7)
@@ -100,6 +134,17 @@ def test_files_without_triangles_or_with_nan_are_named(tmp_path: Path) -> None:
     refused(r"points\.obj", load_mesh, tmp_path / "points.obj")
     (tmp_path / "nan.obj").write_text("v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     refused(r"nan\.obj", load_mesh, tmp_path / "nan.obj")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_vertices_that_are_not_finite_are_refused_in_one_line(value: float, tmp_path: Path) -> None:
+    """No operation before the check warns."""
+    ball = trimesh.creation.icosphere(1)
+    ball.vertices[3, 0] = value
+    trimesh.Trimesh(ball.vertices, ball.faces, process=False).export(tmp_path / "ball.ply")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        refused("vertices that are not finite", load_mesh, tmp_path / "ball.ply")
 
 
 @pytest.mark.parametrize("index", [-1, 8, 2**31 - 1])

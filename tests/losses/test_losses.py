@@ -195,6 +195,22 @@ def test_background_regularizer_adds_no_density_in_front_of_overexposed_pixels()
     assert not torch.autograd.grad(value, passed)[0].any()
 
 
+def test_absorption_replaces_dark_fog_that_explains_the_photograph() -> None:
+    """Fog that takes a fifth of the light has no photometric error; the regularizer increases the absorption."""
+    absorption = torch.tensor([[0.0] * 3, [0.1, 0.2, 0.3]], requires_grad=True)
+    path = example_path(8)
+    path = replace(path, record=replace(path.record, absorption=absorption))
+    passed = torch.full((8,), 0.8, requires_grad=True)
+    light = torch.full((8, 3), 0.5) * path.transmitted(path.far[:, None])[:, 0]
+    fog = replace(rendering(torch.rand(8, 3), light, passed), transmittance=passed, path=path)
+    fog = replace(fog, radiance=passed[:, None] * light)
+    given = replace(example_batch(8), maps={}, rgb=to_srgb(fog.radiance.detach()))
+    exact = Photometric()([fog], given, MODEL.scene)
+    regularizer = BackgroundRegularizer(refracted_only=False)([fog], given, MODEL.scene)
+    assert exact.item() == pytest.approx(0, abs=1e-12)
+    assert (torch.autograd.grad(regularizer, absorption)[0][1] < 0).all()
+
+
 @pytest.mark.parametrize("absorbs", [False, True])
 def test_background_learns_from_selected_rays_and_the_medium_from_all(absorbs: bool) -> None:
     sky = EnvironmentMap([4])
