@@ -24,7 +24,7 @@ from nerfro.viewing.trained_scene import TrainedScene
 
 _GLB_TRIANGLES = 20_000  # default limit of a .glb
 # Codes of glTF 2.0, sections 3.6.2.2 and 5.11: types of components, and targets of buffers.
-_CODES = {"<i2": 5122, "<u2": 5123, "<u4": 5125}
+_CODES = {"<i2": 5122, "<u2": 5123, "<u4": 5125, "<f4": 5126}
 _VERTICES, _INDICES = 34962, 34963
 
 
@@ -56,7 +56,7 @@ def write_mesh(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
 def _encode_glb(scene: TrainedScene, glass: list[trimesh.Trimesh], inside: trimesh.Trimesh | None) -> bytes:
     document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "nerfro"}, "scene": 0, "scenes": [{}], "nodes": [], "meshes": [],
-        "materials": [], "cameras": [], "accessors": [], "bufferViews": [], "extensionsRequired": [QUANTIZATION],
+        "materials": [], "cameras": [], "accessors": [], "bufferViews": [],
     }  # fmt: skip
     content = bytearray()
     bodies = scene.renderer.scene.medium.bodies
@@ -70,7 +70,8 @@ def _encode_glb(scene: TrainedScene, glass: list[trimesh.Trimesh], inside: trime
     _add_cameras(document, scene.cameras("train").to("cpu"))
     document["scenes"][0]["nodes"] = list(range(len(document["nodes"])))
     extensions = {name for material in document["materials"] for name in material["extensions"]}
-    document["extensionsUsed"] = sorted({QUANTIZATION, *extensions})
+    required = [] if inside is None else [QUANTIZATION]
+    document |= {"extensionsUsed": sorted({*required, *extensions}), "extensionsRequired": required}
     document["buffers"] = [{"byteLength": len(content)}]
     text = json.dumps({key: value for key, value in document.items() if value != []}, separators=(",", ":")).encode()
     chunks = [(b"JSON", text + b" " * (-len(text) % 4)), (b"BIN\0", bytes(content))]
@@ -78,32 +79,38 @@ def _encode_glb(scene: TrainedScene, glass: list[trimesh.Trimesh], inside: trime
     return b"glTF" + (2).to_bytes(4, "little") + (12 + len(body)).to_bytes(4, "little") + body
 
 
-def _step(mesh: trimesh.Trimesh) -> float:
-    """Return the unit of the quantized coordinates of a mesh."""
-    return float(mesh.extents.max()) / 65535
-
-
 def _add_mesh(
     document: dict[str, Any], content: bytearray, name: str, mesh: trimesh.Trimesh, material: dict[str, Any]
 ) -> None:
-    """Add a mesh with 16-bit positions, normals and colours; the matrix of its node restores the positions."""
-    values = {
-        "POSITION": ("<u2", (mesh.vertices - mesh.bounds[0]) / _step(mesh)),
-        "NORMAL": ("<i2", 32767 * mesh.vertex_normals),
-    }
+    """Add a mesh. Light bends at glass, which has single precision; content with radiance has 16 bits for each number.
+
+    The matrix of the node restores positions of 16 bits.
+    """
+    origin, unit = np.zeros(3), 1.0
+    values = {"POSITION": ("<f4", mesh.vertices), "NORMAL": ("<f4", mesh.vertex_normals)}
     if "radiance" in mesh.vertex_attributes:
-        values["COLOR_0"] = ("<u2", 65535 * np.clip(mesh.vertex_attributes["radiance"], 0, 1))
+        origin, unit = mesh.bounds[0], float(mesh.extents.max()) / 65535
+        values = {
+            "POSITION": ("<u2", np.rint((mesh.vertices - origin) / unit)),
+            "NORMAL": ("<i2", np.rint(32767 * mesh.vertex_normals)),
+            "COLOR_0": ("<u2", np.rint(65535 * np.clip(mesh.vertex_attributes["radiance"], 0, 1))),
+        }
     # Attributes begin at multiples of four bytes, so each has a fourth, unused component.
     vertices = np.zeros(len(mesh.vertices), [(key, code, 4) for key, (code, _) in values.items()])
     attributes = {}
     for number, (key, (code, numbers)) in enumerate(values.items()):
-        vertices[key][:, :3] = np.rint(numbers)
+        vertices[key][:, :3] = numbers
         attributes[key] = len(document["accessors"])
-        entry = {"type": "VEC3", "componentType": _CODES[code], "byteOffset": 8 * number, "count": len(vertices)}
+        entry = {
+            "type": "VEC3",
+            "componentType": _CODES[code],
+            "byteOffset": number * vertices[key].dtype.itemsize * 4,
+            "count": len(vertices),
+        }
         if key == "POSITION":
             corners = vertices[key][:, :3]
             entry |= {"min": corners.min(0).tolist(), "max": corners.max(0).tolist()}
-        else:
+        elif code != "<f4":
             entry["normalized"] = True
         document["accessors"].append({"bufferView": len(document["bufferViews"]), **entry})
     _add_view(document, content, vertices.tobytes(), target=_VERTICES, byteStride=vertices.itemsize)
@@ -114,7 +121,7 @@ def _add_mesh(
     indices = len(document["accessors"]) - 1
     primitive = {"attributes": attributes, "indices": indices, "material": len(document["materials"])}
     matrix = np.eye(4)
-    matrix[:3] = Z_UP_TO_Y_UP @ np.hstack([_step(mesh) * np.eye(3), mesh.bounds[:1].T])
+    matrix[:3] = Z_UP_TO_Y_UP @ np.hstack([unit * np.eye(3), origin[:, None]])
     document["nodes"].append({"name": name, "mesh": len(document["meshes"]), "matrix": matrix.T.flatten().tolist()})
     document["meshes"].append({"name": name, "primitives": [primitive]})
     document["materials"].append({"name": name, **material})
@@ -144,8 +151,7 @@ def _glass_material(
     mesh: trimesh.Trimesh, ior: float, absorption: np.ndarray, dispersion: Dispersion | None
 ) -> dict[str, Any]:
     """Describe glass by the extensions KHR_materials_transmission, _ior, _volume and _dispersion (Khronos)."""
-    # A thickness is in coordinates of the mesh, and a distance in those of the world.
-    volume: dict[str, Any] = {"thicknessFactor": float(mesh.extents.min()) / _step(mesh)}
+    volume: dict[str, Any] = {"thicknessFactor": float(mesh.extents.min())}
     if absorption.any():
         # At a distance of 1 / max(absorption), no channel underflows, whatever the world unit.
         distance = 1 / float(absorption.max())
