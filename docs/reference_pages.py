@@ -35,6 +35,13 @@ def on_files(files: Any, config: Any) -> Any:
     return files
 
 
+def on_post_page(output: str, page: Any, config: Any) -> str:
+    """Name the search dialog of the theme, which has no accessible name."""
+    return output.replace(
+        'data-md-component="search" role="dialog"', 'data-md-component="search" role="dialog" aria-label="Search"'
+    )
+
+
 def pages() -> dict[str, str]:
     """Return the text of each generated page by its file name."""
     discover()

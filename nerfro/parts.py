@@ -14,7 +14,7 @@ from nerfro.core.paths import resolve_path
 from nerfro.core.types import Batch, Exits, FieldValues, OpticalRecord, Path, Rays, Rendering, Samples
 from nerfro.data.base import DataSource, Views
 from nerfro.evaluation.error_maps import ErrorMap
-from nerfro.evaluation.image_metrics import ImageMetric
+from nerfro.evaluation.image_metrics import ImageMetric, ViewMaps
 from nerfro.fields.base import Field
 from nerfro.files.atomic import write_atomically
 from nerfro.files.reading import load_arrays
@@ -41,6 +41,6 @@ __all__ = [
     "Ge", "Grid", "GridSettings", "Gt", "ImageMetric", "Le", "Loss", "Lt", "Material", "Medium", "MeshSurface",
     "Natural", "NerfroError", "NotNegative", "OpticalRecord", "Path", "PathSampler", "Phase", "PointSampler",
     "Positive", "Rays", "RefractiveModel", "Renderer", "Rendering", "Samples", "Scalars", "Scene", "Space",
-    "Stratified", "Surface", "TrainedScene", "TrainingRun", "Unbounded", "Vectors", "Views", "invert_cdf",
-    "load_arrays", "point_samples", "register", "resolve_path", "spread_uniform", "write_atomically",
+    "Stratified", "Surface", "TrainedScene", "TrainingRun", "Unbounded", "Vectors", "ViewMaps", "Views",
+    "invert_cdf", "load_arrays", "point_samples", "register", "resolve_path", "spread_uniform", "write_atomically",
 ]  # fmt: skip

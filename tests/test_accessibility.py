@@ -1,6 +1,9 @@
 """axe-core finds no problems on the pages that nerfro writes, and no serious ones on its site."""
 
+import functools
 import os
+import threading
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
@@ -53,5 +56,10 @@ def test_site(page: str, tmp_path: Path) -> None:
     site = Path(os.environ.get("NERFRO_SITE", "-"))
     if not site.is_dir():
         pytest.skip("the site is not built: mkdocs build, and set NERFRO_SITE to its folder")
-    with Browser((site / page).resolve().as_uri(), tmp_path, size=(1300, 900)) as browser:
-        assert [line for line in browser.findings() if line.startswith(("serious", "critical"))] == []
+    # The search of the site needs a server.
+    files = functools.partial(SimpleHTTPRequestHandler, directory=str(site))
+    with ThreadingHTTPServer(("localhost", 0), files) as host:
+        threading.Thread(target=host.serve_forever, daemon=True).start()
+        with Browser(f"http://localhost:{host.server_port}/{page}", tmp_path, size=(1300, 900)) as browser:
+            assert [line for line in browser.findings() if line.startswith(("serious", "critical"))] == []
+        host.shutdown()

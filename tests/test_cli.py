@@ -16,7 +16,7 @@ from hydra.errors import OverrideParseException
 from hydra.types import RunMode
 
 from nerfro.cli.calls import values_of
-from nerfro.cli.composition import BoundedFiles, Composer
+from nerfro.cli.composition import BoundedFiles, Composer, quoted
 from nerfro.cli.entry import _flags
 from nerfro.cli.failures import errors_in_one_line, in_one_line
 from nerfro.cli.overrides import as_overrides, full_key
@@ -173,3 +173,12 @@ def test_printed_commands_run_with_any_folder(name: str, tmp_path: Path, capsys:
     values = [values_of([word for word in shlex.split(command) if "=" in word]) for command in commands]
     assert [value.get("checkpoint") for value in values[:2]] == [str(folder)] * 2
     assert (values[2]["hydra"]["run"]["dir"], values[3]["out"]) == (str(folder), str(folder.with_name("ship")))
+
+
+@pytest.mark.parametrize("path", ["out/sweep/mine-seed0-power=1.5/checkpoints/last.ckpt", "a=1,b=2", "-x=a", "é=1/x"])
+def test_paths_of_runs_of_a_sweep_need_no_quotes(path: str) -> None:
+    argument = quoted(f"checkpoint={path}", ())
+    if "," in path:
+        assert argument == f"checkpoint={path}", "a list is left to Hydra"
+    else:
+        assert OverridesParser.create().parse_override(argument).value() == path

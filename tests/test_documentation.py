@@ -140,13 +140,14 @@ def test_links_point_to_existing_files() -> None:
 def test_code_of_the_library_page_executes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     blocks = python_blocks("docs/guides/library.md")
-    build, experiment, paths = ({} for _ in blocks)
-    for block, namespace in zip(blocks, (build, experiment, paths), strict=True):
+    build, experiment, finder, paths = namespaces = [{} for _ in blocks]
+    for block, namespace in zip(blocks, namespaces, strict=True):
         exec(block, namespace)
     assert build["image"].shape == (16, 16, 3)
     assert experiment["scene"].renderer.state_dict().keys() == experiment["again"].renderer.state_dict().keys()
     for name, weights in experiment["module"].renderer.state_dict().items():
         assert torch.equal(experiment["again"].renderer.state_dict()[name], weights)
+    assert finder["finder"].suggestion() == finder["module"].learning_rate
     assert paths["path"].shape[1] == 3
     assert max(len(repr(value)) for value in (build["model"].scene, build["components"].medium)) < 250
 

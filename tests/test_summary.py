@@ -46,7 +46,7 @@ def write_run(
         "trainer": {"max_time": max_time, "max_steps": max_steps, "accelerator": "cpu", "devices": 1},
     }
     record(folder, OmegaConf.create(config))
-    others = {name: 0.5 for name in image_metrics()}
+    others = {name: None if metric.maps else 0.5 for name, metric in image_metrics().items()}
     rows = tuple(
         ViewScores(f"test_{i:03d}", {**others, "psnr": psnr + i - 0.5, "ssim": psnr / 40, "lpips": lpips})
         for i in range(2)
@@ -61,6 +61,15 @@ def write_run(
 def tables(place: Path) -> list[Table]:
     runs, _ = find_runs([str(place)])
     return [to_table(comparison, PAPER, "full") for comparison in compare(runs, {"b": "B"}, {"ship": "Ship"})]
+
+
+def test_metrics_on_maps_that_no_data_have_are_neither_columns_nor_notes(tmp_path: Path) -> None:
+    write_run(tmp_path / "0", "a", 20.0)
+    runs, _ = find_runs([str(tmp_path)])
+    (comparison,) = compare(runs, {}, {})
+    table = to_table(comparison, find_metrics(), "full")
+    assert "depth RMSE" not in [column.title for column in table.columns]
+    assert table.notes == ()
 
 
 def cell(table: Table, label: str, group: str, title: str = "PSNR") -> tuple[float | None, float | None]:

@@ -19,6 +19,8 @@ class CameraModel(nn.Module, ABC):
 
     Args:
         exposure: whether to estimate a gain for each training view.
+        appearance: size of the embedding of each training view, from which a smooth gain over its image is learned, in
+            addition to its exposure; 0 for none.
 
     Attributes:
         moves: whether the model changes the poses or the lens of the data set.
@@ -26,14 +28,14 @@ class CameraModel(nn.Module, ABC):
 
     moves = False
 
-    def __init__(self, exposure: bool = False) -> None:
+    def __init__(self, exposure: bool = False, appearance: int = 0) -> None:
         super().__init__()
-        self.exposure = Exposure() if exposure else None
+        self.exposure = Exposure(appearance) if exposure or appearance else None
 
     def begin(self, cameras: Cameras) -> None:
         """Initialize the model for the training views, given the cameras of the data set."""
         if self.exposure is not None:
-            self.exposure.begin(len(cameras))
+            self.exposure.begin(cameras)
 
     @abstractmethod
     def forward(self, rays: Rays, view: Int[Tensor, "R"]) -> Rays:
@@ -44,9 +46,9 @@ class CameraModel(nn.Module, ABC):
             view: index of the training view of each ray.
         """
 
-    def gains(self, view: Int[Tensor, "R"]) -> Float[Tensor, "R 3"] | None:
+    def gains(self, view: Int[Tensor, "R"], rays: Rays) -> Float[Tensor, "R 3"] | None:
         """Return the gain of linear radiance of each ray's photograph, or None if exposures are not estimated."""
-        return None if self.exposure is None else self.exposure(view)
+        return None if self.exposure is None else self.exposure(view, rays)
 
     def parameters_by_name(self) -> dict[str, nn.Parameter]:
         """Return the parameters that gradient descent learns by name, see `Scene.parameters_by_name`."""

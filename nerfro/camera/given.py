@@ -7,6 +7,7 @@ from torch import Tensor
 
 from nerfro.camera.base import CameraModel
 from nerfro.core.rays import Rays
+from nerfro.registry.allowed import Natural
 from nerfro.registry.registration import register
 
 
@@ -16,7 +17,12 @@ class GivenCamera(CameraModel):
 
     Args:
         exposure: whether to estimate a gain for each training view and colour channel.
+        appearance: size of the embedding of each training view, from which a smooth gain over its image is learned, in
+            addition to its exposure; 0 for none.
     """
+
+    def __init__(self, exposure: bool = False, appearance: Natural = 0) -> None:
+        super().__init__(exposure, appearance)
 
     def forward(self, rays: Rays, view: Int[Tensor, "R"]) -> Rays:
         """Return the rays unchanged."""

@@ -124,8 +124,10 @@ def missing_with_example(command: str) -> Iterator[None]:
 
 
 def quoted(argument: str, keys: tuple[str, ...]) -> str:
-    """Quote the value of an override if its key is one of `keys`."""
+    """Quote the value of an override if its key is one of `keys`, or if it is the path of a run of a sweep (`a=1`)."""
     key, _, value = argument.partition("=")
+    if "=" in value and re.fullmatch(r"[\w./+@%=-]+", value):
+        return f"{key}='{value}'"
     if key not in keys or not set(",=") & set(value) or value[0] in "\"'":
         return argument
     return f"{key}='{value}'"

@@ -53,7 +53,8 @@ class Views:
         masks: coverage of each pixel [H, W] by the refractive object in [0, 1], or None if the data set has no masks.
         names: names of the images in the data set.
         usable: pixels [H, W] that training may use (1 or True), or None if all pixels are usable.
-        maps: further values of each pixel by name, in the resolution of the images, which losses find in `batch.maps`.
+        maps: further values of each pixel by name, in the resolution of the images, which losses find in `batch.maps`
+            and metrics in `ViewMaps.data`.
             The map `depth` has one channel: the arc length of the ray through the pixel, world units; 0 if unknown.
         frames: image and mask files, if the data format knows them; otherwise empty.
         mask_labels: labels of the object in the mask files, see `nerfro.data.image_files.read_mask`.

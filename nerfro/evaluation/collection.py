@@ -18,7 +18,7 @@ def metrics(*names: str) -> torchmetrics.MetricCollection:
     images, which is NaN if an image is too small for the metric.
 
     Args:
-        names: registered metrics; by default, all metrics that are available on this machine.
+        names: registered metrics; by default, all that are available on this machine and need only images.
 
     Raises:
         NerfroError: a metric is unknown, or not available on this machine.
@@ -30,7 +30,9 @@ def metrics(*names: str) -> torchmetrics.MetricCollection:
     for name in names:
         if built[name].missing is not None:
             raise NerfroError(f"metric={name} is not available: {built[name].missing}")
-    usable = names or [name for name, metric in built.items() if metric.missing is None]
+        if built[name].maps:
+            raise NerfroError(f"metric={name} needs maps, which batches of images lack; use scene.evaluate(views)")
+    usable = names or [name for name, metric in built.items() if metric.missing is None and not metric.maps]
     # Metrics with equal values are not the same metric, so torchmetrics must not group them.
     return torchmetrics.MetricCollection({name: MeanOverImages(built[name]) for name in usable}, compute_groups=False)
 

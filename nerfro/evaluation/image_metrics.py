@@ -5,7 +5,8 @@ from __future__ import annotations
 import inspect
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import torch
@@ -25,6 +26,26 @@ MAX_PSNR = 100.0  # dB; the infinite PSNR of equal images has no mean and no rep
 _FIRST = ("psnr", "ssim", "lpips", "flip")
 
 
+@dataclass(frozen=True)
+class ViewMaps:
+    """Values of the pixels of one view beside its colours, by name.
+
+    Attributes:
+        data: maps of the data set, see `Views.maps`.
+        rendered: `depth`, `opacity`, `exit_directions`, `normals` and `refracted` of the model, see `RenderedRays`.
+    """
+
+    data: Mapping[str, Float[Tensor, "H W _"]]
+    rendered: Mapping[str, Float[Tensor, "H W _"]]
+
+    def __getitem__(self, window: tuple[slice, slice]) -> ViewMaps:
+        """Select rows and columns of all maps."""
+        data, rendered = (
+            {name: values[window] for name, values in maps.items()} for maps in (self.data, self.rendered)
+        )
+        return ViewMaps(data, rendered)
+
+
 class ImageMetric(nn.Module, ABC):
     """Score of a rendered image.
 
@@ -34,6 +55,8 @@ class ImageMetric(nn.Module, ABC):
         decimals: number of decimals in tables.
         min_size: smallest side of an image in pixels; smaller images have no score.
         missing: reason why the metric is not available on this machine, or None.
+        maps: names of the maps of the data set that the metric needs; views without them have no score. If there are
+            names, `forward` has a fourth parameter, `maps`, of type `ViewMaps`.
     """
 
     title: ClassVar[str]
@@ -41,6 +64,7 @@ class ImageMetric(nn.Module, ABC):
     decimals: ClassVar[int] = 3
     min_size: int = 1
     missing: str | None = None
+    maps: ClassVar[tuple[str, ...]] = ()
 
     @abstractmethod
     def forward(
@@ -64,11 +88,16 @@ class ImageMetric(nn.Module, ABC):
         """Compute the error of each pixel for sheets of error maps; by default, the metric has no map."""
         return None
 
-    def score(self, prediction: Tensor, target: Tensor, inside: Tensor | None = None) -> float:
-        """Return the score as a number; NaN if the metric is not available or the image is too small."""
+    def score(
+        self, prediction: Tensor, target: Tensor, inside: Tensor | None = None, maps: ViewMaps | None = None
+    ) -> float:
+        """Return the score as a number; NaN if the metric or a map is missing, or the image is too small."""
         if self.missing is not None or min(prediction.shape[:2]) < self.min_size:
             return math.nan
-        return float(self(prediction, target, inside))
+        if not self.maps:
+            return float(self(prediction, target, inside))
+        present = maps is not None and all(name in maps.data for name in self.maps)
+        return float(self(prediction, target, inside, maps)) if present else math.nan
 
 
 def _check_class(name: str, cls: type) -> None:
@@ -82,9 +111,12 @@ def _check_class(name: str, cls: type) -> None:
         raise NerfroError(f"{what} is not a metric; derive it from {ImageMetric.__module__}.ImageMetric")
     if getattr(cls, "better", None) not in ("higher", "lower"):
         raise NerfroError(f'{what} does not say which scores are better; add better = "higher" or better = "lower"')
-    inside = inspect.signature(cls.forward).parameters.get("inside")
+    parameters = inspect.signature(cls.forward).parameters
+    inside = parameters.get("inside")
     if inside is None or inside.default is inside.empty:
         raise NerfroError(f"{what} cannot score a region; write forward(self, prediction, target, inside=None)")
+    if cls.maps and "maps" not in parameters:
+        raise NerfroError(f"{what} needs maps; write forward(self, prediction, target, inside=None, maps=None)")
     cls.title = getattr(cls, "title", name)
 
 
@@ -165,3 +197,27 @@ class Ssim(ImageMetric):
         """Compute 1 - SSIM; NaN in a border of five pixels, because windows there would exceed the image."""
         values = F.pad(1 - ssim_map(prediction, target).mean(-1), [WINDOW // 2] * 4, value=torch.nan)
         return ErrorMap("ssim", "1 - SSIM", values, 1.0)
+
+
+@register("metric", "depth")
+class DepthError(ImageMetric):
+    """Root mean squared error of the depth in pixels that have one, world units.
+
+    Depth cameras and structure from motion assume straight rays, so pixels whose rays meet the medium do not count.
+    """
+
+    title = "depth RMSE"
+    better = "lower"
+    maps = ("depth",)
+
+    def forward(
+        self,
+        prediction: Float[Tensor, "H W 3"],
+        target: Float[Tensor, "H W 3"],
+        inside: Bool[Tensor, "H W"] | None = None,
+        maps: ViewMaps | None = None,
+    ) -> Float[Tensor, ""]:
+        assert maps is not None
+        depth, rendered = maps.data["depth"][..., 0].to(prediction), maps.rendered["depth"][..., 0].to(prediction)
+        counts = (depth > 0) & (maps.rendered["refracted"][..., 0].to(prediction) == 0)
+        return mean_over((rendered - depth).square(), counts if inside is None else counts & inside).sqrt()

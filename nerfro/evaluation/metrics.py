@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerfro.core.errors import NerfroError
-from nerfro.evaluation.image_metrics import ImageMetric, build_metrics
+from nerfro.evaluation.image_metrics import ImageMetric, ViewMaps, build_metrics
 from nerfro.evaluation.regions import crop_rectangle, object_pixels, require_images
 from nerfro.evaluation.results import FULL, OBJECT_REGIONS, EvaluationResult, Region, Score, ViewScores
 from nerfro.files.images import round_to_8bit
@@ -36,6 +36,7 @@ class ImageMetrics(nn.Module):
         prediction: Float[Tensor, "H W 3"],
         target: Float[Tensor, "H W 3"],
         coverage: Float[Tensor, "H W"] | None = None,
+        maps: ViewMaps | None = None,
     ) -> ViewScores:
         """Score one view.
 
@@ -48,6 +49,7 @@ class ImageMetrics(nn.Module):
             target: reference image, sRGB.
             coverage: coverage of each pixel by the object in [0, 1]. Without it, or if the object is not visible, only
                 the full image has scores.
+            maps: further values of the pixels, for metrics that need these.
 
         Raises:
             NerfroError: the sizes differ, or a value is not finite.
@@ -61,9 +63,9 @@ class ImageMetrics(nn.Module):
             regions = self._missing()
         elif inside is not None:
             crop = crop_rectangle(inside)
-            regions["mask"] = self._scores(prediction, target, inside)
-            regions["crop"] = self._scores(prediction[crop], target[crop], None)
-        return ViewScores(name, self._scores(prediction, target, None), regions)
+            regions["mask"] = self._scores(prediction, target, inside, maps)
+            regions["crop"] = self._scores(prediction[crop], target[crop], None, None if maps is None else maps[crop])
+        return ViewScores(name, self._scores(prediction, target, None, maps), regions)
 
     def result(self, views: Sequence[ViewScores]) -> EvaluationResult:
         """Collect the scores of all views, with the reasons for missing scores."""
@@ -76,9 +78,11 @@ class ImageMetrics(nn.Module):
     def _missing(self) -> dict[Region, dict[str, Score]]:
         return {region: dict.fromkeys(self.metrics) for region in OBJECT_REGIONS}
 
-    def _scores(self, prediction: Tensor, target: Tensor, inside: Tensor | None) -> dict[str, Score]:
+    def _scores(
+        self, prediction: Tensor, target: Tensor, inside: Tensor | None, maps: ViewMaps | None
+    ) -> dict[str, Score]:
         """Compute all scores; None if a metric is not available or the image is too small."""
-        scores = {name: metric.score(prediction, target, inside) for name, metric in self.metrics.items()}
+        scores = {name: metric.score(prediction, target, inside, maps) for name, metric in self.metrics.items()}
         return {name: None if math.isnan(score) else score for name, score in scores.items()}
 
     def _notes(self, views: Sequence[ViewScores]) -> dict[str, str]:
@@ -93,6 +97,8 @@ class ImageMetrics(nn.Module):
             if view.score(first, region) is not None
         ]
         for name, metric in self.metrics.items():
+            if metric.maps and all(view.score(name) is None for view in views):
+                continue  # most data have no maps
             if any(view.score(name, region) is None for view, region in scored):
                 too_small = f"images, masks or crops below {metric.min_size} pixels"
                 notes[name] = metric.missing or (too_small if metric.min_size > 1 else "it has no value")

@@ -8,6 +8,8 @@ import torch
 from torch import Tensor
 
 from nerfro.core.cameras import Cameras
+from nerfro.data.base import Views
+from nerfro.evaluation.image_metrics import ViewMaps
 from nerfro.rendering import RenderedRays, Renderer
 from nerfro.samplers.subdivision import Subdivision, contrast, divergence, neighbour_rays, part_rays
 
@@ -40,3 +42,11 @@ def render_view(renderer: Renderer, cameras: Cameras, view: int, subdivision: Su
     size = max(1, renderer.chunk_size // num_parts)
     radiance[pixels_to_divide] = torch.cat(renderer.map_chunks(mean_of_parts, pixels_to_divide, size))
     return replace(rendered, radiance=radiance)
+
+
+def maps_of(views: Views, view: int, rendered: RenderedRays) -> ViewMaps:
+    """Return the maps of a view of the data and of its rendering, on the CPU."""
+    size = views.cameras.height, views.cameras.width
+    names = "depth", "opacity", "exit_directions", "normals", "refracted"
+    of_model = {name: getattr(rendered, name).float().cpu().view(*size, -1) for name in names}
+    return ViewMaps({name: values[view] for name, values in views.maps.items()}, of_model)

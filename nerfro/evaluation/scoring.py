@@ -23,7 +23,7 @@ from nerfro.data.image_files import Alpha, is_linear
 from nerfro.evaluation.error_sheets import write_error_sheet
 from nerfro.evaluation.folders import ImagePair
 from nerfro.evaluation.metrics import ImageMetrics
-from nerfro.evaluation.render_view import render_view
+from nerfro.evaluation.render_view import maps_of, render_view
 from nerfro.evaluation.results import AS_GIVEN, EXPOSED, OF_HALVES, TONE_MAPPED, UNEXPOSED, EvaluationResult, ViewScores
 from nerfro.files.images import save_png
 from nerfro.rendering import ColourSpace, Renderer
@@ -124,7 +124,8 @@ def _score_views(
     cameras, left = views.cameras.to(scene.device), slice(width // 2)
     scores: dict[str, list[ViewScores]] = {treatment: [] for treatment in treatments}
     for view in track("evaluate", range(len(views))):
-        radiance = render_view(renderer, cameras, view, subdivision).radiance.view(height, width, 3).cpu()
+        rendered = render_view(renderer, cameras, view, subdivision)
+        radiance, maps = rendered.radiance.view(height, width, 3).cpu(), maps_of(views, view, rendered)
         target, mask = views.images[view], None if views.masks is None else views.masks[view]
         name = f"{prefix}_{view:03d}"
         for treatment, scored in scores.items():
@@ -137,9 +138,10 @@ def _score_views(
                 rgb, reference = tone_mapped(radiance), tone_mapped(to_linear(target))
             if treatment != UNEXPOSED:
                 save_png(folder / ("images" if treatment == AS_GIVEN else f"images_{treatment}") / f"{name}.png", rgb)
-            part = slice(width // 2, None) if treatment in OF_HALVES else slice(None)
-            coverage = None if mask is None else mask[:, part].contiguous()
-            scored.append(metrics.score(name, rgb[:, part].contiguous(), reference[:, part].contiguous(), coverage))
+            part = slice(None), slice(width // 2 if treatment in OF_HALVES else 0, None)
+            coverage = None if mask is None else mask[part].contiguous()
+            shown, reference = rgb[part].contiguous(), reference[part].contiguous()
+            scored.append(metrics.score(name, shown, reference, coverage, maps[part]))
     return {treatment: metrics.result(scored) for treatment, scored in scores.items()}
 
 

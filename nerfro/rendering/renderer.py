@@ -69,6 +69,7 @@ class RenderedRays:
         opacity: opacity of the fields, in [0, 1].
         exit_directions: unit directions in which the rays leave the volume.
         normals: unit normals, towards the camera, at the first surface of each ray; zero without a surface.
+        refracted: whether the main polyline of each ray meets the medium, see `Path.refracted`.
     """
 
     radiance: Float[Tensor, "R 3"]
@@ -76,6 +77,7 @@ class RenderedRays:
     opacity: Float[Tensor, "R"]
     exit_directions: Float[Tensor, "R 3"]
     normals: Float[Tensor, "R 3"]
+    refracted: Bool[Tensor, "R"]
 
 
 @validated("model")
@@ -142,7 +144,7 @@ class Renderer(Component, nn.Module, ABC):
     def render_batch(self, batch: Batch) -> list[Rendering]:
         """Render the rays of a training step, with the exposures of their photographs."""
         renderings = self.render_path(self.trace(batch.rays, batch.path), batch)
-        gains = self.scene.camera.gains(batch.ray_view)
+        gains = self.scene.camera.gains(batch.ray_view, batch.rays)
         return renderings if gains is None else [rendering.exposed(gains) for rendering in renderings]
 
     def sample(self, path: Path, previous: Rendering | None = None, batch: Batch | None = None) -> Samples:
@@ -245,7 +247,7 @@ class Renderer(Component, nn.Module, ABC):
     def _render_chunk(self, rays: Rays) -> tuple[Tensor, ...]:
         path = self.trace(rays)
         exits, normals = path.main_polyline(path.exit_directions), first_normals(path, self.scene.medium)
-        return *self._render_traced(rays, path), exits, normals
+        return *self._render_traced(rays, path), exits, normals, path.main_polyline(path.refracted)
 
     def _render_traced(self, rays: Rays, path: Path) -> tuple[Tensor, Tensor, Tensor]:
         """Render radiance, depth and opacity of traced rays."""

@@ -48,7 +48,7 @@ class Scene(nn.Module):
         self.medium, self.fields, self.background = medium, nn.ModuleList(fields), background
         self.colour_space = colour_space
         if colour_space is ColourSpace.SRGB and self.camera.exposure is not None:
-            raise NerfroError("camera.exposure=true needs linear radiance; take model.colour=linear")
+            raise NerfroError("camera.exposure and camera.appearance need linear radiance; take model.colour=linear")
         self.register_buffer("_on_device", torch.empty(0), persistent=False)  # a scene may have no other tensor
 
     def __repr__(self) -> str:
@@ -80,7 +80,7 @@ class Scene(nn.Module):
         Returns:
             `fields.*` and `background.*` (weights by their attributes), `bodies.NAME.material.ior` and
             `bodies.NAME.material.absorption` (see `Material`), `medium.*` (parameters of media without bodies),
-            `cameras.exposure`, and further parameters of cameras.
+            `cameras.exposure` (with `cameras.exposure.appearance.*`), and further parameters of cameras.
         """
         parts = {"fields": self.fields, "background": self.background}
         own = {f"{part}.{name}": value for part, module in parts.items() for name, value in module.named_parameters()}
@@ -89,8 +89,11 @@ class Scene(nn.Module):
     def path_parameters(self) -> list[nn.Parameter]:
         """Return the parameters on which paths depend: of the cameras, and of the index and surfaces of the medium."""
         parameters = self.medium.parameters_by_name() | self.camera.parameters_by_name()
-        fixed = ".material.absorption", "cameras.exposure"
-        return [value for name, value in parameters.items() if not name.endswith(fixed)]
+        return [
+            value
+            for name, value in parameters.items()
+            if not name.endswith(".material.absorption") and not name.startswith("cameras.exposure")
+        ]
 
     def measurements(self) -> dict[str, float]:
         """Return learned physical quantities, such as refractive indices, by name, for the log."""

@@ -82,6 +82,8 @@ def to_table(comparison: Comparison, metrics: Mapping[str, type[ImageMetric]], r
         f"{metric.title} {MISSING}: {short(reason)}"
         for run in comparison.runs
         for name, metric in metrics.items()
+        # Most data have no maps.
+        if not metric.maps or any(other.metrics.result.mean(name) is not None for other in comparison.runs)
         if (reason := _reason(run, name, region))
     )
     descriptions = [*_common_description(comparison, region), _describe_seeds(comparison)]

@@ -21,7 +21,7 @@ from nerfro.camera.base import CameraModel
 from nerfro.core.draws import Draws
 from nerfro.core.types import Exits, FieldValues, Path, Rendering, Samples
 from nerfro.data.base import DataSource
-from nerfro.evaluation.image_metrics import ImageMetric
+from nerfro.evaluation.image_metrics import ImageMetric, ViewMaps
 from nerfro.fields.base import Field
 from nerfro.losses.base import Loss
 from nerfro.media.base import Medium
@@ -308,10 +308,16 @@ def _check_metric(metric: ImageMetric) -> None:
         return
     size = max(metric.min_size, 16)
     target = torch.linspace(0, 1, size * size * 3).view(size, size, 3)
-    equal, different = metric(target, target), metric(target.flip(0), target)
+    values = {name: target for name in ("depth", "opacity", "exit_directions", "normals", *metric.maps)}
+    rendered = values | {"refracted": torch.zeros(size, size, 1)}
+    maps = ViewMaps(values, rendered), ViewMaps(values, {name: value.flip(0) for name, value in rendered.items()})
+    equal, different = (
+        metric(image, target, None, *([of_image] if metric.maps else []))
+        for image, of_image in zip((target, target.flip(0)), maps, strict=True)
+    )
     _require(equal.shape == () and bool(equal.isfinite()), "a metric returns a finite scalar")
     _require(bool(equal > different) == (metric.better == "higher"), "equal images score better than different ones")
-    masked = metric.score(target.flip(0), target, torch.ones(size, size, dtype=torch.bool))
+    masked = metric.score(target.flip(0), target, torch.ones(size, size, dtype=torch.bool), maps[1])
     _require(math.isclose(masked, float(different), abs_tol=0.05), "a mask of all pixels does not change the score")
     errors = metric.error_map(target.flip(0), target)
     _require(errors is None or errors.values.shape == (size, size), "an error map has one value for each pixel")

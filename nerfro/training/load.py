@@ -47,4 +47,8 @@ def scene_of(checkpoint: dict[str, Any], config: DictConfig, device: torch.devic
     """Build the scene of a checkpoint from a configuration, whose data and evaluation may differ from training."""
     renderer, cameras = restore(checkpoint, config).to(device), recorded_cameras(checkpoint)
     subdivision = Subdivision(**config.evaluation.subdivision)
-    return TrainedScene(renderer, build_data(config), subdivision, config.name, cameras)
+    name = config.name
+    if "current_model_state" in checkpoint:  # the latest weights, besides the average
+        name = f"{name}, average of weights"
+        print("weights: moving average over the steps of the run (weight_averaging)", flush=True)
+    return TrainedScene(renderer, build_data(config), subdivision, name, cameras)

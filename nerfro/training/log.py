@@ -79,7 +79,7 @@ class TrainingLog(Callback):
         self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: Batch, batch_idx: int
     ) -> None:
         for group in trainer.optimizers[0].param_groups:
-            pl_module.log(f"optimizer/learning_rate/{group['name']}", group["lr"])
+            pl_module.log(f"optimizer/learning_rate/{group.get('name', 'common')}", group["lr"])
         pl_module.log("train/peak_memory_gib", peak_memory(pl_module.device) / 2**30)
         if trainer.global_step == 1 < trainer.log_every_n_steps:  # type: ignore[attr-defined]
             first = {name: float(value) for name, value in trainer.callback_metrics.items()}

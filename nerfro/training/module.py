@@ -187,7 +187,9 @@ class TrainingModule(LightningModule):
         progress = self.renderer.begin_step(training_progress(self.trainer))
         factor = learning_rate_factor(self.global_step, progress, self.optimizer_config)
         for group in self.trainer.optimizers[0].param_groups:
-            group["lr"] = 0.0 if self.global_step < group["start"] else group["initial_lr"] * factor
+            # A scheduler, or an optimizer of a derived class, has rates of its own.
+            if "start" in group and not self.trainer.lr_scheduler_configs:  # type: ignore[attr-defined]
+                group["lr"] = 0.0 if self.global_step < group["start"] else group["initial_lr"] * factor
         # At the end of the previous step, the update would follow the checkpoint, and a resumed run would miss it.
         if self.global_step > 0:
             draws = replace(batch.draws, step=self.global_step)  # a repeated batch repeats its number
@@ -205,6 +207,15 @@ class TrainingModule(LightningModule):
             NerfroError: a pattern of `optimizer.groups` matches no parameter.
         """
         return self.optimizer_config.grouped(self.renderer.parameters_by_name())
+
+    @property
+    def learning_rate(self) -> float:
+        """Common initial learning rate, which the learning-rate finder of Lightning sets."""
+        return self.optimizer_config.learning_rate
+
+    @learning_rate.setter
+    def learning_rate(self, rate: float) -> None:
+        self.optimizer_config = replace(self.optimizer_config, learning_rate=rate)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         # Lightning cannot clip the gradients of a fused optimizer under mixed precision.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Annotated, Any, Literal
@@ -12,6 +12,7 @@ import torch
 from torch import nn
 
 from nerfro.core.errors import NerfroError
+from nerfro.core.joint_optimizer import JointOptimizer
 from nerfro.registry.allowed import Natural, NotNegative, OnlyWith, Positive, validated
 
 # Patterns that have no effect in a scene without these parameters.
@@ -22,12 +23,13 @@ OPTIONAL_PATTERNS = (
 COMMON = "common"
 
 
-OptimizerName = Literal["adam", "adamw", "sgd", "radam"]
+OptimizerName = Literal["adam", "adamw", "sgd", "radam", "muon"]
 _CLASSES: dict[str, type[torch.optim.Optimizer]] = {
     "adam": torch.optim.Adam, "adamw": torch.optim.AdamW, "sgd": torch.optim.SGD, "radam": torch.optim.RAdam,
+    **({"muon": torch.optim.Muon} if hasattr(torch.optim, "Muon") else {}),
 }  # fmt: skip
 # Entries of the state of an optimizer with one number for each parameter.
-MOMENTS = {kind: () if kind == "sgd" else ("exp_avg", "exp_avg_sq") for kind in _CLASSES}
+MOMENTS = dict.fromkeys(_CLASSES, ("exp_avg", "exp_avg_sq")) | {"sgd": (), "muon": ("momentum_buffer",)}
 
 
 @validated("optimizer.groups")
@@ -124,9 +126,13 @@ class OptimizerConfig:
             })  # fmt: skip
         optimizers = {}
         for kind in dict.fromkeys(group["kind"] for group in described):
-            options: dict[str, Any] = {} if kind == "sgd" else {"eps": self.adam_epsilon}
+            options: dict[str, Any] = {} if kind in ("sgd", "muon") else {"eps": self.adam_epsilon}
             options |= {"fused": fused} if kind in ("adam", "adamw") else {}
-            optimizers[kind] = _CLASSES[kind]([group for group in described if group["kind"] == kind], **options)
+            of_kind = [group for group in described if group["kind"] == kind]
+            if kind not in _CLASSES or (kind == "muon" and any(p.ndim != 2 for g in of_kind for p in g["params"])):
+                advice = "name it in optimizer.groups for fields.*.weight"
+                raise NerfroError(f"optimizer {kind} takes matrices only, and needs torch 2.9; {advice}")
+            optimizers[kind] = _CLASSES[kind](of_kind, **options)
         return next(iter(optimizers.values())) if len(optimizers) == 1 else JointOptimizer(optimizers, described)
 
     def grouped(self, parameters: Mapping[str, nn.Parameter]) -> dict[str, list[nn.Parameter]]:
@@ -146,38 +152,6 @@ class OptimizerConfig:
             matching = (pattern for pattern in reversed(self.groups) if matches(name, [pattern]))
             groups.setdefault(next(matching, COMMON), []).append(parameter)
         return groups
-
-
-class JointOptimizer(torch.optim.Optimizer):
-    """Several optimizers of PyTorch as one, each of which steps its own groups.
-
-    Args:
-        optimizers: optimizers by kind.
-        groups: groups of all optimizers, whose `kind` names their optimizer.
-    """
-
-    def __init__(self, optimizers: Mapping[str, torch.optim.Optimizer], groups: list[dict[str, Any]]) -> None:
-        self._optimizers = dict(optimizers)
-        super().__init__(groups, {})
-        self._share()
-
-    def __setstate__(self, state: dict[str, Any]) -> None:  # also called by `load_state_dict`
-        super().__setstate__(state)
-        self._share()
-
-    def _share(self) -> None:
-        for kind, optimizer in self._optimizers.items():
-            optimizer.state = self.state
-            optimizer.param_groups = [group for group in self.param_groups if group["kind"] == kind]
-
-    def step(self, closure: Callable[[], float] | None = None) -> float | None:  # type: ignore[override]
-        loss = None
-        if closure is not None:
-            with torch.enable_grad():
-                loss = closure()
-        for optimizer in self._optimizers.values():
-            optimizer.step()
-        return loss
 
 
 def matches(name: str, patterns: Iterable[str]) -> bool:

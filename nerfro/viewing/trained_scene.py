@@ -19,7 +19,7 @@ from nerfro.core.types import Exits
 from nerfro.core.variants import variant
 from nerfro.data.base import DataSource, Views
 from nerfro.evaluation.metrics import ImageMetrics
-from nerfro.evaluation.render_view import render_view
+from nerfro.evaluation.render_view import maps_of, render_view
 from nerfro.evaluation.results import FULL, Region
 from nerfro.evaluation.tables import Table, views_table
 from nerfro.fields.base import Field
@@ -145,18 +145,23 @@ class TrainedScene:
             prints Markdown.
 
         Raises:
-            NerfroError: a metric does not exist, or the views have no masks for the region.
+            NerfroError: a metric does not exist, or the views lack its maps, or masks for the region.
         """
         scorer = ImageMetrics(metrics)
         split, views = (views, self.views(views)) if isinstance(views, str) else ("given", views)
         if region != FULL and views.masks is None:
             raise NerfroError(f"region={region} needs masks, which the {split} views lack; set region='full'")
-        scores = []
+        for name, metric in scorer.metrics.items():
+            if metrics is not None and not set(metric.maps) <= set(views.maps):
+                needed, available = ", ".join(metric.maps), ", ".join(views.maps) or "no maps"
+                raise NerfroError(f"metric={name} needs the maps {needed}; the {split} views have {available}")
+        scores, device = [], self.renderer.scene.device
         for view in track("evaluate", range(len(views))):
-            rgb, coverage = self._render_view(views.cameras, view, self.subdivision)[0], None
-            if views.masks is not None:
-                coverage = views.masks[view]
-            scores.append(scorer.score(views.names[view], rgb, views.images[view], coverage))
+            rays = render_view(self.renderer, views.cameras.to(device), view, self.subdivision)
+            rgb = self.renderer.scene.colour_space.to_display(rays.radiance).float().cpu()
+            target, coverage = views.images[view], None if views.masks is None else views.masks[view]
+            maps = maps_of(views, view, rays)
+            scores.append(scorer.score(views.names[view], rgb.view(target.shape), target, coverage, maps))
         return views_table(scorer.result(scores), f"{self.name}, {split} views", region)
 
     def _render_view(self, cameras: Cameras, view: int, subdivision: Subdivision) -> tuple[Tensor, ...]:

@@ -9,6 +9,7 @@ import pytest
 import torch
 from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint
 from lightning.pytorch.loggers import CSVLogger
+from lightning.pytorch.tuner import Tuner
 
 import nerfro
 from nerfro.core.paths import PLUGINS_DIR
@@ -73,3 +74,45 @@ def test_experiments_of_an_own_folder_are_built(tiny_default_run: list[str], tmp
     module, _ = nerfro.build("mine", settings, config_dir=tmp_path)
     assert module.optimizer_config.learning_rate == 0.0123
     refused("mine", nerfro.build, "mine", settings)
+
+
+def test_learning_rate_finder_of_lightning_measures_a_curve_and_sets_the_rate(
+    built: tuple[TrainingModule, RayDataModule], tmp_path: Path
+) -> None:
+    """Too small a rate does not lower the loss, too large a rate raises it, and the run begins with the suggestion."""
+    module, data = built
+    before = {name: value.clone() for name, value in module.state_dict().items()}
+    trainer = lightning.Trainer(max_steps=3, logger=False, default_root_dir=tmp_path, **QUIET)
+    finder = Tuner(trainer).lr_find(module, datamodule=data, min_lr=1e-6, max_lr=10, num_training=60)
+    assert finder is not None
+    rates = torch.tensor(finder.results["lr"])
+    growth = rates.log().diff()[1:]  # Lightning skips a rate at the beginning
+    assert torch.allclose(growth, growth[0], rtol=0.01)
+    losses = torch.tensor(finder.results["loss"])
+    assert float(losses[rates < 1e-5][-1]) > 1.1 * float(losses.min())
+    assert float(losses[-1]) > 1.1 * float(losses.min())
+    assert 1e-5 < module.learning_rate == finder.suggestion() < 1
+    assert all(torch.equal(value, before[name]) for name, value in module.state_dict().items())
+    trainer.fit(module, datamodule=data)
+    common = next(group for group in trainer.optimizers[0].param_groups if group["name"] == "common")
+    assert common["initial_lr"] == module.learning_rate
+    assert 0 < common["lr"] < module.learning_rate
+
+
+def test_optimizer_and_scheduler_of_a_derived_module_keep_their_rates(
+    built: tuple[TrainingModule, RayDataModule], tmp_path: Path
+) -> None:
+    class Own(TrainingModule):
+        def configure_optimizers(self):
+            optimizer = torch.optim.Adamax(self.renderer.parameters(), lr=0.01)
+            return [optimizer], [{"scheduler": torch.optim.lr_scheduler.StepLR(optimizer, 1, 0.5), "interval": "step"}]
+
+    module, data = built
+    own = Own(module.renderer, dict(module.objective.losses), module.optimizer_config)
+    trainer = lightning.Trainer(max_steps=3, logger=False, enable_checkpointing=False, **QUIET)
+    trainer.fit(own, datamodule=data)
+    assert trainer.optimizers[0].param_groups[0]["lr"] == pytest.approx(0.01 / 8)
+    own.configure_optimizers = lambda: torch.optim.Adamax(own.renderer.parameters(), lr=0.01)
+    trainer = lightning.Trainer(max_steps=2, logger=False, enable_checkpointing=False, **QUIET)
+    trainer.fit(own, datamodule=data)
+    assert trainer.optimizers[0].param_groups[0]["lr"] == 0.01

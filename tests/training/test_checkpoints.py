@@ -25,7 +25,9 @@ def test_best_checkpoints_and_averages_are_evaluated_and_loaded(
     assert any(not torch.equal(average[name], latest[name]) for name in weights)
     scene = nerfro.load(files[0], device="cpu")
     assert scene.render(scene.cameras("test").select([0])).rgb.shape == (1, 16, 16, 3)
-    evaluate_here(f"checkpoint={files[0]}", f"out={tmp_path / 'scores'}")
+    assert "average of weights" in repr(scene)
+    scored = evaluate_here(f"checkpoint={files[0]}", f"out={tmp_path / 'scores'}")
+    assert "weights: moving average" in scored.out
     assert (tmp_path / "scores" / "metrics.json").is_file()
 
 

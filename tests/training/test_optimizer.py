@@ -16,7 +16,7 @@ from nerfro.losses.radiance import BackgroundRegularizer
 from nerfro.registry.allowed import plain, validate
 from nerfro.training.config import BatchesConfig, EvaluationConfig, TrainConfig
 from nerfro.training.module import learning_rate_factor, training_progress
-from nerfro.training.optimizer import GroupConfig, OptimizerConfig
+from nerfro.training.optimizer import MOMENTS, GroupConfig, OptimizerConfig
 from tests.conftest import composed, refused
 
 PAPER = OptimizerConfig(learning_rate=5e-4, final_learning_rate=5e-6, warmup_steps=2500, warmup_factor=0.01)
@@ -126,6 +126,20 @@ def test_groups_with_several_kinds_of_optimizers_step_like_each_alone_and_resume
     step(alone, *separate)
     for name, parameter in resumed.items():
         assert torch.equal(parameter, alone[name]), name
+
+
+@pytest.mark.skipif(not hasattr(torch.optim, "Muon"), reason="needs torch 2.9")
+def test_muon_learns_the_matrices_of_a_group_and_refuses_other_parameters() -> None:
+    parameters = {"fields.0.mlp.weight": torch.nn.Parameter(torch.ones(3, 2)), "b": torch.nn.Parameter(torch.ones(2))}
+    config = OptimizerConfig(groups={"fields.*.weight": GroupConfig(name="muon")})
+    optimizer = config.optimizer_of(config.grouped(parameters), fused=False)
+    for parameter in parameters.values():
+        parameter.grad = torch.ones_like(parameter)
+    optimizer.step()
+    assert all(bool((parameter < 1).all()) for parameter in parameters.values())
+    assert optimizer.state[parameters["fields.0.mlp.weight"]].keys() == set(MOMENTS["muon"])
+    config = OptimizerConfig(name="muon", groups={})
+    refused("takes matrices only", config.optimizer_of, config.grouped(parameters), fused=False)
 
 
 def test_frozen_parameters_have_no_gradient_and_no_group() -> None:

@@ -5,12 +5,18 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch import Tensor
 
 import nerfro
 from nerfro.core.types import FieldValues, Samples
 from nerfro.core.variants import variant
+from nerfro.evaluation.collection import metrics
+from nerfro.evaluation.image_metrics import ImageMetric, ViewMaps
+from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.results import read_metrics_json
+from nerfro.evaluation.scoring import score_split
 from nerfro.files import lat_long
+from nerfro.registry.registration import register
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.viewing.changes import with_changed_scene
@@ -195,3 +201,42 @@ def test_scores_in_memory_are_those_of_the_command(trained_run: Path) -> None:
     assert "| *mean* |" in str(table)
     refused("did you mean psnr", scene.evaluate, views, ["psrn"])
     refused("needs masks", scene.evaluate, replace(views, masks=None), ["psnr"], "mask")
+
+
+def test_metrics_use_maps_of_the_data_and_of_the_model(
+    scene: TrainedScene, tmp_path: Path, restored_registry: None
+) -> None:
+    """Depths count where the data have them and rays are straight; a metric of one's own uses a map of any name."""
+
+    @register("metric", "weighted")
+    class Weighted(ImageMetric):
+        better, maps = "lower", ("confidence",)
+
+        def forward(
+            self, prediction: Tensor, target: Tensor, inside: Tensor | None = None, maps: ViewMaps | None = None
+        ) -> Tensor:
+            return (maps.data["confidence"] * maps.rendered["opacity"]).sum()
+
+    views, names = scene.views(), ["depth", "weighted"]
+    refused("metric=depth needs the maps depth; the given views have no maps", scene.evaluate, views, names)
+    result, _ = score_split(scene.renderer, views, ImageMetrics(), tmp_path, scene.subdivision, "test")
+    assert result.mean("depth") is None
+    assert "depth" not in result.notes
+    rendered = scene.render(views.cameras)
+    bent = (rendered.exit_directions[0] - views.cameras.image_rays(0).directions.view(32, 32, 3)).norm(dim=-1) > 1e-4
+    # The error is 0.5 in straight rays of the upper half, and unknown below. The object is a column of pixels.
+    depth = rendered.depth[..., None] + torch.where(bent[..., None], 9.0, 0.5)
+    depth[:, :, 20:] += 1
+    depth[:, 16:] = 0
+    masks, confidence = torch.zeros(len(views), 32, 32), torch.rand(len(views), 32, 32, 2)
+    masks[:, :, :8] = 1
+    views = replace(views, maps={"depth": depth, "confidence": confidence}, masks=masks).select([0])
+    straight = scene.evaluate(views, names, "mask")["mean", "depth RMSE"]
+    assert straight == pytest.approx(0.5, abs=1e-4)
+    result, _ = score_split(scene.renderer, views, ImageMetrics(names), tmp_path, scene.subdivision, "test")
+    assert result.mean("depth", "mask") == pytest.approx(0.5, abs=1e-4)
+    assert result.mean("depth") == pytest.approx(scene.evaluate(views, names)["mean", "depth RMSE"])
+    assert 0.5 < result.mean("depth") < 1.5
+    expected = (confidence[0].sum(-1) * rendered.opacity[0]).sum()
+    assert result.mean("weighted") == pytest.approx(float(expected), rel=1e-5)
+    refused("metric=depth needs maps", metrics, "depth")

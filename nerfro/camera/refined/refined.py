@@ -21,6 +21,7 @@ from nerfro.core.cameras import Cameras
 from nerfro.core.lens import distort, undistort
 from nerfro.core.rays import Rays
 from nerfro.geometry.lines import nearest_point
+from nerfro.registry.allowed import Natural
 from nerfro.registry.registration import register
 
 
@@ -34,6 +35,8 @@ class RefinedCamera(PerView, CameraModel):
     Args:
         lens: whether to refine the focal length and the principal point, which all views share.
         exposure: whether to estimate a gain for each training view.
+        appearance: size of the embedding of each training view, from which a smooth gain over its image is learned, in
+            addition to its exposure; 0 for none.
         fix_gauge: whether to remove the gauge freedom. Disable this for cameras of a scene that is fixed.
 
     Attributes:
@@ -58,8 +61,10 @@ class RefinedCamera(PerView, CameraModel):
     gauge_basis: Float[Tensor, "gauge V 6"]
     focal_unit: Float[Tensor, "1"]
 
-    def __init__(self, lens: bool = False, exposure: bool = False, fix_gauge: bool = True) -> None:
-        super().__init__(exposure)
+    def __init__(
+        self, lens: bool = False, exposure: bool = False, appearance: Natural = 0, fix_gauge: bool = True
+    ) -> None:
+        super().__init__(exposure, appearance)
         self.fix_gauge = fix_gauge
         for name in ("motion", "poses", "focal", "distortion", "units", "weights", "gauge_basis", "focal_unit"):
             self.register_buffer(name, torch.zeros(0))

@@ -81,7 +81,7 @@ class BackgroundSteps(Phase):
         self,
         steps: Annotated[Natural, _WITH_MAP, _WITH_BOX] = 10,
         time_share: Annotated[Share, _WITH_MAP, _WITH_BOX, OnlyWith("steps")] = 0.2,
-        start: Annotated[Count | None, _WITH_MAP, _WITH_BOX, OnlyWith("steps")] = 250,
+        start: Annotated[Count | None, _WITH_MAP, _WITH_BOX, OnlyWith("steps")] = 100,
     ) -> None:
         self.steps, self.time_share, self.start = steps, time_share, start
         self.settings.use()
@@ -159,15 +159,17 @@ def _observe_through_object(run: TrainingRun, pixels: Int[Tensor, "Q"], min_back
     """Observe the background along those rays of pixels that cross hardly any content."""
     batches, renderer, scene = run.batches, run.renderer, run.renderer.scene
     view = batches.cameras.view_of(pixels)
-    path = renderer.trace(_rays(run, pixels))
+    rays = _rays(run, pixels)
+    path = renderer.trace(rays)
     neighbours = renderer.exit_directions(scene.camera(neighbour_rays(batches.cameras, pixels), view))
     widths = divergence(batches.cameras, pixels, main_exits(path), neighbours)
     steady = (widths < DIVERGENT).nonzero()[:, 0]
-    path, pixels, view, widths = path.select_rays(steady), pixels[steady], view[steady], widths[steady]
+    path, rays = path.select_rays(steady), rays[steady]
+    pixels, view, widths = pixels[steady], view[steady], widths[steady]
     rendering = renderer.render_path(path)[-1]
     fraction, exits = path.main_polyline(rendering.background_fraction), path.main_polyline(path.exits().directions)
     rgb = batches.photographed(pixels)
-    difference = _photographed(run, rgb, view) - rendering.radiance
+    difference = _photographed(run, rgb, view, rays) - rendering.radiance
     radiance = scene.background(Exits(exits)) + difference / fraction.clamp(min=min_background)
     observed = Observed(exits, radiance, saturated(rgb), fraction.square().mean(-1), widths / batches.cameras.fx[view])
     return observed[fraction.amin(-1) >= min_background]
@@ -178,10 +180,10 @@ def _observe_beside_object(run: TrainingRun, pixels: Int[Tensor, "Q"], rays: Ray
     batches, scene = run.batches, run.renderer.scene
     view, rgb, exposure = batches.cameras.view_of(pixels), batches.photographed(pixels), scene.camera.exposure
     if exposure is not None and fits_gains:
-        exposure.fit(view, scene.background(Exits.unbent(rays)), scene.colour_space.to_radiance(rgb))
+        exposure.fit(view, rays, scene.background(Exits.unbent(rays)), scene.colour_space.to_radiance(rgb))
     widths = 1 / batches.cameras.fx[view]
     seen = Exits.unbent(rays).directions
-    return Observed(seen, _photographed(run, rgb, view), saturated(rgb), torch.ones_like(widths), widths)
+    return Observed(seen, _photographed(run, rgb, view, rays), saturated(rgb), torch.ones_like(widths), widths)
 
 
 def _rays(run: TrainingRun, pixels: Int[Tensor, "Q"]) -> Rays:
@@ -190,10 +192,10 @@ def _rays(run: TrainingRun, pixels: Int[Tensor, "Q"]) -> Rays:
     return run.renderer.scene.camera(pixel_rays(batches.cameras, pixels), batches.cameras.view_of(pixels))
 
 
-def _photographed(run: TrainingRun, rgb: Float[Tensor, "R 3"], view: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
+def _photographed(run: TrainingRun, rgb: Float[Tensor, "R 3"], view: Int[Tensor, "R"], rays: Rays) -> Tensor:
     """Decode the colours of photographs, and divide by the gains of the photographs."""
     scene = run.renderer.scene
-    radiance, gains = scene.colour_space.to_radiance(rgb), scene.camera.gains(view)
+    radiance, gains = scene.colour_space.to_radiance(rgb), scene.camera.gains(view, rays)
     return radiance if gains is None else radiance / gains
 
 

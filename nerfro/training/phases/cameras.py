@@ -114,7 +114,7 @@ class CameraSteps(Phase):
         pixels = informative_pixels(candidates, self.num_pixels, batches.photographed, batches.cameras, past)
 
         def shown(rays: Rays, view: Int[Tensor, "R"]) -> Float[Tensor, "R 3"]:
-            return renderer.scene.colour_space.to_display(renderer.radiance(rays), camera.gains(view))
+            return renderer.scene.colour_space.to_display(renderer.radiance(rays), camera.gains(view, rays))
 
         difference = max(settings.min_difference, settings.first_difference * settings.decay**number)
         fraction = min(1.0, settings.full_steps / (number + 1))
