@@ -211,6 +211,18 @@ def test_absorption_replaces_dark_fog_that_explains_the_photograph() -> None:
     assert (torch.autograd.grad(regularizer, absorption)[0][1] < 0).all()
 
 
+def test_gradient_of_a_body_that_absorbs_all_light_is_finite() -> None:
+    absorption = torch.tensor([[0.0] * 3, [1e4] * 3], requires_grad=True)
+    path = example_path(8)
+    path = replace(path, record=replace(path.record, absorption=absorption))
+    dark = path.transmitted(path.far[:, None])[:, 0]
+    assert (dark == 0).any()
+    black = replace(rendering(torch.zeros(8, 3), dark, torch.ones(8)), transmittance=torch.ones(8), path=path)
+    given = replace(example_batch(8), maps={}, rgb=torch.rand(8, 3))
+    regularizer = BackgroundRegularizer(refracted_only=False)([black], given, MODEL.scene)
+    assert torch.autograd.grad(regularizer, absorption)[0].isfinite().all()
+
+
 @pytest.mark.parametrize("absorbs", [False, True])
 def test_background_learns_from_selected_rays_and_the_medium_from_all(absorbs: bool) -> None:
     sky = EnvironmentMap([4])
