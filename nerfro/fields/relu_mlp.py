@@ -165,13 +165,13 @@ def _differentiated(
 
     def differentiate(number: int) -> list[Tensor]:
         first = number * _BLOCK
-        of_number, size = points[first : first + _BLOCK], min(num_rows - first, _BLOCK)
-        padded = F.pad(of_number, (0, size - len(of_number)))
+        block_points, size = points[first : first + _BLOCK], min(num_rows - first, _BLOCK)
+        padded = F.pad(block_points, (0, size - len(block_points)))
         rows = [
             values[first : first + size] if len(points) == len(gradient) else values.index_select(0, padded)
             for values in activations
         ]
-        of_block = F.pad(gradient[of_number], (0, 0, 0, size - len(of_number)))
+        of_block = F.pad(gradient[block_points], (0, 0, 0, size - len(block_points)))
         of_weights = []
         for i in reversed(range(num_layers)):
             if weights_learn:
@@ -182,7 +182,7 @@ def _differentiated(
                 torch.ops.aten.threshold_backward.grad_input(bits, _comparable(rows[i]), 0, grad_input=bits)
         for of_part, columns, learns in zip(of_parts, inputs, parts_learn, strict=True):
             if learns:
-                of_part[of_number] = (of_block @ columns)[: len(of_number)].to(of_part.dtype)
+                of_part[block_points] = (of_block @ columns)[: len(block_points)].to(of_part.dtype)
         return of_weights[::-1]
 
     of_blocks = share(differentiate, max(1, -(-num_rows // _BLOCK)))
@@ -194,7 +194,8 @@ def _decisive_points(gradient: Float[Tensor, "points O"]) -> Int[Tensor, " decis
 
     All others together have less than a thousandth of the gradient, below the rounding of bfloat16. They lie in empty
     space or behind opaque content, half to three quarters of the samples of a ray through glass after some hundred
-    steps (docs/lab/hash_grid_on_a_cpu.md). Gradients that are not finite are decisive.
+    steps (docs/lab/hash_grid_on_a_cpu.md). Gradients that are not finite are decisive. The gradient of an input
+    therefore depends on the other points.
     """
     size = gradient.abs().sum(1)
     points = (~(size < 1e-3 * size.mean())).nonzero()[:, 0]

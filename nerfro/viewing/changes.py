@@ -46,7 +46,11 @@ class NormalsField(Field):
         if solid.any():
             with torch.inference_mode(False), torch.enable_grad():  # renderings have no gradients otherwise
                 positions = samples.positions[solid].clone().requires_grad_()
-                (gradient,) = torch.autograd.grad(self.field.density(positions).sum(), positions)
+                # The logarithm gives points of all densities the same weight; the gradient of a field leaves out points
+                # of small weight.
+                density_there = self.field.density(positions)
+                logarithm = density_there.clamp(min=torch.finfo(density_there.dtype).tiny).log()
+                (gradient,) = torch.autograd.grad(logarithm.sum(), positions)
             normals[solid] = -nn.functional.normalize(gradient, dim=-1).to(normals)
         return FieldValues(density, normals)
 

@@ -15,11 +15,13 @@ from nerfro.evaluation.image_metrics import ImageMetric, ViewMaps
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.results import read_metrics_json
 from nerfro.evaluation.scoring import score_split
+from nerfro.fields.hash_grid import HashGridField
 from nerfro.files import lat_long
 from nerfro.registry.registration import register
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.subdivision import Subdivision
-from nerfro.viewing.changes import with_changed_scene
+from nerfro.testing import example_path, example_samples, example_space
+from nerfro.viewing.changes import NormalsField, with_changed_scene
 from nerfro.viewing.layers import LAYERS
 from nerfro.viewing.trained_scene import TrainedScene
 from tests.closed_forms import ball_exits
@@ -99,6 +101,17 @@ def test_normals_of_the_content_are_those_of_a_ball(scene: TrainedScene) -> None
     assert not normals[impact > 1.3 * INSIDE_RADIUS].any()
     through_glass = layer.of(ball).render(scene.cameras().select([0]), Subdivision())
     assert (layer.values(through_glass).norm(dim=-1) > 0.5).any()
+
+
+def test_thin_content_has_normals_beside_dense_content() -> None:
+    """The gradient of a batch leaves out points of small weight, but each point of the content needs a normal."""
+    field = HashGridField(example_space()).eval()
+    with torch.no_grad():
+        field.table.mul_(3e5)
+    values = NormalsField(field)(example_samples(example_path(400)))
+    density, solid = values.density.detach(), values.density > 0
+    assert (density[solid] < 1e-3 * density[solid].mean()).float().mean() > 0.3
+    assert (values.radiance[solid].norm(dim=-1) > 0.99).float().mean() > 0.95
 
 
 def test_changed_scene_does_not_change_the_original(scene: TrainedScene) -> None:
