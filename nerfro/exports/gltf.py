@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import math
 from pathlib import Path
@@ -12,7 +11,8 @@ import numpy as np
 import trimesh
 
 from nerfro.core.cameras import Cameras
-from nerfro.core.errors import NerfroError, warn
+from nerfro.core.errors import NerfroError
+from nerfro.core.optional import optional
 from nerfro.exports.meshes import glass_meshes, inside_mesh, one_mesh
 from nerfro.files.atomic import write_atomically
 from nerfro.files.lat_long import save_lat_long
@@ -31,24 +31,23 @@ _VERTICES, _INDICES = 34962, 34963
 def write_mesh(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
     """Write the surfaces of the glass and of the dense content, as .glb with materials, or as one mesh (.ply, .obj).
 
-    A .glb has the training cameras, and the sky beside it.
+    A .glb has the training cameras. The sky is written beside the file.
     """
     suffix, limit = out.suffix.lower(), options.triangles
-    if limit is None and suffix == ".glb":
+    if limit is not None:
+        optional("fast_simplification", "gltf", "triangles= needs fast-simplification")
+    elif suffix == ".glb":
         limit = _GLB_TRIANGLES
-        if importlib.util.find_spec("fast_simplification") is None:
-            warn("the meshes keep all their triangles; pip install 'nerfro[gltf]', which reduces their number")
-            limit = None
     glass = glass_meshes(scene, limit)
-    rest = None if limit is None else limit - sum(len(mesh.faces) for mesh in glass)
+    rest = None if limit is None else max(limit - sum(len(mesh.faces) for mesh in glass), limit // 2)
     inside = inside_mesh(scene, options.resolution, options.half_depth, rest)
     if not glass and inside is None:
         raise NerfroError("the scene has neither glass nor dense content to write; raise half_depth")
     if suffix == ".glb":
         write_atomically(out, _encode_glb(scene, glass, inside))
-        save_lat_long(out.with_name(out.stem + "_sky.hdr"), scene.sky)
     else:
         write_atomically(out, one_mesh(glass, inside, suffix))
+    save_lat_long(out.with_name(out.stem + "_sky.hdr"), scene.sky)
     content = "nothing solid inside" if inside is None else f"{len(inside.faces)} triangles inside"
     return f"{sum(len(mesh.faces) for mesh in glass)} triangles of glass, {content}"
 

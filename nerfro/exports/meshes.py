@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,6 +15,7 @@ from torch.nn import functional
 from trimesh.exchange.obj import export_obj
 from trimesh.exchange.ply import export_ply
 
+from nerfro.core.errors import warn
 from nerfro.core.light import to_srgb
 from nerfro.core.optional import optional
 from nerfro.files.images import to_8bit
@@ -39,27 +41,52 @@ def glass_meshes(scene: TrainedScene, triangles: int | None = None) -> list[trim
     surfaces = surface_of(bodies, triangles=True) if is_simple else scene.surface
     total = sum(len(mesh.faces) for mesh in surfaces)
     if triangles is not None and total > triangles // 2:
-        surfaces = [simplified(mesh, triangles // 2 * len(mesh.faces) // total) for mesh in surfaces]
+        limits = _divided([len(mesh.faces) for mesh in surfaces], triangles // 2)
+        surfaces = [simplified(mesh, limit) for mesh, limit in zip(surfaces, limits, strict=True)]
         # Large flat triangles need the normal of their side, also where they meet a rounded edge.
-        surfaces = [replace(mesh, normals=corner_normals(mesh)) for mesh in surfaces]
+        surfaces = [
+            mesh if mesh.normals is not None else replace(mesh, normals=corner_normals(mesh)) for mesh in surfaces
+        ]
     return [_with_vertex_normals(mesh) for mesh in surfaces]
+
+
+def _divided(sizes: Sequence[int], total: int) -> list[int]:
+    """Divide a number of triangles among meshes: small meshes keep theirs, and the others have equal shares."""
+    limits = list(sizes)
+    in_order = sorted(range(len(sizes)), key=lambda i: sizes[i])
+    for position, i in enumerate(in_order):
+        limits[i] = min(sizes[i], total // (len(sizes) - position))
+        total -= limits[i]
+    return limits
 
 
 def simplified(mesh: TriangleMesh, triangles: int) -> TriangleMesh:
     """Reduce a mesh to a number of triangles, by edge collapses of the smallest quadric error; normals are dropped.
+
+    A warning tells if more triangles are left. A mesh with so few triangles is returned as it is.
 
     Source:
         M. Garland and P. Heckbert, "Surface Simplification Using Quadric Error Metrics", SIGGRAPH 1997; package
         fast-simplification.
     """
     if len(mesh.faces) <= triangles:
-        return replace(mesh, normals=None)
+        return mesh
+    if not can_simplify():
+        warn("the meshes keep all their triangles; pip install 'nerfro[gltf]', which reduces their number")
+        return mesh
     simplification = optional("fast_simplification", "gltf", "triangles= needs fast-simplification")
     vertices, faces, before = mesh.vertices, mesh.faces, len(mesh.faces) + 1
     while triangles < len(faces) < before:  # on flat surfaces, one call stops early
         before = len(faces)
         vertices, faces = simplification.simplify(vertices, faces.astype(np.int32), target_count=triangles)
+    if len(faces) > triangles:
+        warn(f"a mesh keeps {len(faces)} triangles, more than {triangles}, because no simpler mesh has its shape")
     return TriangleMesh(vertices, faces.astype(np.int64))
+
+
+def can_simplify() -> bool:
+    """Return whether the package fast-simplification is installed."""
+    return importlib.util.find_spec("fast_simplification") is not None
 
 
 def _with_vertex_normals(mesh: TriangleMesh) -> trimesh.Trimesh:

@@ -20,6 +20,7 @@ from PIL import Image
 from nerfro.core.errors import NerfroError
 from nerfro.core.light import to_linear, to_srgb
 from nerfro.data.formats.colmap_model import lens_of, read_colmap
+from nerfro.exports.meshes import _divided
 from nerfro.files.lat_long import load_lat_long
 from nerfro.geometry.gltf import Z_UP_TO_Y_UP
 from nerfro.geometry.mesh import load_mesh
@@ -171,6 +172,11 @@ def test_export_and_import_bend_rays_equally(scene: TrainedScene, tmp_path: Path
     angle = torch.rad2deg(2 * torch.asin(0.5 * (first - second).norm(dim=-1)))
     assert angle.median() < 1e-4
     assert angle.quantile(0.98) < 1e-3
+
+
+def test_small_bodies_keep_their_triangles_beside_large_ones() -> None:
+    assert _divided([12, 40_000], 10_000) == [12, 9988]
+    assert _divided([40_000, 500, 200_000], 10_000) == [4750, 500, 4750]
 
 
 @pytest.mark.slow
