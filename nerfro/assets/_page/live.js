@@ -76,9 +76,11 @@ function showLosses(losses) {
   shownLosses = losses;
   if (!losses.length) return;
   $("progress").hidden = false;
-  for (const name of new Set(losses.flatMap(([, values]) => Object.keys(values)))) {
-    if (![...$("curve").options].some(({ value }) => value === name)) $("curve").add(new Option(name));
+  const names = new Set(losses.flatMap(([, values]) => Object.keys(values)));
+  for (const option of [...$("curve").options]) {
+    if (!names.delete(option.value)) option.remove(); // a curve of an earlier training
   }
+  for (const name of names) $("curve").add(new Option(name));
   $("curve").onchange = () => showLosses(shownLosses);
   const name = $("curve").value;
   const curve = losses.filter(([, values]) => name in values).map(([step, values]) => [step, values[name]]);

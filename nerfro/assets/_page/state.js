@@ -62,7 +62,11 @@ function initSaving(page) {
     page.tracer.canvas.toBlob((blob) => download("picture.png", blob));
   });
   $("save-view").addEventListener("click", () => saveViews("view.json", [page.view]));
-  $("save-film").addEventListener("click", () => saveViews("film.json", page.film.views(), { seconds: page.film.seconds }));
+  $("save-film").addEventListener("click", () => {
+    const views = page.film.views();
+    saveViews("film.json", views, { seconds: views.length / FRAME_RATE });
+  });
+  $("copy-code").hidden = window !== window.top; // a frame may not write to the clipboard
   $("copy-code").addEventListener("click", async () => {
     page.writeAddress();
     const code = frameCode();
