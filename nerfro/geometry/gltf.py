@@ -24,9 +24,9 @@ Z_UP_TO_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 QUANTIZATION = "KHR_mesh_quantization"
 _DRACO = "KHR_draco_mesh_compression"
 _COMPRESSIONS = {
-    _DRACO: "Draco",
-    "EXT_meshopt_compression": "meshopt",
-    "KHR_meshopt_compression": "meshopt",
+    _DRACO: "Draco compression",
+    "EXT_meshopt_compression": "meshopt compression",
+    "KHR_meshopt_compression": "meshopt compression",
     QUANTIZATION: "normalized positions",
 }
 # Extensions that do not change the shape.
@@ -101,13 +101,13 @@ def require_readable(path: Path) -> None:
         return  # trimesh describes the damage
     used = [name for key in ("extensionsRequired", "extensionsUsed") for name in document.get(key) or ()]
     decoded = {_DRACO} if importlib.util.find_spec("DracoPy") is not None else set()
-    if not _has_normalized_positions(document):
+    if QUANTIZATION in used and not _has_normalized_positions(document):
         decoded.add(QUANTIZATION)
     for name, compression in _COMPRESSIONS.items():
         if name in used and name not in decoded:
             decoder = ", or pip install 'nerfro[gltf]', which decodes it" if name == _DRACO else ""
             raise NerfroError(
-                f"mesh {path} is compressed by {compression} ({name}), which nerfro does not read; export it without "
+                f"mesh {path} has {compression} ({name}), which nerfro does not read; export it without "
                 f"compression (in Blender, without the option Compression), or as ply{decoder}"
             )
     required = set(document.get("extensionsRequired") or ()) - decoded
@@ -150,9 +150,10 @@ def _unread_shape(document: Mapping[str, Any], used: list[str]) -> str | None:
 
 def _has_normalized_positions(document: Mapping[str, Any]) -> bool:
     """Return whether positions are fractions of the largest integer, which trimesh does not divide by it."""
-    primitives = [primitive for mesh in document.get("meshes", []) for primitive in mesh["primitives"]]
-    accessors = [primitive["attributes"]["POSITION"] for primitive in primitives]
-    return any(document["accessors"][accessor].get("normalized", False) for accessor in accessors)
+    primitives = [primitive for mesh in document.get("meshes") or [] for primitive in mesh.get("primitives", [])]
+    positions = {primitive.get("attributes", {}).get("POSITION") for primitive in primitives} - {None}
+    accessors = document.get("accessors") or []
+    return any(accessors[i].get("normalized", False) for i in positions if i < len(accessors))
 
 
 @cache
