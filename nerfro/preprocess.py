@@ -25,8 +25,8 @@ def main(config: DictConfig) -> None:
     """Reconstruct the surface, search the index, refine the surface if requested, and print the next command."""
     request = Request(**vars(Composition.of_job(config)))
     scene, file = preprocess_composed(request), request.out / SCENE
-    if scene.provenance.reflects is None:
-        print("reflection and absorption are unknown; add experiment=glass, or in a room experiment=glass_room")
+    if scene.provenance.reflects is None and not scene.training_options:
+        print("reflection and absorption are unknown; if the object reflects or absorbs light, add experiment=glass")
     options: dict[str, object] = {"scene": file} | scene.training_options
     print_next("train on it", "train", as_overrides(options))
     if scene.vessel:

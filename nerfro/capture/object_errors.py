@@ -248,7 +248,7 @@ def unsupported_bodies(
     return sorted((name for name in bodies if name not in supported), key=gains.__getitem__, reverse=True)
 
 
-def light_loss(
+def absorption_and_reflection(
     observations: Observations, body: Bodies, settings: ObjectErrorSettings = ObjectErrorSettings()
 ) -> tuple[list[float], bool]:
     """Measure absorption and reflection of a body by the colours of its pixels against the surroundings.

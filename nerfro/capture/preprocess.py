@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 
 from nerfro.capture.index_search import FoundMedium, find_medium, initial_medium
-from nerfro.capture.object_errors import light_loss, unsupported_bodies
+from nerfro.capture.object_errors import absorption_and_reflection, unsupported_bodies
 from nerfro.capture.preprocess_options import MESH, PreprocessConfig, Request, surface_settings, write_scene
 from nerfro.capture.refinement import refine
 from nerfro.capture.surroundings import Observations
@@ -92,17 +92,17 @@ def _preprocess(request: Request) -> SceneFile:
         vessel, fitted = find_vessel(solid, location, mesh, observations)
         unsupported = unsupported_bodies(observations, solid, bool(indexed.provenance.doubts), fitted)
     estimated = settings | {"mesh": location} | indexed.index_settings
-    origin = replace(_with_light_loss(request, observations, indexed), unsupported=unsupported)
+    origin = replace(_with_absorption_and_reflection(request, observations, indexed), unsupported=unsupported)
     scene = SceneFile(medium=estimated, vessel=vessel, surroundings=observations.distance, provenance=origin)
     return write_scene(request, scene, views.cameras, mesh)
 
 
-def _with_light_loss(request: Request, observations: Observations, indexed: FoundMedium) -> Provenance:
+def _with_absorption_and_reflection(request: Request, observations: Observations, indexed: FoundMedium) -> Provenance:
     """Measure and print reflection and absorption, unless the index is given or doubtful, and record them."""
     bodies, origin = indexed.medium.bodies, indexed.provenance
     if bodies is None or not request.searches_index or origin.doubts:
         return origin
-    absorbed, reflects = light_loss(observations, bodies)
+    absorbed, reflects = absorption_and_reflection(observations, bodies)
     shares = ", ".join(f"{share:.0%} of {name}" for share, name in zip(absorbed, COLOURS, strict=True))
     print(f"absorbed along the mean path: {shares} light; partial reflection is {'' if reflects else 'not '}seen")
     return replace(origin, absorbed=absorbed, reflects=reflects)

@@ -19,13 +19,13 @@ class JointOptimizer(torch.optim.Optimizer):
     def __init__(self, optimizers: Mapping[str, torch.optim.Optimizer], groups: list[dict[str, Any]]) -> None:
         self._optimizers = dict(optimizers)
         super().__init__(groups, {})
-        self._share()
+        self._share_state()
 
     def __setstate__(self, state: dict[str, Any]) -> None:  # also called by `load_state_dict`
         super().__setstate__(state)
-        self._share()
+        self._share_state()
 
-    def _share(self) -> None:
+    def _share_state(self) -> None:
         for kind, optimizer in self._optimizers.items():
             optimizer.state = self.state
             optimizer.param_groups = [group for group in self.param_groups if group["kind"] == kind]

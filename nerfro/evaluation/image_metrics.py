@@ -219,5 +219,5 @@ class DepthError(ImageMetric):
     ) -> Float[Tensor, ""]:
         assert maps is not None
         depth, rendered = maps.data["depth"][..., 0].to(prediction), maps.rendered["depth"][..., 0].to(prediction)
-        counts = (depth > 0) & (maps.rendered["refracted"][..., 0].to(prediction) == 0)
-        return mean_over((rendered - depth).square(), counts if inside is None else counts & inside).sqrt()
+        valid = (depth > 0) & (maps.rendered["refracted"][..., 0].to(prediction) == 0)
+        return mean_over((rendered - depth).square(), valid if inside is None else valid & inside).sqrt()

@@ -101,8 +101,9 @@ def announce_scoring(
     if seconds >= 5:
         print(
             f"after the training, the scores of {len(views)} views take about {duration(seconds)} more, which "
-            f"trainer.max_time does not include; trainer.limit_test_batches={-(-len(views) // 4)} scores fewer views, "
-            "evaluation=none none",
+            "trainer.max_time does not include; "
+            + (f"trainer.limit_test_batches={-(-len(views) // 4)} scores fewer views, and " if len(views) > 1 else "")
+            + "evaluation=none scores no view",
             flush=True,
         )
 

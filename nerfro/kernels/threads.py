@@ -36,13 +36,13 @@ def share_rows(task: Callable[[slice], Result], like: Tensor, size: int) -> list
         return share(lambda i: task(chunks[i]), len(chunks))
 
 
-def share_parts(task: Callable[[slice], Result], number_of_rows: int) -> list[Result]:
+def share_parts(task: Callable[[slice], Result], num_rows: int) -> list[Result]:
     """Call a kernel for equal parts of rows, one for each helping thread, see `share`.
 
     A thread that makes batches is a helping thread itself, and a machine with two cores has no other one.
     """
-    size = max(1, -(-number_of_rows // max(1, len(HELPERS))))
-    parts = [slice(i, i + size) for i in range(0, max(number_of_rows, 1), size)]
+    size = max(1, -(-num_rows // max(1, len(HELPERS))))
+    parts = [slice(i, i + size) for i in range(0, max(num_rows, 1), size)]
     return share(lambda i: task(parts[i]), len(parts))
 
 

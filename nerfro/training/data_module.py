@@ -82,7 +82,7 @@ class RayDataModule(LightningDataModule):
         self.tracer = RayTracer(module.renderer, self.subdivision)
         self.end_thread()
         if can_prefetch(module.renderer):
-            self._ahead = Prefetcher(self._batch, spare_cores=not multiplies_large_matrices(module.renderer))
+            self._ahead = Prefetcher(self._batch, shares_steps=not multiplies_large_matrices(module.renderer))
         # Lightning calls this method after restoring a checkpoint, so a resumed run continues with the next batch.
         trainer: Any = self.trainer
         if trainer.check_val_every_n_epoch is not None and isinstance(trainer.val_check_interval, float):
@@ -176,19 +176,19 @@ class Prefetcher(Generic[Made]):
 
     Args:
         make: function that makes the batch of a step.
-        spare_cores: whether threads of Python share each step and each batch, one for each core of PyTorch. PyTorch
+        shares_steps: whether threads of Python share each step and each batch, one for each core of PyTorch. PyTorch
             then uses one core in each of them, because small operators divide badly (docs/lab/threads.md).
     """
 
-    def __init__(self, make: Callable[[int], Made], spare_cores: bool = True) -> None:
+    def __init__(self, make: Callable[[int], Made], shares_steps: bool = True) -> None:
         self._make = torch.no_grad()(make)
         self._step, self._begun = -1, Future[Made]()
         # PyTorch has a number of threads per thread, and new threads inherit the last one.
         self._num_threads = torch.get_num_threads()
         # The last helper makes the batches, because the others are asked first.
-        self._helpers = start_helpers(max(1, self._num_threads - 1) if spare_cores else 1)
+        self._helpers = start_helpers(max(1, self._num_threads - 1) if shares_steps else 1)
         self._thread = self._helpers[-1]
-        if spare_cores:
+        if shares_steps:
             torch.set_num_threads(1)
 
     def __call__(self, step: int) -> Made:

@@ -129,9 +129,15 @@ class OptimizerConfig:
             options: dict[str, Any] = {} if kind in ("sgd", "muon") else {"eps": self.adam_epsilon}
             options |= {"fused": fused} if kind in ("adam", "adamw") else {}
             of_kind = [group for group in described if group["kind"] == kind]
-            if kind not in _CLASSES or (kind == "muon" and any(p.ndim != 2 for g in of_kind for p in g["params"])):
-                advice = "name it in optimizer.groups for fields.*.weight"
-                raise NerfroError(f"optimizer {kind} takes matrices only, and needs torch 2.9; {advice}")
+            if kind not in _CLASSES:
+                raise NerfroError(f"optimizer {kind} needs torch 2.9 or newer, and this is torch {torch.__version__}")
+            shapes = [list(parameter.shape) for group in of_kind for parameter in group["params"]]
+            if kind == "muon" and any(len(shape) != 2 for shape in shapes):
+                raise NerfroError(
+                    f"optimizer muon takes matrices only, and not parameters of shape "
+                    f"{next(shape for shape in shapes if len(shape) != 2)}; name it in optimizer.groups for "
+                    "fields.*.weight"
+                )
             optimizers[kind] = _CLASSES[kind](of_kind, **options)
         return next(iter(optimizers.values())) if len(optimizers) == 1 else JointOptimizer(optimizers, described)
 

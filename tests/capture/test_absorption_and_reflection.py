@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from nerfro.capture.object_errors import light_loss
+from nerfro.capture.object_errors import absorption_and_reflection
 from nerfro.capture.surroundings import Observations, Surroundings
 from nerfro.rendering.scene_file import Provenance, SceneFile
 from nerfro.samplers.paths.snell import Snell
@@ -21,7 +21,7 @@ def test_absorbed_light_and_reflection_are_measured(absorption: tuple[float, ...
     observations = Observations(views, mesh(), False)
     colours = sky(observations.through.rays.directions)
     observations.surroundings = Surroundings(lambda exits: sky(exits.directions), None, 0.0, colours)
-    absorbed, reflects = light_loss(observations, body)
+    absorbed, reflects = absorption_and_reflection(observations, body)
     assert reflects == (branches == "all")
     # A parallel beam crosses 2 R sqrt(1 - (b / n)^2), with a mean of 2 R (1 - (1 - 1 / n^2)^1.5) n^2 2 / 3.
     length = 2 * RADIUS * (1 - (1 - 1 / 1.5**2) ** 1.5) * 1.5**2 * 2 / 3

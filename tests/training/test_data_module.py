@@ -97,7 +97,7 @@ def test_threads_share_a_step_unless_matrices_are_large(width: int, helpers: int
         torch.set_num_threads(3)
         prefetcher = Prefetcher(
             lambda step: (torch.get_num_threads(), torch.is_grad_enabled()),
-            spare_cores=not multiplies_large_matrices(renderer),
+            shares_steps=not multiplies_large_matrices(renderer),
         )
         assert prefetcher(0) == (1, False)
         assert (len(compilation.HELPERS), torch.get_num_threads()) == (helpers, of_torch)
