@@ -22,7 +22,7 @@ from tests.conftest import composed
             ["background=skybox", "phase.background.steps=20"],
             "background=skybox; remove it, or choose background=envmap",
         ),
-        (["phase.background.steps=0", "phase.background.start=100"], "phase.background.steps=0"),
+        (["phase.background.steps=0", "phase.background.start=50"], "phase.background.steps=0"),
         (["content.radius=2"], "content.space=box"),
         (["batches.precrop_fraction=0.3"], "batches.precrop_steps=0"),
         (["optimizer.warmup_steps=0", "optimizer.warmup_factor=0.5"], "optimizer.warmup_steps=0"),
