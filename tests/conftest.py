@@ -31,6 +31,8 @@ from nerfro.core.paths import CONF_DIR
 if "PYTEST_XDIST_WORKER" in os.environ:
     torch.set_num_threads(1)
     os.environ["OMP_NUM_THREADS"] = "1"
+    # Numba reads the number of cores again for each compilation, also while a test pretends another number.
+    os.environ["NUMBA_NUM_THREADS"] = str(os.cpu_count())
 
 # A shell that starts the tests in the background has them ignore Ctrl-C, and all commands that they start.
 signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -131,13 +131,8 @@ class OptimizerConfig:
             of_kind = [group for group in described if group["kind"] == kind]
             if kind not in _CLASSES:
                 raise NerfroError(f"optimizer {kind} needs torch 2.9 or newer, and this is torch {torch.__version__}")
-            shapes = [list(parameter.shape) for group in of_kind for parameter in group["params"]]
-            if kind == "muon" and any(len(shape) != 2 for shape in shapes):
-                raise NerfroError(
-                    f"optimizer muon takes matrices only, and not parameters of shape "
-                    f"{next(shape for shape in shapes if len(shape) != 2)}; name it in optimizer.groups for "
-                    "fields.*.weight"
-                )
+            if kind == "muon" and any(p.ndim != 2 for group in of_kind for p in group["params"]):
+                raise NerfroError("optimizer muon takes matrices only; name it in optimizer.groups for fields.*.weight")
             optimizers[kind] = _CLASSES[kind](of_kind, **options)
         return next(iter(optimizers.values())) if len(optimizers) == 1 else JointOptimizer(optimizers, described)
 
