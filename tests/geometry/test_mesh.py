@@ -66,9 +66,7 @@ def test_compressed_gltf_is_refused(extension: str, name: str, tmp_path: Path, m
 
     scene = trimesh.Scene(trimesh.creation.box())
     (tmp_path / "a.glb").write_bytes(export_glb(scene, tree_postprocessor=compressed))
-    refused(
-        rf"a\.glb has {name} \({extension}\).*export it without compression", load_mesh, tmp_path / "a.glb"
-    )
+    refused(rf"a\.glb has {name} \({extension}\).*export it without compression", load_mesh, tmp_path / "a.glb")
 
 
 @pytest.mark.parametrize(
