@@ -55,6 +55,13 @@ def start_helpers(number: int) -> list[ThreadPoolExecutor]:
     return helpers
 
 
+def end_helpers(helpers: list[ThreadPoolExecutor]) -> None:
+    """End threads of `start_helpers`, and cancel the work that they have not begun."""
+    for helper in helpers:
+        HELPERS.remove(helper)
+        helper.shutdown(cancel_futures=True)
+
+
 @contextlib.contextmanager
 def helping_threads() -> Iterator[int]:
     """Let `share` use a thread for each core of PyTorch; PyTorch uses one core in each of them meanwhile.

@@ -17,8 +17,7 @@ from nerfro.core.errors import NerfroError
 from nerfro.core.types import Batch
 from nerfro.data.base import Views
 from nerfro.evaluation.validation import ValidationPixels
-from nerfro.kernels.compilation import HELPERS
-from nerfro.kernels.threads import start_helpers
+from nerfro.kernels.threads import end_helpers, start_helpers
 from nerfro.rendering import RayTracer, Renderer
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.training.module import TrainingModule
@@ -206,9 +205,7 @@ class Prefetcher(Generic[Made]):
 
     def close(self) -> None:
         """End the threads, and return their cores to PyTorch."""
-        for helper in self._helpers:
-            HELPERS.remove(helper)
-            helper.shutdown(cancel_futures=True)
+        end_helpers(self._helpers)
         torch.set_num_threads(self._num_threads)
 
 

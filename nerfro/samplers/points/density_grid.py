@@ -158,8 +158,8 @@ class DensityGridSampler(PointSampler):
         [density], random = arrays(self.density), arrays(*of_path)
 
         def draw_part(part: slice) -> tuple[np.ndarray, ...]:
-            of_part = tuple(values[part] for values in paths), (*(values[part] for values in random), key)
-            return draw(of_part[0], box, density, of_part[1], num_samples, settings)
+            paths_of_part, random_of_part = (tuple(values[part] for values in group) for group in (paths, random))
+            return draw(paths_of_part, box, density, (*random_of_part, key), num_samples, settings)
 
         fields = zip(*share_parts(draw_part, len(path.s)), strict=True)
         edges, s, positions, directions, occupied, *contracted = (

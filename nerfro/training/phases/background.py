@@ -192,7 +192,9 @@ def _rays(run: TrainingRun, pixels: Int[Tensor, "Q"]) -> Rays:
     return run.renderer.scene.camera(pixel_rays(batches.cameras, pixels), batches.cameras.view_of(pixels))
 
 
-def _photographed(run: TrainingRun, rgb: Float[Tensor, "R 3"], view: Int[Tensor, "R"], rays: Rays) -> Tensor:
+def _photographed(
+    run: TrainingRun, rgb: Float[Tensor, "R 3"], view: Int[Tensor, "R"], rays: Rays
+) -> Float[Tensor, "R 3"]:
     """Decode the colours of photographs, and divide by the gains of the photographs."""
     scene = run.renderer.scene
     radiance, gains = scene.colour_space.to_radiance(rgb), scene.camera.gains(view, rays)
