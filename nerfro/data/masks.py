@@ -17,7 +17,7 @@ from nerfro.core.errors import NerfroError, first_of, warn
 from nerfro.data.base import SPLITS, DataSource, Views
 from nerfro.data.image_files import IMAGE_SUFFIXES, Levels, is_linear, read_levels, read_mask, read_size
 from nerfro.data.lazy_images import LazyImages
-from nerfro.files.reading import open_image, unicode_forms
+from nerfro.files.reading import as_spelled, open_image, unicode_forms
 
 # Lossless format first. Cameras and networks write suffixes in lower or upper case.
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
@@ -75,8 +75,7 @@ def find_mask(root: Path, image: Path, stated: str | None = None) -> Path | None
         The file, or None if there is no silhouette.
     """
     if stated is not None:
-        files = [root / form for form in unicode_forms(stated.replace("\\", "/"))]
-        mask = next((file for file in files if os.path.isfile(file)), files[0])
+        mask = as_spelled(root, stated.replace("\\", "/"))
         if not os.path.isfile(mask):  # False for a name that is too long
             raise NerfroError(f"mask {mask} of {image} does not exist; restore it or remove its path from the data set")
         return mask

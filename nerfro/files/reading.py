@@ -233,6 +233,12 @@ def unicode_forms(name: str) -> list[str]:
     return list(dict.fromkeys((name, *(unicodedata.normalize(form, name) for form in ("NFC", "NFD")))))
 
 
+def as_spelled(folder: Path, name: str) -> Path:
+    """Return the path of a file in the spelling of its name that exists, see `unicode_forms`; else as stated."""
+    paths = [folder / form for form in unicode_forms(name)]
+    return next((path for path in paths if os.path.isfile(path)), paths[0])  # False for a name that is too long
+
+
 def same_content(one: Path, other: Path) -> bool:
     """Test whether two paths name files with the same bytes."""
     files = one, other

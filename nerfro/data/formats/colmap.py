@@ -23,7 +23,7 @@ from nerfro.data.formats.colmap_model import (
 from nerfro.data.frames import Every, FrameSet, PosedImages
 from nerfro.data.image_files import read_size
 from nerfro.data.masks import find_mask
-from nerfro.files.reading import unicode_forms
+from nerfro.files.reading import as_spelled
 from nerfro.registry.registration import register
 
 
@@ -68,8 +68,7 @@ class ColmapData(PosedImages):
         images = self.held_out(model.images, self.test_every, split)
         frames = []
         for image in images:
-            paths = [self.root / self.images / form for form in unicode_forms(image.name)]
-            path = next((path for path in paths if path.is_file()), paths[0])
+            path = as_spelled(self.root / self.images, image.name)
             if not path.is_file():
                 raise NerfroError(f"image {path} of the model {folder} does not exist; set data.images, or restore it")
             frames.append(Frame(image.name, path, find_mask(self.root, path), image.camera_to_world))
