@@ -136,11 +136,9 @@ def files_beside(path: Path) -> Any:
 def _unread_shape(document: Mapping[str, Any], used: list[str]) -> str | None:
     """Name a property of a glTF file that changes its shape and that trimesh ignores; None if there is none."""
     meshes, nodes = document.get("meshes") or [], document.get("nodes") or []
-    primitives = [primitive for mesh in meshes for primitive in mesh.get("primitives", [])]
-    read = {p.get("attributes", {}).get("POSITION") for p in primitives} | {p.get("indices") for p in primitives}
-    accessors = document.get("accessors") or []
+    positions, indices = _accessors(document)
     properties = {
-        "has sparse accessors": any("sparse" in accessors[i] for i in read - {None} if i < len(accessors)),
+        "has sparse accessors": any("sparse" in accessor for accessor in (*positions, *indices)),
         "has shape keys (morph targets)": any(any(mesh.get("weights", [])) for mesh in (*meshes, *nodes)),
         "is posed by a skeleton (skin)": any("skin" in node for node in nodes),
         "has instances (EXT_mesh_gpu_instancing)": "EXT_mesh_gpu_instancing" in used,
@@ -150,10 +148,20 @@ def _unread_shape(document: Mapping[str, Any], used: list[str]) -> str | None:
 
 def _has_normalized_positions(document: Mapping[str, Any]) -> bool:
     """Return whether positions are fractions of the largest integer, which trimesh does not divide by it."""
+    return any(accessor.get("normalized", False) for accessor in _accessors(document)[0])
+
+
+def _accessors(document: Mapping[str, Any]) -> tuple[list[Mapping[str, Any]], list[Mapping[str, Any]]]:
+    """Return the descriptions of the positions and of the indices of all primitives."""
     primitives = [primitive for mesh in document.get("meshes") or [] for primitive in mesh.get("primitives", [])]
-    positions = {primitive.get("attributes", {}).get("POSITION") for primitive in primitives} - {None}
     accessors = document.get("accessors") or []
-    return any(accessors[i].get("normalized", False) for i in positions if i < len(accessors))
+    positions = {primitive.get("attributes", {}).get("POSITION") for primitive in primitives}
+    indices = {primitive.get("indices") for primitive in primitives}
+
+    def described(numbers: set[int | None]) -> list[Mapping[str, Any]]:
+        return [accessors[i] for i in numbers if i is not None and i < len(accessors)]
+
+    return described(positions), described(indices)
 
 
 @cache
