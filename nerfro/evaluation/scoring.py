@@ -95,17 +95,17 @@ def announce_scoring(
         radiance = render_view(renderer, small, 0, subdivision).radiance.view(height, width, 3).cpu()
         rgb = scene.colour_space.to_display(radiance)
         metrics.score("", rgb, rgb, None if views.masks is None else torch.ones(height, width))
-        seconds = time.perf_counter() - begun
-    renderings = 2 if scene.camera.moves else 1  # see `aligned`
-    seconds *= renderings * len(views) * cameras.height * cameras.width / (height * width)
-    if seconds >= 5:
-        print(
-            f"after the training, the scores of {len(views)} views take about {duration(seconds)} more, which "
-            "trainer.max_time does not include; "
-            + (f"trainer.limit_test_batches={-(-len(views) // 4)} scores fewer views, and " if len(views) > 1 else "")
-            + "evaluation=none scores no view",
-            flush=True,
-        )
+        renderings = 2 if scene.camera.moves else 1  # see `aligned`
+        ratio = renderings * len(views) * cameras.height * cameras.width / (height * width)
+        seconds = ratio * (time.perf_counter() - begun)
+        if seconds < 5:
+            return
+    fewer = f"trainer.limit_test_batches={-(-len(views) // 4)} scores fewer views, and " if len(views) > 1 else ""
+    print(
+        f"after the training, the scores of {len(views)} views take about {duration(seconds)} more, which "
+        f"trainer.max_time does not include; {fewer}evaluation=none scores no view",
+        flush=True,
+    )
 
 
 def _score_views(
