@@ -126,11 +126,9 @@ def missing_with_example(command: str) -> Iterator[None]:
 def quoted(argument: str, keys: tuple[str, ...]) -> str:
     """Quote the value of an override if its key is one of `keys`, or if it is the path of a run of a sweep (`a=1`)."""
     key, _, value = argument.partition("=")
-    if "=" in value and re.fullmatch(r"[\w./+@%=-]+", value):
-        return f"{key}='{value}'"
-    if key not in keys or not set(",=") & set(value) or value[0] in "\"'":
-        return argument
-    return f"{key}='{value}'"
+    is_path = "=" in value and re.fullmatch(r"[\w./+@%=-]+", value)
+    is_unquoted = key in keys and set(",=") & set(value) and value[0] not in "\"'"
+    return f"{key}='{value}'" if is_path or is_unquoted else argument
 
 
 def added(argument: str) -> str:

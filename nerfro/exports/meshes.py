@@ -71,7 +71,7 @@ def simplified(mesh: TriangleMesh, triangles: int) -> TriangleMesh:
     """
     if len(mesh.faces) <= triangles:
         return mesh
-    if not can_simplify():
+    if importlib.util.find_spec("fast_simplification") is None:
         warn("the meshes keep all their triangles; pip install 'nerfro[gltf]', which reduces their number")
         return mesh
     simplification = optional("fast_simplification", "gltf", "triangles= needs fast-simplification")
@@ -82,11 +82,6 @@ def simplified(mesh: TriangleMesh, triangles: int) -> TriangleMesh:
     if len(faces) > triangles:
         warn(f"a mesh keeps {len(faces)} triangles, more than {triangles}, because no simpler mesh has its shape")
     return TriangleMesh(vertices, faces.astype(np.int64))
-
-
-def can_simplify() -> bool:
-    """Return whether the package fast-simplification is installed."""
-    return importlib.util.find_spec("fast_simplification") is not None
 
 
 def _with_vertex_normals(mesh: TriangleMesh) -> trimesh.Trimesh:

@@ -79,9 +79,8 @@ class BackgroundRegularizer(Loss):
         error = self._error(path.sum_polylines(fine.transmittance[:, None] * light), batch, scene)
         if path.record is not None and path.record.absorption.requires_grad:
             fixed = replace(path, s=path.s.detach())
-            absorbed = fixed.transmitted(fixed.far[:, None])[:, 0].clamp(
-                min=1e-30
-            )  # zero has no logarithmic derivative
+            # The quotient of zeros would not be a number.
+            absorbed = fixed.transmitted(fixed.far[:, None])[:, 0].clamp(min=1e-30)
             error = error + self._error(path.sum_polylines(light * (absorbed / absorbed.detach())), batch, scene)
         # Gradients are averaged over processes, so each process multiplies its sum by the number of processes.
         return (error * counted).sum() * rank_and_size()[1] / (sum_over_processes(counted.sum()) + 1)

@@ -35,10 +35,7 @@ function initState(page) {
     for (const input of inputs) if (valueOf(input) !== initial.get(input)) next.set(input.id, valueOf(input));
     history.replaceState(null, "", `#${next.toString().replaceAll("%2C", ",")}`);
   };
-  if (location.protocol === "about:") {
-    $("copy-code").hidden = true; // a frame with `srcdoc` has no address
-    return;
-  }
+  if (location.protocol === "about:") return; // in a frame with `srcdoc`, which has no address
   page.writeAddress = write;
   let timer = null;
   page.onChange = () => {
