@@ -25,13 +25,13 @@ from nerfro.media.bodies import Bodies, Body, GridSettings
 from nerfro.media.material import Material
 from nerfro.media.surface import Grid, MeshSurface, Surface
 from nerfro.models.refractive import RefractiveModel
+from nerfro.optimizers.config import OPTIMIZERS, SCHEDULERS
 from nerfro.registry.allowed import Count, Distance, Natural, NotNegative, Positive
 from nerfro.registry.registration import register
 from nerfro.rendering import Components, Renderer, Scene
 from nerfro.samplers.base import PathSampler, PointSampler
 from nerfro.samplers.points.stepfun import invert_cdf, spread_uniform
 from nerfro.samplers.points.stratified import Stratified, point_samples
-from nerfro.training.optimizer import OPTIMIZERS, SCHEDULERS
 from nerfro.training.phases.base import Phase, TrainingRun
 from nerfro.viewing.exports import EXPORTS, Export, ExportConfig
 from nerfro.viewing.trained_scene import TrainedScene

@@ -17,6 +17,7 @@ from nerfro.losses.base import Loss
 from nerfro.losses.density import Distortion
 from nerfro.losses.radiance import BackgroundRegularizer, Photometric
 from nerfro.models.refractive import RefractiveModel
+from nerfro.optimizers.config import GroupConfig, OptimizerConfig
 from nerfro.paper.hierarchical import Hierarchical
 from nerfro.rendering import composite
 from nerfro.samplers.paths.straight import straight_path
@@ -32,7 +33,6 @@ from nerfro.testing import (
     example_space,
 )
 from nerfro.training.module import TrainingModule
-from nerfro.training.optimizer import GroupConfig, OptimizerConfig
 
 
 def split_path(of_straight: float) -> Path:

@@ -20,12 +20,12 @@ from nerfro.core.paths import user_path
 from nerfro.core.types import Batch
 from nerfro.data.base import Views
 from nerfro.losses.base import Loss, Objective, ObjectiveValue
+from nerfro.optimizers.config import OptimizerConfig
 from nerfro.registry.allowed import plain, validate
 from nerfro.registry.registration import discover
 from nerfro.rendering import Renderer, Scene
 from nerfro.training.config import build_each
 from nerfro.training.inputs import INPUTS, inputs_of
-from nerfro.training.optimizer import OptimizerConfig
 from nerfro.training.run_folder import load_run, restore
 from nerfro.training.updates import Updates
 

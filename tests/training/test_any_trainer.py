@@ -13,9 +13,9 @@ from lightning.pytorch.tuner import Tuner
 
 import nerfro
 from nerfro.core.paths import PLUGINS_DIR
+from nerfro.optimizers.config import OPTIMIZERS, OptimizerConfig
 from nerfro.training.data_module import RayDataModule
 from nerfro.training.module import TrainingModule
-from nerfro.training.optimizer import OPTIMIZERS, OptimizerConfig
 from tests.conftest import refused
 
 QUIET = {"accelerator": "cpu", "enable_progress_bar": False, "enable_model_summary": False}

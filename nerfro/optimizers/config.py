@@ -14,7 +14,7 @@ from torch import nn
 from torch.optim import lr_scheduler
 
 from nerfro.core.errors import NerfroError, nearest_of
-from nerfro.core.joint_optimizer import JointOptimizer
+from nerfro.optimizers.joint import JointOptimizer
 from nerfro.registry.allowed import Names, Natural, NotNegative, OnlyWith, Positive, validated
 
 # Patterns that have no effect in a scene without these parameters.

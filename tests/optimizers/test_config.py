@@ -13,10 +13,10 @@ from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Timer
 
 from nerfro.losses.radiance import BackgroundRegularizer
+from nerfro.optimizers.config import GroupConfig, OptimizerConfig
 from nerfro.registry.allowed import plain, validate
 from nerfro.training.config import BatchesConfig, EvaluationConfig, TrainConfig
 from nerfro.training.module import learning_rate_factor, training_progress
-from nerfro.training.optimizer import GroupConfig, OptimizerConfig
 from tests.conftest import composed, refused
 
 PAPER = OptimizerConfig(learning_rate=5e-4, final_learning_rate=5e-6, warmup_steps=2500, warmup_factor=0.01)
