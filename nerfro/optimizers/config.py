@@ -50,7 +50,7 @@ class GroupConfig:
         learning_rate: initial learning rate; None for the common rate.
         start: step at which the parameters begin to learn; None for the step that the component of a run needs
             (`Component.learns_from`), which is 0 except for a background that a phase fits first.
-        name: name in `OPTIMIZERS`; None for the common one.
+        name: optimizer, to which plugins add; None for the common one.
         options: settings of the optimizer of this group, such as {momentum: 0.9}.
     """
 
@@ -75,9 +75,10 @@ class OptimizerConfig:
     The defaults are those of the default experiment. The experiments `paper_*` have the values of the paper.
 
     Attributes:
-        name: name in `OPTIMIZERS`.
+        name: optimizer, to which plugins add.
         options: settings of this optimizer, such as {momentum: 0.9}; the others have PyTorch's defaults.
-        scheduler: name in `SCHEDULERS`, takes a step after each training step, in place of the decay and the warm-up.
+        scheduler: scheduler of PyTorch, in place of the decay and the warm-up; it takes a step after each training
+            step.
         scheduler_options: settings of the scheduler, such as {T_max: 1000}.
         learning_rate: initial learning rate.
         final_learning_rate: learning rate at the end of the run.
