@@ -48,11 +48,10 @@ class Gaussians(NamedTuple):
         Each Gaussian is projected with covariance J W S W^T J^T (Zwicker et al., "EWA Splatting", 2002; Kerbl et al.,
         "3D Gaussian Splatting", SIGGRAPH 2023, Eqn. 5), where J is the derivative of the perspective projection.
         """
-        pose, focal = cameras.camera_to_world[view], torch.stack([cameras.fx[view], cameras.fy[view]])
-        axes, middle = (
-            pose[:, :3] * pose.new_tensor([1.0, -1.0, -1.0]),
-            torch.stack([cameras.cx[view], cameras.cy[view]]),
-        )
+        pose = cameras.camera_to_world[view]
+        axes = pose[:, :3] * pose.new_tensor([1.0, -1.0, -1.0])  # right, down and forward
+        focal = torch.stack([cameras.fx[view], cameras.fy[view]])
+        middle = torch.stack([cameras.cx[view], cameras.cy[view]])
         size = focal.new_tensor([cameras.width, cameras.height])
         limit = _MAX_TANGENT * torch.maximum(middle, size - middle) / focal
         with torch.no_grad():
