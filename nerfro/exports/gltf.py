@@ -206,10 +206,11 @@ def _viewer_page(scene: TrainedScene, file: Path) -> str:
     The element has the y axis up, and orbits a target at an azimuth from z towards x and a polar angle from y.
     """
     cameras, centre = scene.cameras("train").to("cpu"), scene.bounds.mean(0).double().numpy()
-    views = []
+    views, reach = [], 0.0
     for view, pose in enumerate(cameras.camera_to_world.double().numpy()):
         back, eye = pose[:, 2], pose[:, 3]
         distance = max(float(back @ (eye - centre)), 1e-3)  # to the point of the optical axis closest to the centre
+        reach = max(reach, 2 * distance)  # limits the depths that the element shows
         x, y, z = Z_UP_TO_Y_UP @ back
         angles = math.degrees(math.atan2(x, z)), math.degrees(math.acos(min(max(y, -1), 1)))
         target = Z_UP_TO_Y_UP @ (eye - distance * back)
@@ -221,7 +222,8 @@ def _viewer_page(scene: TrainedScene, file: Path) -> str:
         }
         views.append({"name": f"train_{view:03d}", "view": of_element})
     template, sky = Path(__file__).with_name("model_viewer.html.jinja"), f"{file.stem}_sky.hdr"
-    return fill_template(template, title=scene.name or file.stem, model=file.name, sky=sky, cameras=views)
+    title = scene.name or file.stem
+    return fill_template(template, title=title, model=file.name, sky=sky, cameras=views, reach=reach)
 
 
 def _glass_material(

@@ -123,6 +123,8 @@ def test_page_beside_the_glb_shows_it_from_the_training_cameras(scene: TrainedSc
         )
         np.testing.assert_allclose(eye, Z_UP_TO_Y_UP @ pose[:, 3], atol=1e-3)
         np.testing.assert_allclose(target, 0, atol=1e-3)
+        # The element shows no depths far below its largest radius.
+        assert distance < float(element.attrib["max-camera-orbit"].split()[-1][:-1]) < 10 * distance
         assert float(view["fieldOfView"][:-3]) == pytest.approx(math.degrees(0.7), abs=1e-3)
 
 
