@@ -7,7 +7,7 @@ import itertools
 import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future
-from typing import Any, cast
+from typing import Any, Generic, TypeVar, cast
 
 import torch
 from lightning.pytorch import LightningDataModule, Trainer
@@ -164,7 +164,10 @@ class Epoch:
         return iter(range(first, first + self._num_steps))
 
 
-class Prefetcher:
+Made = TypeVar("Made")
+
+
+class Prefetcher(Generic[Made]):
     """Make the batch of the next step in a thread. The batches do not depend on the thread.
 
     The thread uses one core, and kernels release Python and the threads of Numba (`kernels.compilation`). When idle,
@@ -176,9 +179,9 @@ class Prefetcher:
             then uses one core in each of them, because small operators divide badly (docs/lab/threads.md).
     """
 
-    def __init__(self, make: Callable[[int], Batch], shares_steps: bool = True) -> None:
+    def __init__(self, make: Callable[[int], Made], shares_steps: bool = True) -> None:
         self._make = torch.no_grad()(make)
-        self._step, self._begun = -1, Future[Batch]()
+        self._step, self._begun = -1, Future[Made]()
         # PyTorch has a number of threads per thread, and new threads inherit the last one.
         self._num_threads = torch.get_num_threads()
         # The last helper makes the batches, because the others are asked first.
@@ -187,7 +190,7 @@ class Prefetcher:
         if shares_steps:
             torch.set_num_threads(1)
 
-    def __call__(self, step: int) -> Batch:
+    def __call__(self, step: int) -> Made:
         """Return the batch of a step; errors of the thread are raised here."""
         if self._step != step:
             self._begin(step)
