@@ -71,6 +71,10 @@ def pytest_collection_finish() -> None:
     gc.freeze()  # imported modules, which searches for garbage would visit again and again
 
 
+def pytest_sessionfinish() -> None:
+    gc.unfreeze()
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     if config.getoption("last_skipped"):
         names = set(config.cache.get(_SKIPPED, []))
