@@ -272,9 +272,8 @@ class Bodies(Medium):
     def tree(self) -> TriangleTree:
         """Tree of `triangles` for the tracer."""
         assert self.outline is not None
-        low, high = self.box.double().cpu()
-        layer = layers(self.triangles.corners, self.outline.faces)
-        return TriangleTree.of(self.triangles, layer, _SEARCH_OFFSET * float(torch.linalg.vector_norm(high - low)))
+        offset = _SEARCH_OFFSET * float(torch.linalg.vector_norm(self.box.double().diff(dim=0)))
+        return TriangleTree.of(self.triangles, layers(self.triangles.corners, self.outline.faces), offset)
 
     @property
     def outline(self) -> TriangleMesh | None:

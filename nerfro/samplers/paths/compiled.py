@@ -65,8 +65,7 @@ def _shapes(origins: Tensor, *_: Any) -> tuple[Tensor, ...]:
     size = torch.library.get_ctx().new_dynamic_size
     rows, vertices = size(), size()
     of_vertices = [origins.new_empty(rows, vertices, *axes) for axes in ((3,), (3,), ())]
-    types = torch.int8, torch.int8, torch.int8, torch.int32
-    of_bodies = [origins.new_empty(rows, vertices, dtype=dtype) for dtype in types]
+    of_bodies = [origins.new_empty(rows, vertices, dtype=dtype) for dtype in (*[torch.int8] * 3, torch.int32)]
     ray, numbers = (origins.new_empty(rows, *axes, dtype=torch.int64) for axes in ((), (3,)))
     return ray, *of_vertices, *of_bodies, origins.new_empty(rows), numbers
 
@@ -74,9 +73,8 @@ def _shapes(origins: Tensor, *_: Any) -> tuple[Tensor, ...]:
 @cpu_operator(
     "trace_snell(Tensor origins, Tensor directions, Tensor near, Tensor far, Tensor[] solids, bool nested, float shell,"
     " Tensor[] triangles, int num_layers, float offset, int max_events, int max_split_events, float least_weight, "
-    "bool main_only) -> (Tensor ray, Tensor positions, "
-    "Tensor exit_directions, Tensor s, Tensor body, Tensor surface, Tensor far_side, Tensor triangle, Tensor weight, "
-    "Tensor numbers)",
+    "bool main_only) -> (Tensor ray, Tensor positions, Tensor exit_directions, Tensor s, Tensor body, Tensor surface, "
+    "Tensor far_side, Tensor triangle, Tensor weight, Tensor numbers)",
     _shapes,
 )
 def _trace(

@@ -78,9 +78,7 @@ class PolylineBuilder:
             self._crossed = torch.cat([self._crossed, torch.zeros_like(self._crossed)], 1)
         self._vertices[rows, self.counts[rows]] = torch.cat([positions, directions, s[:, None]], -1)
         for i, numbers in enumerate(crossed):
-            self._crossed[rows, self.counts[rows], i] = (
-                numbers.to(torch.int8) if isinstance(numbers, Tensor) else numbers
-            )
+            self._crossed[rows, self.counts[rows], i] = torch.as_tensor(numbers, dtype=torch.int8)
         self.counts[rows] += 1
 
     def take(self, rows: Int[Tensor, "T"]) -> None:

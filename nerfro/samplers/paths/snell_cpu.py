@@ -61,12 +61,10 @@ class Scratch(NamedTuple):
     pending: Float[np.ndarray, "pending 8"]  # line, arc length and weight
     pending_numbers: Int[np.ndarray, "pending 5"]  # vertices, events, and `Crossing` of the reflection
     pending_inside: Bool[np.ndarray, "pending K"]
-    # For triangles in L layers: the first triangle of each layer on a line, its distance, the triangles on which the
-    # line begins (-1 for none), and nodes of the tree that are searched later, with the distances to their boxes.
+    # For triangles in L layers: the first triangle of each layer on a line, -1 for none, its distance, and nodes of the
+    # tree that are searched later, with the distances to their boxes.
     faces: Int[np.ndarray, "L"]
     lengths: Float[np.ndarray, "L"]
-    last: Int[np.ndarray, "L"]
-    pending_last: Int[np.ndarray, "pending L"]
     nodes: Int[np.ndarray, " depth"]
     entries: Float[np.ndarray, " depth"]
 
@@ -112,14 +110,6 @@ def _reflected(line, nx, ny, nz, ratio):
     parallel = (cosine - ratio * transmitted) / (cosine + ratio * transmitted)
     share = 0.5 * (perpendicular * perpendicular + parallel * parallel)
     return Line(x, y, z, dx / norm, dy / norm, dz / norm), share
-
-
-@compiled
-def _surface_normal(solids, body, line):
-    """Return the unit normal of a level of a body's signed distance at the start of a line."""
-    _, nx, ny, nz = spline_value_gradient(solids.coefficients, grid_of(solids, body), line.x, line.y, line.z)
-    norm = math.sqrt(nx * nx + ny * ny + nz * nz)
-    return nx / norm, ny / norm, nz / norm
 
 
 @compiled
@@ -189,8 +179,6 @@ def _push(scratch, size, branch, mirrored, s, weight, crossing):
         numbers[2 + i] = crossing[i]
     for body in range(len(scratch.inside)):
         scratch.pending_inside[size, body] = scratch.inside[body]
-    for layer in range(len(scratch.last)):
-        scratch.pending_last[size, layer] = scratch.last[layer]
     return size + 1
 
 
@@ -209,8 +197,6 @@ def _resume(solids, scratch, top, rows, former, row):
     inside = scratch.inside
     for body in range(len(inside)):
         inside[body] = scratch.pending_inside[top, body]
-    for layer in range(len(scratch.last)):
-        scratch.last[layer] = scratch.pending_last[top, layer]
     count, num_events, surface, across, triangle = scratch.pending_numbers[top]
     for i in range(min(count, rows.vertices.shape[1])):
         for j in range(7):
@@ -288,9 +274,11 @@ def _next_surface(solids, tree, scratch, body, line):
 @compiled
 def _normal(solids, tree, hit, triangle, line, far):
     """Return the unit normal at the next surface; see `_next_surface`, and `far` is the line behind the surface."""
-    if tree is None:
-        return _surface_normal(solids, hit, far)
-    return face_normal(tree, triangle, line)
+    if tree is not None:
+        return face_normal(tree, triangle, line)
+    _, nx, ny, nz = spline_value_gradient(solids.coefficients, grid_of(solids, hit), far.x, far.y, far.z)
+    norm = math.sqrt(nx * nx + ny * ny + nz * nz)
+    return nx / norm, ny / norm, nz / norm
 
 
 @compiled
@@ -336,27 +324,6 @@ def _follow(solids, tree, settings, scratch, rows, row, branch, num_pending):
 
 
 @compiled
-def _begin(solids, tree, scratch, line, enter):
-    """Set which bodies contain the start of a ray, and return the distance at which the search begins.
-
-    Args:
-        solids, tree, scratch: see `_next_surface`.
-        line: line of a ray that meets the box of the bodies.
-        enter: distance at which it enters the box, negative if it begins in the box.
-    """
-    if tree is None:
-        length = max(enter, 0.0)
-        entry = advance(line, length)
-        for body in range(len(scratch.inside)):
-            scratch.inside[body] = body_distance(solids, body, entry.x, entry.y, entry.z) < 0.0
-        return length
-    scratch.last[:] = -1
-    if enter < 0.0:
-        begin_inside(solids, tree, scratch, line)
-    return 0.0
-
-
-@compiled
 def _trace_ray(solids, tree, line, near, far, settings, scratch, rows):
     """Trace the polylines of one ray into rows; returns the number of polylines and the largest number of vertices.
 
@@ -368,8 +335,14 @@ def _trace_ray(solids, tree, line, near, far, settings, scratch, rows):
     enter, leave = box_span(solids.box_low, solids.box_high, x, y, z, dx, dy, dz)
     misses = not (enter < leave and leave > 0.0 and enter < far - near)
     scratch.inside[:] = False
-    if not misses:
-        start = _begin(solids, tree, scratch, branch.line, enter)
+    if tree is not None:
+        if not misses and enter < 0.0:
+            begin_inside(solids, tree, scratch, branch.line)
+    elif not misses:
+        start = max(enter, 0.0)
+        x, y, z, _, _, _ = advance(branch.line, start)
+        for body in range(len(scratch.inside)):
+            scratch.inside[body] = body_distance(solids, body, x, y, z) < 0.0
     branch = _put_vertex(rows, 0, branch, _deciding_body(scratch.inside, solids), Crossing(0, 0, -1))
     if misses:
         return 1, _put_end(solids, rows, 0, branch, far, False)
@@ -405,8 +378,7 @@ def trace_snell(rays, solids, tree, settings, rows, counts):
         scratch = Scratch(
             np.empty(num_bodies, np.bool_), np.empty(num_bodies), np.empty((num_pending, 8)),
             np.empty((num_pending, 5), np.int64), np.empty((num_pending, num_bodies), np.bool_),
-            np.empty(num_layers, np.int64), np.empty(num_layers), np.empty(num_layers, np.int64),
-            np.empty((num_pending, num_layers), np.int64), np.empty(_DEPTH, np.int64), np.empty(_DEPTH),
+            np.empty(num_layers, np.int64), np.empty(num_layers), np.empty(_DEPTH, np.int64), np.empty(_DEPTH),
         )  # fmt: skip
         for ray in range(block * _BLOCK, min((block + 1) * _BLOCK, num_rays)):
             x, d = origins[ray], directions[ray]

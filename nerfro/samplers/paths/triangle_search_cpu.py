@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 
-from nerfro.geometry.triangle_tree import LEAF
 from nerfro.kernels.compilation import compiled
 from nerfro.kernels.lookup import body_distance
 from nerfro.samplers.paths.surface_search_cpu import advance
 
+_FARTHEST = 1e300  # beyond all triangles; boxes that are missed are at infinity
 # Barycentric coordinates beyond which a line misses a triangle: lines through edges meet one of both triangles.
 _TOLERANCE = 1e-9
 
@@ -63,20 +63,17 @@ def face_normal(tree, face, line):
 
 
 @compiled
-def _search_leaf(tree, scratch, faces, line, nearest):
+def _search_leaf(tree, scratch, leaf, line, nearest):
     """Update the first triangle of each layer by the triangles of a leaf; returns the smallest distance so far."""
-    for i in range(LEAF):
-        face = faces[i]
-        length, second, third, _ = _meet(tree.corners[face], line)
+    for i in range(tree.leaves.shape[1]):
+        length, second, third, _ = _meet(tree.leaf_corners[leaf, i], line)
+        if not (min(second, min(third, 1.0 - second - third)) >= -_TOLERANCE and length > tree.offset):
+            continue
+        face = tree.leaves[leaf, i]
         layer = tree.layer[face]
-        is_hit = min(second, min(third, 1.0 - second - third)) >= -_TOLERANCE
-        if is_hit and tree.offset < length < scratch.lengths[layer]:
-            is_last = False
-            for j in range(len(scratch.last)):
-                is_last = is_last or scratch.last[j] == face
-            if not is_last:
-                scratch.lengths[layer], scratch.faces[layer] = length, face
-                nearest = min(nearest, length)
+        if length < scratch.lengths[layer]:
+            scratch.lengths[layer], scratch.faces[layer] = length, face
+            nearest = min(nearest, length)
     return nearest
 
 
@@ -84,26 +81,25 @@ def _search_leaf(tree, scratch, faces, line, nearest):
 def first_triangle(tree, scratch, line):
     """Find the first triangle on a line.
 
-    A straight line meets a plane once, so the triangles of `scratch.last`, on which the line begins, are left out.
-    After the call, `scratch.last` has all triangles at the distance of the first one, because the ray continues behind
-    them, and `scratch.crossings` is negative for bodies whose surface is crossed.
+    After the call, `scratch.faces` has all triangles at the distance of the first one, because the ray continues behind
+    them, at most one in each layer, and `scratch.crossings` is negative for bodies whose surface is crossed.
 
     Returns:
         Body of the first triangle, -1 for none; the triangle; and its distance.
     """
-    lengths, nodes, entries = scratch.lengths, scratch.nodes, scratch.entries
-    lengths[:] = math.inf
+    nodes, entries = scratch.nodes, scratch.entries
+    scratch.lengths[:], scratch.crossings[:] = math.inf, 1.0
     x, y, z, dx, dy, dz = line
     qx, qy, qz = _inverse(dx), _inverse(dy), _inverse(dz)
-    first_leaf, size, nearest = len(tree.leaves) - 1, 1, math.inf
+    first_leaf, size, nearest = len(tree.leaves) - 1, 1, _FARTHEST
     nodes[0], entries[0] = 0, _enter(tree.boxes[0], x, y, z, qx, qy, qz)
     while size > 0:
         size -= 1
         node = nodes[size]
-        if not entries[size] <= nearest + tree.offset or math.isinf(entries[size]):
+        if entries[size] > nearest + tree.offset:
             continue
         if node >= first_leaf:
-            nearest = _search_leaf(tree, scratch, tree.leaves[node - first_leaf], line, nearest)
+            nearest = _search_leaf(tree, scratch, node - first_leaf, line, nearest)
             continue
         left = 2 * node + 1
         near = _enter(tree.boxes[left], x, y, z, qx, qy, qz)
@@ -112,21 +108,14 @@ def first_triangle(tree, scratch, line):
         nodes[size], entries[size] = (left + 1, far) if is_left else (left, near)
         nodes[size + 1], entries[size + 1] = (left, near) if is_left else (left + 1, far)
         size += 2
-    return _met(tree, scratch, nearest)
-
-
-@compiled
-def _met(tree, scratch, nearest):
-    """Select the triangles at the smallest distance; see `first_triangle`."""
     hit, first = -1, -1
-    scratch.crossings[:] = 1.0
-    for layer in range(len(scratch.last)):
-        scratch.last[layer] = -1
-        if scratch.lengths[layer] <= nearest + tree.offset and not math.isinf(nearest):
-            face = scratch.faces[layer]
+    for layer in range(len(scratch.faces)):
+        face = scratch.faces[layer] if scratch.lengths[layer] <= nearest + tree.offset else -1
+        scratch.faces[layer] = face
+        if face >= 0:
             body = tree.body[face]
-            scratch.last[layer], scratch.crossings[body] = face, -scratch.crossings[body]
-            if scratch.lengths[layer] == nearest and hit < 0:
+            scratch.crossings[body] = -scratch.crossings[body]
+            if hit < 0 and scratch.lengths[layer] == nearest:
                 hit, first = body, face
     return hit, first, nearest
 
@@ -146,10 +135,8 @@ def begin_inside(solids, tree, scratch, line):
         spacings = solids.inverse_spacing[body]
         is_near = abs(phi) * min(spacings[0], min(spacings[1], spacings[2])) < 1.0
         decided, leaves = False, False
-        for layer in range(len(scratch.last)):
-            face = scratch.last[layer]
+        for face in scratch.faces:
             if is_near and face >= 0 and tree.body[face] == body:
                 _, _, _, volume = _meet(tree.corners[face], line)
                 decided, leaves = True, leaves or volume < 0.0
         scratch.inside[body] = leaves if decided else hit >= 0 and phi < 0.0
-    scratch.last[:] = -1
