@@ -78,8 +78,7 @@ class MeshIntersector(Planes):
             from embreex.rtcore_scene import EmbreeScene
         except ImportError as error:
             raise NerfroError(
-                f"intersections with triangles need Embree ({error}); pip install embreex (no wheel for Linux on "
-                "ARM), or set sampler.path.interface=sdf"
+                f"intersections with triangles need Embree ({error}); pip install embreex (no wheel for Linux on ARM)"
             ) from error
         self._scene = EmbreeScene()
         # Embree computes in single precision, which is most accurate around the origin.
@@ -101,42 +100,35 @@ def _share_plane(tree: cKDTree, planes: Float[np.ndarray, "F 4"]) -> bool:
     return bool(np.isfinite(distances).any())
 
 
-class LayeredIntersector:
-    """First hits of rays with each of several layers of triangles.
+def layers(corners: Float[Tensor, "F 3 3"], faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, "F"]:
+    """Assign triangles that may coincide to different layers.
 
-    Embree finds one triangle where several coincide. Patches (see `patches`) are therefore in different layers if their
-    bounding boxes overlap and some of their triangles are in one plane.
+    Patches (see `patches`) are in different layers if their bounding boxes overlap and some of their triangles are in
+    one plane.
 
     Args:
         corners: corners of each triangle, world units.
         faces: vertex indices of each triangle.
     """
-
-    def __init__(self, corners: Float[Tensor, "F 3 3"], faces: Int[np.ndarray, "F 3"]) -> None:
-        patch, _ = patches(faces)
-        order = np.argsort(patch, kind="stable")
-        groups = [torch.from_numpy(g) for g in np.split(order, np.flatnonzero(np.diff(patch[order])) + 1)]
-        boxes = torch.stack([torch.stack([corners[g].amin((0, 1)), corners[g].amax((0, 1))]) for g in groups])
-        extent = (boxes[:, 1].amax(0) - boxes[:, 0].amin(0)).max()
-        normals = torch.nn.functional.normalize(torch.linalg.cross(*corners.diff(dim=1).unbind(1)), dim=-1)
-        heights = ((corners.mean(1) - boxes.mean((0, 1))) * normals).sum(-1, keepdim=True) / extent
-        planes = [torch.cat([normals, heights], -1)[group].numpy() for group in groups]
-        trees = [cKDTree(plane) for plane in planes]
-        layers: list[list[int]] = []
-        for number, (low, high) in enumerate(boxes - extent * torch.tensor([[1e-5], [-1e-5]])):
-            for layer in layers:
-                near = ((boxes[layer, 0] <= high) & (boxes[layer, 1] >= low)).all(1)
-                if not any(_share_plane(trees[layer[i]], planes[number]) for i in near.nonzero()[:, 0]):
-                    layer.append(number)
-                    break
-            else:
-                layers.append([number])
-        self.num_layers = len(layers)
-        self._faces = [torch.cat([groups[number] for number in layer]) for layer in layers]
-        self._layers = [MeshIntersector(corners[rows]) for rows in self._faces]
-
-    def first_hits(self, x: Float[Tensor, "R 3"], d: Float[Tensor, "R 3"]) -> Int[Tensor, "R L"]:
-        """Return the first triangle that each ray hits in each layer, -1 for none."""
-        hits = [layer.first_hits(x, d) for layer in self._layers]
-        triangles = [torch.where(hit >= 0, faces[hit], -1) for hit, faces in zip(hits, self._faces, strict=True)]
-        return torch.stack(triangles, -1)
+    patch, _ = patches(faces)
+    order = np.argsort(patch, kind="stable")
+    groups = [torch.from_numpy(g) for g in np.split(order, np.flatnonzero(np.diff(patch[order])) + 1)]
+    boxes = torch.stack([torch.stack([corners[g].amin((0, 1)), corners[g].amax((0, 1))]) for g in groups])
+    extent = (boxes[:, 1].amax(0) - boxes[:, 0].amin(0)).max()
+    normals = torch.nn.functional.normalize(torch.linalg.cross(*corners.diff(dim=1).unbind(1)), dim=-1)
+    heights = ((corners.mean(1) - boxes.mean((0, 1))) * normals).sum(-1, keepdim=True) / extent
+    planes = [torch.cat([normals, heights], -1)[group].numpy() for group in groups]
+    trees = [cKDTree(plane) for plane in planes]
+    members: list[list[int]] = []
+    layer = np.empty(len(faces), np.int64)
+    for number, (low, high) in enumerate(boxes - extent * torch.tensor([[1e-5], [-1e-5]])):
+        for others in members:
+            near = ((boxes[others, 0] <= high) & (boxes[others, 1] >= low)).all(1)
+            if not any(_share_plane(trees[others[i]], planes[number]) for i in near.nonzero()[:, 0]):
+                others.append(number)
+                break
+        else:
+            members.append([number])
+    for i, numbers in enumerate(members):
+        layer[torch.cat([groups[number] for number in numbers]).numpy()] = i
+    return layer

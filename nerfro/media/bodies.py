@@ -17,9 +17,10 @@ from nerfro.core.errors import NerfroError
 from nerfro.core.types import Path
 from nerfro.core.variants import variant
 from nerfro.geometry.box import corners_of_box
-from nerfro.geometry.intersection import LayeredIntersector, Triangles
+from nerfro.geometry.intersection import Triangles, layers
 from nerfro.geometry.mesh import TriangleMesh, local_origin
 from nerfro.geometry.thickness import WallSettings, thickness
+from nerfro.geometry.triangle_tree import TriangleTree
 from nerfro.kernels.available import require_bytes
 from nerfro.kernels.constants import constant
 from nerfro.kernels.tolerances import MIN_COSINE, SAFE_SHARE, STEPS_PER_SHELL
@@ -35,6 +36,9 @@ if TYPE_CHECKING:
 
 _RESOLUTION = 128  # vertices along each side of a grid without thin walls
 _AIR = 4  # voxels around a body if the box of its grid is not given
+# The search for the next triangle begins at this share of the box's diagonal from the last one. Triangles of touching
+# bodies within this distance count as met together.
+_SEARCH_OFFSET = 1e-6
 COLOURS = ("red", "green", "blue")
 # Paths record bodies as 8-bit integers.
 _MAX_BODIES = 127
@@ -265,10 +269,11 @@ class Bodies(Medium):
         return Triangles.of(self.meshes)
 
     @cached_property
-    def intersector(self) -> LayeredIntersector:
-        """Intersector of `triangles`."""
+    def tree(self) -> TriangleTree:
+        """Tree of `triangles` for the tracer."""
         assert self.outline is not None
-        return LayeredIntersector(self.triangles.corners, self.outline.faces)
+        offset = _SEARCH_OFFSET * float(torch.linalg.vector_norm(self.box.double().diff(dim=0)))
+        return TriangleTree.of(self.triangles, layers(self.triangles.corners, self.outline.faces), offset)
 
     @property
     def outline(self) -> TriangleMesh | None:

@@ -49,7 +49,7 @@ def trace_snell() -> tuple[Any, ...]:
     medium = sampled(grid_points(1.5, 20).norm(dim=-1)[None] - 0.8, BOX, [1.5], 0.01)
     rays, solids = example_rays(6), medium.packed()
     packed = [torch.from_numpy(values) for values in solids if isinstance(values, np.ndarray)]
-    settings = solids.nested, solids.shell, 16, 2, 0.02, False
+    settings = solids.nested, solids.shell, [], 0, 0.0, 16, 2, 0.02, False
     return compiled._trace, rays.origins, rays.directions, rays.near, rays.far, packed, *settings
 
 

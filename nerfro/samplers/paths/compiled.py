@@ -1,7 +1,8 @@
-"""The compiled tracer of bodies with distance grids, as an operator of PyTorch."""
+"""The compiled tracer of bodies, as an operator of PyTorch."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from nerfro.core.types import OpticalRecord, Path, Rays
+from nerfro.geometry.triangle_tree import TriangleTree
 from nerfro.kernels.lookup import Solids
 from nerfro.kernels.operators import arrays, cpu_operator
 from nerfro.kernels.threads import share_parts
@@ -25,22 +27,34 @@ if TYPE_CHECKING:
 _MAX_VERTICES, _MAX_POLYLINES = 18, 8
 
 
-def snell_on_grid(rays: Rays, medium: Bodies, max_events: int, branching: Branching) -> SnellTrace:
-    """Evaluate `samplers.paths.snell.trace_interfaces` by the compiled kernel, on the CPU for rays on any device.
+def trace_bodies(
+    rays: Rays, medium: Bodies, tree: TriangleTree | None, max_events: int, branching: Branching
+) -> SnellTrace:
+    """Trace rays by the compiled kernel, on the CPU for rays on any device.
 
     A GPU would need a million small operators of PyTorch for the rays of one training step.
+
+    Args:
+        rays: rays.
+        medium: bodies with grids.
+        tree: triangles of the bodies; None for the zero levels of the grids.
+        max_events, branching: see `samplers.paths.snell.trace_interfaces`.
     """
     *solids, nested, shell = medium.packed()
+    *triangles, num_layers, offset = tree or (0, 0.0)
     columns = _trace(
         rays.origins.cpu(), rays.directions.cpu(), rays.near.cpu(), rays.far.cpu(),
-        [torch.from_numpy(values) for values in solids], nested, shell, max_events, *branching,
+        [torch.from_numpy(values) for values in solids], nested, shell,
+        [torch.from_numpy(values) for values in triangles], num_layers, offset, max_events, *branching,
     )  # fmt: skip
-    ray, positions, directions, s, body, surface, far_side, weight, numbers = [
+    ray, positions, directions, s, body, surface, far_side, triangle, weight, numbers = [
         column.to(rays.radii.device) for column in columns
     ]
     num_vertices, num_events, exceeded = numbers.unbind(1)
     radii = rays.radii[ray] if branching.max_split_events else rays.radii
     record = OpticalRecord.of_bodies(body, surface, far_side)
+    if tree is not None:
+        record = replace(record, triangle=triangle)
     path = Path.unbranched(positions, directions, s, num_vertices > 2, radii, record)
     if branching.max_split_events:
         path = split(path, ray, weight)
@@ -51,19 +65,21 @@ def _shapes(origins: Tensor, *_: Any) -> tuple[Tensor, ...]:
     size = torch.library.get_ctx().new_dynamic_size
     rows, vertices = size(), size()
     of_vertices = [origins.new_empty(rows, vertices, *axes) for axes in ((3,), (3,), ())]
-    of_bodies = [origins.new_empty(rows, vertices, dtype=torch.int8) for _ in range(3)]
+    of_bodies = [origins.new_empty(rows, vertices, dtype=dtype) for dtype in (*[torch.int8] * 3, torch.int32)]
     ray, numbers = (origins.new_empty(rows, *axes, dtype=torch.int64) for axes in ((), (3,)))
     return ray, *of_vertices, *of_bodies, origins.new_empty(rows), numbers
 
 
 @cpu_operator(
     "trace_snell(Tensor origins, Tensor directions, Tensor near, Tensor far, Tensor[] solids, bool nested, float shell,"
-    " int max_events, int max_split_events, float least_weight, bool main_only) -> (Tensor ray, Tensor positions, "
-    "Tensor exit_directions, Tensor s, Tensor body, Tensor surface, Tensor far_side, Tensor weight, Tensor numbers)",
+    " Tensor[] triangles, int num_layers, float offset, int max_events, int max_split_events, float least_weight, "
+    "bool main_only) -> (Tensor ray, Tensor positions, Tensor exit_directions, Tensor s, Tensor body, Tensor surface, "
+    "Tensor far_side, Tensor triangle, Tensor weight, Tensor numbers)",
     _shapes,
 )
 def _trace(
     origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, solids: list[Tensor], nested: bool, shell: float,
+    triangles: list[Tensor], num_layers: int, offset: float,
     max_events: int, max_split_events: int, least_weight: float, main_only: bool,
 ) -> tuple[Tensor, ...]:  # fmt: skip
     """Trace rays; returns ray, vertices and numbers of each polyline, see `TracedRows`.
@@ -72,22 +88,25 @@ def _trace(
         origins, directions, near, far: rays.
         solids: arrays of `kernels.lookup.Solids`.
         nested, shell: numbers of `kernels.lookup.Solids`.
+        triangles: arrays of `TriangleTree`; none for the zero levels of the grids.
+        num_layers, offset: numbers of `TriangleTree`.
         max_events: largest number of events of a polyline.
         max_split_events, least_weight, main_only: see `Branching`.
     """
     rays = ray_arrays(origins, directions, near, far)
     of_bodies: dict[str, Any] = {name: values.numpy() for name, values in zip(Solids._fields, solids, strict=False)}
     packed = Solids(**of_bodies, nested=nested, shell=shell)
+    tree = TriangleTree._make([*arrays(*triangles), num_layers, offset]) if triangles else None
     settings = max_events, max_split_events, least_weight, main_only
     max_polylines = _MAX_POLYLINES if max_split_events and not main_only else 1
-    rows, counts = _traced(rays, packed, settings, _MAX_VERTICES, max_polylines)
+    rows, counts = _traced(rays, (packed, tree), settings, _MAX_VERTICES, max_polylines)
     kept, needed = (counts <= (max_polylines, _MAX_VERTICES)).all(1), counts.max(0, initial=1)
     width = max(int(needed[1]), 2)
     columns = _polylines(rows, np.where(kept, counts[:, 0], 0), width)
     if not kept.all():
         rest = (~kept).nonzero()[0]
         few = ray_arrays(origins[rest], directions[rest], near[rest], far[rest])
-        rows, counts = _traced(few, packed, settings, width, int(needed[0]))
+        rows, counts = _traced(few, (packed, tree), settings, width, int(needed[0]))
         again = _polylines(rows, counts[:, 0], width)
         pairs = zip(columns, [rest[again[0]], *again[1:]], strict=True)
         joined = [np.concatenate(pair) for pair in pairs]
@@ -97,7 +116,7 @@ def _trace(
 
 
 def _traced(
-    rays: tuple[np.ndarray, ...], solids: Solids, settings: tuple[int, int, float, bool],
+    rays: tuple[np.ndarray, ...], surfaces: tuple[Solids, TriangleTree | None], settings: tuple[int, int, float, bool],
     max_vertices: int, max_polylines: int,
 ) -> tuple[TracedRows, Int[np.ndarray, "R 2"]]:  # fmt: skip
     """Return the polylines of rays with memory for S vertices and P polylines each, and their counts.
@@ -109,15 +128,14 @@ def _traced(
     """
     polylines, dtype = (len(rays[0]), max_polylines), rays[0].dtype
     rows = TracedRows(
-        np.empty((*polylines, max_vertices, 7), dtype), np.empty((*polylines, max_vertices, 3), np.int8),
+        np.empty((*polylines, max_vertices, 7), dtype), np.empty((*polylines, max_vertices, 4), np.int32),
         np.empty(polylines, dtype), np.empty((*polylines, 3), np.int64),
     )  # fmt: skip
     counts = np.empty((len(rays[0]), 2), np.int64)
 
     def trace(part: slice) -> None:
         of_part = TracedRows(*(values[part] for values in rows))
-        origins, directions, near, far = (values[part] for values in rays)
-        trace_snell(origins, directions, near, far, solids, settings, of_part, counts[part])
+        trace_snell(tuple(values[part] for values in rays), *surfaces, settings, of_part, counts[part])
 
     share_parts(trace, len(counts))
     return rows, counts

@@ -55,7 +55,7 @@ class PolylineBuilder:
 
     def __init__(self, num_rays: int, like: Float[Tensor, "..."]) -> None:
         self._vertices = like.new_zeros(num_rays, 4, 7)
-        self._crossed = torch.zeros(num_rays, 4, 4, dtype=torch.int32, device=like.device)
+        self._crossed = torch.zeros(num_rays, 4, 3, dtype=torch.int8, device=like.device)
         self.counts = torch.zeros(num_rays, dtype=torch.long, device=like.device)
 
     def append(
@@ -64,21 +64,21 @@ class PolylineBuilder:
         positions: Float[Tensor, "A 3"],
         directions: Float[Tensor, "A 3"],
         s: Float[Tensor, "A"],
-        crossed: Sequence[Int[Tensor, "A"] | int] = (0, 0, 0, -1),
+        crossed: Sequence[Int[Tensor, "A"] | int] = (0, 0, 0),
     ) -> None:
         """Add one vertex to each of some rows.
 
         Args:
             rows: rows, each at most once.
             positions, directions, s: the vertices.
-            crossed: body, surface, far side and triangle of each vertex, see `OpticalRecord`; by default those in air.
+            crossed: body, surface and far side of each vertex, see `OpticalRecord`; by default those in air.
         """
         if len(rows) and int(self.counts[rows].max()) == self._vertices.shape[1]:
             self._vertices = torch.cat([self._vertices, torch.zeros_like(self._vertices)], 1)
             self._crossed = torch.cat([self._crossed, torch.zeros_like(self._crossed)], 1)
         self._vertices[rows, self.counts[rows]] = torch.cat([positions, directions, s[:, None]], -1)
         for i, numbers in enumerate(crossed):
-            self._crossed[rows, self.counts[rows], i] = numbers.int() if isinstance(numbers, Tensor) else numbers
+            self._crossed[rows, self.counts[rows], i] = torch.as_tensor(numbers, dtype=torch.int8)
         self.counts[rows] += 1
 
     def take(self, rows: Int[Tensor, "T"]) -> None:
@@ -111,8 +111,7 @@ class PolylineBuilder:
         index = torch.arange(capacity, device=self.counts.device).minimum(self.counts[:, None] - 1)[..., None]
         vertices = self._vertices.take_along_dim(index, 1).to(like)
         crossed = self._crossed.take_along_dim(index, 1).to(like.device)
-        *numbers, triangle = crossed.unbind(-1)
-        record = replace(OpticalRecord.of_bodies(*(values.to(torch.int8) for values in numbers)), triangle=triangle)
+        record = OpticalRecord.of_bodies(*crossed.unbind(-1))
         return Path.unbranched(
             vertices[..., :3], vertices[..., 3:6], vertices[..., 6], refracted.to(like.device), rays.radii, record
         )

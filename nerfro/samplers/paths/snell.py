@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 import torch
 from annotated_types import Ge, Le
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from torch import Tensor
 from torch.nn import functional
 
@@ -23,16 +23,13 @@ from nerfro.registry.allowed import OnlyWith, Positive, Share
 from nerfro.registry.registration import register
 from nerfro.samplers.base import PathSampler
 from nerfro.samplers.paths.branching import ONE_PATH, Branching
-from nerfro.samplers.paths.compiled import snell_on_grid
+from nerfro.samplers.paths.compiled import trace_bodies
 from nerfro.samplers.paths.polylines import SnellTrace
 from nerfro.samplers.paths.replay import Intersect, intersect_solid, intersect_triangles, replay, smallest_cosine
 from nerfro.samplers.paths.straight import replay_straight, straight_path
 from nerfro.samplers.paths.wavefront import Wavefront
 
 _ROOT_ITERATIONS = 60
-# The search for the next triangle begins at this share of the box's diagonal from the last one, beyond the rounding
-# errors of Embree's single precision.
-_SEARCH_OFFSET = 1e-6
 # Training uses no derivatives of paths whose `smallest_cosine` is below this value.
 _STEADY = 0.15
 
@@ -70,14 +67,16 @@ class GridTracer(Tracer):
     releases_gil = True
 
     def trace(self, rays: Rays, max_events: int, branching: Branching) -> SnellTrace:
-        return snell_on_grid(rays, self.medium, max_events, branching)
+        return trace_bodies(rays, self.medium, None, max_events, branching)
 
 
 class TriangleTracer(Tracer):
-    """Trace triangles of meshes."""
+    """Trace triangles of meshes by the compiled kernel."""
+
+    releases_gil = True
 
     def trace(self, rays: Rays, max_events: int, branching: Branching) -> SnellTrace:
-        return _trace_triangles(rays, self.medium, max_events, branching)
+        return trace_bodies(rays, self.medium, self.medium.tree, max_events, branching)
 
     def intersect(self, path: Path) -> Intersect:
         assert path.record is not None
@@ -154,7 +153,7 @@ class Snell(PathSampler):
             tracer: type[Tracer] = GridTracer if len(bodies.grids) else ReferenceTracer
         elif bodies.meshes:
             tracer = TriangleTracer
-            bodies.intersector  # noqa: B018 (created once, before the variants of all wavelengths share it)
+            bodies.tree  # noqa: B018 (created once, before the variants of all wavelengths share it)
         else:
             raise NerfroError(
                 "sampler.path.interface=mesh needs a medium made of meshes; give each body of medium=sdf_grid a "
@@ -187,7 +186,7 @@ class Snell(PathSampler):
         return smallest_cosine(path, medium) > _STEADY
 
     def releases_gil(self, medium: Medium) -> bool:
-        return not self.traces_triangles and self.tracers(medium)[0].releases_gil
+        return self.tracers(medium)[0].releases_gil
 
     @torch.no_grad()
     def trace(self, rays: Rays, medium: Medium, branching: Branching | None = None) -> SnellTrace:
@@ -238,74 +237,6 @@ def _replay_in_bands(path: Path, rays: Rays, tracers: Sequence[Tracer], branchin
     order, names = torch.cat(rows).argsort(), ("positions", "directions", "s", "throughput")
     columns: dict[str, Any] = {name: torch.cat([getattr(part, name) for part in replayed])[order] for name in names}
     return replace(path, **columns)
-
-
-def _trace_triangles(rays: Rays, medium: Bodies, max_events: int, branching: Branching) -> SnellTrace:
-    """Trace rays from triangle to triangle of meshes, on the CPU and in double precision.
-
-    The number of crossings of its surface determines whether a ray is inside a body.
-    """
-    triangles, scene = medium.triangles, medium.intersector
-    box = medium.box.double().cpu()
-    offset = _SEARCH_OFFSET * float(torch.linalg.vector_norm(box[1] - box[0]))
-    front = Wavefront(rays.to("cpu").to(torch.float64), medium, box, max_events, branching, offset, scene.num_layers)
-    within = (front.moving & (front.enter < 0)).nonzero()[:, 0]
-    if len(within):
-        x, d = front.x[within], front.d[within]
-        front.start[within] = offset  # a ray that begins on a surface does not cross it
-        front.inside[within] = _inside_at_start(medium, x, d, offset)
-    front.add_vertices(front.ray)
-    while len(rows := front.moving.nonzero()[:, 0]):
-        faces = scene.first_hits(front.x[rows] + front.start[rows, None] * front.d[rows], front.d[rows])
-        hit = (faces >= 0).any(1)
-        front.moving[rows] = hit
-        rows, faces = rows[hit], faces[hit]
-        # A straight line meets a plane once, so finding a triangle of the last vertex again is a rounding error.
-        again = ((faces[:, :, None] == front.triangles[rows][:, None]) & (faces >= 0)[:, :, None]).any((1, 2))
-        front.start[rows[again]] += offset
-        rows, faces = rows[~again], faces[~again]
-        lengths = triangles.distance(front.x[rows, None], front.d[rows, None], faces).clamp(min=0)
-        lengths, order = torch.where(faces >= 0, lengths, torch.inf).sort(1)
-        faces, length = faces.gather(1, order), lengths[:, 0]
-        # All triangles at one distance count, because the ray continues behind them.
-        faces = torch.where(lengths <= length[:, None] + offset, faces, -1)
-        body = torch.where(faces >= 0, triangles.body[faces], -1)
-        normal = triangles.normal(front.x[rows] + length[:, None] * front.d[rows], faces[:, 0])
-        front.apply_interface(rows, length, length, body, normal, faces)
-    return front.finish(rays)
-
-
-def _inside_at_start(
-    medium: Bodies, x: Float[Tensor, "P 3"], d: Float[Tensor, "P 3"], offset: float
-) -> Bool[Tensor, "P K"]:
-    """Return which bodies contain the starts of rays, given by triangles.
-
-    Signed distances half-way to the first triangle determine the bodies. The smooth surface of the distances differs
-    from the triangles. Therefore, if the distance to the body of the first triangle is less than a voxel, a ray begins
-    inside this body if it leaves the body through the triangle.
-
-    Args:
-        medium: bodies with meshes.
-        x, d: starts of the rays, and unit directions.
-        offset: distance from the start at which the search for triangles begins; triangles within this distance of the
-            first one count as well.
-    """
-    triangles = medium.triangles
-    faces = medium.intersector.first_hits(x + offset * d, d)
-    lengths = torch.where(faces >= 0, triangles.distance(x[:, None], d[:, None], faces), torch.inf)
-    length = lengths.amin(1, keepdim=True)
-    half_way = x + 0.5 * torch.where(length < torch.inf, length, 0.0) * d
-    phi = medium.signed_distances(half_way.to(medium.box))[0].cpu()
-    inside = (phi < 0) & (length < torch.inf)
-    is_near = phi.abs() < torch.stack([grid.spacing.max() for grid in medium.grids]).cpu()
-    row, layer = ((faces >= 0) & (lengths <= length + offset)).nonzero(as_tuple=True)
-    first = faces[row, layer]
-    decides = is_near[row, triangles.body[first]]
-    row, first = row[decides], first[decides]
-    leaves = (triangles.areas(first) * d[row]).sum(-1) > 0
-    inside[row, triangles.body[first]] = False
-    inside[row[leaves], triangles.body[first[leaves]]] = True
-    return inside
 
 
 def trace_interfaces(rays: Rays, medium: Bodies, max_events: int, branching: Branching = ONE_PATH) -> SnellTrace:

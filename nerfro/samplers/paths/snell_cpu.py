@@ -1,6 +1,7 @@
-"""Compiled refraction and reflection at the zero level of signed-distance solids, one thread per ray.
+"""Compiled refraction and reflection at the surfaces of bodies, one thread per ray.
 
-The algorithm is `samplers.paths.snell.trace_interfaces`, for one ray at a time. A *segment* is the straight part of a
+The algorithm is `samplers.paths.snell.trace_interfaces`, for one ray at a time. The surfaces are the zero levels of
+distance grids, or the triangles of a `TriangleTree`. A *segment* is the straight part of a
 polyline between two *events*, refractions or reflections at a surface. If light splits, the transmitted part is
 followed first. The reflected part becomes a *pending branch*, which shares the polyline up to the event; pending
 branches are followed later, the last one first.
@@ -12,15 +13,17 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Int8
+from jaxtyping import Bool, Float, Int, Int32
 from numba import prange
 
 from nerfro.kernels.compilation import compiled, compiled_parallel
 from nerfro.kernels.lookup import body_distance, box_span, distance_out, grid_of, spline_value_gradient
 from nerfro.samplers.paths.branching import Branching
 from nerfro.samplers.paths.surface_search_cpu import Line, advance, first_surface
+from nerfro.samplers.paths.triangle_search_cpu import begin_inside, face_normal, first_triangle
 
 _BLOCK = 64  # number of rays for which a thread allocates scratch memory once
+_DEPTH = 64  # largest depth of a tree of triangles
 
 
 class Branch(NamedTuple):
@@ -33,11 +36,19 @@ class Branch(NamedTuple):
     num_events: int
 
 
+class Crossing(NamedTuple):
+    """Surface of a vertex, as in `types.OpticalRecord`; the defaults are those of a vertex on no surface."""
+
+    surface: int = 0
+    across: int = 0
+    triangle: int = -1
+
+
 class TracedRows(NamedTuple):
     """Polylines of one ray, one row each (P rows, S vertices)."""
 
     vertices: Float[np.ndarray, "P S 7"]  # position, direction and arc length
-    crossed: Int8[np.ndarray, "P S 3"]  # `body`, `surface_body` and `far_side` of `types.OpticalRecord`
+    crossed: Int32[np.ndarray, "P S 4"]  # body behind the vertex, and its `Crossing`
     weight: Float[np.ndarray, "P"]
     numbers: Int[np.ndarray, "P 3"]  # number of vertices, number of events, and whether the limit of events was met
 
@@ -46,10 +57,16 @@ class Scratch(NamedTuple):
     """Memory of a thread, with the stack of reflected branches that are followed later (K bodies)."""
 
     inside: Bool[np.ndarray, "K"]  # whether the ray is inside each body's surface
-    crossings: Float[np.ndarray, "K"]  # see `first_surface`
+    crossings: Float[np.ndarray, "K"]  # see `first_surface` and `first_triangle`
     pending: Float[np.ndarray, "pending 8"]  # line, arc length and weight
-    pending_numbers: Int[np.ndarray, "pending 4"]  # vertices, events, surface of the reflection, body behind it
+    pending_numbers: Int[np.ndarray, "pending 5"]  # vertices, events, and `Crossing` of the reflection
     pending_inside: Bool[np.ndarray, "pending K"]
+    # For triangles in L layers: the first triangle of each layer on a line, -1 for none, its distance, and nodes of the
+    # tree that are searched later, with the distances to their boxes.
+    faces: Int[np.ndarray, "L"]
+    lengths: Float[np.ndarray, "L"]
+    nodes: Int[np.ndarray, " depth"]
+    entries: Float[np.ndarray, " depth"]
 
 
 @compiled
@@ -96,12 +113,11 @@ def _reflected(line, nx, ny, nz, ratio):
 
 
 @compiled
-def _event(solids, hit, line_before, line_behind, ratio, branching, branch):
+def _event(normal, line_before, line_behind, ratio, branching, branch):
     """Decide whether light is refracted, reflected or split at a surface.
 
     Args:
-        solids: bodies.
-        hit: body whose surface is met.
+        normal: unit normal of the surface.
         line_before, line_behind: arriving line, with its start just before and just behind the surface.
         ratio: ratio of the index before the surface to the index behind the surface.
         branching: rule for splitting.
@@ -111,10 +127,7 @@ def _event(solids, hit, line_before, line_behind, ratio, branching, branch):
         Line of the part that is followed first; whether this part is reflected; line of the reflected part, which
         becomes a pending branch if light splits; and its share of the light, 0 if light does not split.
     """
-    x, y, z = line_behind.x, line_behind.y, line_behind.z
-    _, nx, ny, nz = spline_value_gradient(solids.coefficients, grid_of(solids, hit), x, y, z)
-    norm = math.sqrt(nx * nx + ny * ny + nz * nz)
-    nx, ny, nz = nx / norm, ny / norm, nz / norm
+    nx, ny, nz = normal
     transmitted, total = _transmitted(line_behind, nx, ny, nz, ratio)
     if not total and branch.num_events >= branching.max_split_events:
         return transmitted, False, transmitted, 0.0
@@ -129,7 +142,7 @@ def _event(solids, hit, line_before, line_behind, ratio, branching, branch):
 
 
 @compiled
-def _put_vertex(rows, row, branch, body, surface, across):
+def _put_vertex(rows, row, branch, body, crossing):
     """Append the vertex of a branch to a row; beyond the capacity of the row, vertices are only counted."""
     i, line = branch.num_vertices, branch.line
     if i < rows.vertices.shape[1]:
@@ -137,7 +150,7 @@ def _put_vertex(rows, row, branch, body, surface, across):
         for j in range(6):
             vertex[j] = line[j]
         vertex[6] = branch.s
-        crossed[0], crossed[1], crossed[2] = body, surface, across
+        crossed[0], crossed[1], crossed[2], crossed[3] = body, crossing.surface, crossing.across, crossing.triangle
     return Branch(line, branch.s, branch.weight, i + 1, branch.num_events)
 
 
@@ -151,17 +164,19 @@ def _put_end(solids, rows, row, branch, far, exceeded):
     end = Branch(advance(line, ahead), branch.s + ahead, branch.weight, branch.num_vertices, branch.num_events)
     rows.weight[row], numbers = branch.weight, rows.numbers[row]
     numbers[0], numbers[1], numbers[2] = branch.num_vertices + 1, branch.num_events, exceeded
-    return _put_vertex(rows, row, end, 0, 0, 0).num_vertices
+    return _put_vertex(rows, row, end, 0, Crossing(0, 0, -1)).num_vertices
 
 
 @compiled
-def _push(scratch, size, branch, mirrored, s, weight, surface, across):
+def _push(scratch, size, branch, mirrored, s, weight, crossing):
     """Put the reflected part of a branch on the stack; returns the size of the stack."""
     light, numbers = scratch.pending[size], scratch.pending_numbers[size]
     for i in range(6):
         light[i] = mirrored[i]
     light[6], light[7] = s, weight
-    numbers[0], numbers[1], numbers[2], numbers[3] = branch.num_vertices, branch.num_events + 1, surface, across
+    numbers[0], numbers[1] = branch.num_vertices, branch.num_events + 1
+    for i in range(3):
+        numbers[2 + i] = crossing[i]
     for body in range(len(scratch.inside)):
         scratch.pending_inside[size, body] = scratch.inside[body]
     return size + 1
@@ -182,15 +197,15 @@ def _resume(solids, scratch, top, rows, former, row):
     inside = scratch.inside
     for body in range(len(inside)):
         inside[body] = scratch.pending_inside[top, body]
-    count, num_events, surface, across = scratch.pending_numbers[top]
+    count, num_events, surface, across, triangle = scratch.pending_numbers[top]
     for i in range(min(count, rows.vertices.shape[1])):
         for j in range(7):
             rows.vertices[row, i, j] = rows.vertices[former, i, j]
-        for j in range(3):
+        for j in range(4):
             rows.crossed[row, i, j] = rows.crossed[former, i, j]
     x, y, z, dx, dy, dz, s, weight = scratch.pending[top]
     branch = Branch(Line(x, y, z, dx, dy, dz), s, weight, count, num_events)
-    return _put_vertex(rows, row, branch, _deciding_body(inside, solids), surface, across)
+    return _put_vertex(rows, row, branch, _deciding_body(inside, solids), Crossing(surface, across, triangle))
 
 
 @compiled
@@ -224,75 +239,117 @@ def _cross(solids, scratch, body, hit, after):
 
 @compiled
 def _flip(scratch):
-    """Change the side of all surfaces that `_cross` has crossed."""
+    """Change the side of all surfaces that are crossed."""
     for body in range(len(scratch.inside)):
         if scratch.crossings[body] < 0.0:
             scratch.inside[body] = not scratch.inside[body]
 
 
 @compiled
-def _follow(solids, max_events, branching, scratch, rows, row, branch, num_pending):
+def _next_surface(solids, tree, scratch, body, line):
+    """Move a ray to the other side of the next surface on a line.
+
+    Args:
+        solids: bodies.
+        tree: triangles of the bodies; None for the zero levels of the grids.
+        scratch: memory of the thread.
+        body: body before the surface.
+        line: line of the ray.
+
+    Returns:
+        Body whose surface is met, -1 for none; its triangle; body on the other side; and arc lengths before and behind
+        the surface.
+    """
+    if tree is None:
+        hit, before, after = first_surface(solids, scratch.inside, scratch.crossings, line)
+        if hit < 0:
+            return hit, -1, 0, before, after
+        across, behind = _cross(solids, scratch, body, hit, after)
+        return hit, -1, across, before, behind
+    hit, triangle, length = first_triangle(tree, scratch, line)
+    _flip(scratch)
+    return hit, triangle, _deciding_body(scratch.inside, solids), length, length
+
+
+@compiled
+def _normal(solids, tree, hit, triangle, line, far):
+    """Return the unit normal at the next surface; see `_next_surface`, and `far` is the line behind the surface."""
+    if tree is not None:
+        return face_normal(tree, triangle, line)
+    _, nx, ny, nz = spline_value_gradient(solids.coefficients, grid_of(solids, hit), far.x, far.y, far.z)
+    norm = math.sqrt(nx * nx + ny * ny + nz * nz)
+    return nx / norm, ny / norm, nz / norm
+
+
+@compiled
+def _follow(solids, tree, settings, scratch, rows, row, branch, num_pending):
     """Follow a branch from event to event, until there is no surface ahead or the limit of events is met.
 
     Returns:
         The branch at the last event, whether the limit was met, and the number of pending branches.
     """
-    inside = scratch.inside
+    max_events, branching = settings[0], Branching(settings[1], settings[2], settings[3])
     while True:
         here = branch.line
-        hit, before, after = first_surface(solids, inside, scratch.crossings, here)
+        body = _deciding_body(scratch.inside, solids)
+        hit, triangle, across, before, behind = _next_surface(solids, tree, scratch, body, here)
         if hit < 0:
             return branch, False, num_pending
-        body = _deciding_body(inside, solids)
-        across, behind = _cross(solids, scratch, body, hit, after)
+        crossing = Crossing(hit + 1, across, triangle)
         n_before, n_across = solids.iors[body], solids.iors[across]
         far = advance(here, behind)
         if n_before == n_across:
             branch = Branch(far, branch.s + behind, branch.weight, branch.num_vertices, branch.num_events)
             if body != across and (solids.absorbs[body] or solids.absorbs[across]):
-                branch = _put_vertex(rows, row, branch, across, hit + 1, across)
+                branch = _put_vertex(rows, row, branch, across, crossing)
             continue
         if branch.num_events >= max_events:
             return branch, True, num_pending
         ratio, weight = n_before / n_across, branch.weight
         arriving = advance(here, before)
-        line, is_reflected, mirrored, share = _event(solids, hit, arriving, far, ratio, branching, branch)
+        normal = _normal(solids, tree, hit, triangle, here, far)
+        line, is_reflected, mirrored, share = _event(normal, arriving, far, ratio, branching, branch)
         if share > 0.0:
             if not branching.main_only:
                 _flip(scratch)
                 s = branch.s + before
-                num_pending = _push(scratch, num_pending, branch, mirrored, s, weight * share, hit + 1, across)
+                num_pending = _push(scratch, num_pending, branch, mirrored, s, weight * share, crossing)
                 _flip(scratch)
             weight *= 1.0 - share
         if is_reflected:
             _flip(scratch)
         length = before if is_reflected else behind
         branch = Branch(line, branch.s + length, weight, branch.num_vertices, branch.num_events + 1)
-        branch = _put_vertex(rows, row, branch, body if is_reflected else across, hit + 1, across)
+        branch = _put_vertex(rows, row, branch, body if is_reflected else across, crossing)
 
 
 @compiled
-def _trace_ray(solids, line, near, far, settings, scratch, rows):
+def _trace_ray(solids, tree, line, near, far, settings, scratch, rows):
     """Trace the polylines of one ray into rows; returns the number of polylines and the largest number of vertices.
 
     Entries after the last vertex of a row are undefined. Polylines beyond the capacity are only counted.
     """
-    inside, last_row = scratch.inside, len(rows.weight) - 1
-    max_events, branching = settings[0], Branching(settings[1], settings[2], settings[3])
+    last_row, start = len(rows.weight) - 1, 0.0
     branch = Branch(advance(line, near), near, 1.0, 0, 0)
     x, y, z, dx, dy, dz = branch.line
     enter, leave = box_span(solids.box_low, solids.box_high, x, y, z, dx, dy, dz)
     misses = not (enter < leave and leave > 0.0 and enter < far - near)
-    entry = advance(branch.line, max(enter, 0.0))
-    for body in range(len(inside)):
-        inside[body] = not misses and body_distance(solids, body, entry.x, entry.y, entry.z) < 0.0
-    branch = _put_vertex(rows, 0, branch, _deciding_body(inside, solids), 0, 0)
+    scratch.inside[:] = False
+    if tree is not None:
+        if not misses and enter < 0.0:
+            begin_inside(solids, tree, scratch, branch.line)
+    elif not misses:
+        start = max(enter, 0.0)
+        x, y, z, _, _, _ = advance(branch.line, start)
+        for body in range(len(scratch.inside)):
+            scratch.inside[body] = body_distance(solids, body, x, y, z) < 0.0
+    branch = _put_vertex(rows, 0, branch, _deciding_body(scratch.inside, solids), Crossing(0, 0, -1))
     if misses:
         return 1, _put_end(solids, rows, 0, branch, far, False)
-    branch = Branch(entry, near + max(enter, 0.0), 1.0, branch.num_vertices, 0)
+    branch = Branch(advance(branch.line, start), near + start, 1.0, branch.num_vertices, 0)
     row, num_polylines, most_vertices, num_pending = 0, 0, 0, 0
     while True:
-        branch, exceeded, num_pending = _follow(solids, max_events, branching, scratch, rows, row, branch, num_pending)
+        branch, exceeded, num_pending = _follow(solids, tree, settings, scratch, rows, row, branch, num_pending)
         num_polylines += 1
         most_vertices = max(most_vertices, _put_end(solids, rows, row, branch, far, exceeded))
         if num_pending == 0:
@@ -303,20 +360,25 @@ def _trace_ray(solids, line, near, far, settings, scratch, rows):
 
 
 @compiled_parallel
-def trace_snell(origins, directions, near, far, solids, settings, rows, counts):
+def trace_snell(rays, solids, tree, settings, rows, counts):
     """Trace the polylines of all rays, which may split at their first events (`samplers.paths.branching`).
 
     Args:
-        origins, directions, near, far: rays [R, ...].
+        rays: origins, directions, near and far [R, ...].
         solids: bodies, a `kernels.lookup.Solids`.
+        tree: triangles of the bodies, a `TriangleTree`; None for the zero levels of the grids.
         settings: largest number of events of a polyline, and the fields of a `Branching`.
         rows, counts: memory for the results, see `samplers.paths.compiled._traced`.
     """
-    num_rays, num_bodies, num_pending = origins.shape[0], len(solids.low), settings[1]
+    origins, directions, near, far = rays
+    num_rays, num_bodies, num_pending, num_layers = origins.shape[0], len(solids.low), settings[1], 0
+    if tree is not None:
+        num_layers = tree.num_layers
     for block in prange((num_rays + _BLOCK - 1) // _BLOCK):
         scratch = Scratch(
             np.empty(num_bodies, np.bool_), np.empty(num_bodies), np.empty((num_pending, 8)),
-            np.empty((num_pending, 4), np.int64), np.empty((num_pending, num_bodies), np.bool_),
+            np.empty((num_pending, 5), np.int64), np.empty((num_pending, num_bodies), np.bool_),
+            np.empty(num_layers, np.int64), np.empty(num_layers), np.empty(_DEPTH, np.int64), np.empty(_DEPTH),
         )  # fmt: skip
         for ray in range(block * _BLOCK, min((block + 1) * _BLOCK, num_rays)):
             x, d = origins[ray], directions[ray]
@@ -326,7 +388,7 @@ def trace_snell(origins, directions, near, far, solids, settings, rows, counts):
             )  # fmt: skip
             row = TracedRows(rows.vertices[ray], rows.crossed[ray], rows.weight[ray], rows.numbers[ray])
             start, end = np.float64(near[ray]), np.float64(far[ray])
-            counts[ray] = _trace_ray(solids, line, start, end, settings, scratch, row)
+            counts[ray] = _trace_ray(solids, tree, line, start, end, settings, scratch, row)
 
 
 @compiled_parallel
@@ -339,11 +401,12 @@ def polylines_of_width(rows, ray, place, width):
         width: number of vertices, S.
 
     Returns:
-        positions, directions, s, body, surface and across.
+        positions, directions, s, body, surface, across and triangle.
     """
     number, max_vertices, dtype = len(ray), rows.vertices.shape[2], rows.vertices.dtype
     positions, directions = np.empty((number, width, 3), dtype), np.empty((number, width, 3), dtype)
     s, crossed = np.empty((number, width), dtype), np.empty((3, number, width), np.int8)
+    triangle = np.empty((number, width), np.int32)
     for p in prange(number):
         vertices, bodies = rows.vertices[ray[p], place[p]], rows.crossed[ray[p], place[p]]
         last = min(rows.numbers[ray[p], place[p], 0], max_vertices, width) - 1
@@ -352,5 +415,5 @@ def polylines_of_width(rows, ray, place, width):
             for axis in range(3):
                 positions[p, i, axis], directions[p, i, axis] = vertices[j, axis], vertices[j, 3 + axis]
                 crossed[axis, p, i] = bodies[j, axis]
-            s[p, i] = vertices[j, 6]
-    return positions, directions, s, crossed[0], crossed[1], crossed[2]
+            s[p, i], triangle[p, i] = vertices[j, 6], bodies[j, 3]
+    return positions, directions, s, crossed[0], crossed[1], crossed[2], triangle

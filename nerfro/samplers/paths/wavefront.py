@@ -19,7 +19,7 @@ from nerfro.samplers.paths.replay import indices_of
 from nerfro.samplers.paths.snell_law import reflectance, refract
 
 # Attributes of `Wavefront` with one row for each polyline.
-_COLUMNS = ("x", "d", "s", "inside", "triangles", "start", "moving", "ray", "weight", "num_events", "exceeded")
+_COLUMNS = ("x", "d", "s", "inside", "moving", "ray", "weight", "num_events", "exceeded")
 
 
 class _Crossing(NamedTuple):
@@ -29,7 +29,6 @@ class _Crossing(NamedTuple):
     after: Float[Tensor, "A"]
     body: Int[Tensor, "A L"]
     normal: Float[Tensor, "A 3"]
-    triangles: Int[Tensor, "A L"]
     flipped: Bool[Tensor, "A K"]  # whether the far side is inside each surface
     across: Int[Tensor, "A"]  # body on the far side, numbered from 1; 0 for air
     n_before: Float[Tensor, "A"]
@@ -53,15 +52,11 @@ class Wavefront:
         box: box of the medium, as precise as the rays and on their device.
         max_events: largest number of refractions and reflections of a polyline.
         branching: which parts of light that is partly reflected are followed.
-        offset: distance from a surface at which the search for the next one begins, world units.
-        num_layers: largest number of triangles that a row meets at one distance, L.
 
     Attributes:
         x, d: position in world units and unit direction of each row [P, 3].
         s: arc length from the camera [P].
         inside: whether each row is inside the surface of each body [P, K]; the tracers set the first values.
-        triangles: triangles that each row lies on [P, L]; -1 for none.
-        start: distance from `x` at which the search for the next surface begins.
         moving: whether each row may intersect another surface.
         ray, weight: ray of each row, and its share of the light of this ray.
         num_events, exceeded: events of each row, and whether it met the limit.
@@ -75,10 +70,8 @@ class Wavefront:
         box: Float[Tensor, "2 3"],
         max_events: int,
         branching: Branching,
-        offset: float = 0.0,
-        num_layers: int = 1,
     ) -> None:
-        self.medium, self.box, self.max_events, self.branching, self.offset = medium, box, max_events, branching, offset
+        self.medium, self.box, self.max_events, self.branching = medium, box, max_events, branching
         self.indices, self.far = indices_of(medium, box), rays.far
         self.absorbs = functional.pad(medium.absorbs.to(box.device), (1, 0))
         self.x, self.d = rays.origins + rays.near[:, None] * rays.directions, rays.directions.clone()
@@ -86,9 +79,8 @@ class Wavefront:
         self.enter, leave = intersect_box(box, self.x, self.d)
         self.moving = (self.enter < leave) & (leave > 0) & (self.enter < rays.far - self.s)
         self.ray = torch.arange(len(rays), device=self.s.device)
-        self.triangles = torch.full_like(self.ray[:, None].expand(-1, num_layers), -1)
         self.num_events = torch.zeros_like(self.ray)
-        self.start, self.weight = torch.zeros_like(self.s), torch.ones_like(self.s)
+        self.weight = torch.ones_like(self.s)
         self.exceeded = torch.zeros_like(self.moving)
         self.inside = self.exceeded[:, None].repeat(1, len(medium.iors))
         self.lines = PolylineBuilder(len(rays), self.x)
@@ -112,11 +104,10 @@ class Wavefront:
         rows: Int[Tensor, "A"],
         surface: Int[Tensor, "A"] | int = 0,
         across: Int[Tensor, "A"] | int = 0,
-        triangle: Int[Tensor, "A"] | int = -1,
     ) -> None:
         """Record the present positions of rows as vertices; see `Path` for the numbers."""
         body = self.medium.deciding_body(self.inside[rows])
-        self.lines.append(rows, self.x[rows], self.d[rows], self.s[rows], (body, surface, across, triangle))
+        self.lines.append(rows, self.x[rows], self.d[rows], self.s[rows], (body, surface, across))
 
     def apply_interface(
         self,
@@ -125,7 +116,6 @@ class Wavefront:
         after: Float[Tensor, "A"],
         body: Int[Tensor, "A L"],
         normal: Float[Tensor, "A 3"],
-        triangles: Int[Tensor, "A L"] | None = None,
     ) -> None:
         """Refract and reflect rows at the next surface.
 
@@ -135,9 +125,7 @@ class Wavefront:
                 transmitted light continues.
             body: bodies whose surfaces are met at this distance, from 0; -1 for none. The first is recorded.
             normal: unit normal of either orientation.
-            triangles: triangles that are met, as in `body`; by default none.
         """
-        triangles = torch.full_like(self.triangles[rows], -1) if triangles is None else triangles
         inside = self.inside[rows]
         # Number of crossed surfaces of each body; the first column takes the entries without a surface.
         num_crossed = rows.new_zeros(len(rows), inside.shape[1] + 1)
@@ -149,7 +137,7 @@ class Wavefront:
         recorded = visible | (number != across) & (self.absorbs[number] | self.absorbs[across])
         exceeds = visible & (self.num_events[rows] >= self.max_events)
         self.exceeded[rows], self.moving[rows] = exceeds, ~exceeds
-        met = _Crossing(before, after, body, normal, triangles, flipped, across, n_before, n_after, visible, recorded)
+        met = _Crossing(before, after, body, normal, flipped, across, n_before, n_after, visible, recorded)
         rows, met = rows[~exceeds], met.select(~exceeds)
         outgoing, reflected = refract(self.d[rows], met.normal, met.n_before, met.n_after)
         reflected &= met.visible
@@ -163,10 +151,9 @@ class Wavefront:
         self.x[rows] += length[:, None] * self.d[rows]
         self.s[rows] += length
         self.d[rows] = torch.where(met.visible[:, None], outgoing, self.d[rows])
-        self.triangles[rows], self.start[rows] = met.triangles, self.offset
         self.num_events[rows] += met.visible
         vertex = met.select(met.recorded)
-        self.add_vertices(rows[met.recorded], vertex.body[:, 0] + 1, vertex.across, vertex.triangles[:, 0])
+        self.add_vertices(rows[met.recorded], vertex.body[:, 0] + 1, vertex.across)
 
     def _split(
         self, rows: Int[Tensor, "A"], share: Float[Tensor, "A"], reflected: Bool[Tensor, "A"]

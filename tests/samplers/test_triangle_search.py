@@ -1,0 +1,79 @@
+"""The search for triangles: against all triangles one by one, on edges, and without Embree."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from nerfro.geometry.intersection import Triangles
+from nerfro.geometry.triangle_tree import TriangleTree
+from nerfro.kernels.compilation import compiled_parallel
+from nerfro.media.body_settings import make_bodies
+from nerfro.samplers.paths.snell import Snell
+from nerfro.samplers.paths.snell_cpu import Scratch
+from nerfro.samplers.paths.surface_search_cpu import Line
+from nerfro.samplers.paths.triangle_search_cpu import first_triangle
+from tests.closed_forms import random_rays
+
+
+@compiled_parallel
+def _first_triangles(tree, scratch, origins, directions, lengths):  # type: ignore[no-untyped-def]
+    for i in range(len(origins)):
+        x, d = origins[i], directions[i]
+        lengths[i] = first_triangle(tree, scratch, Line(x[0], x[1], x[2], d[0], d[1], d[2]))[2]
+
+
+def _lengths(corners: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    triangles = Triangles(torch.tensor(corners), torch.zeros(corners.shape), torch.zeros(len(corners)).long())
+    tree = TriangleTree.of(triangles, np.zeros(len(corners), np.int64), 1e-6)
+    one, number = np.empty(1), np.empty(1, np.int64)
+    scratch = Scratch(
+        np.empty(1, np.bool_), one, np.empty((0, 8)), np.empty((0, 5), np.int64), np.empty((0, 1), np.bool_),
+        number, one.copy(), np.empty(64, np.int64), np.empty(64),
+    )  # fmt: skip
+    lengths = np.empty(len(origins))
+    _first_triangles(tree, scratch, origins, directions, lengths)
+    return lengths
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 500])
+def test_tree_finds_the_nearest_of_all_triangles(count: int) -> None:
+    generator = np.random.default_rng(count)
+    corners = generator.normal(size=(count, 1, 3)) + 0.3 * generator.normal(size=(count, 3, 3))
+    origins = 3 * generator.normal(size=(400, 3))
+    directions = corners[generator.integers(count, size=400)].mean(1) - origins
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    a, u, v = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    # x + t d = a + second u + third v
+    system = np.stack(np.broadcast_arrays(-directions[:, None], u[None], v[None]), -1)
+    t, second, third = np.moveaxis(np.linalg.solve(system, (origins[:, None] - a)[..., None])[..., 0], -1, 0)
+    hit = (second >= 0) & (third >= 0) & (second + third <= 1) & (t > 1e-6)
+    expected = np.where(hit, t, np.inf).min(1)
+    assert np.isfinite(expected).all()
+    np.testing.assert_allclose(_lengths(corners, origins, directions), expected, rtol=1e-9)
+
+
+def test_rays_through_edges_corners_and_along_axes_meet_a_closed_surface() -> None:
+    """Such rays are in the planes of faces of bounding boxes, and on the borders of triangles."""
+    shape = trimesh.creation.box((2, 2, 2)).subdivide().subdivide()
+    corners = np.array(shape.triangles)
+    targets = np.concatenate([shape.vertices, shape.vertices[shape.edges_unique].mean(1)])
+    above = targets[(targets[:, 2] == 1) & (np.abs(targets[:, :2]) < 1).all(1)] + np.array([0, 0, 2])
+    np.testing.assert_allclose(_lengths(corners, above, np.tile([0.0, 0, -1], (len(above), 1))), 2)
+    np.testing.assert_allclose(_lengths(corners, np.zeros_like(targets), targets), 1, rtol=1e-9)
+
+
+def test_triangles_are_traced_without_embree(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "embreex.mesh_construction", None)
+    trimesh.creation.box((1, 1, 1)).export(tmp_path / "box.ply")
+    medium = make_bodies(str(tmp_path / "box.ply"), 1.5, resolution=16, cache=False)
+    trace = Snell("mesh").trace(random_rays(100, 0.4, seed=0, far=4).to(torch.float32), medium)
+    assert trace.path.refracted.all()
+
+
+def test_triangles_are_traced_beside_the_training(tmp_path: Path) -> None:
+    trimesh.creation.box((1, 1, 1)).export(tmp_path / "box.ply")
+    assert Snell("mesh").releases_gil(make_bodies(str(tmp_path / "box.ply"), 1.5, resolution=16, cache=False))
