@@ -273,7 +273,7 @@ def _not_modelled(document: Mapping[str, Any]) -> Iterator[str]:
                 yield f"{name}: transmission below 1 is not modelled; it is clear glass"
             if not extensions.get("KHR_materials_volume", {}).get("thicknessFactor", 0) > 0:
                 yield f"{name}: thin-walled transmission is not modelled; its closed objects are solid"
-            if base.get("baseColorFactor", [1.0])[:3] != [1.0] * 3 or "baseColorTexture" in base:
+            if base.get("baseColorFactor", [1.0] * 3)[:3] != [1.0] * 3 or "baseColorTexture" in base:
                 yield f"{name}: the colour of the surface is not modelled; set an attenuation colour"
             if extensions.get("KHR_materials_dispersion", {}).get("dispersion", 0) > 0:
                 yield f"{name}: dispersion is not modelled; images and scene.json have the index of the d line"
