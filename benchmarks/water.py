@@ -120,7 +120,7 @@ def write_scene(name: str, path: Path) -> None:
     bodies, contents = SCENES[name]
     generator, scene, turn = np.random.default_rng(0), trimesh.Scene(), np.eye(4)
     turn[:3, :3] = Z_UP_TO_Y_UP
-    palette = generator.integers(20, 236, (211, 3))
+    palette = generator.integers(20, 236, (211, 3), dtype=np.uint8)
     for body, (mesh, _) in bodies.items():
         scene.add_geometry(mesh, geom_name=body, node_name=body, transform=turn)
     for number, mesh in enumerate(contents):
