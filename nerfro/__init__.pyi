@@ -17,6 +17,7 @@ from .media.material import Material
 from .media.surface import MeshSurface
 from .media.surfaces.ball import BallSurface
 from .models.refractive import RefractiveModel
+from .optimizers.config import GroupConfig, OptimizerConfig
 from .pipeline.evaluate import evaluate
 from .pipeline.export import export
 from .pipeline.reconstruct import reconstruct
@@ -32,7 +33,6 @@ from .training.build import build
 from .training.data_module import RayDataModule
 from .training.load import load
 from .training.module import TrainingModule
-from .training.optimizer import GroupConfig, OptimizerConfig
 from .training.pixel_batches import PixelBatches
 from .training.run import Run, train
 from .viewing.trained_scene import TrainedScene

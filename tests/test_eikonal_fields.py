@@ -19,6 +19,7 @@ from nerfro.files import lat_long
 from nerfro.files.images import save_png
 from nerfro.geometry.space import Box
 from nerfro.media.base import Medium
+from nerfro.optimizers.config import OptimizerConfig
 from nerfro.paper.eikonal import Eikonal
 from nerfro.paper.nerf import NerfField
 from nerfro.registry.registration import discover, find
@@ -27,7 +28,6 @@ from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import example_rays
 from nerfro.training.config import build_model
 from nerfro.training.module import TrainingModule
-from nerfro.training.optimizer import OptimizerConfig
 from nerfro.training.run_folder import load_checkpoint, restore
 from tests.ball_photographs import save
 from tests.closed_forms import Ball

@@ -20,9 +20,9 @@ from tests.size import count_by_component, count_code_lines
 
 # From above to below: a package imports what follows it, and itself.
 ORDER = (
-    "commands", "parts", "testing", "pipeline", "report", "training", "paper", "exports", "masks", "synthetic", "poses",
-    "viewing", "evaluation", "capture", "models", "losses", "rendering", "camera", "silhouettes", "backgrounds",
-    "samplers", "fields", "media", "data", "geometry", "kernels", "files", "cli", "registry", "core",
+    "commands", "parts", "testing", "pipeline", "report", "training", "optimizers", "paper", "exports", "masks",
+    "synthetic", "poses", "viewing", "evaluation", "capture", "models", "losses", "rendering", "camera", "silhouettes",
+    "backgrounds", "samplers", "fields", "media", "data", "geometry", "kernels", "files", "cli", "registry", "core",
 )  # fmt: skip
 FILES = {
     ".".join(("nerfro", *file.relative_to(PACKAGE_DIR).with_suffix("").parts)).removesuffix(".__init__"): file

@@ -17,6 +17,7 @@ from nerfro.losses.base import Loss
 from nerfro.losses.density import Distortion
 from nerfro.losses.radiance import BackgroundRegularizer, Photometric
 from nerfro.models.refractive import RefractiveModel
+from nerfro.optimizers.config import GroupConfig, OptimizerConfig
 from nerfro.paper.hierarchical import Hierarchical
 from nerfro.rendering import composite
 from nerfro.samplers.paths.straight import straight_path
@@ -32,7 +33,6 @@ from nerfro.testing import (
     example_space,
 )
 from nerfro.training.module import TrainingModule
-from nerfro.training.optimizer import GroupConfig, OptimizerConfig
 
 
 def split_path(of_straight: float) -> Path:
@@ -166,7 +166,7 @@ def test_every_learned_parameter_has_a_group_and_a_learning_rate() -> None:
     model.scene.camera.shift = torch.nn.Parameter(torch.zeros(3))
     rates = {"medium.*": GroupConfig(learning_rate=2e-2), "cameras.*": GroupConfig(learning_rate=3e-2)}
     optimizer = OptimizerConfig(learning_rate=1e-2, groups=rates)
-    groups = TrainingModule(model, {}, optimizer).configure_optimizers().param_groups
+    groups = TrainingModule(model, {}, optimizer).configure_optimizers()[0][0].param_groups
     assert [group["name"] for group in groups] == ["common", "medium.*", "cameras.*"]
     assert [group["initial_lr"] for group in groups] == [1e-2, 2e-2, 3e-2]
     assert sum(len(group["params"]) for group in groups) == len(list(model.parameters()))

@@ -132,11 +132,13 @@ def quoted(argument: str, keys: tuple[str, ...]) -> str:
 
 
 def added(argument: str) -> str:
-    """Add the plus sign with which Hydra adds patterns, and options of groups without a default (experiment=glass)."""
-    if argument.startswith("optimizer.groups="):
+    """Add Hydra's plus sign for additions to mappings, and for groups without a default (experiment=glass)."""
+    key = argument.partition("=")[0]
+    if key == "optimizer.groups":
         # Hydra reads names with dots inside of a mapping, such as `cameras.exposure`, without quotes.
         argument = argument.replace('"', "")
-    return f"+{argument}" if argument.partition("=")[0] in (*ADDED_GROUPS, "optimizer.groups") else argument
+    mappings = ("optimizer.groups", "optimizer.options", "optimizer.scheduler_options")
+    return f"+{argument}" if key in (*ADDED_GROUPS, *mappings) else argument
 
 
 class _ConfigLoader(GuardedConfigLoader):

@@ -323,7 +323,8 @@ def _parts(hint: Any) -> tuple[Any, str, tuple[Any, ...]]:
 def type_name(hint: Any) -> str:
     """Describe a type and its allowed values, in Markdown."""
     inner, limits, choices = _parts(hint)
-    names = [name for mark in get_args(hint) if isinstance(mark, Names) for name in mark.of()] or choices
+    marks = [mark for level in (hint, *get_args(hint)[:1]) for mark in get_args(level) if isinstance(mark, Names)]
+    names = [name for mark in marks for name in mark.of()] or choices
     if names:
         text = ", ".join(f"`{name}`" for name in names)
     elif get_origin(inner) in (list, tuple, Sequence):

@@ -24,6 +24,7 @@ from nerfro.kernels.available import find_gpu, require_accelerator
 from nerfro.media.analytic import Vacuum
 from nerfro.media.base import Medium
 from nerfro.media.body_settings import origin_of
+from nerfro.optimizers.config import OptimizerConfig
 from nerfro.registry.allowed import (
     Count,
     Names,
@@ -51,7 +52,6 @@ from nerfro.registry.registration import (
 from nerfro.rendering import Components, Renderer
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.training.content import ContentConfig, require_box, space_of
-from nerfro.training.optimizer import OptimizerConfig
 from nerfro.training.settings import with_values
 
 MetricName = Annotated[str, Names(lambda: [plugin.name for plugin in plugins("metric")])]  # of a region: mask.NAME

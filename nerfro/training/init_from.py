@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from nerfro.core.errors import NerfroError
+from nerfro.optimizers.config import matches, require_matches
 from nerfro.rendering import Renderer
 from nerfro.training.load import checkpoint_of
-from nerfro.training.optimizer import matches, require_matches
 from nerfro.training.run_folder import load_run, restore
 
 

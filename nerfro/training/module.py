@@ -20,12 +20,12 @@ from nerfro.core.paths import user_path
 from nerfro.core.types import Batch
 from nerfro.data.base import Views
 from nerfro.losses.base import Loss, Objective, ObjectiveValue
+from nerfro.optimizers.config import OptimizerConfig
 from nerfro.registry.allowed import plain, validate
 from nerfro.registry.registration import discover
 from nerfro.rendering import Renderer, Scene
 from nerfro.training.config import build_each
 from nerfro.training.inputs import INPUTS, inputs_of
-from nerfro.training.optimizer import OptimizerConfig
 from nerfro.training.run_folder import load_run, restore
 from nerfro.training.updates import Updates
 
@@ -196,6 +196,13 @@ class TrainingModule(LightningModule):
             self.renderer.point_sampler.update(list(self.renderer.scene.fields), draws)  # type: ignore[arg-type]
         self.trainer.datamodule.prefetch()  # type: ignore[attr-defined]
 
+    def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
+        if self.trainer.lr_scheduler_configs:  # type: ignore[attr-defined] # the rates are those of the scheduler
+            for group in optimizer.param_groups:
+                if self.global_step < group.get("start", 0):
+                    for parameter in group["params"]:
+                        parameter.grad = None
+
     def on_train_batch_end(self, outputs: object, batch: Batch, batch_index: int) -> None:  # after the callbacks
         every: int = self.trainer.log_every_n_steps  # type: ignore[attr-defined]
         self.is_logged_step = (self.global_step + 1) % every == 0
@@ -217,10 +224,12 @@ class TrainingModule(LightningModule):
     def learning_rate(self, rate: float) -> None:
         self.optimizer_config = replace(self.optimizer_config, learning_rate=rate)
 
-    def configure_optimizers(self) -> torch.optim.Optimizer:
+    def configure_optimizers(self) -> Any:
         # Lightning cannot clip the gradients of a fused optimizer under mixed precision.
         fused = self._trainer is None or not self._trainer.gradient_clip_val
-        return self.optimizer_config.optimizer_of(self.parameter_groups(), fused)
+        optimizer = self.optimizer_config.optimizer_of(self.parameter_groups(), fused)
+        scheduler = self.optimizer_config.scheduler_of(optimizer)
+        return [optimizer], [{"scheduler": scheduler, "interval": "step"}] if scheduler else []
 
     def validation_step(self, batch: int, batch_index: int) -> dict[str, Any] | None:
         if not self.trainer.is_global_zero:

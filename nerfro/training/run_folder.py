@@ -40,7 +40,6 @@ from nerfro.training.inputs import (
     require_files,
     require_same_inputs,
 )
-from nerfro.training.optimizer import MOMENTS
 from nerfro.training.settings import RESUMING, first_difference, settings
 
 LAST_CHECKPOINT = Path("checkpoints", "last.ckpt")
@@ -224,17 +223,17 @@ def require_finite(weights: Mapping[str, Any], path: Path) -> None:
 def require_optimizer_fits(checkpoint: Mapping[str, Any], optimizer: torch.optim.Optimizer, path: Path) -> None:
     """Refuse the state of another optimizer, or with moments of wrong shape or infinite values."""
     parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
-    kinds = [group["kind"] for group in optimizer.param_groups for _ in group["params"]]
-    free = ("params", "lr", "initial_lr", "start", "eps", "fused")
     try:
         (saved,) = checkpoint["optimizer_states"]
         fits = all(
-            saved["state"][number][moment].shape == parameters[number].shape
-            and saved["state"][number][moment].isfinite().all()
-            for number in saved["state"]
-            for moment in MOMENTS[kinds[number]]
+            (moment.shape == parameters[number].shape or not name.startswith(("exp_avg", "momentum_buffer")))
+            and moment.isfinite().all()
+            for number, state in saved["state"].items()
+            for name, moment in state.items()
+            if isinstance(moment, Tensor)
         ) and all(
-            group[name] == value or (name in free and isinstance(group[name], list | float | int))
+            # The rates, and the numbers that a scheduler changes, may differ.
+            group[name] == value or (type(group[name]) is type(value) and not isinstance(value, str))
             for group, own in zip(saved["param_groups"], optimizer.param_groups, strict=True)
             for name, value in own.items()
             if name != "params"

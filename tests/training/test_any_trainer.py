@@ -13,6 +13,7 @@ from lightning.pytorch.tuner import Tuner
 
 import nerfro
 from nerfro.core.paths import PLUGINS_DIR
+from nerfro.optimizers.config import OPTIMIZERS, OptimizerConfig
 from nerfro.training.data_module import RayDataModule
 from nerfro.training.module import TrainingModule
 from tests.conftest import refused
@@ -97,6 +98,69 @@ def test_learning_rate_finder_of_lightning_measures_a_curve_and_sets_the_rate(
     common = next(group for group in trainer.optimizers[0].param_groups if group["name"] == "common")
     assert common["initial_lr"] == module.learning_rate
     assert 0 < common["lr"] < module.learning_rate
+
+
+class Signs(torch.optim.Optimizer):
+    """Step by the sign of the gradient, as the optimizer of a plugin."""
+
+    def __init__(self, params, lr: float = 0.1, size: float = 1.0) -> None:
+        super().__init__(params, {"lr": lr, "size": size})
+
+    @torch.no_grad()
+    def step(self, closure=None):
+        for group in self.param_groups:
+            for parameter in group["params"]:
+                if parameter.grad is not None:
+                    parameter -= group["lr"] * group["size"] * parameter.grad.sign()
+
+
+def test_optimizers_and_schedulers_by_name_set_the_rates(
+    unchecked: None, tiny_default_run: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(OPTIMIZERS, "signs", Signs)
+    by_name = [
+        *tiny_default_run, "trainer.max_steps=4", "~phase.background",
+        "optimizer.name=signs", "optimizer.options={size: 0.5}", "optimizer.learning_rate=0.01",
+        "optimizer.groups={background.*: {name: sgd, options: {momentum: 0.9}, start: 2}}",
+        "optimizer.scheduler=ExponentialLR", "optimizer.scheduler_options={gamma: 0.5}",
+    ]  # fmt: skip
+    module, data = nerfro.build(None, by_name)
+    before = {name: value.detach().clone() for name, value in module.renderer.parameters_by_name().items()}
+    trainer = lightning.Trainer(max_steps=1, logger=False, enable_checkpointing=False, **QUIET)
+    trainer.fit(module, datamodule=data)
+    groups = {group["name"]: group for group in trainer.optimizers[0].param_groups}
+    assert (groups["common"]["lr"], groups["common"]["size"]) == (0.005, 0.5)
+    assert groups["background.*"]["momentum"] == 0.9
+    for name, value in module.renderer.parameters_by_name().items():
+        change = (value.detach() - before[name]).abs()
+        step = 0.0 if name.startswith("background.") else 0.005
+        assert torch.all((change - step).abs().lt(1e-6) | change.eq(0)), name
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("optimizer.name=adem", "optimizer.name=adem is not allowed; did you mean adam"),
+        ("optimizer.scheduler=StepLr", "optimizer.scheduler=StepLr is not allowed; did you mean StepLR"),
+        ("optimizer.options={momentum: 0.9}", "optimizer adam has no option momentum; choose from lr, betas"),
+        ("optimizer.options={betas: [2, 3]}", "optimizer adam: Invalid beta parameter"),
+        ("optimizer.groups={background.*: {name: x}}", "groups: name=x is not allowed; known: adam"),
+    ],
+)
+def test_wrong_optimizers_and_options_are_refused(
+    override: str, message: str, unchecked: None, tiny_default_run: list[str]
+) -> None:
+    refused(
+        message,
+        lambda: nerfro.build(None, [*tiny_default_run, "trainer.max_steps=4", override])[0].configure_optimizers(),
+    )
+
+
+def test_missing_and_unknown_options_of_a_scheduler_are_refused() -> None:
+    optimizer = torch.optim.SGD([torch.nn.Parameter(torch.ones(1))])
+    for options, message in (({}, "missing .* 'T_max'"), ({"gamma": 1}, "has no option gamma; choose from T_max")):
+        config = OptimizerConfig(scheduler="CosineAnnealingLR", scheduler_options=options)
+        refused(f"optimizer.scheduler=CosineAnnealingLR.*{message}", config.scheduler_of, optimizer)
 
 
 def test_optimizer_and_scheduler_of_a_derived_module_keep_their_rates(

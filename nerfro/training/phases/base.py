@@ -14,8 +14,8 @@ from torch import Tensor, nn
 
 from nerfro.core.errors import NerfroError
 from nerfro.data.base import Views
+from nerfro.optimizers.config import require_matches
 from nerfro.rendering import RayTracer, Renderer
-from nerfro.training.optimizer import require_matches
 from nerfro.training.pixel_batches import PixelBatches
 
 

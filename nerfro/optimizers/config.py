@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+import inspect
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import torch
 from torch import nn
+from torch.optim import lr_scheduler
 
-from nerfro.core.errors import NerfroError
-from nerfro.core.joint_optimizer import JointOptimizer
-from nerfro.registry.allowed import Natural, NotNegative, OnlyWith, Positive, validated
+from nerfro.core.errors import NerfroError, nearest_of
+from nerfro.optimizers.joint import JointOptimizer
+from nerfro.registry.allowed import Names, Natural, NotNegative, OnlyWith, Positive, validated
 
 # Patterns that have no effect in a scene without these parameters.
 OPTIONAL_PATTERNS = (
@@ -22,14 +24,21 @@ OPTIONAL_PATTERNS = (
 # Name of the group of all parameters that no pattern matches.
 COMMON = "common"
 
-
-OptimizerName = Literal["adam", "adamw", "sgd", "radam", "muon"]
-_CLASSES: dict[str, type[torch.optim.Optimizer]] = {
+# Optimizers and schedulers by name, to which plugins add; see docs/guides/experiments_and_sweeps.md.
+OPTIMIZERS: dict[str, type[torch.optim.Optimizer]] = {
     "adam": torch.optim.Adam, "adamw": torch.optim.AdamW, "sgd": torch.optim.SGD, "radam": torch.optim.RAdam,
     **({"muon": torch.optim.Muon} if hasattr(torch.optim, "Muon") else {}),
 }  # fmt: skip
-# Entries of the state of an optimizer with one number for each parameter.
-MOMENTS = dict.fromkeys(_CLASSES, ("exp_avg", "exp_avg_sq")) | {"sgd": (), "muon": ("momentum_buffer",)}
+SCHEDULERS: dict[str, type[lr_scheduler.LRScheduler]] = {
+    scheduler.__name__: scheduler
+    for scheduler in (
+        lr_scheduler.CosineAnnealingLR, lr_scheduler.CosineAnnealingWarmRestarts, lr_scheduler.CyclicLR,
+        lr_scheduler.ExponentialLR, lr_scheduler.LinearLR, lr_scheduler.MultiStepLR, lr_scheduler.OneCycleLR,
+        lr_scheduler.PolynomialLR, lr_scheduler.StepLR,
+    )
+}  # fmt: skip
+OptimizerName = Annotated[str, Names(lambda: OPTIMIZERS)]
+SchedulerName = Annotated[str, Names(lambda: SCHEDULERS)]
 
 
 @validated("optimizer.groups")
@@ -41,12 +50,17 @@ class GroupConfig:
         learning_rate: initial learning rate; None for the common rate.
         start: step at which the parameters begin to learn; None for the step that the component of a run needs
             (`Component.learns_from`), which is 0 except for a background that a phase fits first.
-        name: optimizer of PyTorch; None for the common one.
+        name: optimizer, to which plugins add; None for the common one.
+        options: settings of the optimizer of this group, such as {momentum: 0.9}.
     """
 
     learning_rate: Positive | None = None
     start: Natural | None = None
     name: OptimizerName | None = None
+    options: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        _require_name("optimizer.groups: name", self.name, OPTIMIZERS)
 
 
 def _default_groups() -> dict[str, GroupConfig]:
@@ -61,7 +75,11 @@ class OptimizerConfig:
     The defaults are those of the default experiment. The experiments `paper_*` have the values of the paper.
 
     Attributes:
-        name: optimizer of PyTorch, whose other settings have PyTorch's defaults.
+        name: optimizer, to which plugins add.
+        options: settings of this optimizer, such as {momentum: 0.9}; the others have PyTorch's defaults.
+        scheduler: scheduler of PyTorch, in place of the decay and the warm-up; it takes a step after each training
+            step.
+        scheduler_options: settings of the scheduler, such as {T_max: 1000}.
         learning_rate: initial learning rate.
         final_learning_rate: learning rate at the end of the run.
         groups: learning rate and start of parameters by the pattern of their names
@@ -75,6 +93,9 @@ class OptimizerConfig:
     """
 
     name: OptimizerName = "adam"
+    options: dict[str, Any] = dataclasses.field(default_factory=dict)
+    scheduler: SchedulerName | None = None
+    scheduler_options: Annotated[dict[str, Any], OnlyWith("scheduler")] = dataclasses.field(default_factory=dict)
     learning_rate: Positive = 1e-2
     final_learning_rate: Positive = 5e-4
     groups: dict[str, GroupConfig] = dataclasses.field(default_factory=_default_groups)
@@ -84,6 +105,8 @@ class OptimizerConfig:
     freeze: list[str] = dataclasses.field(default_factory=list)
 
     def __post_init__(self) -> None:
+        _require_name("optimizer.name", self.name, OPTIMIZERS)
+        _require_name("optimizer.scheduler", self.scheduler, SCHEDULERS)
         self.groups = {
             pattern: group if isinstance(group, GroupConfig) else GroupConfig(**group)
             for pattern, group in self.groups.items()
@@ -115,26 +138,45 @@ class OptimizerConfig:
         Args:
             groups: result of `grouped`.
             fused: whether to fuse the operations of Adam.
+
+        Raises:
+            NerfroError: an optimizer does not have an option, or refuses its value or its parameters.
         """
         described: list[dict[str, Any]] = []
-        for name, parameters in groups.items():
-            own = self.group(name)
-            rate, start = own.learning_rate or self.learning_rate, own.start or 0
-            described.append({
-                "params": parameters, "lr": rate, "initial_lr": rate, "name": name, "start": start,
-                "kind": own.name or self.name,
-            })  # fmt: skip
-        optimizers = {}
-        for kind in dict.fromkeys(group["kind"] for group in described):
-            options: dict[str, Any] = {} if kind in ("sgd", "muon") else {"eps": self.adam_epsilon}
-            options |= {"fused": fused} if kind in ("adam", "adamw") else {}
-            of_kind = [group for group in described if group["kind"] == kind]
-            if kind not in _CLASSES:
-                raise NerfroError(f"optimizer {kind} needs torch 2.9 or newer, and this is torch {torch.__version__}")
+        optimizers: dict[str, torch.optim.Optimizer] = {}
+        for kind, options, of_kind in self._by_kind(groups):
             if kind == "muon" and any(p.ndim != 2 for group in of_kind for p in group["params"]):
                 raise NerfroError("optimizer muon takes matrices only; name it in optimizer.groups for fields.*.weight")
-            optimizers[kind] = _CLASSES[kind](of_kind, **options)
-        return next(iter(optimizers.values())) if len(optimizers) == 1 else JointOptimizer(optimizers, described)
+            options = ({"eps": self.adam_epsilon} if kind in ("adam", "adamw", "radam") else {}) | options
+            options = ({"fused": fused} if kind in ("adam", "adamw") else {}) | options
+            optimizers[of_kind[0]["kind"]] = _created(f"optimizer {kind}", OPTIMIZERS[kind], of_kind, options)
+            described += of_kind
+        if len(optimizers) == 1:
+            return next(iter(optimizers.values()))
+        return JointOptimizer(optimizers, described)
+
+    def _by_kind(self, groups: Mapping[str, list[nn.Parameter]]) -> list[tuple[str, dict, list[dict[str, Any]]]]:
+        """Describe groups for an optimizer, by the name and the options of their optimizer."""
+        kinds: dict[str, tuple[str, dict, list[dict[str, Any]]]] = {}
+        for name, parameters in groups.items():
+            own = self.group(name)
+            rate, kind = own.learning_rate or self.learning_rate, own.name or self.name
+            options = (self.options if kind == self.name else {}) | own.options
+            group = {"params": parameters, "lr": rate, "initial_lr": rate, "name": name, "start": own.start or 0}
+            key = f"{kind} {options}" if options else kind
+            kinds.setdefault(key, (kind, options, []))[-1].append({**group, "kind": key})
+        return list(kinds.values())
+
+    def scheduler_of(self, optimizer: torch.optim.Optimizer) -> lr_scheduler.LRScheduler | None:
+        """Create the scheduler of an optimizer; None without `scheduler`.
+
+        Raises:
+            NerfroError: the scheduler does not have an option, or refuses its value.
+        """
+        if self.scheduler is None:
+            return None
+        where = f"optimizer.scheduler={self.scheduler}"
+        return _created(where, SCHEDULERS[self.scheduler], optimizer, self.scheduler_options)
 
     def grouped(self, parameters: Mapping[str, nn.Parameter]) -> dict[str, list[nn.Parameter]]:
         """Group the parameters that learn by the last pattern that matches; the others are in the group `COMMON`.
@@ -178,3 +220,20 @@ def require_matches(where: str, patterns: Iterable[str], names: Iterable[str]) -
                 f"{where}: {pattern} matches no learned parameter; choose from {', '.join(learned) or 'none'}, with * "
                 "for any text"
             )
+
+
+def _require_name(where: str, name: str | None, names: Mapping[str, Any]) -> None:
+    if name is not None and name not in names:
+        raise NerfroError(f"{where}={name} is not allowed; {nearest_of(name, list(names))}")
+
+
+def _created(where: str, cls: Callable[..., Any], of: object, options: Mapping[str, Any]) -> Any:
+    """Create an optimizer of groups of parameters, or a scheduler of an optimizer."""
+    allowed = list(inspect.signature(cls).parameters)[1:]
+    unknown = next((name for name in options if name not in allowed), None)
+    if unknown is not None:
+        raise NerfroError(f"{where} has no option {unknown}; choose from {', '.join(allowed)}")
+    try:
+        return cls(of, **options)
+    except (TypeError, ValueError) as error:
+        raise NerfroError(f"{where}: {error}; see the documentation of {cls.__name__} for its options") from error

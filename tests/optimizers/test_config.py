@@ -13,10 +13,10 @@ from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Timer
 
 from nerfro.losses.radiance import BackgroundRegularizer
+from nerfro.optimizers.config import GroupConfig, OptimizerConfig
 from nerfro.registry.allowed import plain, validate
 from nerfro.training.config import BatchesConfig, EvaluationConfig, TrainConfig
 from nerfro.training.module import learning_rate_factor, training_progress
-from nerfro.training.optimizer import MOMENTS, GroupConfig, OptimizerConfig
 from tests.conftest import composed, refused
 
 PAPER = OptimizerConfig(learning_rate=5e-4, final_learning_rate=5e-6, warmup_steps=2500, warmup_factor=0.01)
@@ -137,7 +137,7 @@ def test_muon_learns_the_matrices_of_a_group_and_refuses_other_parameters() -> N
         parameter.grad = torch.ones_like(parameter)
     optimizer.step()
     assert all(bool((parameter < 1).all()) for parameter in parameters.values())
-    assert optimizer.state[parameters["fields.0.mlp.weight"]].keys() == set(MOMENTS["muon"])
+    assert optimizer.state[parameters["fields.0.mlp.weight"]].keys() == {"momentum_buffer"}
     config = OptimizerConfig(name="muon", groups={})
     refused("takes matrices only", config.optimizer_of, config.grouped(parameters), fused=False)
 

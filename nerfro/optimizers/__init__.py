@@ -1,0 +1,1 @@
+"""Optimizers and schedulers of PyTorch by name, for groups of parameters."""
