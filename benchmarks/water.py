@@ -164,8 +164,10 @@ def synthesize_scene(name: str, folder: Path, pixels: int = 80, spp: int = 32, n
 def compare(name: str, folder: Path, seconds: int) -> str:
     """Train on a synthesized scene with bent and with straight rays; returns a row of the table."""
     data = synthesize_scene(name, folder)
-    scores = []
-    for kind, options in (("bent", []), ("straight", [f"bodies.{body}.ior=1" for body in SCENES[name][0]])):
+    scores: list[float] = []
+    # The scene file of a single body sets `medium.ior`.
+    names = [f"bodies.{body}.ior" for body in SCENES[name][0]] if len(SCENES[name][0]) > 1 else ["medium.ior"]
+    for kind, options in (("bent", []), ("straight", [f"{setting}=1" for setting in names])):
         run = folder / f"{name}_{kind}"
         limit = f"trainer.max_time=00:00:{seconds // 60:02}:{seconds % 60:02}"
         command = [sys.executable, str(ROOT / "benchmarks" / "processor_time.py"), f"scene={data / 'scene.json'}"]
