@@ -27,11 +27,11 @@ from torch.nn.functional import avg_pool2d
 
 from nerfro.core.paths import ASSETS_DIR
 from nerfro.evaluation.error_maps import SQUARED_ERROR_LIMIT, squared_error_map
+from nerfro.evaluation.image_metrics import image_metrics
 from nerfro.evaluation.results import RunMetrics, read_metrics_json
 from nerfro.evaluation.tables import Column, Row, Table, to_markdown
 from nerfro.files.drawing import magma, sheet
 from nerfro.files.images import load_png, save_image
-from nerfro.report.comparison import find_metrics
 
 METHODS = {
     "mipnerf": "mip-NeRF",
@@ -96,7 +96,7 @@ def one_core(core: int | None) -> Iterator[None]:
 
 def table(metrics: dict[str, RunMetrics]) -> Table:
     """Tabulate mean scores, optimizer steps and rays per second by the clock."""
-    shown = find_metrics(["psnr", "ssim", "lpips"])
+    shown = image_metrics(["psnr", "ssim", "lpips"])
     columns = (
         *(Column(metric.title, metric.better, metric.decimals) for metric in shown.values()),
         Column("steps", None, 0),

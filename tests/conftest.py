@@ -1,6 +1,7 @@
 """Fixtures and helpers of all tests."""
 
 import functools
+import gc
 import importlib
 import json
 import math
@@ -64,6 +65,14 @@ def pytest_configure(config: pytest.Config) -> None:
     worker = hasattr(config, "workerinput")  # of pytest-xdist
     if not worker and not config.option.collectonly and config.pluginmanager.hasplugin("cacheprovider"):
         config.pluginmanager.register(SkippedTests(config.cache))
+
+
+def pytest_collection_finish() -> None:
+    gc.freeze()  # imported modules, which searches for garbage would visit again and again
+
+
+def pytest_sessionfinish() -> None:
+    gc.unfreeze()
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -502,22 +502,6 @@ def scored_trial(name: str, folder: Path, images: torch.Tensor, views: Views) ->
     return Trial(Hypothesis(name, []), Run(folder, RunMetrics(metrics.result(scores))))
 
 
-@pytest.mark.parametrize(("size", "best"), [(48, "vessel"), (30, "straight rays")])
-def test_sharp_details_in_a_slightly_wrong_position_are_preferred_if_the_crop_is_large_enough(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], size: int, best: str
-) -> None:
-    pattern = (torch.arange(size) // 4 % 2)[:, None] == (torch.arange(size) // 4 % 2)
-    sharp = pattern.float()[None, ..., None].expand(1, size, size, 3) * 0.2 + 0.4
-    masks = torch.ones(1, size, size)
-    views = Views(cameras_at(random_poses(1), size, size, 50.0), sharp, masks, ["IMG_0.png"])
-    blurred = scored_trial("straight rays", tmp_path / "straight", torch.full_like(sharp, 0.5), views)
-    shifted = scored_trial("vessel", tmp_path / "vessel", sharp.roll(1, 2), views)
-    assert decide([blurred, shifted], ["out=DIR"]).hypothesis.name == best
-    printed = capsys.readouterr().out
-    assert ("PSNR alone decides" in printed) == (size < 31)
-    assert ("python -m nerfro.reconstruct out=DIR hypothesis=straight\n" in printed) == (size > 31)
-
-
 def test_picture_shows_every_hypothesis_beside_three_photographs(tmp_path: Path) -> None:
     size, num_views = 64, 5
     masks = torch.zeros(num_views, size, size)

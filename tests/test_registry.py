@@ -84,13 +84,6 @@ def test_constructor_with_arbitrary_arguments_is_refused() -> None:
                 super().__init__()
 
 
-@pytest.mark.parametrize("name", ["sdf_grid", "voxel_grid"])  # a function, and a class
-def test_number_that_is_not_allowed_is_refused(name: str) -> None:
-    setting = {"sdf_grid": "shell_voxels", "voxel_grid": "smoothing_size"}[name]
-    node = {"_target_": find("medium", name).target, "mesh": "none.ply", setting: float("nan")}
-    refused(f"medium={name}: {setting}=nan is not allowed", build, node)
-
-
 def test_missing_required_field_is_named() -> None:
     refused(r"data=opencv needs root; add data\.root=\.\.\.", configure, find("data", "opencv"), {})
 

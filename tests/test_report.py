@@ -11,11 +11,12 @@ import pytest
 import torch
 from PIL import Image
 
+from nerfro.evaluation.image_metrics import image_metrics
 from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.results import RunMetrics, write_metrics_json
 from nerfro.files.images import load_png, save_png
 from nerfro.registry.registration import discover
-from nerfro.report.comparison import compare, find_metrics, to_table
+from nerfro.report.comparison import compare, to_table
 from nerfro.report.page import report_page
 from nerfro.report.runs import find_runs
 from nerfro.report.views import Selection, embed_image, scene_images
@@ -23,7 +24,7 @@ from tests.conftest import refused
 from tests.test_summary import write_run
 from tests.viewing.browser import Browser, needs_chromium
 
-PSNR = find_metrics(["psnr"])
+PSNR = image_metrics(["psnr"])
 
 
 def write_scored_run(folder: Path, name: str, scene: Path, noise: float, num_views: int = 2) -> None:

@@ -106,30 +106,8 @@ def test_resuming_a_finished_run_with_more_steps_trains_the_rest(
     train: Runner, trained_run: Path, tmp_path: Path
 ) -> None:
     shutil.copytree(trained_run, tmp_path / "run")
-    options = ["evaluation.every=0", "trainer.max_steps=5", "ckpt_path=last"]
-    log = tmp_path / "run" / "csv" / "metrics.csv"
-    before = log_rows(log)
-    train(*options, "logger=tensorboard", "trainer.log_every_n_steps=1")
-    assert before
-    assert log_rows(log)[: len(before)] == before, "the log keeps its earlier rows"
-    assert len(log_rows(log)) > len(before)
-    checkpoint, _ = load_checkpoint(tmp_path / "run" / LAST_CHECKPOINT)
-    assert checkpoint["global_step"] == 5
-    assert checkpoint["callbacks"]["Throughput"]["num_rays"] >= 5 * 32
-
-
-def test_scores_of_fewer_steps_are_removed_when_a_finished_run_is_resumed(
-    train: Runner, trained_run: Path, tmp_path: Path
-) -> None:
-    shutil.copytree(trained_run, tmp_path / "run")
     shutil.copytree(trained_run, tmp_path / "run" / "evaluate_test")
     assert list((tmp_path / "run").glob("metrics.*"))
-    train("evaluation.every=0", "evaluation.split=null", "trainer.max_steps=3", "ckpt_path=last")
-    assert not list((tmp_path / "run").rglob("metrics.json")), "a table would show them beside the new budget"
-
-
-def test_log_of_a_resumed_run_has_each_step_once(train: Runner, trained_run: Path, tmp_path: Path) -> None:
-    shutil.copytree(trained_run, tmp_path / "run")
     log = tmp_path / "run" / "csv" / "metrics.csv"
     rows = log_rows(log)
     lost = [rows[0] | {"step": str(step)} for step in (2, 3)]  # of a process that was killed after its checkpoint
@@ -137,11 +115,17 @@ def test_log_of_a_resumed_run_has_each_step_once(train: Runner, trained_run: Pat
         writer = csv.DictWriter(stream, sorted({name for row in rows for name in row}))
         writer.writeheader()
         writer.writerows([*rows, *lost])
-    options = ["evaluation.every=0", "trainer.max_steps=5", "ckpt_path=last"]
+    options = ["evaluation.every=0", "evaluation.split=null", "trainer.max_steps=5", "ckpt_path=last"]
     train(*options, "logger=tensorboard", "trainer.log_every_n_steps=1")
+    assert log_rows(log)[: len(rows)] == rows, "the log keeps its earlier rows"
     trained = [row["step"] for row in log_rows(log) if "loss/total" in row]
     assert trained == sorted(set(trained), key=int)
     assert set(trained) >= {"2", "3", "4"}
+    checkpoint, _ = load_checkpoint(tmp_path / "run" / LAST_CHECKPOINT)
+    assert checkpoint["global_step"] == 5
+    assert checkpoint["callbacks"]["Throughput"]["num_rays"] >= 5 * 32
+    scores = list((tmp_path / "run").rglob("metrics.json"))
+    assert not scores, "a table would show the scores of fewer steps beside the new budget"
 
 
 def test_resuming_with_fewer_steps_than_the_checkpoint_has_is_refused(

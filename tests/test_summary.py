@@ -13,12 +13,12 @@ from nerfro.evaluation.image_metrics import image_metrics
 from nerfro.evaluation.results import EvaluationResult, RunMetrics, ViewScores, write_metrics_json
 from nerfro.evaluation.tables import Table
 from nerfro.files.images import save_png
-from nerfro.report.comparison import compare, find_metrics, to_table
+from nerfro.report.comparison import compare, to_table
 from nerfro.report.runs import find_runs
 from nerfro.training.run_folder import LAST_CHECKPOINT, record
 from tests.conftest import Runner, refused
 
-PAPER = find_metrics(["psnr", "ssim", "lpips"])
+PAPER = image_metrics(["psnr", "ssim", "lpips"])
 FIELD = {"_target_": "nerfro.fields.nerf.NerfField", "width": 64, "scale": 1.0}
 
 
@@ -67,7 +67,7 @@ def test_metrics_on_maps_that_no_data_have_are_neither_columns_nor_notes(tmp_pat
     write_run(tmp_path / "0", "a", 20.0)
     runs, _ = find_runs([str(tmp_path)])
     (comparison,) = compare(runs, {}, {})
-    table = to_table(comparison, find_metrics(), "full")
+    table = to_table(comparison, image_metrics(), "full")
     assert "depth RMSE" not in [column.title for column in table.columns]
     assert table.notes == ()
 
@@ -252,8 +252,8 @@ def test_tables_of_runs_without_a_limit_lie_in_the_output_folder(tmp_path: Path,
 @pytest.mark.parametrize(
     ("override", "said"),
     [
-        ("metrics=[]", "metrics: the list is empty; choose from psnr"),
-        ("metrics=[psnr,foo]", "'foo' is not a metric; choose from psnr"),
+        ("metrics=[]", "metrics: the list is empty; known: depth"),
+        ("metrics=[psnr,foo]", "'foo' is not a metric; known: depth"),
         ("region=x", "choose 'full', 'mask', 'crop'"),
         ("pictures=[a.png]", "are shown in the report; add report=true"),
     ],

@@ -1,7 +1,6 @@
 """Commands execute nerfro, Hydra and registered plugins, but no code of files or the current directory."""
 
 import pickle
-import subprocess
 from pathlib import Path
 
 import pytest
@@ -11,7 +10,7 @@ from nerfro.cli.composition import Composer
 from nerfro.core.errors import NerfroError
 from nerfro.registry.registration import discover
 from nerfro.training.config import TrainConfig
-from tests.conftest import Bomb
+from tests.conftest import Bomb, Runner
 from tests.processes import python
 
 discover()
@@ -21,7 +20,7 @@ EVIL = "import pathlib\n\n\ndef run(*args, **options):\n    pathlib.Path(__file_
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A folder with a module `evil` and a Hydra plugin, which leave a file where they are executed."""
+    """A folder with a module `evil` and a Hydra plugin, which leave a file where they are executed; none may be."""
     (tmp_path / "evil.py").write_text(EVIL)
     (tmp_path / "hydra_plugins").mkdir()
     (tmp_path / "hydra_plugins" / "evil.py").write_text(f"{EVIL}\n\nrun()\n")
@@ -30,17 +29,6 @@ def folder(tmp_path: Path) -> Path:
 
 def executed(folder: Path) -> list[Path]:
     return list(folder.rglob("executed"))
-
-
-def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess:
-    done = python(*arguments, folder=folder)
-    assert not executed(folder), done.stderr
-    return done
-
-
-def test_plugins_of_hydra_in_the_current_directory_are_not_imported(folder: Path) -> None:
-    done = run(folder, "-m", "nerfro.train", "--cfg", "job")
-    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize(
@@ -69,11 +57,11 @@ def test_configuration_files_name_no_foreign_code(hydra: str, folder: Path) -> N
         composition.compose_config("train", ["+experiment=other"], RunMode.RUN)
 
 
-@pytest.mark.parametrize("flags", [(), ("-m", "seed=1,2")], ids=["run", "sweep"])
-def test_no_foreign_code_is_executed_before_it_is_refused(flags: tuple[str, ...], folder: Path) -> None:
+def test_no_foreign_code_is_executed_before_it_is_refused(folder: Path) -> None:
     write_experiment(folder, "callbacks: {a: {_target_: evil.run}}")
-    options = ("--config-dir", str(folder / "conf"), *flags, "+experiment=other", "trainer.max_steps=1")
-    done = run(folder, "-m", "nerfro.train", *options)
+    options = ("--config-dir", str(folder / "conf"), "-m", "seed=1,2", "+experiment=other", "trainer.max_steps=1")
+    done = python("-m", "nerfro.train", *options, folder=folder)
+    assert not executed(folder), done.stderr
     assert done.returncode == 1
     assert done.stderr.startswith("nerfro: error: hydra.callbacks.a._target_=evil.run is not allowed")
     assert len(done.stderr.splitlines()) == 1
@@ -86,8 +74,10 @@ def write_experiment(folder: Path, hydra: str) -> None:
     (conf / "other.yaml").write_text(f"# @package _global_\nhydra: {{{hydra}}}\n{loss}")
 
 
-def test_pickled_configuration_is_not_read(folder: Path) -> None:
-    (folder / "config.pickle").write_bytes(pickle.dumps(Bomb("touch executed")))
-    done = run(folder, "-m", "nerfro.train", "--experimental-rerun", "config.pickle")
-    assert done.returncode == 1
-    assert "--experimental-rerun executes code" in done.stderr
+def test_pickled_configuration_is_not_read(folder: Path, run_here: Runner, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    Path("config.pickle").write_bytes(pickle.dumps(Bomb("touch executed")))
+    assert (
+        "--experimental-rerun executes code" in run_here("train", "--experimental-rerun", "config.pickle", code=1).error
+    )
+    assert not executed(folder)

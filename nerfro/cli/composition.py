@@ -34,6 +34,7 @@ from nerfro.registry.allowed import MissingSettingError, hints_of, plain, requir
 from nerfro.registry.registration import discover
 
 Expand = Callable[[Sequence[str], Sequence[str]], list[str]]
+SWEEP = "hydra.mode=MULTIRUN"  # override of the configuration of a sweep and of its jobs
 
 
 @dataclass(frozen=True)
@@ -167,6 +168,8 @@ class _ConfigLoader(GuardedConfigLoader):
 
     def check(self, config: DictConfig) -> None:
         discover()  # the process may be a launcher's worker
+        if config.hydra.mode == RunMode.MULTIRUN and SWEEP not in config.hydra.overrides.hydra:
+            raise NerfroError("hydra.mode=MULTIRUN is not allowed here; start a sweep with the option -m")
         # Hydra adds the group `env`, and the options of plugins of other packages are theirs to check.
         _require_declared(config.hydra, "hydra.", ["env", "sweeper", "launcher"])
         job, hydra_config = copy.deepcopy(config), HydraConfig.instance()

@@ -20,7 +20,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from nerfro.cli.calls import values_of
-from nerfro.cli.composition import Composer, Expand, missing_with_example
+from nerfro.cli.composition import SWEEP, Composer, Expand, missing_with_example
 from nerfro.cli.failures import errors_in_one_line, in_one_line
 from nerfro.cli.options import describe, has_groups, recall, remember
 from nerfro.core.errors import NerfroError
@@ -107,10 +107,10 @@ def _run_by_hydra(composer: Composer, task: Task, flags: Namespace, parser: Argu
             hydra.show_info(flags.info, name, overrides)
         elif flags.shell_completion:
             hydra.shell_completion(name, overrides)
-        elif flags.multirun or hydra.get_mode(name, overrides) == RunMode.MULTIRUN:
-            hydra.multirun(name, _job(task, command, failures), [*overrides, "hydra.mode=MULTIRUN"])
+        elif flags.multirun or SWEEP in overrides:
+            hydra.multirun(name, _job(task, command, failures), [*overrides, SWEEP])
         else:
-            hydra.run(name, _job(task, command, failures), [*overrides, "hydra.mode=RUN"])
+            hydra.run(name, _job(task, command, failures), overrides)
     if failures:
         raise failures[0]
 

@@ -106,10 +106,7 @@ class ColourSpace(Enum):
         return to_linear(radiance.clamp(min=0)) if self is ColourSpace.SRGB else radiance
 
     def prediction_and_target(
-        self,
-        radiance: Float[Tensor, "*batch 3"],
-        rgb: Float[Tensor, "*batch 3"],
-        gains: Float[Tensor, "*#batch 3"] | None = None,
+        self, radiance: Float[Tensor, "*batch 3"], rgb: Float[Tensor, "*batch 3"]
     ) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch 3"]]:
         """Return the values of a prediction and a photograph for a loss: sRGB, or scaled radiance for `HDR`.
 
@@ -124,17 +121,15 @@ class ColourSpace(Enum):
         Args:
             radiance: predicted radiance in this colour space.
             rgb: values of the photograph, sRGB in [0, 1].
-            gains: brightness of each photograph relative to the scene, a factor of linear radiance.
 
         Returns:
             Prediction and target. The prediction is not clipped.
         """
-        prediction = self.to_srgb(radiance, gains)
+        prediction = self.to_srgb(radiance)
         if self is ColourSpace.SRGB:
             return prediction, rgb
         target = clipped_alike(rgb, prediction)
         if self is ColourSpace.LINEAR:
             return prediction, target
-        radiance = radiance if gains is None else radiance * gains
         scale = _LOG_SLOPE / (radiance.detach().clamp(min=0) + _LOG_OFFSET)
         return scale * radiance, scale * to_linear(target)

@@ -32,19 +32,6 @@ from nerfro.core.cameras import Cameras
 from nerfro.core.draws import Draws
 from nerfro.core.rays import Rays, in_room
 
-__all__ = [
-    "WORLD_ORIGIN",
-    "Batch",
-    "Exits",
-    "FieldValues",
-    "OpticalRecord",
-    "Path",
-    "Pixels",
-    "Rays",
-    "Rendering",
-    "Samples",
-]
-
 WORLD_ORIGIN = np.zeros(3)
 
 

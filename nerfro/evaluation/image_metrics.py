@@ -18,7 +18,7 @@ from nerfro.core.errors import NerfroError, nearest_of
 from nerfro.evaluation.error_maps import SQUARED_ERROR_LIMIT, ErrorMap, squared_error_map
 from nerfro.evaluation.regions import mean_over, require_images
 from nerfro.evaluation.ssim import WINDOW, ssim, ssim_map
-from nerfro.registry.registration import CHECKS, Plugin, create, discover, plugins, register
+from nerfro.registry.registration import CHECKS, create, discover, find, plugins, register
 
 MAX_PSNR = 100.0  # dB; the infinite PSNR of equal images has no mean and no representation in JSON
 
@@ -123,31 +123,28 @@ def _check_class(name: str, cls: type) -> None:
 CHECKS["metric"] = _check_class
 
 
-def image_metrics() -> dict[str, type[ImageMetric]]:
-    """Return the registered metrics by name, in the order of tables."""
-    return {plugin.name: plugin.cls for plugin in _in_order()}
-
-
-def build_metrics(names: Sequence[str] | None = None) -> dict[str, ImageMetric]:
-    """Build metrics by name, in the order of tables.
+def image_metrics(names: Sequence[str] | None = None) -> dict[str, type[ImageMetric]]:
+    """Return registered metrics by name.
 
     Args:
-        names: names of registered metrics; by default all.
+        names: names of the metrics, in the order of the result; by default all, in the order of tables.
 
     Raises:
         NerfroError: a metric is not registered, or `names` is empty.
     """
-    registered = {plugin.name: plugin for plugin in _in_order()}
-    selected = registered if names is None else names
-    unknown = next((name for name in selected if name not in registered), None)
-    if unknown is not None or not selected:
-        raise NerfroError(f"metrics={list(selected)}: {nearest_of(str(unknown), list(registered))}")
-    return {name: create(plugin, {}) for name, plugin in registered.items() if name in selected}
-
-
-def _in_order() -> list[Plugin]:
     discover()
-    return sorted(plugins("metric"), key=lambda plugin: (*_FIRST, plugin.name).index(plugin.name))
+    registered = {plugin.name: plugin.cls for plugin in plugins("metric")}
+    names = sorted(registered, key=lambda name: (*_FIRST, name).index(name)) if names is None else names
+    unknown = next((name for name in names if name not in registered), None)
+    if unknown is not None or not names:
+        problem = f"'{unknown}' is not a metric" if names else "the list is empty"
+        raise NerfroError(f"metrics: {problem}; {nearest_of(str(unknown), list(registered))}")
+    return {name: registered[name] for name in names}
+
+
+def build_metrics(names: Sequence[str] | None = None) -> dict[str, ImageMetric]:
+    """Build metrics, see `image_metrics`."""
+    return {name: create(find("metric", name), {}) for name in image_metrics(names)}
 
 
 def psnr(

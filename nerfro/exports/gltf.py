@@ -1,4 +1,4 @@
-"""Export of glass and dense content as meshes in glTF format, with glass materials and cameras."""
+"""Export of glass, dense content and Gaussians in glTF format, with glass materials and cameras."""
 
 from __future__ import annotations
 
@@ -8,21 +8,27 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 import trimesh
+from torch.nn import functional
 
 from nerfro.core.cameras import Cameras
 from nerfro.core.errors import NerfroError
+from nerfro.core.light import to_linear
 from nerfro.core.optional import optional
+from nerfro.exports.gaussians import HARMONIC_0, Gaussians
 from nerfro.exports.meshes import glass_meshes, inside_mesh, one_mesh
 from nerfro.files.atomic import write_atomically
 from nerfro.files.lat_long import save_lat_long
+from nerfro.files.templates import fill_template
 from nerfro.geometry.gltf import QUANTIZATION, Z_UP_TO_Y_UP
 from nerfro.media.material import Dispersion
 from nerfro.viewing.changes import absorption_of
-from nerfro.viewing.exports import EXPORTS, Export, ExportConfig
+from nerfro.viewing.exports import EXPORTS, OF_SPLATS, Export, ExportConfig
 from nerfro.viewing.trained_scene import TrainedScene
 
-_GLB_TRIANGLES = 20_000  # default limit of a .glb
+GLB_TRIANGLES = 20_000  # default limit of a .glb
+_SPLATTING = "KHR_gaussian_splatting"
 # Codes of glTF 2.0, sections 3.6.2.2 and 5.11: types of components, and targets of buffers.
 _CODES = {"<i2": 5122, "<u2": 5123, "<u4": 5125, "<f4": 5126}
 _VERTICES, _INDICES = 34962, 34963
@@ -31,20 +37,21 @@ _VERTICES, _INDICES = 34962, 34963
 def write_mesh(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
     """Write the surfaces of the glass and of the dense content, as .glb with materials, or as one mesh (.ply, .obj).
 
-    A .glb has the training cameras. The sky is written beside the file.
+    A .glb has the training cameras. The sky is written beside the file, and beside a .glb the page that shows both.
     """
     suffix, limit = out.suffix.lower(), options.triangles
     if limit is not None:
         optional("fast_simplification", "gltf", "triangles= needs fast-simplification")
     elif suffix == ".glb":
-        limit = _GLB_TRIANGLES
+        limit = GLB_TRIANGLES
     glass = glass_meshes(scene, limit)
     rest = None if limit is None else max(limit - sum(len(mesh.faces) for mesh in glass), limit // 2)
     inside = inside_mesh(scene, options.resolution, options.half_depth, rest)
     if not glass and inside is None:
         raise NerfroError("the scene has neither glass nor dense content to write; raise half_depth")
     if suffix == ".glb":
-        write_atomically(out, _encode_glb(scene, glass, inside))
+        write_atomically(out, encode_glb(scene, glass, inside))
+        write_atomically(out.with_name(out.stem + "_viewer.html"), _viewer_page(scene, out))
     else:
         write_atomically(out, one_mesh(glass, inside, suffix))
     save_lat_long(out.with_name(out.stem + "_sky.hdr"), scene.sky)
@@ -52,7 +59,13 @@ def write_mesh(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
     return f"{sum(len(mesh.faces) for mesh in glass)} triangles of glass, {content}"
 
 
-def _encode_glb(scene: TrainedScene, glass: list[trimesh.Trimesh], inside: trimesh.Trimesh | None) -> bytes:
+def encode_glb(
+    scene: TrainedScene,
+    glass: list[trimesh.Trimesh],
+    inside: trimesh.Trimesh | None,
+    gaussians: Gaussians | None = None,
+) -> bytes:
+    """Encode the surfaces of the bodies, dense content, Gaussians and training cameras as .glb."""
     document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "nerfro"}, "scene": 0, "scenes": [{}], "nodes": [], "meshes": [],
         "materials": [], "cameras": [], "accessors": [], "bufferViews": [],
@@ -66,9 +79,12 @@ def _encode_glb(scene: TrainedScene, glass: list[trimesh.Trimesh], inside: trime
     if inside is not None:
         # The colours are radiance and not albedo, so lights of the other program must not shade them again.
         _add_mesh(document, content, "inside", inside, {"extensions": {"KHR_materials_unlit": {}}})
+    if gaussians is not None:
+        _add_gaussians(document, content, gaussians)
     _add_cameras(document, scene.cameras("train").to("cpu"))
     document["scenes"][0]["nodes"] = list(range(len(document["nodes"])))
     extensions = {name for material in document["materials"] for name in material["extensions"]}
+    extensions |= set() if gaussians is None else {_SPLATTING}
     required = [] if inside is None else [QUANTIZATION]
     document |= {"extensionsUsed": sorted({*required, *extensions}), "extensionsRequired": required}
     document["buffers"] = [{"byteLength": len(content)}]
@@ -118,9 +134,47 @@ def _add_mesh(
     document["accessors"].append({"bufferView": len(document["bufferViews"]), **entry})
     _add_view(document, content, mesh.faces.astype(code).tobytes(), target=_INDICES)
     indices = len(document["accessors"]) - 1
-    primitive = {"attributes": attributes, "indices": indices, "material": len(document["materials"])}
+    _add_node(document, name, {"attributes": attributes, "indices": indices}, material, unit, origin)
+
+
+def _add_gaussians(document: dict[str, Any], content: bytearray, gaussians: Gaussians) -> None:
+    """Add Gaussians as points (KHR_gaussian_splatting), with colours for programs without the extension."""
+    opacities, rotations = gaussians.logits.sigmoid()[:, None], functional.normalize(gaussians.rotations, dim=-1)
+    colours = to_linear((0.5 + HARMONIC_0 * gaussians.harmonics[:, 0]).clamp(0, 1))
+    values = {
+        "POSITION": gaussians.positions,
+        "COLOR_0": torch.cat([colours, opacities], -1),
+        f"{_SPLATTING}:SCALE": gaussians.log_scales,
+        f"{_SPLATTING}:ROTATION": rotations[:, [1, 2, 3, 0]],
+        f"{_SPLATTING}:OPACITY": opacities,
+        f"{_SPLATTING}:SH_DEGREE_0_COEF_0": gaussians.harmonics[:, 0],
+    } | {f"{_SPLATTING}:SH_DEGREE_1_COEF_{n}": gaussians.harmonics[:, 1 + n] for n in range(3)}
+    attributes = {}
+    for name, numbers in values.items():
+        attributes[name] = len(document["accessors"])
+        kind = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[numbers.shape[1]]
+        entry = {"type": kind, "componentType": _CODES["<f4"], "count": len(numbers)}
+        if name == "POSITION":
+            entry |= {"min": numbers.amin(0).tolist(), "max": numbers.amax(0).tolist()}
+        document["accessors"].append({"bufferView": len(document["bufferViews"]), **entry})
+        _add_view(document, content, numbers.numpy().astype("<f4").tobytes(), target=_VERTICES)
+    kernel = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    primitive = {"attributes": attributes, "mode": 0, "extensions": {_SPLATTING: kernel}}
+    _add_node(document, "gaussians", primitive, {"extensions": {"KHR_materials_unlit": {}}})
+
+
+def _add_node(
+    document: dict[str, Any],
+    name: str,
+    primitive: dict[str, Any],
+    material: dict[str, Any],
+    unit: float = 1.0,
+    origin: np.ndarray | tuple[float, ...] = (0.0, 0.0, 0.0),
+) -> None:
+    """Add a node with a mesh of one primitive and its material, whose coordinates have a unit and an origin."""
     matrix = np.eye(4)
-    matrix[:3] = Z_UP_TO_Y_UP @ np.hstack([unit * np.eye(3), origin[:, None]])
+    matrix[:3] = Z_UP_TO_Y_UP @ np.column_stack([unit * np.eye(3), origin])
+    primitive |= {"material": len(document["materials"])}
     document["nodes"].append({"name": name, "mesh": len(document["meshes"]), "matrix": matrix.T.flatten().tolist()})
     document["meshes"].append({"name": name, "primitives": [primitive]})
     document["materials"].append({"name": name, **material})
@@ -146,6 +200,30 @@ def _add_cameras(document: dict[str, Any], cameras: Cameras) -> None:
         document["cameras"].append({"name": name, "type": "perspective", "perspective": lens})
 
 
+def _viewer_page(scene: TrainedScene, file: Path) -> str:
+    """Return a page that shows a .glb and its sky by Google's element <model-viewer>, from the training cameras.
+
+    The element has the y axis up, and orbits a target at an azimuth from z towards x and a polar angle from y.
+    """
+    cameras, centre = scene.cameras("train").to("cpu"), scene.bounds.mean(0).double().numpy()
+    views = []
+    for view, pose in enumerate(cameras.camera_to_world.double().numpy()):
+        back, eye = pose[:, 2], pose[:, 3]
+        distance = max(float(back @ (eye - centre)), 1e-3)  # to the point of the optical axis closest to the centre
+        x, y, z = Z_UP_TO_Y_UP @ back
+        angles = math.degrees(math.atan2(x, z)), math.degrees(math.acos(min(max(y, -1), 1)))
+        target = Z_UP_TO_Y_UP @ (eye - distance * back)
+        field_of_view = 2 * math.degrees(math.atan(0.5 * cameras.height / float(cameras.fy[view])))
+        of_element = {
+            "cameraOrbit": f"{angles[0]:.4f}deg {angles[1]:.4f}deg {distance:.6g}m",
+            "cameraTarget": " ".join(f"{value:.6g}m" for value in target),
+            "fieldOfView": f"{field_of_view:.4f}deg",
+        }
+        views.append({"name": f"train_{view:03d}", "view": of_element})
+    template, sky = Path(__file__).with_name("model_viewer.html.jinja"), f"{file.stem}_sky.hdr"
+    return fill_template(template, title=scene.name or file.stem, model=file.name, sky=sky, cameras=views)
+
+
 def _glass_material(
     mesh: trimesh.Trimesh, ior: float, absorption: np.ndarray, dispersion: Dispersion | None
 ) -> dict[str, Any]:
@@ -166,4 +244,4 @@ def _glass_material(
     return {"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.0}, "extensions": extensions}
 
 
-EXPORTS["mesh"] = Export((".glb", ".ply", ".obj"), write_mesh, ("_sky.hdr",))
+EXPORTS["mesh"] = Export((".glb", ".ply", ".obj"), write_mesh, ("_sky.hdr", "_viewer.html"), unused=OF_SPLATS)

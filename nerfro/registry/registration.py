@@ -141,7 +141,6 @@ def register(kind: str, name: str) -> Callable[[Part], Part]:
     Raises:
         NerfroError: the plugin type is unknown, the name is taken, or the class lacks a part of its contract.
     """
-    _require_kind(kind)
 
     def wrap(cls: Part) -> Part:
         check = validated(f"{kind}={name}")

@@ -7,9 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from nerfro.core.errors import NerfroError
 from nerfro.core.paths import shown
-from nerfro.evaluation.image_metrics import ImageMetric, image_metrics
+from nerfro.evaluation.image_metrics import ImageMetric
 from nerfro.evaluation.results import FULL, OBJECT, Region
 from nerfro.evaluation.tables import MISSING, Column, Row, Table, short
 from nerfro.report.runs import Budget, EvaluatedRun, EvaluationSet
@@ -90,23 +89,6 @@ def to_table(comparison: Comparison, metrics: Mapping[str, type[ImageMetric]], r
     title = "; ".join([comparison.budget.title, *descriptions])
     table = Table(title, "method", tuple(columns), tuple(rows), medals=len(rows) > 1, notes=tuple(notes))
     return table.without_empty_columns()
-
-
-def find_metrics(names: Sequence[str] | None = None) -> dict[str, type[ImageMetric]]:
-    """Return the metrics with the given names, in this order; by default PSNR, SSIM, LPIPS, FLIP and those of plugins.
-
-    Raises:
-        NerfroError: there is no name, or a name is unknown.
-    """
-    available = image_metrics()
-    if names is None:
-        names = list(available)
-    if not names:
-        raise NerfroError(f"metrics: the list is empty; choose from {', '.join(available)}")
-    for name in names:
-        if name not in available:
-            raise NerfroError(f"metrics: '{name}' is not a metric; choose from {', '.join(available)}")
-    return {name: available[name] for name in names}
 
 
 def _comparison(

@@ -10,13 +10,14 @@ import rich
 
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import user_path
+from nerfro.evaluation.image_metrics import image_metrics
 from nerfro.evaluation.results import FULL, Region
 from nerfro.evaluation.tables import FORMATS, Table, to_rich, write_table
 from nerfro.files.atomic import refuse_existing, write_atomically
 from nerfro.files.folder_lock import lock_folder
 from nerfro.files.images import load_png
 from nerfro.registry.allowed import Natural
-from nerfro.report.comparison import compare, find_metrics, to_table
+from nerfro.report.comparison import compare, to_table
 from nerfro.report.page import report_page
 from nerfro.report.runs import find_runs
 from nerfro.report.views import Selection
@@ -85,7 +86,7 @@ class SummaryConfig:
 
 def summarize(options: SummaryConfig) -> None:
     """Read and compare runs, and print and write the result."""
-    metrics, region = find_metrics(options.metrics), cast(Region, options.region)
+    metrics, region = image_metrics(options.metrics), cast(Region, options.region)
     if options.pictures and not options.report:
         raise NerfroError(f"pictures={options.pictures} are shown in the report; add report=true")
     pictures = [user_path(file) for file in options.pictures]

@@ -230,7 +230,7 @@ def _nested(parts: list[Part]) -> list[Part]:
     for part in sorted(parts, key=lambda part: order[part.name]):
         around = [nested[name] for name in nested if (part.name, name) in inside and nested[name].ior is not None]
         outer = around[-1] if around else None
-        if part.ior is not None and _volume(part.surface) < 0:
+        if part.ior is not None and part.surface.as_trimesh().volume < 0:
             surface = part.surface
             surface = replace(surface, faces=surface.faces[:, ::-1].copy(), normals=-surface.normals)
             part = replace(part, surface=surface)
@@ -251,11 +251,6 @@ def _is_within(surface: SurfaceMesh, body: SurfaceMesh) -> bool:
     along = torch.nn.functional.normalize(torch.tensor([[0.31, 0.53, 0.79]], dtype=torch.float64), dim=-1)
     _, winding = crossings(MeshIntersector(corners), points, along.expand_as(points).contiguous())
     return bool((winding != 0).double().mean() > 0.5)
-
-
-def _volume(surface: SurfaceMesh) -> float:
-    a, b, c = surface.vertices[surface.faces].astype(np.float64).swapaxes(0, 1)
-    return float((np.cross(a, b) * c).sum() / 6)
 
 
 _MODELLED = {"KHR_materials_transmission", "KHR_materials_ior", "KHR_materials_volume"}

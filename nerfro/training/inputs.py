@@ -14,7 +14,7 @@ from omegaconf import DictConfig
 
 from nerfro.core.cameras import Cameras
 from nerfro.core.errors import NerfroError
-from nerfro.core.paths import EMBEDDED_PREFIX, resolve_path
+from nerfro.core.paths import ASSETS_DIR, EMBEDDED_PREFIX, resolve_path
 from nerfro.data.base import Views
 from nerfro.files.atomic import atomic_file
 from nerfro.files.cache import content_hash, file_hash
@@ -76,10 +76,11 @@ def copy_files(folder: Path, config: DictConfig) -> None:
 
     Embedded files, and `.gltf` files, which consist of several files, are left out.
     """
-    for name, location in _texts(config, _GROUPS):
-        copied = folder / INPUTS_FOLDER / f"{name}{PurePath(location).suffix}"
-        if _is_own_file(location) and not same_content(resolve_path(location), copied):
-            with resolve_path(location).open("rb") as source, atomic_file(copied) as target:
+    for name, file in _files(config, _GROUPS).items():
+        copied = folder / INPUTS_FOLDER / f"{name}{file.suffix}"
+        own = not file.is_relative_to(ASSETS_DIR) and file.suffix.lower() not in ("", ".gltf")
+        if own and not same_content(file, copied):
+            with file.open("rb") as source, atomic_file(copied) as target:
                 shutil.copyfileobj(source, target)
 
 
@@ -130,13 +131,15 @@ def _texts(config: DictConfig, groups: Collection[str]) -> Iterator[tuple[str, s
             yield from ((item, text) for item, text in items.items() if isinstance(text, str))
 
 
-def _is_own_file(location: str) -> bool:
-    """Test whether a text names an existing file that nerfro does not include."""
-    with suppress(OSError, NerfroError):  # other texts than paths
-        suffix = PurePath(location).suffix.lower()
-        own = not location.startswith(EMBEDDED_PREFIX) and suffix not in ("", ".gltf")
-        return own and resolve_path(location).is_file()
-    return False
+def _files(config: DictConfig, groups: Collection[str]) -> dict[str, Path]:
+    """Return the existing files that settings of some groups name."""
+    files = {}
+    for name, location in _texts(config, groups):
+        with suppress(OSError, NerfroError):  # other texts than paths
+            path = resolve_path(location)
+            if path.is_file():
+                files[name] = path
+    return files
 
 
 def file_hashes(config: DictConfig) -> dict[str, str]:
@@ -146,12 +149,7 @@ def file_hashes(config: DictConfig) -> dict[str, str]:
     """
     if not plugin_of(config.sampler.path).cls.needs_medium:  # type: ignore[attr-defined]
         return {}
-    hashes = {}
-    for name, location in _texts(config, ("medium",)):
-        with suppress(OSError, NerfroError):  # other texts than paths
-            if resolve_path(location).is_file():
-                hashes[name] = file_hash(resolve_path(location))
-    return hashes
+    return {name: file_hash(file) for name, file in _files(config, ("medium",)).items()}
 
 
 def changed_file(checkpoint: Mapping[str, Any], config: DictConfig) -> str | None:

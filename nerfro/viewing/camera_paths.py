@@ -5,9 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.interpolate import CubicSpline, make_interp_spline
+from scipy.spatial.transform import Rotation, RotationSpline
 from torch import Tensor
 from torch.nn import functional
 
@@ -128,3 +132,29 @@ def path_cameras(geometry: CaptureGeometry, name: str, start: OrbitPosition, num
     last = num_frames if closed else max(num_frames - 1, 1)
     poses = [geometry.pose_at(path(start, frame / last)) for frame in range(num_frames)]
     return geometry.cameras_at(torch.stack(poses))
+
+
+def between_keys(keys: Cameras, num_frames: int) -> Cameras:
+    """Interpolate cameras as key frames at equal intervals of time, from the first to the last one.
+
+    Positions follow a cubic spline, and rotations a spline of continuous angular acceleration (SciPy); lenses change
+    linearly.
+
+    Raises:
+        NerfroError: there are less than two cameras.
+    """
+    if len(keys) < 2:
+        raise NerfroError(f"frames={num_frames} needs two or more cameras in the file of the path; leave frames out")
+    keys = keys.to("cpu")
+    times, at = np.arange(len(keys)), np.linspace(0, len(keys) - 1, num_frames)
+    poses = keys.camera_to_world.double().numpy()
+    rotations = RotationSpline(times, Rotation.from_matrix(poses[:, :, :3]))(at).as_matrix()
+    positions = CubicSpline(times, poses[:, :, 3])(at)
+    of_lens = {name: getattr(keys, name) for name in ("fx", "fy", "cx", "cy", "distortion")}
+    lens: dict[str, Any] = {
+        name: torch.from_numpy(make_interp_spline(times, values.double().numpy(), k=1)(at)).to(values)
+        for name, values in of_lens.items()
+        if values is not None
+    }
+    pose = torch.from_numpy(np.concatenate([rotations, positions[..., None]], -1)).to(keys.camera_to_world)
+    return replace(keys, camera_to_world=pose, **lens)

@@ -27,11 +27,14 @@ class ExportConfig:
         what: content and kind of the file.
         out: output file, whose ending selects the format, or the folder of cameras and colmap.
         resolution: grid vertices along the longest side of the volume (default 128), or rows of the sky (by
-            default as many as the background has, at least 512).
+            default as many as the background has, at least 512), or the longest side of the images that Gaussians are
+            fitted to (by default at most 256 pixels).
         half_depth: length, world units, within which dense content absorbs half the light; the surface is
             extracted at this density. By default a hundredth of the object's longest side.
         triangles: largest number of triangles of a mesh, of which the glass has at most half. By default 20000 in a
             .glb, and as many as the surfaces have in .ply and .obj.
+        gaussians: number of Gaussians of splats.
+        steps: steps of gradient descent that fit Gaussians.
         sky: lat-long image that replaces the sky (.hdr, .exr, .png, .jpg).
         root: folder of the data, if it has moved since training.
         device: `cpu` or `cuda`; `auto` means the CPU.
@@ -44,6 +47,8 @@ class ExportConfig:
     resolution: Count | None = None
     half_depth: Positive | None = None
     triangles: Annotated[int, Ge(100)] | None = None
+    gaussians: Annotated[int, Ge(10)] = 50_000
+    steps: Count = 500
     sky: str | None = None
     root: str | None = None
     device: str = "auto"
@@ -76,6 +81,7 @@ class Export:
         return [out, *(out.with_name(out.stem + ending) for ending in self.companions)]
 
 
+OF_SPLATS = ("gaussians", "steps")  # options of splats alone
 EXPORTS: dict[str, Export] = {}
 """Exports by the name in `what=`; modules that `discover` imports add theirs."""
 

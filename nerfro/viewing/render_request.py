@@ -24,11 +24,11 @@ from nerfro.data.lenses import Lens, check_lenses
 from nerfro.registry.allowed import Count, Positive, refuse_unused
 from nerfro.samplers.subdivision import SubdivisionChanges
 from nerfro.viewing.camera_files import cameras_of_file, stated_seconds
-from nerfro.viewing.camera_paths import PATHS, CaptureGeometry, OrbitPosition, path_cameras
+from nerfro.viewing.camera_paths import PATHS, CaptureGeometry, OrbitPosition, between_keys, path_cameras
 from nerfro.viewing.trained_scene import TrainedScene
 
 Angle = Annotated[float, Gt(0), Lt(180)]
-_OF_PATHS = ("frames", "azimuth", "elevation", "distance")  # options of paths around the object
+_OF_PATHS = ("azimuth", "elevation", "distance")  # options of paths around the object
 FilmFormat = Literal["mp4", "gif"]
 
 
@@ -39,7 +39,8 @@ class RenderConfig:
     Attributes:
         checkpoint: run folder or a checkpoint in it.
         path: path around the object: orbit, spiral, arc or dolly; or FILE.json of cameras.
-        frames: number of frames of the film.
+        frames: number of frames of the film, by default 120, or as many as a file has cameras; with another number, the
+            cameras of the file are key frames, which splines connect.
         seconds: duration of the film; by default that of the file of cameras (`seconds`), or 5.
         azimuth: start of the path, degrees around the object.
         elevation: start of the path, degrees above the object.
@@ -67,7 +68,7 @@ class RenderConfig:
 
     checkpoint: str = MISSING
     path: str | None = None
-    frames: Count = 120
+    frames: Count | None = None
     seconds: Positive | None = None
     azimuth: float = 0.0
     elevation: Annotated[float, Ge(-90), Le(90)] = 10.0
@@ -125,7 +126,7 @@ def check_request(options: RenderConfig) -> None:
     if options.path not in PATHS:
         refuse_unused(options, _OF_PATHS, f"without path={' or '.join(PATHS)}")
     if options.path is None:
-        refuse_unused(options, ("seconds", "film"), "on still images")
+        refuse_unused(options, ("frames", "seconds", "film"), "on still images")
     elif options.format == "exr":
         refuse_unused(options, ("seconds", "film"), "with format=exr, of which no film is made")
 
@@ -160,10 +161,12 @@ def _free_cameras(options: RenderConfig, scene: TrainedScene) -> Shots:
         cameras = geometry.look_at(_local(options.position, scene)[None], target)
     elif options.path in PATHS:
         start = OrbitPosition(options.azimuth, options.elevation, options.distance or geometry.distance)
-        cameras = path_cameras(geometry, options.path, start, options.frames)
+        cameras = path_cameras(geometry, options.path, start, options.frames or 120)
     else:
         file = user_path(str(options.path))
         cameras, seconds = cameras_of_file(file, geometry, scene.source), stated_seconds(file)
+        if options.frames is not None:
+            cameras = geometry.with_ray_bounds(between_keys(cameras, options.frames))
     seconds = options.seconds or seconds or Shots.seconds
     return Shots(cameras, _numbered("frame", len(cameras), 4), len(cameras) > 1, seconds)
 

@@ -1,7 +1,6 @@
 """Keys of the lens in transforms files, and lenses that every format refuses."""
 
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -26,14 +25,10 @@ from .formats import (
     TRAIN,
     K,
     P,
-    write_colmap,
-    write_idr,
-    write_llff,
-    write_nerfstudio,
     write_opencv,
     write_transforms,
 )
-from .photographs import CX, CY, FX, FY, HEIGHT, WIDTH, check_views, world_to_camera
+from .photographs import CX, CY, FX, FY, HEIGHT, WIDTH, check_views
 
 SIZE = (WIDTH, HEIGHT)
 CENTRE = (WIDTH / 2, HEIGHT / 2)
@@ -142,21 +137,6 @@ def test_impossible_lenses_are_refused(lens: Lens, message: str) -> None:
 def test_principal_points_outside_the_image_are_reported(capsys: pytest.CaptureFixture[str]) -> None:
     check_lenses([Lens(FX, FY, CX, CY), Lens(FX, FY, WIDTH + 1, CY)], ["a", "b"], SIZE)
     assert "the principal point lies outside the image: b;" in capsys.readouterr().out
-
-
-MATRIX = np.vstack([np.array([[FX, 0, 9999], [0, FY, CY], [0, 0, 1]]) @ world_to_camera(1), [0, 0, 0, 1]])
-BEYOND: dict[str, Callable[[Path], Path]] = {
-    "opencv": lambda root: write_opencv(root, cam_mat=[[FX, 0, 9999], [0, FY, CY], [0, 0, 1]]),
-    "nerfstudio": lambda root: write_nerfstudio(root, top=SHARED | {"cx": 9999}),
-    "colmap": lambda root: write_colmap(root, cameras={1: ("PINHOLE", (FX, FY, 9999, CY))}),
-    "llff": lambda root: write_llff(root, size=(HEIGHT, WIDTH, 1e8)),
-    "idr": lambda root: write_idr(root, world_mat_1=MATRIX),
-}
-
-
-@pytest.mark.parametrize("form", BEYOND)
-def test_extreme_lenses_are_refused_in_every_format(tmp_path: Path, form: str) -> None:
-    refused(r"for an image of 24x18 pixels, has (cx=[1-9]\d|fx=1)", FORMATS[form].load, BEYOND[form](tmp_path))
 
 
 @pytest.mark.parametrize("dist", [[0.1, -0.02, 0.001, 0.002, 0.003], [0.4, 0.05, 0.001, -0.002, 0.002, 0.6, 0.1, 0.01]])

@@ -338,8 +338,10 @@ def test_cameras_without_a_common_target_need_near_and_far(tmp_path: Path) -> No
     assert load(root).cameras.near == 0.5
 
 
-@pytest.mark.parametrize("form", ["nerfstudio", "blender"])
-@pytest.mark.parametrize(("suffix", "stated"), [(".avif", True), (".HEIC", True), (".heic", False)])
+@pytest.mark.parametrize(
+    ("form", "suffix", "stated"),
+    [("nerfstudio", ".avif", True), ("blender", ".HEIC", True), ("blender", ".heic", False)],
+)
 def test_images_of_other_types_are_refused_by_their_type(form: str, suffix: str, stated: bool, tmp_path: Path) -> None:
     root = FORMATS[form].write(tmp_path)
     file = root / ("transforms.json" if form == "nerfstudio" else "transforms_train.json")

@@ -1,17 +1,12 @@
 """Validation views: their selection, and that training does not use them."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import pytest
 import torch
 
-import nerfro
-from nerfro.data.base import Views
 from nerfro.data.blender import BlenderData
 from nerfro.data.validation_views import WithValidationViews, spread
-from nerfro.training.pixel_batches import PixelBatches
 from tests.conftest import Runner
 
 
@@ -44,22 +39,6 @@ def test_held_out_views_become_the_val_split(tiny_scene: Path) -> None:
     many = WithValidationViews(source, 2)
     assert many.load("train").names == val.names, "of many that are held back, those that train are spread"
     assert many.load("val").names == train.names
-
-
-def test_training_never_draws_validation_views(train: Runner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn: list[Views] = []
-    make = PixelBatches.__init__
-
-    def spied(self: PixelBatches, views: Views, *given: Any) -> None:
-        drawn.append(views)
-        make(self, views, *given)
-
-    monkeypatch.setattr(PixelBatches, "__init__", spied)
-    train("trainer.max_steps=2", "evaluation.every=0", "batches.num_validation_views=1")
-    val = nerfro.load(tmp_path / "run", device="cpu").views("val")
-    assert [len(views) for views in drawn] == [2]
-    assert len(val) == 1
-    assert not {frame.image for frame in drawn[0].frames} & {frame.image for frame in val.frames}
 
 
 def test_too_many_validation_views_are_refused(train: Runner) -> None:

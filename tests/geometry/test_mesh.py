@@ -73,7 +73,6 @@ def test_compressed_gltf_is_refused(extension: str, name: str, tmp_path: Path, m
     ("change", "name"),
     [
         (lambda tree: tree["accessors"][0].update(sparse={"count": 1}), "sparse accessors"),
-        (lambda tree: tree["accessors"][1].update(sparse={"count": 1}), "sparse accessors"),
         (lambda tree: tree["meshes"][0].update(weights=[0.0, 1.0]), "shape keys"),
         (lambda tree: tree["nodes"][0].update(weights=[0.5]), "shape keys"),
         (lambda tree: tree["nodes"][0].update(skin=0), "skeleton"),
@@ -127,11 +126,9 @@ def test_meshes_compressed_by_draco_are_decoded(tmp_path: Path) -> None:
     assert np.linalg.norm(mesh.vertices, axis=1) == pytest.approx(0.7, abs=1e-3)
 
 
-def test_files_without_triangles_or_with_nan_are_named(tmp_path: Path) -> None:
+def test_files_without_triangles_are_named(tmp_path: Path) -> None:
     (tmp_path / "points.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n")
     refused(r"points\.obj", load_mesh, tmp_path / "points.obj")
-    (tmp_path / "nan.obj").write_text("v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    refused(r"nan\.obj", load_mesh, tmp_path / "nan.obj")
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])

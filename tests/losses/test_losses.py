@@ -51,20 +51,6 @@ def test_photometric_loss_reaches_both_fields_and_the_background(model: Renderer
     assert min(norms.values()) > 0
 
 
-def test_background_regularizer_matches_a_manual_computation(model: Renderer) -> None:
-    batch = example_batch()
-    transmittance = torch.linspace(0, 1, NUM_RAYS)
-    rendering = replace(example_rendering(), transmittance=transmittance)
-    total, count = 0.0, 0
-    for ray in range(NUM_RAYS):
-        if transmittance[ray] > 0.5:
-            count += 1
-            passed = transmittance[ray] * rendering.background_radiance[ray]
-            total += sum(abs(float(passed[c] - batch.rgb[ray, c])) for c in range(3))
-    value = BackgroundRegularizer(refracted_only=False)([rendering, rendering], batch, model.scene)
-    assert value.item() == pytest.approx(total / (count + 1), rel=1e-5)
-
-
 def test_background_regularizer_can_be_restricted_to_refracted_rays(model: Renderer) -> None:
     batch = example_batch()
     rendering = replace(example_rendering(), transmittance=torch.ones(NUM_RAYS))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shlex
 import subprocess
 import sys
 from collections.abc import Callable, Iterable
@@ -86,14 +85,6 @@ def test_models_without_points_have_no_reprojection_errors(tmp_path: Path, comma
     assert "RuntimeWarning" not in printed
     report = json.loads((tmp_path / "calibration.json").read_text(), parse_constant=pytest.fail)
     assert {(image["error"], image["num_observations"]) for image in report["images"].values()} == {(None, 0)}
-
-
-def test_printed_command_quotes_the_folder(tmp_path: Path, command: Callable[..., str]) -> None:
-    out = tmp_path / "DIR [1], (x)"
-    model = synthesized(out / "sparse" / "0", ("SIMPLE_PINHOLE", [1280.0, 512, 384]), 0.0)
-    blank(out / "images", [image.name for image in model.images.values()], (512, 384))
-    printed = command("calibrate", f'images="{out / "images"}"', f'out="{out}"', "target=colmap", "test_every=3")
-    assert shlex.split(printed.splitlines()[-1])[5] == f'data.root="{out}"'
 
 
 def test_inconsistent_models_are_refused(tmp_path: Path) -> None:

@@ -16,7 +16,6 @@ from torch import Tensor
 from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.core.light import to_srgb
 from nerfro.core.types import Exits
-from nerfro.data.base import Views
 from nerfro.data.blender import BlenderData
 from nerfro.evaluation.results import read_metrics_json
 from nerfro.fields.base import Field
@@ -24,8 +23,6 @@ from nerfro.fields.hash_grid import HashGridField
 from nerfro.rendering import RayTracer
 from nerfro.training.build import build
 from nerfro.training.callbacks import steps_by_phase
-from nerfro.training.data_module import RayDataModule
-from nerfro.training.module import TrainingModule
 from nerfro.training.phases.background import BackgroundSettings, BackgroundSteps
 from nerfro.training.phases.base import TrainingRun
 from nerfro.training.pixel_batches import PixelBatches
@@ -52,19 +49,25 @@ def test_only_the_background_is_fitted_before_the_first_step(weights: Callable[.
     assert changed == {"renderer.scene.background.texels"}
 
 
-def run_of(module: TrainingModule, data: RayDataModule, views: Views) -> TrainingRun:
-    optimizer = torch.optim.Adam(module.parameters())
-    return TrainingRun(module.renderer, data.batches, RayTracer(module.renderer), views, optimizer, 0.0)
+@pytest.fixture
+def begun(tiny_scene: Path, tiny_default_run: list[str]) -> Callable[..., TrainingRun]:
+    """What phases get at the beginning of a run."""
+
+    def begin(*options: str) -> TrainingRun:
+        module, data = build(overrides=[*tiny_default_run, "trainer.max_steps=1", *options])
+        views, optimizer = BlenderData(str(tiny_scene), 2.0, 6.0).load("train"), torch.optim.Adam(module.parameters())
+        return TrainingRun(module.renderer, data.batches, RayTracer(module.renderer), views, optimizer, 0.0)
+
+    return begin
 
 
 def test_directions_behind_the_object_are_learned_through_it(
-    tiny_scene: Path, tiny_default_run: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    begun: Callable[..., TrainingRun], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    module, data = build(overrides=[*tiny_default_run, "medium.ior=1.0001", "trainer.max_steps=1"])
-    views = BlenderData(str(tiny_scene), near=2.0, far=6.0).load("train")
-    run, phase = run_of(module, data, views), BackgroundSteps(steps=4, start=8)
-    state, towards_the_ball = phase.begin(run), -torch.nn.functional.normalize(views.cameras.camera_to_world[:, :, 3])
-    sky, background = 0.5 + 0.4 * towards_the_ball, module.renderer.scene.background
+    run, phase = begun("medium.ior=1.0001"), BackgroundSteps(steps=4, start=8)
+    state, centres = phase.begin(run), run.views.cameras.camera_to_world[:, :, 3]
+    towards_the_ball = -torch.nn.functional.normalize(centres)
+    sky, background = 0.5 + 0.4 * towards_the_ball, run.renderer.scene.background
 
     def error() -> float:
         return float((to_srgb(background(Exits(towards_the_ball))).detach() - sky).abs().max())
@@ -80,20 +83,17 @@ def test_directions_behind_the_object_are_learned_through_it(
 
 
 def test_fits_of_few_pixels_use_the_pixels_of_larger_fits(
-    tiny_scene: Path, tiny_default_run: list[str], monkeypatch: pytest.MonkeyPatch
+    begun: Callable[..., TrainingRun], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     used, rows = [], PixelBatches.rows
     monkeypatch.setattr(PixelBatches, "rows", lambda *given: used.append(rows(*given)) or used[-1])
     of_limit = {}
     for limit in (10**6, 64):
-        module, data = build(overrides=[*tiny_default_run, "trainer.max_steps=1"])
-        views = BlenderData(str(tiny_scene), near=2.0, far=6.0).load("train")
-        run = run_of(module, data, views)
-        phase = BackgroundSteps(steps=2)
+        run, phase = begun(), BackgroundSteps(steps=2)
         state = phase.begin(run)
         phase.settings = BackgroundSettings(max_fitted_pixels=limit)
         assert all(phase.step(run, number, state) for number in range(2))
-        sky = module.renderer.scene.background(Exits(views.cameras.image_rays(0).directions)).detach()
+        sky = run.renderer.scene.background(Exits(run.views.cameras.image_rays(0).directions)).detach()
         of_limit[limit] = torch.cat(used).sort().values, state["weights"].sum(), to_srgb(sky)
         used.clear()
     (pixels, weight, sky), (pixels_of_all, weight_of_all, sky_of_all) = of_limit[64], of_limit[10**6]
@@ -103,15 +103,11 @@ def test_fits_of_few_pixels_use_the_pixels_of_larger_fits(
 
 
 def test_rays_that_split_into_colours_do_not_show_the_background(
-    tiny_scene: Path, tiny_default_run: list[str], monkeypatch: pytest.MonkeyPatch
+    begun: Callable[..., TrainingRun], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    flint = "medium.bodies={object: {ior: 1.5, abbe: 30}}"
-    module, data = build(overrides=[*tiny_default_run, flint, "trainer.max_steps=1"])
-    views = BlenderData(str(tiny_scene), near=2.0, far=6.0).load("train")
-    run = run_of(module, data, views)
-    phase = BackgroundSteps(steps=2, start=8)
+    run, phase = begun("medium.bodies={object: {ior: 1.5, abbe: 30}}"), BackgroundSteps(steps=2, start=8)
     state = phase.begin(run)
-    monkeypatch.setattr(module.renderer, "trace", lambda *given: pytest.fail("rays through the object are traced"))
+    monkeypatch.setattr(run.renderer, "trace", lambda *given: pytest.fail("rays through the object are traced"))
     assert all(phase.step(run, number, state) for number in range(4))
 
 

@@ -10,22 +10,18 @@ from unittest.mock import Mock
 
 import pytest
 import torch
-from lightning.pytorch import Trainer
 
 from nerfro.core.draws import Draws
-from nerfro.core.types import Batch
 from nerfro.data.blender import BlenderData
 from nerfro.data.pixel_store import PixelStore
 from nerfro.kernels import compilation
 from nerfro.media.bodies import Bodies
 from nerfro.paper.eikonal import Eikonal
-from nerfro.rendering import RayTracer, Renderer, Scene
+from nerfro.rendering import Renderer, Scene
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.testing import example_space
-from nerfro.training.data_module import Prefetcher, RayDataModule, can_prefetch, multiplies_large_matrices
-from nerfro.training.module import TrainingModule
-from nerfro.training.pixel_batches import PixelBatches
+from nerfro.training.data_module import Prefetcher, can_prefetch, multiplies_large_matrices
 from tests.closed_forms import grid_points, random_rays, sampled
 from tests.conftest import Runner, weights_of
 from tests.pretended_gpu import GPU, PretendedGpu
@@ -55,18 +51,6 @@ def ahead():
     for one in made:
         one.close()
     assert not running()
-
-
-def test_prefetched_paths_equal_those_of_the_step_in_any_order(ahead, ball: Bodies) -> None:
-    sampler = Snell()
-    make: Any = lambda step: sampler(random_rays(300, 1.6, step, 6.0), ball)  # noqa: E731
-    one = ahead(make)
-    for step in (0, 1, 2, 7, 8, 3):
-        expected, got = make(step), one(step)
-        one.begin_next()
-        for name in ("positions", "directions", "s", "exit_directions"):
-            assert torch.equal(getattr(got, name), getattr(expected, name))
-        assert torch.equal(got.record.body, expected.record.body)
 
 
 def test_next_batch_is_made_during_the_step(ahead) -> None:
@@ -161,38 +145,10 @@ def test_weights_depend_neither_on_the_thread_nor_on_an_interruption(
     assert any(name.endswith("point_sampler.density") and value.any() for name, value in expected.items())
 
 
-@pytest.mark.parametrize("learns", [True, False])
-def test_batch_is_made_when_its_step_begins_if_paths_learn(
-    learns: bool, ball: Bodies, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Lightning fetches one step early, so what it fetches must not be the batch."""
+def test_no_batch_is_made_ahead_if_paths_learn(train: Runner, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("os.sched_getaffinity", lambda pid: {0, 1}, raising=False)
-    made: list[int] = []
-    batch = Mock(spec=Batch)
-    batches: Any = Mock(spec=PixelBatches, draw=lambda step: made.append(step))
-    batches.for_rank = lambda rank, size: batches
-    batches.to = lambda device, dtype: batches
-    batches.release_memory = lambda: None
-    monkeypatch.setattr(RayTracer, "trace", lambda tracer, pixels: batch)
-    data = RayDataModule(batches)
-    scene = Mock(spec=Scene, medium=ball)
-    renderer = Mock(spec=Renderer, path_sampler=Snell(), scene=scene, paths_learn=learns, modules=list)
-    module = Mock(spec=TrainingModule, renderer=renderer, dtype=torch.float32)
-    strategy = Mock(root_device=torch.device("cpu"))
-    data.trainer = Mock(  # type: ignore[assignment]
-        spec=Trainer, strategy=strategy, lightning_module=module, global_step=5, training=True,
-        check_val_every_n_epoch=None, val_check_interval=10,
-    )  # fmt: skip
-    steps = iter(data.train_dataloader())
-    first, _second = next(steps), next(steps)
-    assert not made
-    assert data.transfer_batch_to_device(first, torch.device("cpu"), 0) is batch
-    assert bool(running()) != learns
-    assert made == [5] or not learns
-    data.trainer.training = False  # type: ignore[misc]
-    assert data.transfer_batch_to_device(3, torch.device("cpu"), 0) == 3, "a validation view stays its number"
-    data.teardown("fit")
-    assert not running()
+    monkeypatch.setattr(Prefetcher, "__init__", lambda *_: pytest.fail("a thread makes batches"))
+    train("trainer.max_steps=2", "evaluation=none", "medium.learn_ior=true")
 
 
 def test_training_pixels_have_one_copy(train: Runner, monkeypatch: pytest.MonkeyPatch) -> None:

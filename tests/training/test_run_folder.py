@@ -41,10 +41,11 @@ def evaluate(begun: Path, evaluate_here: Runner) -> Runner:
     return functools.partial(evaluate_here, f"checkpoint={begun / LAST_CHECKPOINT}")
 
 
-@pytest.mark.parametrize("file", ["config.yaml", "notes/mine.txt"])
-@pytest.mark.parametrize("going_on", ["null", "last", "elsewhere"])
+@pytest.mark.parametrize(
+    ("going_on", "file"), [("null", "config.yaml"), ("last", "notes/mine.txt"), ("elsewhere", "config.yaml")]
+)
 def test_files_of_others_in_the_run_folder_are_kept(
-    file: str, going_on: str, train: Runner, trained_run: Path, tmp_path: Path
+    going_on: str, file: str, train: Runner, trained_run: Path, tmp_path: Path
 ) -> None:
     folder = tmp_path / "run"
     (folder / file).parent.mkdir(parents=True)

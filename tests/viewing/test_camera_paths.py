@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 from nerfro.viewing.camera_files import cameras_of_file, read_cameras
-from nerfro.viewing.camera_paths import PATHS, CaptureGeometry, OrbitPosition, path_cameras
+from nerfro.viewing.camera_paths import PATHS, CaptureGeometry, OrbitPosition, between_keys, path_cameras
 from nerfro.viewing.trained_scene import TrainedScene
 from tests.conftest import refused
 from tests.data.formats import FORMATS
@@ -40,6 +40,21 @@ def test_all_cameras_look_at_the_centre_upright(name: str, around: CaptureGeomet
     distances = (cameras.camera_to_world[:, :, 3] - CENTRE).norm(dim=-1)
     assert cameras.near <= distances.min() - around.distance + around.camera.near + 1e-4
     assert cameras.far >= distances.max() - around.distance + around.camera.far - 1e-4
+
+
+def test_splines_through_key_frames_follow_a_smooth_path(around: CaptureGeometry) -> None:
+    keys, dense = (path_cameras(around, "spiral", OrbitPosition(0, 30, 5.0), number) for number in (33, 65))
+    keys = replace(
+        keys, fx=torch.linspace(40.0, 72.0, 33), distortion=torch.linspace(0, 0.1, 33)[:, None].expand(33, 9)
+    )
+    between = between_keys(keys, 65)
+    torch.testing.assert_close(between.camera_to_world[::2], keys.camera_to_world, atol=1e-5, rtol=0)
+    torch.testing.assert_close(between.camera_to_world, dense.camera_to_world, atol=0.01, rtol=0)
+    straight = 0.5 * (keys.camera_to_world[1:, :, 3] + keys.camera_to_world[:-1, :, 3])
+    assert (straight - dense.camera_to_world[1::2, :, 3]).norm(dim=-1).max() > 0.05, "lines are no substitute"
+    torch.testing.assert_close(between.fx, torch.linspace(40.0, 72.0, 65))
+    torch.testing.assert_close(between.distortion[1], torch.full((9,), 0.1 / 64))
+    refused("frames=9 needs two or more cameras", between_keys, keys.select([0]), 9)
 
 
 def test_target_is_in_the_centre_of_the_image_although_photographs_are_off_centre(scene: TrainedScene) -> None:

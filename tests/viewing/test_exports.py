@@ -100,6 +100,32 @@ def test_glb_contains_glass_as_dielectric_and_the_content_as_emission(scene: Tra
     np.testing.assert_allclose(lifted[:3], [INSIDE_CENTRE[0], INSIDE_CENTRE[2], -INSIDE_CENTRE[1]], atol=CELL)
 
 
+def test_page_beside_the_glb_shows_it_from_the_training_cameras(scene: TrainedScene, tmp_path: Path) -> None:
+    write(scene, "mesh", tmp_path / "ball.glb", resolution=16)
+    page = (tmp_path / "ball_viewer.html").read_text()
+    element = ElementTree.fromstring(
+        page[page.index("<model-viewer") : page.index("</model-viewer>")].replace(" camera-controls", "")
+        + "</model-viewer>"
+    )
+    for name in ("src", "skybox-image"):
+        assert (tmp_path / element.attrib[name]).is_file()
+    views = json.loads(page[page.index("cameras = ") + 10 : page.index(", viewer = ")])
+    cameras = scene.cameras("train")
+    assert len(views) == len(cameras)
+    for pose, entry in zip(cameras.camera_to_world.numpy(), views, strict=True):
+        orbit, view = entry["view"]["cameraOrbit"].split(), entry["view"]
+        azimuth, polar, distance = float(orbit[0][:-3]), float(orbit[1][:-3]), float(orbit[2][:-1])
+        azimuth, polar = math.radians(azimuth), math.radians(polar)
+        target = np.array([float(number[:-1]) for number in view["cameraTarget"].split()])
+        # Of the orbit of the element: https://modelviewer.dev/docs/#entrydocs-stagingandcameras-attributes-cameraOrbit
+        eye = target + distance * np.array(
+            [math.sin(polar) * math.sin(azimuth), math.cos(polar), math.sin(polar) * math.cos(azimuth)]
+        )
+        np.testing.assert_allclose(eye, Z_UP_TO_Y_UP @ pose[:, 3], atol=1e-3)
+        np.testing.assert_allclose(target, 0, atol=1e-3)
+        assert float(view["fieldOfView"][:-3]) == pytest.approx(math.degrees(0.7), abs=1e-3)
+
+
 @pytest.fixture
 def two_bodies(scene: TrainedScene, tmp_path: Path) -> TrainedScene:
     """Bodies apart: a ball of water that disperses, and an absorbing ball."""
@@ -390,7 +416,7 @@ class Absent(Photographs):
     ("what", "name", "message"),
     [
         ("colmap", "a.txt", "must be a folder"),
-        ("fog", "a.glb", "what=fog is not known; choose page, colmap"),
+        ("fog", "a.glb", "what=fog is not known; choose .*colmap"),
         ("mesh", "a.stl", "must end in .glb"),
         ("volume", "a.vdb", "must end in .npz"),
     ],

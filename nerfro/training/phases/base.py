@@ -5,7 +5,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from typing import Any
 
 import torch
@@ -14,7 +13,7 @@ from torch import Tensor, nn
 
 from nerfro.core.errors import NerfroError
 from nerfro.data.base import Views
-from nerfro.optimizers.config import require_matches
+from nerfro.optimizers.config import matches, require_matches
 from nerfro.rendering import RayTracer, Renderer
 from nerfro.training.pixel_batches import PixelBatches
 
@@ -47,7 +46,7 @@ class TrainingRun:
         """
         learned = {name: own for name, own in self.renderer.parameters_by_name().items() if own.requires_grad}
         require_matches("the patterns of a phase", patterns, learned)
-        return [own for name, own in learned.items() if any(fnmatchcase(name, pattern) for pattern in patterns)]
+        return [own for name, own in learned.items() if matches(name, patterns)]
 
     def descend(self, loss: Float[Tensor, ""], parameters: Sequence[nn.Parameter]) -> None:
         """Take a step of the optimizer with some parameters.
