@@ -2,6 +2,7 @@
 
 import functools
 import importlib
+import itertools
 import json
 import shutil
 import signal
@@ -117,9 +118,9 @@ def test_missing_data_name_the_command_that_renders_them(sweep: Runner, tmp_path
 def test_sweep_file_composes_its_cells(name: str) -> None:
     hydra: Any = OmegaConf.load(CONF_DIR / "sweep" / f"{name}.yaml").hydra
     assert hydra.sweep.dir == f"outputs/sweeps/{name}"
-    for key, values in hydra.sweeper.params.items():
-        for value in values.split(","):
-            validate(TrainConfig, plain(composed(f"{key}={value}")))
+    axes = ([f"{key}={value}" for value in values.split(",")] for key, values in hydra.sweeper.params.items())
+    for cell in itertools.zip_longest(*axes):  # every value is in one of these cells
+        validate(TrainConfig, plain(composed(*filter(None, cell))))
 
 
 SWEEPER = """

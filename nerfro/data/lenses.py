@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -40,6 +41,7 @@ _NUMBERS = {
     **dict.fromkeys(("x_fov", "y_fov"), Annotated[float, Gt(0), Lt(180)]),
     **dict.fromkeys(("cx", "cy", *_NAMES), float),
 }
+_SAME_FOCAL = 0.02  # relative difference of two statements of one focal length
 
 
 @dataclass(frozen=True)
@@ -214,8 +216,22 @@ def _focal_lengths(
 
 
 def _focal_length(level: Mapping[str, float], axis: str, side: float) -> float | None:
-    angle = level.get(f"camera_angle_{axis}")
-    return level.get(f"fl_{axis}", None if angle is None else 0.5 * side / math.tan(0.5 * angle))
+    """Return the focal length that one level states, in pixels, and warn of two that differ by more than rounding."""
+    stated, angle = level.get(f"fl_{axis}"), level.get(f"camera_angle_{axis}")
+    if angle is None:
+        return stated
+    of_angle = 0.5 * side / math.tan(0.5 * angle)
+    if stated is not None and abs(of_angle - stated) > _SAME_FOCAL * stated:
+        _warn_of_contradiction(axis, stated, angle, side, of_angle)
+    return of_angle if stated is None else stated
+
+
+@functools.cache  # one line for all frames
+def _warn_of_contradiction(axis: str, stated: float, angle: float, side: float, of_angle: float) -> None:
+    warn(
+        f"fl_{axis}={stated:g} contradicts camera_angle_{axis}={angle:g}, with which {side:g} pixels have the focal "
+        f"length {of_angle:g}; fl_{axis} is taken: remove the wrong one, or state the calibrated size by w and h"
+    )
 
 
 def lens_tensors(lenses: Sequence[Lens]) -> tuple[Float[Tensor, "V 4"], Float[Tensor, "V 9"] | None]:

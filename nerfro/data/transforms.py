@@ -148,6 +148,9 @@ def _frame_name(where: str, entry: object) -> str:
     for key in ("file_path", "transform_matrix"):
         if entry.get(key) is None:
             raise NerfroError(f"{where} has no '{key}'; add it or take the frame out")
+    for key in ("transform_matrix_start", "transform_matrix_end"):
+        if entry.get(key) not in (None, entry["transform_matrix"]):
+            raise NerfroError(f"{where}: {key} says that the camera moves during the exposure; take the frame out")
     check(f"{where}: ", _PATHS, {key: entry.get(key) for key in _PATHS})
     return PurePosixPath(entry["file_path"].replace("\\", "/")).as_posix()
 

@@ -61,6 +61,12 @@ def test_frame_keys_and_focal_lengths_have_precedence(file: dict, frame: dict, e
     assert lens.distortion is None
 
 
+def test_contradicting_focal_length_and_angle_are_named(capsys: pytest.CaptureFixture[str]) -> None:
+    for file, is_named in (({"fl_x": 12.1, **WIDE}, False), ({"fl_x": 13, "x_fov": 90}, True)):
+        read_lens(file, {}, SIZE, "it")
+        assert ("fl_x=13 contradicts camera_angle_x=1.5708, with which 24" in capsys.readouterr().out) == is_named
+
+
 @pytest.mark.parametrize(
     ("file", "frame", "expected"),
     [

@@ -111,6 +111,10 @@ FRAME = r"transforms_train\.json: frame 1 \('train/r_2'\)"
         (lambda d: d.update(camera_angle_x=39.6), "camera_angle_x=39.6 is not allowed; take more than 0"),
         (lambda d: d["frames"][1].pop("file_path"), r"transforms_train\.json: frame 1 has no 'file_path'"),
         (lambda d: d["frames"][1].pop("transform_matrix"), r"frame 1 has no 'transform_matrix'"),
+        (
+            lambda d: d["frames"][1].update(transform_matrix_end=[[1]]),
+            "frame 1: transform_matrix_end says that the cam",
+        ),
         (lambda d: d["frames"][1].update(file_path=3), "frame 1: file_path=3 is not allowed; take text"),
         (lambda d: d["frames"][1].update(file_path="train/r_1"), "'train/r_1' occurs in several frames"),
         (lambda d: d["frames"][1].update(file_path="train/r_1.png"), "'train/r_1', 'train/r_1.png' occurs in several"),
