@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 import nerfro
-from benchmarks.water import VIEWS, media_of_the_guide, misses
+from benchmarks.water import SCENES, VIEWS, media_of_the_guide, misses, synthesize_scene, write_scene
 from nerfro.media.body_settings import make_bodies
-from tests.conftest import Runner
+from nerfro.synthetic.gltf_scene import GltfScene
+from tests.conftest import SMALL, Runner
 
 MEDIA = media_of_the_guide()
 
@@ -76,3 +77,24 @@ def test_media_of_the_guide_train(name: str, tiny_default_run: list[str], train_
     options = f"bodies={bodies}", *box, interface, grid, "trainer.max_steps=2", f"hydra.run.dir={tmp_path}"
     train_here(*tiny_default_run, *options)
     assert (tmp_path / "metrics.json").is_file()
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_bodies_of_synthesized_scenes_are_nested(name: str, tmp_path: Path) -> None:
+    write_scene(name, tmp_path / "scene.glb")
+    bodies, contents = SCENES[name]
+    parts = GltfScene(tmp_path / "scene.glb").parts
+    indices = [ior for _, ior in bodies.values()]
+    assert [part.ior for part in parts if part.ior is not None] == indices
+    assert [part.outer_ior for part in parts if part.ior is not None] == [1.0, *indices[:-1]]
+    assert [part.outer_ior for part in parts if part.ior is None] == [indices[-1]] * len(contents)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("mitsuba")
+@pytest.mark.parametrize("name", SCENES)
+def test_synthesized_scenes_train(name: str, train_here: Runner, tmp_path: Path) -> None:
+    data = synthesize_scene(name, tmp_path / "data", pixels=16, spp=2, num_views=2)
+    options = "sampler.path.interface=mesh", "trainer.max_steps=2", f"hydra.run.dir={tmp_path / 'run'}"
+    train_here(f"scene={data / 'scene.json'}", *SMALL, *options)
+    assert (tmp_path / "run" / "metrics.json").is_file()

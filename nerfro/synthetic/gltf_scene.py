@@ -168,10 +168,10 @@ def _part(primitive: Primitive, geometry: Any) -> Part:
     normals = geometry.vertex_normals if has_normals else None
     mesh = trimesh.Trimesh(geometry.vertices, geometry.faces, vertex_normals=normals, process=False)
     visual: Any = geometry.visual
-    colours = None
     coordinates = getattr(visual, "uv", None)
-    if visual.kind == "vertex":
-        colours = visual.vertex_colors[:, :3] / 255
+    # With a material, trimesh keeps the colours as an attribute.
+    attributes = getattr(visual, "vertex_attributes", {})
+    colours = visual.vertex_colors if visual.kind == "vertex" else attributes.get("color")
     turn[:3, :3] = Z_UP_TO_Y_UP.T
     mesh.apply_transform(turn @ primitive.to_world)
     corners = np.arange(3 * len(mesh.faces)).reshape(-1, 3)
@@ -183,7 +183,8 @@ def _part(primitive: Primitive, geometry: Any) -> Part:
     texture = getattr(getattr(visual, "material", None), "baseColorTexture", None)
     glass = primitive.glass
     if colours is not None:
-        colours = to_srgb(colours[mesh.faces].reshape(-1, 3) * albedo).astype(np.float32)
+        linear = colours[:, :3] / (np.iinfo(colours.dtype).max if colours.dtype.kind == "u" else 1)
+        colours = to_srgb(linear[mesh.faces].reshape(-1, 3) * albedo).astype(np.float32)
     if coordinates is not None:  # rows of textures run downwards, and v of trimesh upwards
         coordinates = np.stack([coordinates[:, 0], 1 - coordinates[:, 1]], -1)[mesh.faces].reshape(-1, 2)
     surface = SurfaceMesh(
@@ -268,7 +269,7 @@ def _not_modelled(document: Mapping[str, Any]) -> Iterator[str]:
                 yield f"{name}: transmission below 1 is not modelled; it is clear glass"
             if not extensions.get("KHR_materials_volume", {}).get("thicknessFactor", 0) > 0:
                 yield f"{name}: thin-walled transmission is not modelled; its closed objects are solid"
-            if base.get("baseColorFactor", [1.0])[:3] != [1.0] * 3 or "baseColorTexture" in base:
+            if base.get("baseColorFactor", [1.0] * 3)[:3] != [1.0] * 3 or "baseColorTexture" in base:
                 yield f"{name}: the colour of the surface is not modelled; set an attenuation colour"
             if extensions.get("KHR_materials_dispersion", {}).get("dispersion", 0) > 0:
                 yield f"{name}: dispersion is not modelled; images and scene.json have the index of the d line"

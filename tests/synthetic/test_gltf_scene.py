@@ -10,6 +10,7 @@ import torch
 import trimesh
 from trimesh.exchange.gltf import export_glb
 
+from nerfro.core.light import to_srgb
 from nerfro.files.images import load_png
 from nerfro.geometry.gltf import Z_UP_TO_Y_UP
 from nerfro.geometry.mesh import load_mesh
@@ -62,6 +63,23 @@ def write_scene(path: Path, *, hollow: bool = False) -> Path:
 
     path.write_bytes(export_glb(scene, tree_postprocessor=add))
     return path
+
+
+def test_vertex_colours_are_factors_of_the_colour_of_the_material(tmp_path: Path) -> None:
+    cube = trimesh.creation.box([0.2, 0.2, 0.2])
+    cube.visual.vertex_colors = np.tile(np.array([255, 51, 102, 255], np.uint8), (8, 1))
+    scene = trimesh.Scene({"drop": trimesh.creation.icosphere(1), "cube": cube})
+
+    def add(tree: dict[str, Any]) -> None:
+        tree["materials"] = [GLASS, RED]
+        for mesh in tree["meshes"]:
+            mesh["primitives"][0]["material"] = int(mesh["name"] == "cube")
+
+    (tmp_path / "colours.glb").write_bytes(export_glb(scene, tree_postprocessor=add))
+    (part,) = (part for part in GltfScene(tmp_path / "colours.glb").parts if part.ior is None)
+    assert part.surface.colours is not None
+    expected = to_srgb(np.array([0.8, 0.1, 0.1]) * [1.0, 0.2, 0.4])
+    np.testing.assert_allclose(part.surface.colours, np.tile(expected, (36, 1)), rtol=1e-5)
 
 
 def test_materials_of_nodes_become_bodies_and_contents(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
