@@ -81,7 +81,7 @@ def test_run_on_the_gpu_is_resumed_evaluated_rendered_and_exported(
         out = tmp_path / device
         run_here("evaluate", f"checkpoint={run}", f"device={device}", f"out={out}", "split=val")
         scores[device] = json.loads((out / "metrics.json").read_text())["test"]["psnr"]
-        run_here("render", f"checkpoint={run}", f"device={device}", "views=val", f"out={out / 'rendered'}", "frames=1")
+        run_here("render", f"checkpoint={run}", f"device={device}", "views=val", f"out={out / 'rendered'}")
     assert scores["cuda"] == pytest.approx(scores["cpu"], abs=0.05)
     run_here("export", f"checkpoint={run}", "what=page", f"out={tmp_path / 'page.html'}", "device=cuda")
     assert (tmp_path / "page.html").stat().st_size > 100_000
