@@ -16,7 +16,7 @@ from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.paths.snell_cpu import Scratch
 from nerfro.samplers.paths.surface_search_cpu import Line
 from nerfro.samplers.paths.triangle_search_cpu import first_triangle
-from tests.closed_forms import random_rays
+from tests.closed_forms import make_rays, random_rays
 
 
 @compiled_parallel
@@ -77,3 +77,23 @@ def test_triangles_are_traced_without_embree(tmp_path: Path, monkeypatch: pytest
 def test_triangles_are_traced_beside_the_training(tmp_path: Path) -> None:
     trimesh.creation.box((1, 1, 1)).export(tmp_path / "box.ply")
     assert Snell("mesh").releases_gil(make_bodies(str(tmp_path / "box.ply"), 1.5, resolution=16, cache=False))
+
+
+def test_faces_of_two_bodies_that_almost_coincide_are_met_together(tmp_path: Path) -> None:
+    """The gap is smaller than the offset of the search, and refraction lengthens the way through it."""
+    generator = np.random.default_rng(0)
+    directions = generator.normal(size=(4000, 3)) + np.array([0, 0, 2])
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    origins = torch.tensor(generator.uniform(-0.4, 0.4, size=(4000, 3)))
+    exits = []
+    for gap in (0.0, 5e-7, 2e-6):
+        bodies = {}
+        for name, z, ior in (("lower", 0.0, 1.6), ("upper", 1 + gap, 1.05)):
+            shape = trimesh.creation.box((1, 1, 1), trimesh.transformations.translation_matrix([0, 0, z]))
+            bodies[name] = {"mesh": str(tmp_path / f"{name}_{gap}.ply"), "ior": ior}
+            shape.export(tmp_path / f"{name}_{gap}.ply")
+        medium = make_bodies(bodies=bodies, resolution=16, cache=False)
+        rays = make_rays(origins, torch.tensor(directions), 0.0, 9.0)
+        exits.append(Snell("mesh")(rays, medium).exit_directions)
+    for other in exits[1:]:
+        torch.testing.assert_close(other, exits[0])

@@ -268,7 +268,11 @@ def _next_surface(solids, tree, scratch, body, line):
         return hit, -1, across, before, behind
     hit, triangle, length = first_triangle(tree, scratch, line)
     _flip(scratch)
-    return hit, triangle, _deciding_body(scratch.inside, solids), length, length
+    behind = length
+    for layer in range(len(scratch.faces)):
+        if scratch.faces[layer] >= 0:
+            behind = max(behind, scratch.lengths[layer])
+    return hit, triangle, _deciding_body(scratch.inside, solids), length, behind
 
 
 @compiled
