@@ -32,7 +32,6 @@ ADAPTIVE = ["sampler.path.integrator=adaptive", "sampler.path.max_steps=60", "sa
 # A constant is copied to the device once. Fields are asked for samples in the object alone, whose number must be known.
 ONCE = "kernels/constants.py: constant (tensor)"
 # Triangles are met on the CPU in a replay as well. Some rays are traced again with more vertices.
-TO_CPU = {"core/rays.py: <lambda> (to)", "samplers/paths/replay.py: indices_of (to)"}
 AGAIN = "core/rays.py: <lambda> (__getitem__)"
 SELECTED = "fields/base.py: evaluate_selected (nonzero)"
 
@@ -41,7 +40,7 @@ SELECTED = "fields/base.py: evaluate_selected (nonzero)"
     ("experiment", "waits"),
     [
         (["refractive"], {ONCE, SELECTED}),
-        (["refractive", "sampler.path.interface=mesh"], {ONCE, SELECTED, *TO_CPU}),
+        (["refractive", "sampler.path.interface=mesh"], {ONCE, SELECTED}),
         (["refractive_room"], {ONCE}),
         (["straight"], {ONCE}),
         (["mipnerf"], set()),
