@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+import nerfro
 from nerfro.data.blender import BlenderData
 from nerfro.data.validation_views import WithValidationViews, spread
 from tests.conftest import Runner
@@ -39,6 +40,14 @@ def test_held_out_views_become_the_val_split(tiny_scene: Path) -> None:
     many = WithValidationViews(source, 2)
     assert many.load("train").names == val.names, "of many that are held back, those that train are spread"
     assert many.load("val").names == train.names
+
+
+def test_training_draws_no_validation_views(unchecked: None, tiny_default_run: list[str]) -> None:
+    options = [*tiny_default_run, "trainer.max_steps=1", "batches.num_validation_views=1"]
+    _, data = nerfro.build(None, options)
+    drawn, held = data.batches.cameras.camera_to_world, data.validation.cameras.camera_to_world
+    assert (len(drawn), len(held)) == (2, 1)
+    assert not (drawn == held).all((1, 2)).any()
 
 
 def test_too_many_validation_views_are_refused(train: Runner) -> None:

@@ -61,6 +61,17 @@ def test_next_batch_is_made_during_the_step(ahead) -> None:
     assert begun.wait(10), "nobody has asked for step 1 yet"
 
 
+def test_prefetched_paths_equal_those_of_the_step_in_any_order(ahead, ball: Bodies) -> None:
+    sampler = Snell()
+    make: Any = lambda step: sampler(random_rays(300, 1.6, step, 6.0), ball)  # noqa: E731
+    one = ahead(make)
+    for step in (0, 1, 7, 3):
+        expected, path = make(step), one(step)
+        one.begin_next()
+        for name in ("positions", "directions", "s", "exit_directions"):
+            assert torch.equal(getattr(path, name), getattr(expected, name))
+
+
 def test_prefetcher_reraises_errors_of_its_thread(ahead) -> None:
     def make(step: int) -> int:
         if step == 2:
@@ -117,7 +128,6 @@ def test_paths_are_not_prefetched_if_they_learn_or_need_python(ball: Bodies, mon
 
     assert can_prefetch(model(Snell()))
     assert not can_prefetch(model(Snell(), learns=True))
-    assert not can_prefetch(model(Snell("mesh")))
     assert not can_prefetch(model(Eikonal("euler")))
     monkeypatch.setattr("os.sched_getaffinity", lambda pid: {0}, raising=False)
     assert not can_prefetch(model(Snell())), "one core has nobody who waits"
