@@ -156,7 +156,7 @@ def parts_of_step(
     """Return milliseconds of the parts of a step, and of a step with rays traced one step ahead if possible."""
     module, data = build(experiment, *arguments.options)
     module.to(device)
-    [optimizer], _ = module.configure_optimizers()
+    optimizer = module.make_optimizer()
     batches, tracer = data.batches.to(device, torch.float32), RayTracer(module.renderer, data.subdivision)
     of_parts, number = dict.fromkeys(("tracing", "forward", "backward", "Adam"), 0.0), 0
     torch.set_num_threads(threads)

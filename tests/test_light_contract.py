@@ -166,7 +166,7 @@ def test_every_learned_parameter_has_a_group_and_a_learning_rate() -> None:
     model.scene.camera.shift = torch.nn.Parameter(torch.zeros(3))
     rates = {"medium.*": GroupConfig(learning_rate=2e-2), "cameras.*": GroupConfig(learning_rate=3e-2)}
     optimizer = OptimizerConfig(learning_rate=1e-2, groups=rates)
-    groups = TrainingModule(model, {}, optimizer).configure_optimizers()[0][0].param_groups
+    groups = TrainingModule(model, {}, optimizer).make_optimizer().param_groups
     assert [group["name"] for group in groups] == ["common", "medium.*", "cameras.*"]
     assert [group["initial_lr"] for group in groups] == [1e-2, 2e-2, 3e-2]
     assert sum(len(group["params"]) for group in groups) == len(list(model.parameters()))

@@ -138,6 +138,8 @@ def added(argument: str) -> str:
     if key == "optimizer.groups":
         # Hydra reads names with dots inside of a mapping, such as `cameras.exposure`, without quotes.
         argument = argument.replace('"', "")
+    if key.startswith(("optimizer.options.", "optimizer.scheduler_options.")):
+        return f"++{argument}"
     mappings = ("optimizer.groups", "optimizer.options", "optimizer.scheduler_options")
     return f"+{argument}" if key in (*ADDED_GROUPS, *mappings) else argument
 

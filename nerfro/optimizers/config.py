@@ -32,11 +32,12 @@ OPTIMIZERS: dict[str, type[torch.optim.Optimizer]] = {
 SCHEDULERS: dict[str, type[lr_scheduler.LRScheduler]] = {
     scheduler.__name__: scheduler
     for scheduler in (
-        lr_scheduler.CosineAnnealingLR, lr_scheduler.CosineAnnealingWarmRestarts, lr_scheduler.CyclicLR,
-        lr_scheduler.ExponentialLR, lr_scheduler.LinearLR, lr_scheduler.MultiStepLR, lr_scheduler.OneCycleLR,
-        lr_scheduler.PolynomialLR, lr_scheduler.StepLR,
+        lr_scheduler.CosineAnnealingLR, lr_scheduler.CosineAnnealingWarmRestarts, lr_scheduler.ExponentialLR,
+        lr_scheduler.LinearLR, lr_scheduler.MultiStepLR, lr_scheduler.PolynomialLR, lr_scheduler.StepLR,
     )
 }  # fmt: skip
+# Tensors of the state, by the optimizer, without which no step is taken.
+MOMENTS = dict.fromkeys(("adam", "adamw", "radam"), ("exp_avg", "exp_avg_sq")) | {"muon": ("momentum_buffer",)}
 OptimizerName = Annotated[str, Names(lambda: OPTIMIZERS)]
 SchedulerName = Annotated[str, Names(lambda: SCHEDULERS)]
 
@@ -148,7 +149,8 @@ class OptimizerConfig:
             if kind == "muon" and any(p.ndim != 2 for group in of_kind for p in group["params"]):
                 raise NerfroError("optimizer muon takes matrices only; name it in optimizer.groups for fields.*.weight")
             options = ({"eps": self.adam_epsilon} if kind in ("adam", "adamw", "radam") else {}) | options
-            options = ({"fused": fused} if kind in ("adam", "adamw") else {}) | options
+            if kind in ("adam", "adamw") and not {"foreach", "differentiable"} & options.keys():
+                options = {"fused": fused} | options
             optimizers[of_kind[0]["kind"]] = _created(f"optimizer {kind}", OPTIMIZERS[kind], of_kind, options)
             described += of_kind
         if len(optimizers) == 1:
@@ -229,11 +231,14 @@ def _require_name(where: str, name: str | None, names: Mapping[str, Any]) -> Non
 
 def _created(where: str, cls: Callable[..., Any], of: object, options: Mapping[str, Any]) -> Any:
     """Create an optimizer of groups of parameters, or a scheduler of an optimizer."""
-    allowed = list(inspect.signature(cls).parameters)[1:]
-    unknown = next((name for name in options if name not in allowed), None)
+    _, *parameters = inspect.signature(cls).parameters.values()
+    allowed = [parameter.name for parameter in parameters if parameter.name != "lr"]
+    takes_any = any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in parameters)
+    unknown = next((name for name in options if name == "lr" or not (takes_any or name in allowed)), None)
     if unknown is not None:
-        raise NerfroError(f"{where} has no option {unknown}; choose from {', '.join(allowed)}")
+        advice = "set learning_rate" if unknown == "lr" else f"choose from {', '.join(allowed)}"
+        raise NerfroError(f"{where} has no option {unknown}; {advice}")
     try:
         return cls(of, **options)
-    except (TypeError, ValueError) as error:
+    except (ArithmeticError, LookupError, RuntimeError, TypeError, ValueError) as error:
         raise NerfroError(f"{where}: {error}; see the documentation of {cls.__name__} for its options") from error

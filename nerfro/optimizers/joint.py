@@ -36,5 +36,5 @@ class JointOptimizer(torch.optim.Optimizer):
             with torch.enable_grad():
                 loss = closure()
         for optimizer in self._optimizers.values():
-            optimizer.step()
+            optimizer.step(None if closure is None else lambda: loss)  # type: ignore[arg-type, return-value]
         return loss

@@ -224,12 +224,18 @@ class TrainingModule(LightningModule):
     def learning_rate(self, rate: float) -> None:
         self.optimizer_config = replace(self.optimizer_config, learning_rate=rate)
 
-    def configure_optimizers(self) -> Any:
+    def make_optimizer(self) -> torch.optim.Optimizer:
+        """Create the optimizer of all learned parameters."""
         # Lightning cannot clip the gradients of a fused optimizer under mixed precision.
         fused = self._trainer is None or not self._trainer.gradient_clip_val
-        optimizer = self.optimizer_config.optimizer_of(self.parameter_groups(), fused)
+        return self.optimizer_config.optimizer_of(self.parameter_groups(), fused)
+
+    def configure_optimizers(self) -> Any:
+        optimizer = self.make_optimizer()
         scheduler = self.optimizer_config.scheduler_of(optimizer)
-        return [optimizer], [{"scheduler": scheduler, "interval": "step"}] if scheduler else []
+        if scheduler is None:
+            return optimizer
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
     def validation_step(self, batch: int, batch_index: int) -> dict[str, Any] | None:
         if not self.trainer.is_global_zero:

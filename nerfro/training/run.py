@@ -95,7 +95,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetr
     test = training.views if split is None else training.source.load(split).checked()
     test = test.select(range(len(test))[: config.trainer.limit_test_batches])
     metrics, renderer = ImageMetrics(), training.module.renderer
-    [optimizer], _ = training.module.configure_optimizers()
+    optimizer = training.module.make_optimizer()
     num_steps = require_same_run(folder, checkpoint, config, optimizer, training.views)
     throughput, interruption, subdivision = Throughput(), StopOnSignal(), Subdivision(**config.evaluation.subdivision)
     viewers = [Viewer(config, training.source, test)] if config.viewer else []

@@ -16,7 +16,7 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
-from torch import Tensor
+from torch import Tensor, nn
 
 from nerfro.cli.overrides import as_overrides, command_line
 from nerfro.core.errors import Interrupted, NerfroError, first_of, warn
@@ -28,6 +28,7 @@ from nerfro.files.folder_lock import lock_folder, require_only
 from nerfro.files.foreign_config import foreign_config, read_foreign_config
 from nerfro.files.reading import reading
 from nerfro.kernels.available import fast_bfloat16, gpu_name
+from nerfro.optimizers.config import MOMENTS, OPTIMIZERS
 from nerfro.rendering import Renderer
 from nerfro.training.config import build_model, check_trained, training_device
 from nerfro.training.content import describe
@@ -222,16 +223,21 @@ def require_finite(weights: Mapping[str, Any], path: Path) -> None:
 
 def require_optimizer_fits(checkpoint: Mapping[str, Any], optimizer: torch.optim.Optimizer, path: Path) -> None:
     """Refuse the state of another optimizer, or with moments of wrong shape or infinite values."""
-    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+    kinds = [(parameter, group["kind"]) for group in optimizer.param_groups for parameter in group["params"]]
+
+    def state_fits(state: Mapping[str, Any], parameter: nn.Parameter, kind: str) -> bool:
+        name = kind.partition(" ")[0]
+        tensors = [state[moment] for moment in MOMENTS.get(name, ())]
+        tensors += [value for value in state.values() if isinstance(value, Tensor)]
+        is_own = not OPTIMIZERS[name].__module__.startswith("torch.")  # states of plugins have any shape
+        return all(
+            (is_own or tensor.numel() == 1 or tensor.shape == parameter.shape) and bool(tensor.isfinite().all())
+            for tensor in tensors
+        )
+
     try:
         (saved,) = checkpoint["optimizer_states"]
-        fits = all(
-            (moment.shape == parameters[number].shape or not name.startswith(("exp_avg", "momentum_buffer")))
-            and moment.isfinite().all()
-            for number, state in saved["state"].items()
-            for name, moment in state.items()
-            if isinstance(moment, Tensor)
-        ) and all(
+        fits = all(state_fits(state, *kinds[number]) for number, state in saved["state"].items()) and all(
             # The rates, and the numbers that a scheduler changes, may differ.
             group[name] == value or (type(group[name]) is type(value) and not isinstance(value, str))
             for group, own in zip(saved["param_groups"], optimizer.param_groups, strict=True)

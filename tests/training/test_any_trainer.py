@@ -108,10 +108,13 @@ class Signs(torch.optim.Optimizer):
 
     @torch.no_grad()
     def step(self, closure=None):
+        with torch.enable_grad():
+            loss = closure()
         for group in self.param_groups:
             for parameter in group["params"]:
                 if parameter.grad is not None:
                     parameter -= group["lr"] * group["size"] * parameter.grad.sign()
+        return loss
 
 
 def test_optimizers_and_schedulers_by_name_set_the_rates(
@@ -120,7 +123,7 @@ def test_optimizers_and_schedulers_by_name_set_the_rates(
     monkeypatch.setitem(OPTIMIZERS, "signs", Signs)
     by_name = [
         *tiny_default_run, "trainer.max_steps=4", "~phase.background",
-        "optimizer.name=signs", "optimizer.options={size: 0.5}", "optimizer.learning_rate=0.01",
+        "optimizer.name=signs", "optimizer.options.size=0.5", "optimizer.learning_rate=0.01",
         "optimizer.groups={background.*: {name: sgd, options: {momentum: 0.9}, start: 2}}",
         "optimizer.scheduler=ExponentialLR", "optimizer.scheduler_options={gamma: 0.5}",
     ]  # fmt: skip
@@ -142,7 +145,8 @@ def test_optimizers_and_schedulers_by_name_set_the_rates(
     [
         ("optimizer.name=adem", "optimizer.name=adem is not allowed; did you mean adam"),
         ("optimizer.scheduler=StepLr", "optimizer.scheduler=StepLr is not allowed; did you mean StepLR"),
-        ("optimizer.options={momentum: 0.9}", "optimizer adam has no option momentum; choose from lr, betas"),
+        ("optimizer.options={momentum: 0.9}", "optimizer adam has no option momentum; choose from betas"),
+        ("optimizer.options={lr: 0.5}", "optimizer adam has no option lr; set learning_rate"),
         ("optimizer.options={betas: [2, 3]}", "optimizer adam: Invalid beta parameter"),
         ("optimizer.groups={background.*: {name: x}}", "groups: name=x is not allowed; known: adam"),
     ],

@@ -214,6 +214,8 @@ def test_damaged_checkpoints_are_refused_in_one_line(damage: str, trained_run: P
     [
         (lambda content: content.update(optimizer_states=[]), "does not fit its weights"),
         (lambda content: content["optimizer_states"][0]["state"][0].update(exp_avg=torch.zeros(7)), "does not fit"),
+        (lambda content: content["optimizer_states"][0]["state"][0].pop("exp_avg_sq"), "does not fit"),
+        (lambda content: content["optimizer_states"][0]["state"][0].update(other=torch.zeros(7)), "does not fit"),
         (lambda content: content["optimizer_states"][0]["state"][0]["exp_avg"].fill_(math.nan), "does not fit"),
         (lambda content: content["optimizer_states"][0]["param_groups"][0].update(betas=3), "does not fit"),
         (lambda content: content.update(loops={"fit_loop": 3}), "cannot be resumed"),
