@@ -20,7 +20,7 @@ from nerfro.kernels.rasterizer import rasterize
 HARMONIC_0 = 0.28209479177387814  # value of the first basis function
 _SIGNS = (1.0, -1.0, 1.0, -1.0)  # with the Condon-Shortley phase, as in files of Gaussians
 _BLUR = 0.3  # variance of the low-pass filter of the paper's implementation, pixels squared
-_MIN_DEPTH = 0.01  # depth below which Gaussians are left out, relative to their median depth
+_MIN_DEPTH = 0.1  # depth below which Gaussians are left out, relative to where the rays of a camera begin
 _MAX_TANGENT = 1.3  # of rays for the linear projection, relative to that of the edge of the image
 
 
@@ -58,7 +58,7 @@ class Gaussians(NamedTuple):
             local = (self.positions - pose[:, 3]) @ axes
             z = local[:, 2]
             reach = limit * z[:, None] + 3 * self.log_scales.amax(-1, keepdim=True).exp()
-            seen = (local[:, :2].abs() < reach).all(-1) & (z > _MIN_DEPTH * z.abs().median())
+            seen = (local[:, :2].abs() < reach).all(-1) & (z > max(_MIN_DEPTH * cameras.near, 1e-6 * cameras.far))
             rows = seen.nonzero()[:, 0]
             rows = rows[z[rows].argsort()]
         positions, log_scales, rotations, logits, harmonics = (values[rows] for values in self)

@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from nerfro.core.cameras import Cameras
+from nerfro.core.errors import NerfroError
 from nerfro.core.light import to_srgb
 from nerfro.core.progress import track
 from nerfro.exports.gaussians import HARMONIC_0, Gaussians
@@ -25,12 +26,15 @@ from nerfro.viewing.exports import EXPORTS, Export, ExportConfig
 from nerfro.viewing.trained_scene import TrainedScene
 
 _SKY_DISTANCE = 100.0  # of Gaussians of the background, in distances of the farthest camera from the object
+_SPZ_DISTANCE = 100.0  # of cameras, world units
 _MAX_PIXELS, _MAX_VIEWS = 256, 128  # longest side and number of pictures that Gaussians are fitted to
 _RATES = {"positions": 0.1, "log_scales": 0.02, "rotations": 0.02, "logits": 0.05, "harmonics": 0.01}  # of Adam
 
 
 def write_splats(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
     """Write Gaussians as .ply or .spz, or as .glb (KHR_gaussian_splatting) beside the glass meshes."""
+    if out.suffix.lower() == ".spz":
+        _require_moderate_units(scene)
     gaussians, psnr = fitted_gaussians(scene, options)
     if out.suffix.lower() == ".glb":
         content = encode_glb(scene, glass_meshes(scene, options.triangles or GLB_TRIANGLES), None, gaussians)
@@ -38,6 +42,16 @@ def write_splats(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
         content = gaussians.to_ply() if out.suffix.lower() == ".ply" else gaussians.to_spz()
     write_atomically(out, content)
     return f"{len(gaussians.positions)} Gaussians, {psnr:.1f} dB against straight rays of the training cameras"
+
+
+def _require_moderate_units(scene: TrainedScene) -> None:
+    """Refuse scenes whose distant Gaussians are larger than an .spz file can hold, exp(5.94) units."""
+    farthest = float((scene.cameras("train").camera_to_world[:, :, 3].cpu() - scene.bounds.mean(0)).norm(dim=-1).max())
+    if farthest > _SPZ_DISTANCE:
+        raise NerfroError(
+            f"a camera is {farthest:.0f} units from the object, and .spz holds scenes of up to {_SPZ_DISTANCE:.0f}; "
+            "take .ply or .glb"
+        )
 
 
 def fitted_gaussians(scene: TrainedScene, options: ExportConfig) -> tuple[Gaussians, float]:

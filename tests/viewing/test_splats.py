@@ -13,6 +13,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 import nerfro
+from nerfro.exports import splats
 from nerfro.exports.gaussians import Gaussians
 from nerfro.exports.splats import fitted_gaussians
 from nerfro.geometry.gltf import Z_UP_TO_Y_UP
@@ -20,10 +21,11 @@ from nerfro.geometry.mesh import load_mesh
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.viewing.exports import ExportConfig
 from nerfro.viewing.trained_scene import TrainedScene
-from tests.conftest import Runner
+from tests.conftest import Runner, refused
 from tests.viewing.conftest import RADIUS
 from tests.viewing.test_exports import document_of, validated, with_box, write
 
+OPTIONS = ExportConfig(checkpoint="run", what="splats", out="a.spz")
 SMALL = {"gaussians": 400, "steps": 3, "resolution": 16}
 
 
@@ -59,6 +61,28 @@ def test_one_gaussian_has_the_projected_covariance_and_colour(scene: TrainedScen
     expected = torch.where(alpha < 1 / 255, 0.0, alpha)[..., None] * (0.5 + basis @ harmonics)
     assert expected.max() > 0.2
     torch.testing.assert_close(one.render(camera, 0), expected, atol=1e-5, rtol=1e-4)
+
+
+def test_content_near_a_camera_is_seen_before_any_sky(scene: TrainedScene) -> None:
+    camera = replace(scene.cameras("train").select([0]), near=0.05)
+    forward = -camera.camera_to_world[0, :, 2]
+    near, sky = (camera.camera_to_world[0, :, 3] + distance * forward for distance in (0.1, 1e4))
+    number = torch.tensor([0, *[1] * 9])
+    all_of_them = Gaussians(
+        torch.stack([near, sky])[number], torch.tensor([[-3.0], [6.0]])[number].expand(-1, 3), torch.ones(10, 4),
+        torch.full((10,), 9.0), torch.zeros(10, 4, 3),
+    )  # fmt: skip
+    all_of_them.harmonics[0, 0, 0] = 1.0
+    alone = Gaussians(*(values[:1] for values in all_of_them)).render(camera, 0)
+    assert alone[8, 8, 0] > 0.6
+    torch.testing.assert_close(all_of_them.render(camera, 0)[8, 8, 0], alone[8, 8, 0], atol=0.02, rtol=0)
+
+
+def test_spz_of_large_units_is_refused_before_the_fit(
+    scene: TrainedScene, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(splats, "_SPZ_DISTANCE", 0.1)
+    refused(r"units from the object, and \.spz .* take \.ply", splats.write_splats, scene, tmp_path / "a.spz", OPTIONS)
 
 
 def test_ply_is_read_with_the_names_of_the_common_layout(tmp_path: Path) -> None:
