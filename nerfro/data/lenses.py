@@ -203,7 +203,7 @@ def _focal_lengths(
 ) -> tuple[float, float]:
     """Return fx and fy in pixels from the keys of the frame if it has any, otherwise from those of the file."""
     for level in (frame, file):
-        fx, fy = (_focal_length(level, axis, side) for axis, side in zip("xy", size, strict=True))
+        fx, fy = (_focal_length(level, axis, side, where) for axis, side in zip("xy", size, strict=True))
         # Pixels are square, unless a frame changes fl_x alone beside the fl_y of its file.
         if fx is not None:
             return fx, fy if fy is not None else file.get("fl_y", fx) if "fl_x" in level else fx
@@ -215,22 +215,22 @@ def _focal_lengths(
     )
 
 
-def _focal_length(level: Mapping[str, float], axis: str, side: float) -> float | None:
+def _focal_length(level: Mapping[str, float], axis: str, side: float, where: str) -> float | None:
     """Return the focal length that one level states, in pixels, and warn of two that differ by more than rounding."""
     stated, angle = level.get(f"fl_{axis}"), level.get(f"camera_angle_{axis}")
     if angle is None:
         return stated
     of_angle = 0.5 * side / math.tan(0.5 * angle)
     if stated is not None and abs(of_angle - stated) > _SAME_FOCAL * stated:
-        _warn_of_contradiction(axis, stated, angle, side, of_angle)
+        _warn_of_contradiction(where.partition(":")[0], axis, stated, angle, side, of_angle)
     return of_angle if stated is None else stated
 
 
-@functools.cache  # one line for all frames
-def _warn_of_contradiction(axis: str, stated: float, angle: float, side: float, of_angle: float) -> None:
+@functools.cache  # one line for all frames of a file
+def _warn_of_contradiction(file: str, axis: str, stated: float, angle: float, side: float, of_angle: float) -> None:
     warn(
-        f"fl_{axis}={stated:g} contradicts camera_angle_{axis}={angle:g}, with which {side:g} pixels have the focal "
-        f"length {of_angle:g}; fl_{axis} is taken: remove the wrong one, or state the calibrated size by w and h"
+        f"{file}: fl_{axis}={stated:g} contradicts camera_angle_{axis}={angle:g}, with which {side:g} pixels have the "
+        f"focal length {of_angle:g}; fl_{axis} is taken: remove the wrong one, or state the calibrated size by w and h"
     )
 
 
