@@ -64,7 +64,7 @@ def test_one_gaussian_has_the_projected_covariance_and_colour(scene: TrainedScen
 
 
 def test_content_near_a_camera_is_seen_before_any_sky(scene: TrainedScene) -> None:
-    camera = replace(scene.cameras("train").select([0]), near=0.05)
+    camera = replace(scene.cameras("train").select([0]), near=0.05, far=float("inf"))
     forward = -camera.camera_to_world[0, :, 2]
     near, sky = (camera.camera_to_world[0, :, 3] + distance * forward for distance in (0.1, 1e4))
     number = torch.tensor([0, *[1] * 9])
