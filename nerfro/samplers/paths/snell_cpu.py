@@ -266,13 +266,9 @@ def _next_surface(solids, tree, scratch, body, line):
             return hit, -1, 0, before, after
         across, behind = _cross(solids, scratch, body, hit, after)
         return hit, -1, across, before, behind
-    hit, triangle, length = first_triangle(tree, scratch, line)
+    hit, triangle, before, behind = first_triangle(tree, scratch, line)
     _flip(scratch)
-    behind = length
-    for layer in range(len(scratch.faces)):
-        if scratch.faces[layer] >= 0:
-            behind = max(behind, scratch.lengths[layer])
-    return hit, triangle, _deciding_body(scratch.inside, solids), length, behind
+    return hit, triangle, _deciding_body(scratch.inside, solids), before, behind
 
 
 @compiled

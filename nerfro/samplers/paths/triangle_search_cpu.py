@@ -85,7 +85,7 @@ def first_triangle(tree, scratch, line):
     them, at most one in each layer, and `scratch.crossings` is negative for bodies whose surface is crossed.
 
     Returns:
-        Body of the first triangle, -1 for none; the triangle; and its distance.
+        Body of the first triangle, -1 for none; the triangle; its distance; and the distance of the last of `scratch.faces`.
     """
     nodes, entries = scratch.nodes, scratch.entries
     scratch.lengths[:], scratch.crossings[:] = math.inf, 1.0
@@ -108,16 +108,17 @@ def first_triangle(tree, scratch, line):
         nodes[size], entries[size] = (left + 1, far) if is_left else (left, near)
         nodes[size + 1], entries[size + 1] = (left, near) if is_left else (left + 1, far)
         size += 2
-    hit, first = -1, -1
+    hit, first, farthest = -1, -1, nearest
     for layer in range(len(scratch.faces)):
         face = scratch.faces[layer] if scratch.lengths[layer] <= nearest + tree.offset else -1
         scratch.faces[layer] = face
         if face >= 0:
+            farthest = max(farthest, scratch.lengths[layer])
             body = tree.body[face]
             scratch.crossings[body] = -scratch.crossings[body]
             if hit < 0 and scratch.lengths[layer] == nearest:
                 hit, first = body, face
-    return hit, first, nearest
+    return hit, first, nearest, farthest
 
 
 @compiled
@@ -128,7 +129,7 @@ def begin_inside(solids, tree, scratch, line):
     from the triangles. Therefore, if the distance to the body of the first triangle is less than a voxel, a ray begins
     inside this body if it leaves the body through the triangle.
     """
-    hit, _, length = first_triangle(tree, scratch, line)
+    hit, _, length, _ = first_triangle(tree, scratch, line)
     half_way = advance(line, 0.5 * length if hit >= 0 else 0.0)
     for body in range(len(scratch.inside)):
         phi = body_distance(solids, body, half_way.x, half_way.y, half_way.z)
