@@ -58,7 +58,9 @@ class Gaussians(NamedTuple):
             local = (self.positions - pose[:, 3]) @ axes
             z = local[:, 2]
             reach = limit * z[:, None] + 3 * self.log_scales.amax(-1, keepdim=True).exp()
-            seen = (local[:, :2].abs() < reach).all(-1) & (z > (1e-9 * z.abs().amax()).clamp(min=_MIN_DEPTH * cameras.near))
+            seen = (local[:, :2].abs() < reach).all(-1) & (
+                z > (1e-9 * z.abs().amax()).clamp(min=_MIN_DEPTH * cameras.near)
+            )
             rows = seen.nonzero()[:, 0]
             rows = rows[z[rows].argsort()]
         positions, log_scales, rotations, logits, harmonics = (values[rows] for values in self)

@@ -33,13 +33,14 @@ _RATES = {"positions": 0.1, "log_scales": 0.02, "rotations": 0.02, "logits": 0.0
 
 def write_splats(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
     """Write Gaussians as .ply or .spz, or as .glb (KHR_gaussian_splatting) beside the glass meshes."""
-    if out.suffix.lower() == ".spz":
+    suffix = out.suffix.lower()
+    if suffix == ".spz":
         _require_moderate_units(scene)
     gaussians, psnr = fitted_gaussians(scene, options)
-    if out.suffix.lower() == ".glb":
+    if suffix == ".glb":
         content = encode_glb(scene, glass_meshes(scene, options.triangles or GLB_TRIANGLES), None, gaussians)
     else:
-        content = gaussians.to_ply() if out.suffix.lower() == ".ply" else gaussians.to_spz()
+        content = gaussians.to_ply() if suffix == ".ply" else gaussians.to_spz()
     write_atomically(out, content)
     return f"{len(gaussians.positions)} Gaussians, {psnr:.1f} dB against straight rays of the training cameras"
 
