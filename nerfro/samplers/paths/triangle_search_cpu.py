@@ -85,7 +85,7 @@ def first_triangle(tree, scratch, line):
     them, at most one in each layer, and `scratch.crossings` is negative for bodies whose surface is crossed.
 
     Returns:
-        Body of the first triangle, -1 for none; the triangle; and the distances of the first and last of `scratch.faces`.
+        Body of the first triangle, -1 for none; the triangle; and the distances of the first and last triangle met.
     """
     nodes, entries = scratch.nodes, scratch.entries
     scratch.lengths[:], scratch.crossings[:] = math.inf, 1.0
