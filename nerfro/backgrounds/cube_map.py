@@ -89,10 +89,16 @@ def padded_texels(resolution: int) -> Int[Tensor, "6 m m"]:
 
     Three faces meet at a corner, where no fourth texel exists. The corners of the margin are therefore not valid.
     """
-    n = resolution
+    n, margin = resolution, torch.ones(resolution + 2, resolution + 2, dtype=torch.bool)
+    margin[1:-1, 1:-1] = False
     # In double precision, because texels beside a corner project almost to the border of the neighbouring face.
-    directions = _directions((torch.arange(-1, n + 1, dtype=torch.float64) + 0.5) / n * 2 - 1)
-    return nearest_texel(directions, n).view(6, n + 2, n + 2).int()
+    place = margin.nonzero().flip(-1)
+    coordinates = (place - 0.5).double() / n * 2 - 1
+    directions = unproject(torch.arange(6).repeat_interleave(len(place)), coordinates.repeat(6, 1))
+    texels = torch.empty(6, n + 2, n + 2, dtype=torch.int32)
+    texels[:, 1:-1, 1:-1] = torch.arange(6 * n * n).view(6, n, n)
+    texels[:, margin] = nearest_texel(directions, n).view(6, -1).int()
+    return texels
 
 
 def nearest_texel(directions: Float[Tensor, "P 3"], resolution: int) -> Int[Tensor, "P"]:
