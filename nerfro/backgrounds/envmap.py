@@ -64,7 +64,8 @@ class Observed:
 
     @classmethod
     def joined(cls, parts: Sequence[Observed]) -> Observed:
-        return cls(*(torch.cat(values) for values in zip(*(vars(part).values() for part in parts), strict=True)))
+        columns = zip(*(vars(part).values() for part in parts), strict=True)
+        return parts[0] if len(parts) == 1 else cls(*map(torch.cat, columns))
 
 
 def _is_fitted(settings: DictConfig) -> bool:
@@ -182,8 +183,7 @@ class EnvironmentMap(Background):
             Weight of these observations of each texel: the sum over rays of bilinear weight times weight of the ray.
         """
         face, coordinates = cube_map.project(observed.directions.float())
-        target = _raw(observed.radiance.clamp(min=_DARKEST))
-        residual = target - self._raw_at(face, coordinates)
+        residual = _raw(observed.radiance.clamp(min=_DARKEST)) - self._raw_at(face, coordinates)
         residual = torch.where(observed.saturated, residual.clamp(min=0), residual)
         total = []
         levels = zip(
@@ -193,16 +193,15 @@ class EnvironmentMap(Background):
             wide = observed.widths > _MAX_TEXELS * 0.5 * math.pi / n
             weights = observed.weights.masked_fill(wide, 0)[:, None].expand(-1, 3)
             with torch.enable_grad():
-                change = torch.zeros_like(values, requires_grad=True)
-                changed = cube_map.lookup(face, coordinates, change, of_level, (n,))
-            sums, counts = (
-                torch.autograd.grad(changed, change, gradient, retain_graph=True)[0]
-                for gradient in (weights * residual, weights)
-            )
-            change = sums / (counts + earlier[:, None] + 1)
+                texels = values.detach().requires_grad_()
+                interpolated = cube_map.lookup(face, coordinates, texels, of_level, (n,))
+            # The finest level has most of the memory of a run, so it exists as few times as possible.
+            counts = torch.autograd.grad(interpolated, texels, weights, retain_graph=True)[0][:, 0].clone()
+            change = torch.autograd.grad(interpolated, texels, weights * residual)[0]
+            change /= (counts + earlier).add_(1)[:, None]
             values += change
             residual -= cube_map.lookup(face, coordinates, change, of_level, (n,))
-            total.append(counts[:, 0])
+            total.append(counts)
         return torch.cat(total)
 
     @torch.no_grad()

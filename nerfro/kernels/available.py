@@ -105,7 +105,7 @@ def fast_bfloat16(device: str) -> bool:
 
 
 def keep_freed_memory() -> bool:
-    """Let the process keep memory that is freed from now on, for the tensors of the next step.
+    """Return freed memory to the system, and keep memory that is freed from now on for the tensors of the next step.
 
     By default, glibc returns large blocks to the system when a tensor is freed. Every step then allocates the same
     memory again, one page fault and 4 KiB of zeros at a time, which can cost more than the arithmetic. The price is

@@ -1,5 +1,6 @@
 """The environment map and its cube map: learning, files, conventions, and the compiled lookup."""
 
+import itertools
 import math
 from pathlib import Path
 
@@ -43,6 +44,19 @@ def test_fitted_texels_are_the_mean_of_all_rays_and_one_zero_residual() -> None:
     raw = torch.log(torch.expm1(radiance.sqrt() * 2 * math.log(2)))  # of a texel that one ray has seen
     expected = (weights[..., None] * raw).sum(0) / (weights.sum(0) + 1)[:, None]
     torch.testing.assert_close(background.texels.detach(), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_fit_has_the_finest_level_in_memory_as_few_times_as_possible() -> None:
+    background, directions = EnvironmentMap([4, 256]), random_directions(1000)
+    sky, widths = smooth_sky(directions), torch.zeros(1000)
+    observed, past = Observed(directions, sky, sky >= 1, torch.ones(1000), widths), torch.zeros(len(background.texels))
+    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU], profile_memory=True) as profile:
+        background.fit(observed, past)
+    assert profile.profiler is not None
+    events = [event for event in profile.profiler.kineto_results.events() if event.name() == "[memory]"]
+    changes = [event.nbytes() for event in sorted(events, key=lambda event: event.start_ns())]
+    assert changes
+    assert max(itertools.accumulate(changes)) < 2 * background.texels.nbytes
 
 
 def test_wide_cones_do_not_change_fine_levels() -> None:

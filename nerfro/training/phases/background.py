@@ -14,10 +14,11 @@ from nerfro.backgrounds.envmap import EnvironmentMap, Observed
 from nerfro.core.errors import warn
 from nerfro.core.light import saturated
 from nerfro.core.provenance import AlgorithmSettings
-from nerfro.core.rays import Rays
+from nerfro.core.rays import Rays, in_room
 from nerfro.core.types import Exits
 from nerfro.fields.base import Field
 from nerfro.geometry.interpolation import misses
+from nerfro.kernels.available import keep_freed_memory
 from nerfro.registry.allowed import Count, Natural, OnlyWith, Share
 from nerfro.registry.registration import register
 from nerfro.rendering import Renderer
@@ -114,6 +115,7 @@ class BackgroundSteps(Phase):
         state["weights"] = state["weights"].to(background.texels.device)
         if part == 0:
             state["weights"].zero_()
+            keep_freed_memory()  # returns that of training steps, because fits have tensors of other sizes
         num_pixels, settings = run.batches.num_pixels, self.settings
         most_pixels = min(num_pixels, settings.max_pixels * background.levels.sizes[-1])
         fits_per_step = math.ceil(most_pixels / (self.steps * settings.max_fitted_pixels))
@@ -126,12 +128,14 @@ class BackgroundSteps(Phase):
                 for turn in range(settings.turns):
                     observed_pixels = _observe_beside_object(run, beside, rays, fits_gains=turn > 0)
                     background.fit(observed_pixels, torch.zeros_like(state["weights"]))
-            observed = [_observe_beside_object(run, beside, rays)]
+            parts = [_observe_beside_object(run, beside, rays)]
             if number_of_pass > 0 and not run.renderer.scene.medium.disperses:
                 used = crossing[:: self._spacing(run, len(crossing) * num_fits, number_of_pass)]
                 chunks = used.split(run.renderer.chunk_size)
-                observed += [_observe_through_object(run, chunk, settings.min_background) for chunk in chunks]
-            state["weights"] += background.fit(Observed.joined(observed), state["weights"])
+                parts += [_observe_through_object(run, chunk, settings.min_background) for chunk in chunks]
+            observed = Observed.joined(parts)
+            del beside, rays, parts  # the fit needs their memory
+            state["weights"] += background.fit(observed, state["weights"])
         return True
 
     def _spacing(self, run: TrainingRun, num_crossing: int, number_of_pass: int) -> int:
@@ -182,7 +186,7 @@ def _observe_beside_object(run: TrainingRun, pixels: Int[Tensor, "Q"], rays: Ray
     if exposure is not None and fits_gains:
         exposure.fit(view, rays, scene.background(Exits.unbent(rays)), scene.colour_space.to_radiance(rgb))
     widths = 1 / batches.cameras.fx[view]
-    seen = Exits.unbent(rays).directions
+    seen = in_room(rays.directions, rays.room)
     return Observed(seen, _photographed(run, rgb, view, rays), saturated(rgb), torch.ones_like(widths), widths)
 
 
