@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import logging
 import re
 import warnings
@@ -193,7 +192,8 @@ class CheckpointFiles(TorchCheckpointIO):
     """
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
-        content = io.BytesIO()
-        torch.save(checkpoint, content)
         with atomic_file(path) as stream:
-            stream.write(content.getbuffer())
+            try:
+                torch.save(checkpoint, stream)
+            except RuntimeError as error:  # PyTorch raises it in place of the error of a full disk
+                raise OSError(error) from error

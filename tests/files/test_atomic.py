@@ -2,6 +2,7 @@
 
 import errno
 import os
+import resource
 import stat
 import tempfile
 from collections.abc import Callable
@@ -33,6 +34,20 @@ def test_full_disk_keeps_the_old_file_and_no_temporary_file(
 
     monkeypatch.setattr(os, step, fail)
     refused(r"metrics\.json: No space left on device", write, path, "new")
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_disk_that_fills_up_within_a_checkpoint_keeps_the_old_one(tmp_path: Path) -> None:
+    path = tmp_path / "last.ckpt"
+    save_checkpoint(path, "old")
+    before = path.read_bytes()
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
+    try:
+        refused(r"last\.ckpt.*the old file is unchanged; free some space", save_checkpoint, path, "new" * 100_000)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
 
