@@ -2,9 +2,10 @@
 
     python benchmarks/memory.py [--steps 300] [ROW ...]
 
-Writes folders of noise images, trains on them, evaluates one view, and prints a Markdown table. ROW is `embedded` or
-COUNTxWIDTHxHEIGHT of the training images. Load on the machine changes the times but not the memory. The memory of the
-process leaves out mapped files, such as photographs, whose pages the system can drop at any time.
+Writes folders of noise images, trains on them, evaluates one view, and prints a Markdown table, and another one with
+the largest memory of each part of a run. ROW is `embedded` or COUNTxWIDTHxHEIGHT of the training images. Load on the
+machine changes the times but not the memory. The memory of the process leaves out mapped files, such as photographs,
+whose pages the system can drop at any time.
 """
 
 from __future__ import annotations
@@ -30,8 +31,16 @@ from PIL import Image
 from nerfro.core.paths import cache_dir
 
 # The embedded scene, and numbers of training pictures with their width and height.
-ROWS = ("embedded", "200x800x800", "300x1600x1200")
+ROWS = ("embedded", "60x400x400", "200x800x800", "300x1600x1200")
 _FIRST_STEP = re.compile(r"step [1-9]")
+_PROGRESS = re.compile(r"(\w+): +\d+%")
+# Parts of a run by their bars of progress; the bar of the training appears before the fits of the background.
+PARTS = {
+    "start": "before training",
+    "background": "fits of the background",
+    "train": "training",
+    "evaluate": "evaluation",
+}
 
 
 def main() -> None:
@@ -44,6 +53,7 @@ def main() -> None:
     print("| training images | seconds to the first step | MiB after the first step", end=" | ")
     print("after one minute | at the last step | peak | peak with mapped files |")
     print("|---|---|---|---|---|---|---|")
+    parts: list[str] = []
     for name in arguments.rows or ROWS:
         count, width, height = (0, 128, 128) if name == "embedded" else map(int, name.split("x"))
         with tempfile.TemporaryDirectory() as folder:
@@ -52,10 +62,14 @@ def main() -> None:
                 make_noise(Path(folder), count, width, height)
                 options += [f"data.root={folder}", "medium.mesh=embedded:torus/mesh.ply"]
             kept = set(cache_dir().glob("mapped_*.npy"))
-            measured = measure(["trainer.max_time=null", "evaluation.every=0", *options, *arguments.options])
+            measured, largest = measure(["trainer.max_time=null", "evaluation.every=0", *options, *arguments.options])
             for path in set(cache_dir().glob("mapped_*.npy")) - kept:
                 path.unlink()
-        print(f"| {count or 100} of {width}x{height} | {' | '.join(measured)} |", flush=True)
+        row = f"| {count or 100} of {width}x{height} | "
+        print(row + " | ".join(measured) + " |", flush=True)
+        parts.append(row + " | ".join(f"{largest[part]:.0f}" if part in largest else "n/a" for part in PARTS) + " |")
+    print(f"\n| largest MiB | {' | '.join(PARTS.values())} |\n|---|{'---|' * len(PARTS)}")
+    print("\n".join(parts))
 
 
 def make_noise(folder: Path, count: int, width: int, height: int) -> None:
@@ -74,12 +88,12 @@ def make_noise(folder: Path, count: int, width: int, height: int) -> None:
         (folder / f"transforms_{split}.json").write_text(json.dumps(document))
 
 
-def measure(options: list[str]) -> list[str]:
+def measure(options: list[str]) -> tuple[list[str], dict[str, float]]:
     """Measure the seconds to the first step and the memory in MiB.
 
     Returns:
         Seconds; memory without mapped files after the first step, a minute later, at the last step and at its peak;
-        peak with mapped files.
+        peak with mapped files. Largest memory without mapped files in each of `PARTS`.
     """
     begun = time.perf_counter()
     process = subprocess.Popen(
@@ -95,6 +109,8 @@ def measure(options: list[str]) -> list[str]:
     threading.Thread(target=watch, daemon=True).start()
     assert process.stderr is not None
     first, last, shown = math.inf, 0.0, ""
+    largest: dict[str, float] = {}
+    seen = 0  # samples that belong to a part
     while part := os.read(process.stderr.fileno(), 4096).decode(errors="replace"):
         shown = (shown + part)[-8192:]
         now = time.perf_counter() - begun
@@ -102,12 +118,16 @@ def measure(options: list[str]) -> list[str]:
             first = now
         if "evaluate" not in shown:
             last = now
+        for name in _PROGRESS.findall(part)[-1:]:  # a bar also appears at the end of its part
+            of_part = name if largest else "start"
+            new = [largest.get(of_part, 0.0), *(megabytes for _, megabytes in samples[seen:])]
+            largest[of_part], seen = max(new), seen + len(new) - 1
     _, status, usage = os.wait4(process.pid, 0)
     if status != 0:
         raise SystemExit(f"failed: {' '.join(options)}\n{shown}")
     at = [next((m for t, m in reversed(samples) if t <= when), math.nan) for when in (first + 1, first + 60, last)]
     memory = [*at, max(megabytes for _, megabytes in samples), usage.ru_maxrss / 1024]
-    return [f"{first:.0f}", *(f"{megabytes:.0f}" for megabytes in memory)]
+    return [f"{first:.0f}", *(f"{megabytes:.0f}" for megabytes in memory)], largest
 
 
 def _own_memory(pid: int) -> Iterator[float]:

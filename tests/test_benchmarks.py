@@ -284,7 +284,7 @@ def test_cameras_benchmark_writes_its_runs(
 @pytest.mark.slow
 def test_memory_benchmark_prints_a_complete_table(run: Run, tiny_default_run: list[str]) -> None:
     options = [option for option in tiny_default_run if not option.startswith("data.root")]
-    assert len(table_rows(run("memory", "2x8x8", "--steps", 2, "--options", *options))) == 2
+    assert len(table_rows(run("memory", "2x8x8", "--steps", 2, "--options", *options))) == 4
 
 
 @pytest.mark.slow
