@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 from torch.overrides import TorchFunctionMode
+from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_map
 
 from nerfro.core.paths import PACKAGE_DIR, PLUGINS_DIR
@@ -33,12 +34,28 @@ class OnGpu(torch.Tensor):
     is_cuda = property(lambda self: True)  # type: ignore[assignment]
 
 
+class Launches(TorchDispatchMode):
+    """Count the operators that a GPU would launch; views need no launch."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.count = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
+        self.count += not (func.is_view or func.overloadpacket.__name__ in ("detach", "empty", "_unsafe_view"))
+        return func(*args, **(kwargs or {}))
+
+
 class PretendedGpu(TorchFunctionMode):
-    """`with PretendedGpu() as gpu:` gives the machine a GPU; `gpu.waits` are places where the host waited for it."""
+    """`with PretendedGpu() as gpu:` gives the machine a GPU; `gpu.waits` are places where the host waited for it.
+
+    `gpu.launches.count` is the number of operators on the GPU.
+    """
 
     def __init__(self) -> None:
         super().__init__()
         self.waits: set[str] = set()
+        self.launches = Launches()
 
     def __torch_function__(self, func: Callable, types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
         kwargs, name = dict(kwargs or {}), getattr(func, "__name__", "")
@@ -65,8 +82,10 @@ class PretendedGpu(TorchFunctionMode):
             if here and name in ("tensor", "as_tensor", "new_tensor"):
                 self._waited(name)
             kwargs["device"] = "cpu"
-        result = func(*args, **kwargs)
-        return _on_gpu(result) if here else result
+        if not here:
+            return func(*args, **kwargs)
+        with self.launches:
+            return _on_gpu(func(*args, **kwargs))
 
     def _to(self, tensor: torch.Tensor, *args: Any, **kwargs: Any) -> torch.Tensor:
         """`Tensor.to`, between the devices a copy."""
@@ -80,6 +99,7 @@ class PretendedGpu(TorchFunctionMode):
         moved = tensor.as_subclass(torch.Tensor).to(*local[0], **local[1])
         if to_gpu != from_gpu:
             moved = moved.clone()
+            self.launches.count += 1
         return moved.as_subclass(OnGpu) if to_gpu else moved
 
     def _waited(self, name: str) -> None:

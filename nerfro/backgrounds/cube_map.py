@@ -138,18 +138,20 @@ def lookup_in_torch(
     resolution, offset, padded_offset = (
         constant(values, texels.device) for values in (levels.resolutions, levels.offsets, padded_offsets)
     )
+    # Axes are points, levels, and (column, row) or the four texels around a point, of which the first two share a row.
     position = (coordinates[:, None] + 1) * (0.5 * resolution[:, None]) + 0.5  # in padded texels, with integer centres
     corner = torch.minimum(position.long().clamp(min=0), resolution[:, None])
-    (u, v), (column, row) = (position - corner).unbind(-1), corner.unbind(-1)
-    weights = torch.stack([(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v], dim=-1)
+    fraction, (column, row) = position - corner, corner.unbind(-1)
+    sides = torch.stack([1 - fraction, fraction], dim=-1)
+    weights = (sides[:, :, 1, :, None] * sides[:, :, 0, None]).flatten(-2)
     # Where three faces meet, the missing fourth texel is the mean of the three.
-    ends = (0, resolution)
-    missing = torch.stack([(column == c) & (row == r) for r in ends for c in ends], dim=-1)
+    ends = torch.stack([corner == 0, corner == resolution[:, None]], dim=-1)
+    missing = (ends[:, :, 1, :, None] & ends[:, :, 0, None]).flatten(-2)
     absent = (weights * missing).sum(-1, keepdim=True)
     weights = torch.where(missing, 0.0, weights + absent / 3)
     width = resolution + 2
     first = padded_offset + (face[:, None] * width + row) * width + column
-    index = torch.stack([first, first + 1, first + width, first + width + 1], dim=-1)
+    index = first[..., None] + constant(tuple((0, 1, n + 2, n + 3) for n in levels.resolutions), texels.device)
     texel = padded.index_select(0, index.flatten()).view(index.shape) + offset[:, None]
     # The gradient of index_select is one index_add; that of indexing with brackets sorts all indices first.
     return (texels.index_select(0, texel.flatten()).view(*texel.shape, 3) * weights[..., None]).sum((1, 2))

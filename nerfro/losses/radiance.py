@@ -109,11 +109,12 @@ class TotalVariation(Loss):
         self.angle = angle
 
     def forward(self, renderings: list[Rendering], batch: Batch, scene: Scene) -> Float[Tensor, ""]:
-        index = torch.arange(_NUM_PAIRS, device=batch.rgb.device)
-        numbers = batch.draws.uniform(index, 3, "total variation")
+        # 150 small operators, which the CPU takes while a GPU is busy.
+        numbers = batch.draws.uniform(torch.arange(_NUM_PAIRS), 3, "total variation")
         angle = _NUM_DETAILS * scene.background.detail if self.angle is None else self.angle
         first, second = direction_pairs(numbers, math.radians(angle))
-        rgb = scene.colour_space.to_srgb(scene.background(Exits(torch.cat([first, second]))))
+        directions = torch.cat([first, second]).to(batch.rgb.device, non_blocking=True)
+        rgb = scene.colour_space.to_srgb(scene.background(Exits(directions)))
         return (rgb[_NUM_PAIRS:] - rgb[:_NUM_PAIRS]).abs().mean()
 
 
