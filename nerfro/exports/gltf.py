@@ -5,11 +5,10 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-import trimesh
 from torch.nn import functional
 
 from nerfro.core.cameras import Cameras
@@ -26,6 +25,9 @@ from nerfro.media.material import Dispersion
 from nerfro.viewing.changes import absorption_of
 from nerfro.viewing.exports import EXPORTS, OF_SPLATS, Export, ExportConfig
 from nerfro.viewing.trained_scene import TrainedScene
+
+if TYPE_CHECKING:
+    import trimesh
 
 GLB_TRIANGLES = 20_000  # default limit of a .glb
 _SPLATTING = "KHR_gaussian_splatting"

@@ -7,9 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import scipy
 import torch
 from jaxtyping import Float
-from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn import functional
 
@@ -101,7 +101,8 @@ def _drawn(
     # Behind the sky that cameras see.
     positions = torch.cat([positions, centre + 1.1 * distance * elsewhere])
     colours = torch.cat([images.view(-1, 3)[pixels], to_srgb(scene.background(elsewhere)).clamp(0, 1)])
-    spacing = torch.from_numpy(KDTree(positions.numpy()).query(positions.numpy(), 4)[0][:, 1:].mean(1)).float()
+    distances, _ = scipy.spatial.KDTree(positions.numpy()).query(positions.numpy(), 4)
+    spacing = torch.from_numpy(distances[:, 1:].mean(1)).float()
     harmonics = functional.pad((colours - 0.5)[:, None] / HARMONIC_0, (0, 0, 0, 3))
     rotations = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(len(positions), 4)
     log_scales = (0.5 * spacing).clamp(min=1e-7 * distance).log()[:, None].expand(-1, 3)
