@@ -16,7 +16,7 @@ from nerfro.core.paths import relative_path
 from nerfro.exports.meshes import colours_of, glass_meshes, inside_mesh
 from nerfro.files.atomic import write_atomically
 from nerfro.viewing.camera_files import transforms_document
-from nerfro.viewing.exports import EXPORTS, OF_SPLATS, Export, ExportConfig
+from nerfro.viewing.exports import EXPORTS, Export, ExportConfig
 from nerfro.viewing.trained_scene import TrainedScene
 
 Points = tuple[Float[np.ndarray, "N 3"], UInt8[np.ndarray, "N 3"]]
@@ -111,5 +111,5 @@ def _write_lines(file: Path, lines: list[str]) -> None:
     write_atomically(file, "\n".join(lines) + "\n")
 
 
-EXPORTS["colmap"] = Export(("",), write_colmap, unused=("sky", "triangles", *OF_SPLATS))
-EXPORTS["cameras"] = Export(("",), write_transforms, unused=("sky", "triangles", *OF_SPLATS))
+EXPORTS["colmap"] = Export(("",), write_colmap, uses=("resolution", "half_depth"))
+EXPORTS["cameras"] = Export(("",), write_transforms, uses=("resolution", "half_depth"))

@@ -19,7 +19,7 @@ from nerfro.files.atomic import refuse_existing, write_atomically
 from nerfro.files.deep_images import write_radiance
 from nerfro.files.lat_long import envmap_texture
 from nerfro.viewing.changes import absorption_of
-from nerfro.viewing.exports import EXPORTS, OF_SPLATS, Export, ExportConfig
+from nerfro.viewing.exports import EXPORTS, Export, ExportConfig
 from nerfro.viewing.page import page_split
 from nerfro.viewing.trained_scene import TrainedScene
 
@@ -175,4 +175,4 @@ def _numbers(values: Iterable[float]) -> str:
     return " ".join(f"{value:.9g}" for value in values)
 
 
-EXPORTS["mitsuba"] = Export((".xml",), write_mitsuba, MITSUBA_FILES, unused=("triangles", *OF_SPLATS))
+EXPORTS["mitsuba"] = Export((".xml",), write_mitsuba, MITSUBA_FILES, ("resolution", "half_depth", "sky"))
