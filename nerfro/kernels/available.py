@@ -105,7 +105,7 @@ def fast_bfloat16(device: str) -> bool:
 
 
 def keep_freed_memory() -> bool:
-    """Return freed memory to the system, and keep memory that is freed from now on for the tensors of the next step.
+    """Let the process keep memory that is freed from now on, for the tensors of the next step.
 
     By default, glibc returns large blocks to the system when a tensor is freed. Every step then allocates the same
     memory again, one page fault and 4 KiB of zeros at a time, which can cost more than the arithmetic. The price is
@@ -115,9 +115,16 @@ def keep_freed_memory() -> bool:
     Returns:
         Whether the C library supports the setting.
     """
+    if not return_freed_memory():
+        return False
+    library = ctypes.CDLL(None)
+    return all(library.mallopt(*setting) for setting in _SETTINGS.items())
+
+
+def return_freed_memory() -> bool:
+    """Return the memory that has been freed so far to the system, if the C library supports it."""
     try:
-        library = ctypes.CDLL(None)
-        library.malloc_trim(0)
+        ctypes.CDLL(None).malloc_trim(0)
     except (OSError, TypeError, AttributeError):  # not a Unix, or another C library
         return False
-    return all(library.mallopt(*setting) for setting in _SETTINGS.items())
+    return True

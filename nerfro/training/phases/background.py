@@ -18,7 +18,7 @@ from nerfro.core.rays import Rays, in_room
 from nerfro.core.types import Exits
 from nerfro.fields.base import Field
 from nerfro.geometry.interpolation import misses
-from nerfro.kernels.available import keep_freed_memory
+from nerfro.kernels.available import return_freed_memory
 from nerfro.registry.allowed import Count, Natural, OnlyWith, Share
 from nerfro.registry.registration import register
 from nerfro.rendering import Renderer
@@ -115,7 +115,7 @@ class BackgroundSteps(Phase):
         state["weights"] = state["weights"].to(background.texels.device)
         if part == 0:
             state["weights"].zero_()
-            keep_freed_memory()  # returns that of training steps, because fits have tensors of other sizes
+            return_freed_memory()  # of training steps, because fits have tensors of other sizes
         num_pixels, settings = run.batches.num_pixels, self.settings
         most_pixels = min(num_pixels, settings.max_pixels * background.levels.sizes[-1])
         fits_per_step = math.ceil(most_pixels / (self.steps * settings.max_fitted_pixels))
