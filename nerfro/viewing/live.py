@@ -67,9 +67,10 @@ class LivePage:
             return
         self.show()
         duration = time.monotonic() - start
-        # Updates take at most 2 % of the time, and the resolution is adapted to an update every 5 seconds.
-        self._next = start + max(duration / 0.02, 5.0)
-        scale = (0.02 * 5.0 / duration) ** (1 / 3)
+        # Updates take at most 1.5 % of the time, answers to browsers little more, and the resolution is adapted to an
+        # update every 5 seconds.
+        self._next = start + max(duration / 0.015, 5.0)
+        scale = (0.015 * 5.0 / duration) ** (1 / 3)
         self._resolution = round(min(max(self._resolution * min(max(scale, 0.7), 1.3), 24), 128))
 
     def finish(self) -> None:
