@@ -12,13 +12,7 @@ from __future__ import annotations
 import inspect
 import sys
 
-import nerfro.capture.refinement
-import nerfro.capture.vessel_fit
-import nerfro.cli.startup
-import nerfro.masks.masking
-import nerfro.pipeline.trials
-import nerfro.poses.structure_from_motion
-import nerfro.silhouettes.surface  # noqa: F401 - registers settings, as the imports above
+import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
 from nerfro.cli.failures import errors_in_one_line
 from nerfro.cli.options import laid_out, plugin_options
 from nerfro.core.provenance import AlgorithmSettings
@@ -54,6 +48,14 @@ def _print_materials() -> None:
 
 def _print_settings() -> None:
     """Print the settings of algorithms, which Python code passes as the argument `settings`, with their defaults."""
+    # These imports register the settings; the import of Lightning by the trials takes seconds.
+    import nerfro.capture.refinement
+    import nerfro.capture.vessel_fit
+    import nerfro.masks.masking
+    import nerfro.pipeline.trials
+    import nerfro.poses.structure_from_motion
+    import nerfro.silhouettes.surface  # noqa: F401
+
     for settings in AlgorithmSettings.classes.values():
         print(f"{settings.__module__}.{settings()!r}\n\n{inspect.getdoc(settings)}\n")
 

@@ -39,46 +39,12 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-_SKIPPED = "nerfro/skipped"
-
-
-def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--last-skipped", action="store_true", help="run only the tests that the last run has skipped")
-
-
-class SkippedTests:
-    """Remembers the skipped tests of a run in pytest's cache, for `--last-skipped`."""
-
-    def __init__(self, cache: pytest.Cache) -> None:
-        self.cache = cache
-        self.names: set[str] = set()
-
-    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        if report.skipped:
-            self.names.add(report.nodeid)
-
-    def pytest_sessionfinish(self) -> None:
-        self.cache.set(_SKIPPED, sorted(self.names))
-
-
-def pytest_configure(config: pytest.Config) -> None:
-    worker = hasattr(config, "workerinput")  # of pytest-xdist
-    if not worker and not config.option.collectonly and config.pluginmanager.hasplugin("cacheprovider"):
-        config.pluginmanager.register(SkippedTests(config.cache))
-
-
 def pytest_collection_finish() -> None:
     gc.freeze()  # imported modules, which searches for garbage would visit again and again
 
 
 def pytest_sessionfinish() -> None:
     gc.unfreeze()
-
-
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    if config.getoption("last_skipped"):
-        names = set(config.cache.get(_SKIPPED, []))
-        items[:] = [item for item in items if item.nodeid in names]
 
 
 @pytest.fixture

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import scipy
 from jaxtyping import Float, Float32, UInt8, UInt16
 from PIL import Image
-from scipy.sparse import csr_array
 
 from nerfro.core.errors import NerfroError
 from nerfro.core.light import encode_photograph, to_linear
@@ -199,9 +199,9 @@ def area_mean(values: Float[np.ndarray, "H W *C"], size: tuple[int, int]) -> Flo
     return mean.clip(values.min(), values.max()).astype(np.float32)
 
 
-def _coverage(count: int, fewer: int) -> csr_array:
+def _coverage(count: int, fewer: int) -> scipy.sparse.csr_array:
     """Return weights [fewer, count] that average `count` samples of a line over `fewer` intervals of equal length."""
     edges = np.union1d(np.arange(count + 1) / count, np.arange(fewer + 1) / fewer)
     middle, length = 0.5 * (edges[1:] + edges[:-1]), np.diff(edges)
     places = (middle * fewer).astype(int), (middle * count).astype(int)
-    return csr_array((length * fewer, places), shape=(fewer, count))
+    return scipy.sparse.csr_array((length * fewer, places), shape=(fewer, count))

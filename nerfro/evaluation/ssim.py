@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 from jaxtyping import Bool, Float
-from skimage.metrics import structural_similarity
+from skimage import metrics
 from torch import Tensor
 
 from nerfro.core.errors import NerfroError
@@ -35,7 +35,7 @@ def ssim_map(prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"])
     require_images(prediction, target)
     if min(prediction.shape[:2]) < WINDOW:
         raise NerfroError(f"SSIM needs at least {WINDOW} x {WINDOW} pixels, got {list(prediction.shape[:2])}; use PSNR")
-    _, similarity = structural_similarity(
+    _, similarity = metrics.structural_similarity(
         *(image.detach().cpu().double().numpy() for image in (prediction, target)),
         gaussian_weights=True,
         sigma=1.5,

@@ -6,10 +6,9 @@ import json
 from pathlib import Path
 
 import numpy as np
+import scipy
 import torch
-import trimesh
 from jaxtyping import Float, UInt8
-from scipy.spatial.transform import Rotation
 
 from nerfro.core.cameras import Cameras
 from nerfro.core.errors import NerfroError
@@ -17,7 +16,7 @@ from nerfro.core.paths import relative_path
 from nerfro.exports.meshes import colours_of, glass_meshes, inside_mesh
 from nerfro.files.atomic import write_atomically
 from nerfro.viewing.camera_files import transforms_document
-from nerfro.viewing.exports import EXPORTS, OF_SPLATS, Export, ExportConfig
+from nerfro.viewing.exports import EXPORTS, Export, ExportConfig
 from nerfro.viewing.trained_scene import TrainedScene
 
 Points = tuple[Float[np.ndarray, "N 3"], UInt8[np.ndarray, "N 3"]]
@@ -33,7 +32,7 @@ def write_colmap(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
     _write_lines(model / "cameras.txt", [f"{i} {lens}" for i, lens in enumerate(lenses, 1)])
     rotations, centres = _poses(scene, cameras)
     # COLMAP stores world-to-camera poses with axes right, down and forward, and the scalar part of quaternions first.
-    inverse = Rotation.from_matrix(rotations * [1.0, -1.0, -1.0]).inv()
+    inverse = scipy.spatial.transform.Rotation.from_matrix(rotations * [1.0, -1.0, -1.0]).inv()
     quaternions, shifts = inverse.as_quat()[:, [3, 0, 1, 2]], -inverse.apply(centres)
     poses = [" ".join(map(repr, pose)) for pose in np.hstack([quaternions, shifts]).tolist()]
     # The second line of an image has its features.
@@ -57,6 +56,8 @@ def write_transforms(scene: TrainedScene, out: Path, options: ExportConfig) -> s
     document = transforms_document(cameras, names, scene.source.origin)
     write_atomically(out / "transforms.json", json.dumps(document | {"ply_file_path": "points.ply"}, indent=1) + "\n")
     positions, colours = _points(scene, options)
+    import trimesh
+
     cloud = trimesh.PointCloud(positions, colors=colours)
     write_atomically(out / "points.ply", cloud.export(file_type="ply"))
     return f"{len(cameras)} cameras and {len(positions)} points for nerfstudio"
@@ -110,5 +111,5 @@ def _write_lines(file: Path, lines: list[str]) -> None:
     write_atomically(file, "\n".join(lines) + "\n")
 
 
-EXPORTS["colmap"] = Export(("",), write_colmap, unused=("sky", "triangles", *OF_SPLATS))
-EXPORTS["cameras"] = Export(("",), write_transforms, unused=("sky", "triangles", *OF_SPLATS))
+EXPORTS["colmap"] = Export(("",), write_colmap, uses=("resolution", "half_depth"))
+EXPORTS["cameras"] = Export(("",), write_transforms, uses=("resolution", "half_depth"))

@@ -5,11 +5,10 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-import trimesh
 from torch.nn import functional
 
 from nerfro.core.cameras import Cameras
@@ -24,8 +23,11 @@ from nerfro.files.templates import fill_template
 from nerfro.geometry.gltf import QUANTIZATION, Z_UP_TO_Y_UP
 from nerfro.media.material import Dispersion
 from nerfro.viewing.changes import absorption_of
-from nerfro.viewing.exports import EXPORTS, OF_SPLATS, Export, ExportConfig
+from nerfro.viewing.exports import EXPORTS, Export, ExportConfig
 from nerfro.viewing.trained_scene import TrainedScene
+
+if TYPE_CHECKING:
+    import trimesh
 
 GLB_TRIANGLES = 20_000  # default limit of a .glb
 _SPLATTING = "KHR_gaussian_splatting"
@@ -246,4 +248,6 @@ def _glass_material(
     return {"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.0}, "extensions": extensions}
 
 
-EXPORTS["mesh"] = Export((".glb", ".ply", ".obj"), write_mesh, ("_sky.hdr", "_viewer.html"), unused=OF_SPLATS)
+EXPORTS["mesh"] = Export(
+    (".glb", ".ply", ".obj"), write_mesh, ("_sky.hdr", "_viewer.html"), ("resolution", "half_depth", "triangles", "sky")
+)

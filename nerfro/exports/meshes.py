@@ -6,14 +6,12 @@ import importlib.util
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-import trimesh
 from jaxtyping import UInt8
 from torch.nn import functional
-from trimesh.exchange.obj import export_obj
-from trimesh.exchange.ply import export_ply
 
 from nerfro.core.errors import warn
 from nerfro.core.light import to_srgb
@@ -26,6 +24,9 @@ from nerfro.geometry.normals import corner_normals
 from nerfro.viewing.surface import level_set, surface_of
 from nerfro.viewing.trained_scene import TrainedScene
 from nerfro.viewing.volume import POINTS_AT_ONCE, RESOLUTION, sample_field
+
+if TYPE_CHECKING:
+    import trimesh
 
 
 def glass_meshes(scene: TrainedScene, triangles: int | None = None) -> list[trimesh.Trimesh]:
@@ -86,6 +87,8 @@ def simplified(mesh: TriangleMesh, triangles: int) -> TriangleMesh:
 
 def _with_vertex_normals(mesh: TriangleMesh) -> trimesh.Trimesh:
     """Convert normals of triangle corners to normals of vertices; vertices on creases are duplicated."""
+    import trimesh
+
     assert mesh.normals is not None
     corners = np.concatenate([mesh.triangles, mesh.normals], -1).reshape(-1, 6).astype(np.float32)
     unique, index = np.unique(corners, axis=0, return_inverse=True)
@@ -131,6 +134,8 @@ def inside_mesh(
         for positions, directions in zip(vertices.split(POINTS_AT_ONCE), (-normals).split(POINTS_AT_ONCE), strict=True)
     ]
     linear = network.colour_space.to_linear(torch.cat(radiance)).numpy()
+    import trimesh
+
     return trimesh.Trimesh(
         mesh.vertices, mesh.faces, vertex_normals=normals.numpy(), vertex_attributes={"radiance": linear}, process=False
     )
@@ -144,6 +149,10 @@ def one_mesh(glass: Sequence[trimesh.Trimesh], inside: trimesh.Trimesh | None, s
         inside: dense content, or None.
         suffix: ending of the file, `.ply` or `.obj`.
     """
+    import trimesh
+    from trimesh.exchange.obj import export_obj
+    from trimesh.exchange.ply import export_ply
+
     parts = [*glass, *([] if inside is None else [inside])]
     colours = [np.full((len(mesh.vertices), 3), 255, np.uint8) for mesh in glass]
     if inside is not None:

@@ -5,25 +5,26 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
 
 import numpy as np
 import torch
-import trimesh
 from jaxtyping import Float
-from trimesh.exchange.ply import export_ply
 
 from nerfro.core.cameras import Cameras
 from nerfro.core.errors import NerfroError, warn
 from nerfro.exports.meshes import glass_meshes, inside_mesh
 from nerfro.files.atomic import refuse_existing, write_atomically
 from nerfro.files.deep_images import write_radiance
-from nerfro.synthetic.path_tracer import envmap_texture
+from nerfro.files.lat_long import envmap_texture
 from nerfro.viewing.changes import absorption_of
-from nerfro.viewing.exports import EXPORTS, OF_SPLATS, Export, ExportConfig
+from nerfro.viewing.exports import EXPORTS, Export, ExportConfig
 from nerfro.viewing.page import page_split
 from nerfro.viewing.trained_scene import TrainedScene
+
+if TYPE_CHECKING:
+    import trimesh
 
 MITSUBA_FILES = ("_glass.ply", "_inside.ply", "_sky.hdr")  # endings of the files beside the .xml
 # Clip distances of the sensors, relative to the largest distance between a camera and a corner of the object's bounds.
@@ -63,7 +64,7 @@ def write_mitsuba(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
     }
     glass_files = [glass_file, *(out.with_name(f"{out.stem}_glass_{body}.ply") for body in range(1, len(glass)))]
     refuse_existing(glass_files[1:], options.overwrite)
-    corners = torch.from_numpy(trimesh.bounds.corners(scene.bounds.numpy())).float()
+    corners = torch.cartesian_prod(*scene.bounds.T.float())
     reach = float(torch.cdist(cameras.camera_to_world[..., 3].float(), corners).max())
     _write_sky(sky_file, scene)
     for body, (mesh, file) in enumerate(zip(glass, glass_files, strict=False)):
@@ -117,6 +118,8 @@ def _write_sky(file: Path, scene: TrainedScene) -> None:
 
 
 def _write_shape(file: Path, mesh: trimesh.Trimesh) -> dict[str, Any]:
+    from trimesh.exchange.ply import export_ply
+
     write_atomically(file, export_ply(mesh, vertex_normal=True))
     return {"type": "ply", "filename": file.name}
 
@@ -172,4 +175,4 @@ def _numbers(values: Iterable[float]) -> str:
     return " ".join(f"{value:.9g}" for value in values)
 
 
-EXPORTS["mitsuba"] = Export((".xml",), write_mitsuba, MITSUBA_FILES, unused=("triangles", *OF_SPLATS))
+EXPORTS["mitsuba"] = Export((".xml",), write_mitsuba, MITSUBA_FILES, ("resolution", "half_depth", "sky"))

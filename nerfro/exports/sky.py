@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from nerfro.files.lat_long import save_lat_long
-from nerfro.viewing.exports import EXPORTS, OF_SPLATS, Export, ExportConfig
+from nerfro.viewing.exports import EXPORTS, Export, ExportConfig
 from nerfro.viewing.trained_scene import TrainedScene
 
 
@@ -18,4 +18,4 @@ def write_sky(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
     return f"the sky: {sky.shape[1]}x{sky.shape[0]} pixels, lat-long, z up{frame}"
 
 
-EXPORTS["sky"] = Export((".hdr", ".exr", ".png"), write_sky, unused=("half_depth", "triangles", *OF_SPLATS))
+EXPORTS["sky"] = Export((".hdr", ".exr", ".png"), write_sky, uses=("resolution", "sky"))

@@ -7,9 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import scipy
 import torch
 from jaxtyping import Float
-from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn import functional
 
@@ -21,6 +21,8 @@ from nerfro.exports.gaussians import HARMONIC_0, Gaussians
 from nerfro.exports.gltf import GLB_TRIANGLES, encode_glb
 from nerfro.exports.meshes import glass_meshes
 from nerfro.files.atomic import write_atomically
+from nerfro.geometry.normals import fibonacci_lattice
+from nerfro.registry.allowed import refuse_unused
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.viewing.exports import EXPORTS, Export, ExportConfig
 from nerfro.viewing.trained_scene import TrainedScene
@@ -34,6 +36,8 @@ _RATES = {"positions": 0.1, "log_scales": 0.02, "rotations": 0.02, "logits": 0.0
 def write_splats(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
     """Write Gaussians as .ply or .spz, or as .glb (KHR_gaussian_splatting) beside the glass meshes."""
     suffix = out.suffix.lower()
+    if suffix != ".glb":
+        refuse_unused(options, ["triangles"], f"on {suffix}")
     if suffix == ".spz":
         _require_moderate_units(scene)
     gaussians, psnr = fitted_gaussians(scene, options)
@@ -97,23 +101,16 @@ def _drawn(
     distance = _SKY_DISTANCE * float((origins - centre).norm(dim=-1).max())
     of_sky = centre + distance * directions
     positions = torch.where(length[:, None] < distance, origins + length.nan_to_num()[:, None] * directions, of_sky)
-    elsewhere = _spread_directions(number // 10)
+    elsewhere = torch.from_numpy(fibonacci_lattice(number // 10)).float()
     # Behind the sky that cameras see.
     positions = torch.cat([positions, centre + 1.1 * distance * elsewhere])
     colours = torch.cat([images.view(-1, 3)[pixels], to_srgb(scene.background(elsewhere)).clamp(0, 1)])
-    spacing = torch.from_numpy(KDTree(positions.numpy()).query(positions.numpy(), 4)[0][:, 1:].mean(1)).float()
+    distances, _ = scipy.spatial.KDTree(positions.numpy()).query(positions.numpy(), 4)
+    spacing = torch.from_numpy(distances[:, 1:].mean(1)).float()
     harmonics = functional.pad((colours - 0.5)[:, None] / HARMONIC_0, (0, 0, 0, 3))
     rotations = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(len(positions), 4)
     log_scales = (0.5 * spacing).clamp(min=1e-7 * distance).log()[:, None].expand(-1, 3)
     return Gaussians(positions, log_scales, rotations, torch.ones(len(positions)), harmonics)
-
-
-def _spread_directions(number: int) -> Float[Tensor, "number 3"]:
-    """Return unit vectors that are spread evenly over the sphere (a Fibonacci lattice)."""
-    index = torch.arange(number) + 0.5
-    z, azimuth = 1 - 2 * index / number, math.pi * (1 + math.sqrt(5)) * index
-    radius = (1 - z.square()).sqrt()
-    return torch.stack([radius * azimuth.cos(), radius * azimuth.sin(), z], -1)
 
 
 def _fitted(
@@ -145,4 +142,6 @@ def _fitted(
     return Gaussians(*(value.detach() for value in gaussians())), -10 * math.log10(sum(last) / max(len(last), 1))
 
 
-EXPORTS["splats"] = Export((".ply", ".spz", ".glb"), write_splats, unused=("half_depth",))
+EXPORTS["splats"] = Export(
+    (".ply", ".spz", ".glb"), write_splats, uses=("resolution", "triangles", "gaussians", "steps", "sky")
+)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from nerfro.files.cache import save_arrays
-from nerfro.viewing.exports import EXPORTS, OF_SPLATS, Export, ExportConfig
+from nerfro.viewing.exports import EXPORTS, Export, ExportConfig
 from nerfro.viewing.trained_scene import TrainedScene
 from nerfro.viewing.volume import RESOLUTION, sample_field
 
@@ -18,4 +18,4 @@ def write_volume(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
     return f"the inside: {'x'.join(map(str, volume.density.shape))} vertices with density and linear rgb"
 
 
-EXPORTS["volume"] = Export((".npz",), write_volume, unused=("half_depth", "sky", "triangles", *OF_SPLATS))
+EXPORTS["volume"] = Export((".npz",), write_volume, uses=("resolution",))

@@ -7,7 +7,6 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-import matplotlib
 import torch
 from jaxtyping import Float
 from PIL import Image, ImageDraw, ImageFont
@@ -51,6 +50,8 @@ def _resized(image: Float[Tensor, "h w 3"], width: int, height: int) -> Image.Im
 
 
 def _font(size: float = TEXT_SIZE) -> ImageFont.FreeTypeFont:
+    import matplotlib
+
     # Pillow's own font lacks signs such as ≥ and ↑, which the font of matplotlib has.
     return ImageFont.truetype(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf", size)
 
@@ -75,6 +76,8 @@ def magma(values: Float[Tensor, "H W"], limit: float) -> Float[Tensor, "H W 3"]:
     """
     if not limit > 0:
         raise NerfroError(f"limit={limit} of a colour scale is not allowed; give a positive number")
+    import matplotlib
+
     num_colours = 256
     table = torch.from_numpy(matplotlib.colormaps["magma"](range(num_colours))[:, :3]).float()
     values = values.detach().cpu().float()

@@ -7,6 +7,8 @@ left, so that a viewer inside sees the sky unmirrored. Blender's environment tex
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +23,7 @@ from nerfro.files.images import save_png
 from nerfro.files.reading import open_image, reading
 
 _FORMATS = (".png", ".jpg", ".jpeg", ".hdr", ".exr")
+_TEXELS_PER_TASK = 1 << 17
 
 
 def directions(height: int) -> Float[Tensor, "H 2*H 3"]:
@@ -44,6 +47,36 @@ def sample(radiance: Float[Tensor, "H W 3"], where: Float[Tensor, "points 3"], w
     grid = torch.stack([u / (columns + 2) * 2 - 1, v * 2 - 1], dim=-1)[None, None]
     sampled = torch.nn.functional.grid_sample(image, grid, padding_mode="border", align_corners=False)
     return sampled[0, :, 0].T
+
+
+def envmap_texture(sky: Callable[[np.ndarray], np.ndarray], height: int, to_world: np.ndarray) -> np.ndarray:
+    """Return the sky sampled at the texels of Mitsuba's `envmap`, float32 [H, 2H, 3].
+
+    Mitsuba reads row j at the polar angle pi j / (H - 1), so the first and last rows are the poles, and column i at the
+    azimuth 2 pi (i + 1/2) / W. Texels at edges of the sky are averages of several samples; other texels are one sample.
+    `to_world` [3, 3] rotates the frame of the emitter (y up) to the world.
+    """
+    width = 2 * height
+
+    def sample(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        theta, phi = np.broadcast_arrays(np.pi * rows / (height - 1), 2 * np.pi * (columns + 0.5) / width)
+        local = np.stack([np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)], -1)
+        return sky(local @ to_world.T).astype(np.float32)
+
+    def refined(texels: np.ndarray) -> np.ndarray:
+        offsets = np.mgrid[-1:2, -1:2].reshape(2, 9) / 3
+        return sample(texels[:, :1] + offsets[0], texels[:, 1:] + offsets[1]).mean(1)
+
+    bands = np.array_split(np.arange(height), -(-height * width // _TEXELS_PER_TASK))
+    with ThreadPoolExecutor() as pool:
+        texture = np.concatenate(list(pool.map(lambda rows: sample(rows[:, None], np.arange(width)), bands)))
+        right = np.abs(texture - np.roll(texture, -1, 1)).max(-1)
+        below = np.pad(np.abs(np.diff(texture, axis=0)).max(-1), ((1, 1), (0, 0)))
+        contrast = np.maximum.reduce([right, np.roll(right, 1, 1), below[:-1], below[1:]])
+        edges = np.argwhere(contrast > 0.1)
+        tasks = np.array_split(edges, -(-9 * len(edges) // _TEXELS_PER_TASK) or 1)
+        texture[edges[:, 0], edges[:, 1]] = np.concatenate(list(pool.map(refined, tasks)))
+    return texture
 
 
 def load_lat_long(path: Path | str) -> Float[Tensor, "H 2*H 3"]:

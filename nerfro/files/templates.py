@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import jinja2
-
 
 def fill_template(file: Path, **values: object) -> str:
     """Fill a Jinja template, which may include other files of its folder; values are escaped and required."""
+    import jinja2  # takes a quarter of a second
+
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(file.parent),
         autoescape=True,

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy
 import torch
 from jaxtyping import Bool, Float
-from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from nerfro.core.errors import NerfroError
@@ -129,7 +129,9 @@ def smooth(values: Float[Tensor, "X Y Z *C"], size: int, sigma: float) -> Float[
             f"smoothing_size={size}, smoothing_sigma={sigma} is not a valid kernel; "
             "the size must be odd (or 0 for no smoothing) and sigma positive"
         )
-    smoothed = gaussian_filter(values.detach().cpu().numpy(), sigma, mode="nearest", radius=size // 2, axes=(0, 1, 2))
+    smoothed = scipy.ndimage.gaussian_filter(
+        values.detach().cpu().numpy(), sigma, mode="nearest", radius=size // 2, axes=(0, 1, 2)
+    )
     return torch.from_numpy(smoothed).to(values)
 
 

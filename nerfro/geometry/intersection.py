@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 import torch
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from nerfro.core.errors import NerfroError
@@ -93,7 +93,7 @@ class MeshIntersector(Planes):
         return torch.from_numpy(np.asarray(hits)).long()
 
 
-def _share_plane(tree: cKDTree, planes: Float[np.ndarray, "F 4"]) -> bool:
+def _share_plane(tree: scipy.spatial.KDTree, planes: Float[np.ndarray, "F 4"]) -> bool:
     """Return whether a plane, in either orientation, is one of the planes of a search tree."""
     # Tolerance of unit normals, and of heights as fractions of the extent.
     distances = [tree.query(sign * planes, distance_upper_bound=1e-3)[0] for sign in (1, -1)]
@@ -118,7 +118,7 @@ def layers(corners: Float[Tensor, "F 3 3"], faces: Int[np.ndarray, "F 3"]) -> In
     normals = torch.nn.functional.normalize(torch.linalg.cross(*corners.diff(dim=1).unbind(1)), dim=-1)
     heights = ((corners.mean(1) - boxes.mean((0, 1))) * normals).sum(-1, keepdim=True) / extent
     planes = [torch.cat([normals, heights], -1)[group].numpy() for group in groups]
-    trees = [cKDTree(plane) for plane in planes]
+    trees = [scipy.spatial.KDTree(plane) for plane in planes]
     members: list[list[int]] = []
     layer = np.empty(len(faces), np.int64)
     for number, (low, high) in enumerate(boxes - extent * torch.tensor([[1e-5], [-1e-5]])):

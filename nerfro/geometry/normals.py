@@ -114,6 +114,14 @@ def axes_along(last: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     return np.stack([across, np.cross(last, across), last])
 
 
+def fibonacci_lattice(number: int) -> Float[np.ndarray, "number 3"]:
+    """Return unit vectors that are spread evenly over the sphere."""
+    index = np.arange(number) + 0.5
+    z, azimuth = 1 - 2 * index / number, np.pi * (1 + np.sqrt(5)) * index
+    radius = np.sqrt(1 - z * z)
+    return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], -1)
+
+
 def unit(vectors: Float[np.ndarray, "vectors 3"]) -> Float[np.ndarray, "vectors 3"]:
     """Normalize vectors; zero vectors stay zero."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import trimesh
 from jaxtyping import Float
 
 from nerfro.geometry.mesh import TriangleMesh
@@ -20,6 +19,8 @@ def revolve(
         foot: world coordinates of height 0 on the axis.
         axis: unit direction of the axis.
     """
+    import trimesh  # takes half a second
+
     size = np.ptp(profile, axis=0).max()  # trimesh drops triangles with areas below 1e-8
     body = trimesh.creation.revolve(profile / size, sections=160)
     return TriangleMesh(size * body.vertices @ axes_along(axis) + foot, np.asarray(body.faces))

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float
 from numba import prange
-from scipy.ndimage import distance_transform_edt
 
 from nerfro.core.progress import track
 from nerfro.geometry.mesh import TriangleMesh, require_inside
@@ -87,7 +87,9 @@ def distance_to_set(members: Bool[np.ndarray, "X Y Z"], spacing: Float[np.ndarra
     if not members.any():
         return np.full(members.shape, np.inf, np.float32)
     # SciPy's distances need 48 bytes per vertex, the indices of the nearest member only 12.
-    nearest = distance_transform_edt(~members, sampling=spacing, return_distances=False, return_indices=True)
+    nearest = scipy.ndimage.distance_transform_edt(
+        ~members, sampling=spacing, return_distances=False, return_indices=True
+    )
     squared = np.zeros(members.shape, np.float32)
     for axis, index in enumerate(np.ogrid[tuple(map(slice, members.shape))]):
         squared += np.square((nearest[axis] - index) * np.float32(spacing[axis]))

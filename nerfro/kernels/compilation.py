@@ -138,15 +138,17 @@ def imported_sources(module: str) -> dict[str, bytes]:
     return sources
 
 
-def _imports(source: bytes, package: str | None) -> Iterator[str]:
-    """Yield the names of imported modules, and of names in modules, which may be modules as well."""
+@functools.cache
+def _imports(source: bytes, package: str | None) -> list[str]:
+    """Return the names of imported modules, and of names in modules, which may be modules as well."""
+    names = []
     for node in ast.parse(source).body:
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             module = importlib.util.resolve_name("." * node.level + (node.module or ""), package)
-            yield module
-            yield from (f"{module}.{alias.name}" for alias in node.names)
+            names += [module, *(f"{module}.{alias.name}" for alias in node.names)]
+    return names
 
 
 def share(task: Callable[[int], Result], number: int) -> list[Result]:

@@ -7,9 +7,9 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy
 import torch
 from jaxtyping import Bool, Float, Int8
-from scipy.ndimage import distance_transform_cdt
 from torch import Tensor, nn
 from torch.nn.functional import max_pool3d
 
@@ -123,7 +123,9 @@ class DistanceGrid(nn.Module):
         lowest, highest = _extremes(self._coefficients_of_blocks(), [SURFACE_BLOCK + 3] * 3)
         outside = lowest > torch.where(self._border_blocks(), highest / _CONTINUED, 0)
         inside = (highest < 0) & ~self._border_blocks()
-        distance = distance_transform_cdt((outside | inside).numpy(), "chessboard").clip(0, 127).astype(np.int8)
+        distance = (
+            scipy.ndimage.distance_transform_cdt((outside | inside).numpy(), "chessboard").clip(0, 127).astype(np.int8)
+        )
         return torch.where(inside, -torch.from_numpy(distance), torch.from_numpy(distance))
 
     def _coefficients_of_blocks(self) -> Float[Tensor, "X Y Z"]:

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy import sparse
 
 from nerfro.core.provenance import AlgorithmSettings
 from nerfro.geometry.normals import unit
@@ -97,8 +97,8 @@ def _solved(
         (rims.first, rims.second), (1 - rims.fraction, rims.fraction), rims.normal, len(vertices)
     )
     flatness, staying = len(rims.fraction) * sides.flat, len(rims.fraction) * sides.staying
-    system = observed.T @ sparse.diags(rims.weight) @ observed + flatness * (flat.T @ flat)
-    system += staying * sparse.identity(3 * len(vertices))
+    system = observed.T @ scipy.sparse.diags(rims.weight) @ observed + flatness * (flat.T @ flat)
+    system += staying * scipy.sparse.identity(3 * len(vertices))
     right = observed.T @ (rims.weight * rims.misfit) - flatness * (flat.T @ (flat @ vertices.ravel()))
     right += staying * (mesh.spread(vertices) - vertices).ravel()
     step = solve_symmetric(system, right).reshape(-1, 3)
@@ -130,7 +130,7 @@ def _filtered_normals(
     variance = squared_distance[squared_distance > 0].mean()
     weights = np.exp(-squared_distance / (2 * variance) - squared_difference / (2 * settings.angular_width**2))
     weights = area[column] * weights
-    averaging, direction = sparse.csr_matrix((weights, (row, column)), touching.shape), unit(normals)
+    averaging, direction = scipy.sparse.csr_matrix((weights, (row, column)), touching.shape), unit(normals)
     for _ in range(settings.rounds):
         direction = unit(averaging @ direction)
     return direction, area
@@ -141,9 +141,9 @@ def _projected_differences(
     weights: tuple[np.ndarray, np.ndarray],
     directions: Float[np.ndarray, "rows 3"],
     num_vertices: int,
-) -> sparse.csr_matrix:
+) -> scipy.sparse.csr_matrix:
     """Build the matrix that maps vertex coordinates to weighted sums of two vertices along directions, one per row."""
     row = np.tile(np.repeat(np.arange(len(directions)), 3), 2)
     column = np.concatenate([(3 * end[:, None] + np.arange(3)).ravel() for end in ends])
     values = np.concatenate([(weight[:, None] * directions).ravel() for weight in weights])
-    return sparse.csr_matrix((values, (row, column)), (len(directions), 3 * num_vertices))
+    return scipy.sparse.csr_matrix((values, (row, column)), (len(directions), 3 * num_vertices))

@@ -6,9 +6,8 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Float, Int
-from scipy import sparse
-from scipy.sparse.linalg import splu
 
 from nerfro.geometry.normals import unit
 from nerfro.geometry.orientation import area_vectors
@@ -48,7 +47,7 @@ class MovingMesh:
         both = np.concatenate([self.edges, self.edges[:, ::-1]])
         num_vertices = int(faces.max()) + 1
         degree = np.bincount(both[:, 0], minlength=num_vertices)
-        self.mean = sparse.csr_matrix((1 / degree[both[:, 0]], both.T), (num_vertices, num_vertices))
+        self.mean = scipy.sparse.csr_matrix((1 / degree[both[:, 0]], both.T), (num_vertices, num_vertices))
 
     def face_normals(self, vertices: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "F 3"]:
         """Compute triangle normals whose length is twice the area."""
@@ -68,10 +67,10 @@ class MovingMesh:
         return MeshGeometry(vertices, self.edges, normals, self.edges[sharp], beside[sharp])
 
     @cached_property
-    def touching(self) -> sparse.coo_matrix:
+    def touching(self) -> scipy.sparse.coo_matrix:
         """Adjacency matrix [F, F]: one for triangles that share a vertex, and on the diagonal."""
         number = np.repeat(np.arange(len(self.faces)), 3)
-        corners = sparse.csr_matrix((np.ones(len(number)), (number, self.faces.ravel())))
+        corners = scipy.sparse.csr_matrix((np.ones(len(number)), (number, self.faces.ravel())))
         return ((corners @ corners.T) > 0).astype(np.float64).tocoo()
 
     def edge_length(self, vertices: Float[np.ndarray, "vertices 3"]) -> float:
@@ -85,7 +84,11 @@ class MovingMesh:
         return vertices + 0.5 * (towards - (towards * normals).sum(1, keepdims=True) * normals)
 
 
-def solve_symmetric(system: sparse.spmatrix, right: Float[np.ndarray, " vectors"]) -> Float[np.ndarray, " vectors"]:
+def solve_symmetric(
+    system: scipy.sparse.spmatrix, right: Float[np.ndarray, " vectors"]
+) -> Float[np.ndarray, " vectors"]:
     """Solve a sparse symmetric positive definite system, without pivoting and with a fill-reducing ordering."""
     options = {"SymmetricMode": True}
-    return splu(system.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0, options=options).solve(right)
+    return scipy.sparse.linalg.splu(
+        system.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0, options=options
+    ).solve(right)

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
+import scipy
 import torch
 from jaxtyping import Float, Int
-from scipy.ndimage import binary_erosion, distance_transform_edt
-from scipy.special import log_ndtr
 from torch import Tensor
 
 from nerfro.core.cameras import Cameras
@@ -144,8 +143,8 @@ def _look_up(
 
 def _nearest_outline_pixel(inside: np.ndarray) -> Int[np.ndarray, "H W"]:
     """Return the index of the outline pixel of a mask nearest to each pixel."""
-    outline = inside & ~binary_erosion(inside, border_value=1)
-    rows, columns = distance_transform_edt(~outline, return_distances=False, return_indices=True)
+    outline = inside & ~scipy.ndimage.binary_erosion(inside, border_value=1)
+    rows, columns = scipy.ndimage.distance_transform_edt(~outline, return_distances=False, return_indices=True)
     return rows.astype(np.int64) * inside.shape[1] + columns
 
 
@@ -209,7 +208,7 @@ def by_pixel_sides(
         side = np.where(inside[row, column], 1.0, -1.0)
         weight = in_image * np.exp(-0.5 * (along / settings.along) ** 2)
         margin = side * depth / sigma
-        hazard = np.exp(-0.5 * (margin**2 + np.log(2 * np.pi)) - log_ndtr(margin))
+        hazard = np.exp(-0.5 * (margin**2 + np.log(2 * np.pi)) - scipy.special.log_ndtr(margin))
         gradient[of_view] = sigma * (weight * side * hazard).sum(0)
         curvature[of_view] = (weight * hazard * (hazard + margin)).sum(0)
     misfit = (gradient / curvature.clip(settings.min_second_derivative)).clip(-settings.max_step, settings.max_step)

@@ -8,9 +8,8 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy import sparse
-from scipy.spatial import cKDTree
 
 from nerfro.core.progress import progress_bar
 from nerfro.core.provenance import AlgorithmSettings
@@ -180,7 +179,7 @@ class _Fit:
         self.degree = np.bincount(edges.ravel())
         # Sparse matrix that maps values at vertices to differences along edges.
         signs, number = np.repeat([1.0, -1.0], len(edges)), np.tile(np.arange(len(edges)), 2)
-        self.across = sparse.csr_matrix((signs, (number, edges.T.ravel())), (len(edges), len(mesh.vertices)))
+        self.across = scipy.sparse.csr_matrix((signs, (number, edges.T.ravel())), (len(edges), len(mesh.vertices)))
         self.outlines = outlines_of(silhouettes)
         self.training, self.validation = _split_views(self.outlines)
 
@@ -327,14 +326,14 @@ class _Fit:
         self, surface: MeshGeometry, stiffness: Float[np.ndarray, " vertices"], pressure: Float[np.ndarray, " vertices"]
     ) -> _Term:
         """Sum of squared edge lengths, balanced by a pressure along the normals."""
-        tension = self.across.T @ sparse.diags(stiffness[surface.edges].prod(1)) @ self.across
-        system = sum(n @ tension @ n for n in map(sparse.diags, surface.normals.T))
+        tension = self.across.T @ scipy.sparse.diags(stiffness[surface.edges].prod(1)) @ self.across
+        system = sum(n @ tension @ n for n in map(scipy.sparse.diags, surface.normals.T))
         stretched = sum(n * (tension @ x) for n, x in zip(surface.normals.T, surface.vertices.T, strict=True))
         return _Term(system, pressure - stretched)
 
     def _change_term(self, surface: MeshGeometry, curvature: _Curvature) -> _Term:
         """Sum of squared changes of curvature along edges and flat sides."""
-        alike = sparse.diags(_along_edges(surface, self.mesh.mean, self.settings))
+        alike = scipy.sparse.diags(_along_edges(surface, self.mesh.mean, self.settings))
         changes = curvature.change.T @ self.across.T @ alike @ self.across
         return _Term(changes @ curvature.change, -changes @ curvature.value)
 
@@ -347,14 +346,14 @@ def _contour_error(rims: Rims) -> float:
 class _Term(NamedTuple):
     """Half the second derivative of a term with respect to the displacements, and minus half its gradient."""
 
-    system: sparse.spmatrix
+    system: scipy.sparse.spmatrix
     right: Float[np.ndarray, " vertices"]
 
 
 class _Curvature(NamedTuple):
     """Half the mean curvature at vertices times the edge length, negative on a ball."""
 
-    change: sparse.csr_matrix  # derivative with respect to displacements along the normals
+    change: scipy.sparse.csr_matrix  # derivative with respect to displacements along the normals
     value: Float[np.ndarray, " vertices"]
     around: Float[np.ndarray, " vertices"]  # mean squared length of the edges at each vertex
 
@@ -365,15 +364,15 @@ def _outline_term(rims: Rims, normals: Float[np.ndarray, "vertices 3"]) -> _Term
     row, column = np.tile(np.arange(num_rims), 2), np.concatenate([rims.first, rims.second])
     along = (normals[column] * np.tile(rims.normal, (2, 1))).sum(1)
     weights = along * np.concatenate([1 - rims.fraction, rims.fraction])
-    observed = sparse.csr_matrix((weights, (row, column)), (num_rims, len(normals)))
-    return _Term(observed.T @ sparse.diags(rims.weight) @ observed, observed.T @ (rims.weight * rims.misfit))
+    observed = scipy.sparse.csr_matrix((weights, (row, column)), (num_rims, len(normals)))
+    return _Term(observed.T @ scipy.sparse.diags(rims.weight) @ observed, observed.T @ (rims.weight * rims.misfit))
 
 
 def _bending_term(
     curvature: _Curvature, stiffness: Float[np.ndarray, " vertices"], excess: Float[np.ndarray, " vertices"]
 ) -> _Term:
     """Sum of squared curvatures beyond the typical curvature."""
-    weighted = curvature.change.T @ sparse.diags(stiffness)
+    weighted = curvature.change.T @ scipy.sparse.diags(stiffness)
     return _Term(weighted @ curvature.change, -weighted @ excess)
 
 
@@ -384,7 +383,7 @@ def _split_views(outlines: Outlines) -> tuple[Outlines, Outlines]:
     return {view: outline for view, outline in outlines.items() if view not in validation}, validation
 
 
-def _mean_curvature(surface: MeshGeometry, mean: sparse.csr_matrix) -> _Curvature:
+def _mean_curvature(surface: MeshGeometry, mean: scipy.sparse.csr_matrix) -> _Curvature:
     """Compute the curvature at vertices, see `_Curvature`.
 
     The mean of the neighbours of a vertex is displaced by r^2 H / 2 along the normal, with the mean curvature H and the
@@ -396,13 +395,15 @@ def _mean_curvature(surface: MeshGeometry, mean: sparse.csr_matrix) -> _Curvatur
     around = np.bincount(both[:, 0], square) / np.bincount(both[:, 0])
     typical = around.mean()
     # Marching cubes produces some very small triangles, whose curvature is noise.
-    scale = sparse.diags(np.sqrt(typical) / around.clip(0.05 * typical))
-    umbrella = mean - sparse.identity(len(vertices))
-    change = scale @ sum(n @ umbrella @ n for n in map(sparse.diags, normals.T))
+    scale = scipy.sparse.diags(np.sqrt(typical) / around.clip(0.05 * typical))
+    umbrella = mean - scipy.sparse.identity(len(vertices))
+    change = scale @ sum(n @ umbrella @ n for n in map(scipy.sparse.diags, normals.T))
     return _Curvature(change.tocsr(), scale @ (normals * (umbrella @ vertices)).sum(1), around)
 
 
-def _along_edges(surface: MeshGeometry, mean: sparse.csr_matrix, settings: FitSettings) -> Float[np.ndarray, " edges"]:
+def _along_edges(
+    surface: MeshGeometry, mean: scipy.sparse.csr_matrix, settings: FitSettings
+) -> Float[np.ndarray, " edges"]:
     """Weight edges by their alignment with the direction of smallest curvature: 1 along, 0 across, 1 if undefined."""
     edges, num_vertices = surface.edges, len(surface.vertices)
     along, turn = (values[edges[:, 1]] - values[edges[:, 0]] for values in (surface.vertices, surface.normals))
@@ -430,7 +431,7 @@ def _typical_curvature(
     """
     points = np.concatenate([surface.vertices, normal_distance * surface.normals], 1)
     spread = np.linspace(0, len(points) - 1, min(len(points), settings.num_spread)).astype(np.int64)
-    _, index = cKDTree(points[spread]).query(points, k=min(settings.num_neighbours, len(spread)))
+    _, index = scipy.spatial.KDTree(points[spread]).query(points, k=min(settings.num_neighbours, len(spread)))
     near = curved[spread][index]
     sign = np.sign(np.median(near, axis=1))
     return sign * np.quantile((near * sign[:, None]).clip(min=0), 1 - settings.min_exceeding, axis=1)

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy
 import torch
 from jaxtyping import Bool, Float, Shaped
-from scipy.ndimage import distance_transform_edt, gaussian_filter
-from scipy.special import ndtri
 from torch import Tensor
 
 from nerfro.core.cameras import Cameras, Window
@@ -37,9 +36,10 @@ def outline_distance(mask: Float[np.ndarray, "H W"], blur: float = 1.0, reach: f
     inside = mask > 0.5
     if inside.all() or not inside.any():
         return np.where(inside, np.inf, -np.inf)
-    counted = np.where(inside, distance_transform_edt(inside) - 0.5, 0.5 - distance_transform_edt(~inside))
-    blurred = gaussian_filter(np.asarray(mask, np.float64), blur, mode="nearest")
-    refined = blur * ndtri(blurred.clip(1e-6, 1 - 1e-6))
+    distance = scipy.ndimage.distance_transform_edt
+    counted = np.where(inside, distance(inside) - 0.5, 0.5 - distance(~inside))
+    blurred = scipy.ndimage.gaussian_filter(np.asarray(mask, np.float64), blur, mode="nearest")
+    refined = blur * scipy.special.ndtri(blurred.clip(1e-6, 1 - 1e-6))
     if is_antialiased(mask, counted):  # the curvature of a binary mask is dominated by noise
         # A blur shrinks an outline of radius r by its variance / 2r. The box filter of a pixel adds a variance of 1/12.
         refined -= 0.5 * (blur**2 + 1 / 12) * _level_curvature(refined).clip(-1, 1)

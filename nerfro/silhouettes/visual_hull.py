@@ -6,11 +6,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
-from scipy.ndimage import binary_fill_holes, label
-from skimage.measure import marching_cubes
+from skimage import measure
 from torch import Tensor
 
 from nerfro.core.cameras import Cameras
@@ -221,9 +221,9 @@ def remove_strays(
         Number of components before and after the removal.
     """
     inside = distances < 0
-    voids = binary_fill_holes(inside) & ~inside
+    voids = scipy.ndimage.binary_fill_holes(inside) & ~inside
     distances[voids] = -np.abs(distances[voids]) - 1e-6
-    parts, num_parts = label(distances < 0)
+    parts, num_parts = scipy.ndimage.label(distances < 0)
     if num_parts == 0:
         return 0, 0
     sizes = np.bincount(parts.ravel())[1:]
@@ -246,7 +246,7 @@ def extract_surface(
         raise NerfroError("the visual hull is empty: no point is inside all masks; check masks and poses")
     padded = np.pad(distances, 1, constant_values=0.5 * np.max(spacing))
     sides = tuple(np.broadcast_to(spacing, 3))
-    vertices, faces, _, _ = marching_cubes(padded, 0.0, spacing=sides, gradient_direction="descent")
+    vertices, faces, _, _ = measure.marching_cubes(padded, 0.0, spacing=sides, gradient_direction="descent")
     return merge_vertices(vertices.astype(np.float64) + corner - spacing, faces.astype(np.int64))
 
 

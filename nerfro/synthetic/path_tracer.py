@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
@@ -14,16 +13,16 @@ import numpy as np
 from nerfro.core.errors import NerfroError
 from nerfro.core.light import to_linear
 from nerfro.core.optional import optional
+from nerfro.files.lat_long import envmap_texture
 from nerfro.synthetic import llvm
 from nerfro.synthetic.glass import EMBEDDED, PLUGIN, register_materials
-from nerfro.synthetic.scene import Panel, Part, Sky, SyntheticScene
+from nerfro.synthetic.scene import Panel, Part, SyntheticScene
 from nerfro.synthetic.surface import SurfaceMesh
 
 VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb", "scalar_rgb")
 # Hammersley points: at most one point lies in each row and column, which edges may be parallel to.
 SILHOUETTE_PLACES = [((k + 0.5) / 128, (int(f"{k:07b}"[::-1], 2) + 0.5) / 128) for k in range(128)]
 SAMPLES_PER_PASS = 6_000_000  # a wavefront of paths takes about 1 GB of memory per 10 million paths
-_TEXELS_PER_TASK = 1 << 17
 ROULETTE_DEPTH, MAX_DEPTH = 32, 1024  # large, because cubes reflect light many times inside
 
 
@@ -180,36 +179,6 @@ class PathTracer:
                 hits = self.glass.ray_test(rays)
             total += np.asarray(hits, bool).reshape(total.shape)
         return total / len(SILHOUETTE_PLACES)
-
-
-def envmap_texture(sky: Sky, height: int, to_world: np.ndarray) -> np.ndarray:
-    """Return the sky sampled at the texels of Mitsuba's `envmap`, float32 [H, 2H, 3].
-
-    Mitsuba reads row j at the polar angle pi j / (H - 1), so the first and last rows are the poles, and column i at the
-    azimuth 2 pi (i + 1/2) / W. Texels at edges of the sky are averages of several samples; other texels are one sample.
-    `to_world` [3, 3] rotates the frame of the emitter (y up) to the world.
-    """
-    width = 2 * height
-
-    def sample(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        theta, phi = np.broadcast_arrays(np.pi * rows / (height - 1), 2 * np.pi * (columns + 0.5) / width)
-        local = np.stack([np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)], -1)
-        return sky(local @ to_world.T).astype(np.float32)
-
-    def refined(texels: np.ndarray) -> np.ndarray:
-        offsets = np.mgrid[-1:2, -1:2].reshape(2, 9) / 3
-        return sample(texels[:, :1] + offsets[0], texels[:, 1:] + offsets[1]).mean(1)
-
-    bands = np.array_split(np.arange(height), -(-height * width // _TEXELS_PER_TASK))
-    with ThreadPoolExecutor() as pool:
-        texture = np.concatenate(list(pool.map(lambda rows: sample(rows[:, None], np.arange(width)), bands)))
-        right = np.abs(texture - np.roll(texture, -1, 1)).max(-1)
-        below = np.pad(np.abs(np.diff(texture, axis=0)).max(-1), ((1, 1), (0, 0)))
-        contrast = np.maximum.reduce([right, np.roll(right, 1, 1), below[:-1], below[1:]])
-        edges = np.argwhere(contrast > 0.1)
-        tasks = np.array_split(edges, -(-9 * len(edges) // _TEXELS_PER_TASK) or 1)
-        texture[edges[:, 0], edges[:, 1]] = np.concatenate(list(pool.map(refined, tasks)))
-    return texture
 
 
 def panel_shape(mi: ModuleType, panel: Panel) -> dict:

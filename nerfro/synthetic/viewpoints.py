@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
+from nerfro.geometry.normals import fibonacci_lattice
+
 
 def directions_on_sphere(count: int, seed: int, split: int) -> np.ndarray:
     """Return well-spread unit directions [count, 3]: a Fibonacci lattice, turned at random and jittered.
@@ -12,11 +14,7 @@ def directions_on_sphere(count: int, seed: int, split: int) -> np.ndarray:
     Each `split` of the data set of a `seed` gets its own rotation, so no test view repeats a training view.
     """
     generator = np.random.default_rng([seed, split])
-    index = np.arange(count) + 0.5
-    z = 1 - 2 * index / count
-    phi = np.pi * (1 + np.sqrt(5)) * index
-    radius = np.sqrt(1 - z * z)
-    lattice = np.stack([radius * np.cos(phi), radius * np.sin(phi), z], -1)
+    lattice = fibonacci_lattice(count)
     turn = trimesh.transformations.random_rotation_matrix(generator.random(3))[:3, :3]
     spacing = np.sqrt(4 * np.pi / count)
     jittered = lattice @ turn.T + 0.2 * spacing * generator.normal(size=lattice.shape)

@@ -8,7 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast, get_args
 
+import numpy as np
 from annotated_types import Ge, Gt, Le
+from jaxtyping import Float
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -368,7 +370,7 @@ def require_inputs(config: DictConfig) -> None:
     """
     require_accelerator(config.trainer.accelerator)
     require_data(config)
-    build_data(config).load("train")
+    _data(config, np.zeros(3)).load("train")
 
 
 def build_data(config: DictConfig) -> DataSource:
@@ -376,8 +378,11 @@ def build_data(config: DictConfig) -> DataSource:
 
     A `val` split is made of training views if `num_validation_views` is set.
     """
-    source, number = build(config.data), config.batches.num_validation_views
-    source = source.with_origin(origin_of(OmegaConf.select(config, "medium")))
+    return _data(config, origin_of(OmegaConf.select(config, "medium")))
+
+
+def _data(config: DictConfig, origin: Float[np.ndarray, "3"]) -> DataSource:
+    source, number = build(config.data).with_origin(origin), config.batches.num_validation_views
     return WithValidationViews(source, number) if number else source
 
 

@@ -8,10 +8,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy
 import torch
 from jaxtyping import Float
-from scipy.interpolate import CubicSpline, make_interp_spline
-from scipy.spatial.transform import Rotation, RotationSpline
 from torch import Tensor
 from torch.nn import functional
 
@@ -148,11 +147,12 @@ def between_keys(keys: Cameras, num_frames: int) -> Cameras:
     keys = keys.to("cpu")
     times, at = np.arange(len(keys)), np.linspace(0, len(keys) - 1, num_frames)
     poses = keys.camera_to_world.double().numpy()
-    rotations = RotationSpline(times, Rotation.from_matrix(poses[:, :, :3]))(at).as_matrix()
-    positions = CubicSpline(times, poses[:, :, 3])(at)
+    turns = scipy.spatial.transform.Rotation.from_matrix(poses[:, :, :3])
+    rotations = scipy.spatial.transform.RotationSpline(times, turns)(at).as_matrix()
+    positions = scipy.interpolate.CubicSpline(times, poses[:, :, 3])(at)
     of_lens = {name: getattr(keys, name) for name in ("fx", "fy", "cx", "cy", "distortion")}
     lens: dict[str, Any] = {
-        name: torch.from_numpy(make_interp_spline(times, values.double().numpy(), k=1)(at)).to(values)
+        name: torch.from_numpy(scipy.interpolate.make_interp_spline(times, values.double().numpy(), k=1)(at)).to(values)
         for name, values in of_lens.items()
         if values is not None
     }

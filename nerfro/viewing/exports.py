@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated
 
@@ -63,25 +63,31 @@ class Export:
         suffixes: allowed endings of the file; `("",)` for a folder of files.
         write: writes the file and returns a short description of the content.
         companions: endings of further files; `_sky.hdr` stands for `scene_sky.hdr` beside `scene.xml`.
-        unused: options of `ExportConfig` without effect on the file.
+        uses: options of `ExportConfig` with an effect on the file, beside checkpoint, what, out, root, device and
+            overwrite.
     """
 
     suffixes: tuple[str, ...]
     write: Callable[[TrainedScene, Path, ExportConfig], str]
     companions: tuple[str, ...] = ()
-    unused: tuple[str, ...] = ()
+    uses: tuple[str, ...] = ()
 
     @property
     def is_folder(self) -> bool:
         """Whether `out` is a folder."""
         return self.suffixes == ("",)
 
+    @property
+    def unused(self) -> list[str]:
+        """Options without effect on the file."""
+        used = {"checkpoint", "what", "out", "root", "device", "overwrite", *self.uses}
+        return [field.name for field in fields(ExportConfig) if field.name not in used]
+
     def files(self, out: Path) -> list[Path]:
         """Return all files that `write` may write."""
         return [out, *(out.with_name(out.stem + ending) for ending in self.companions)]
 
 
-OF_SPLATS = ("gaussians", "steps")  # options of splats alone
 EXPORTS: dict[str, Export] = {}
 """Exports by the name in `what=`; modules that `discover` imports add theirs."""
 

@@ -23,7 +23,7 @@ from nerfro.geometry.space import Box, Space
 from nerfro.rendering import ColourSpace
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.viewing.baking import Baked, bake_sky, bake_surface, bake_volume
-from nerfro.viewing.exports import EXPORTS, OF_SPLATS, Export, ExportConfig
+from nerfro.viewing.exports import EXPORTS, Export, ExportConfig
 from nerfro.viewing.trained_scene import TrainedScene
 from nerfro.viewing.volume import MIN_OPTICAL_DEPTH, RESOLUTION, sample_field
 
@@ -185,4 +185,4 @@ def _write(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
     return f"an interactive page of {len(page) / 1e6:.1f} MB"
 
 
-EXPORTS["page"] = Export((".html",), _write, unused=("half_depth", "triangles", *OF_SPLATS))
+EXPORTS["page"] = Export((".html",), _write, uses=("resolution", "sky"))

@@ -85,6 +85,11 @@ def test_spz_of_large_units_is_refused_before_the_fit(
     refused(r"units from the object, and \.spz .* take \.ply", splats.write_splats, scene, tmp_path / "a.spz", OPTIONS)
 
 
+def test_triangles_of_files_without_glass_are_refused(scene: TrainedScene, tmp_path: Path) -> None:
+    options = replace(OPTIONS, triangles=500)
+    refused(r"triangles=500 has no effect on \.ply; remove it", splats.write_splats, scene, tmp_path / "a.ply", options)
+
+
 def test_ply_is_read_with_the_names_of_the_common_layout(tmp_path: Path) -> None:
     gaussians = random_gaussians()
     (tmp_path / "g.ply").write_bytes(gaussians.to_ply())

@@ -11,10 +11,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy import sparse
-from scipy.ndimage import gaussian_filter
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -164,7 +163,9 @@ def _downscaled_roots(
 def _blurred(images: Float[Tensor, "V C h w"], deviation: float) -> Float[Tensor, "V C h w"]:
     """Convolve images with a Gaussian; pixels outside the images are black."""
     deviations = 0, 0, deviation, deviation
-    blurred = gaussian_filter(images.cpu().numpy(), deviations, mode="constant", radius=int(3 * deviation) + 1)
+    blurred = scipy.ndimage.gaussian_filter(
+        images.cpu().numpy(), deviations, mode="constant", radius=int(3 * deviation) + 1
+    )
     return torch.from_numpy(blurred).to(images)
 
 
@@ -319,15 +320,15 @@ def _equations(
     rows = torch.arange(3 * num).view(num, 3, 1).expand(values.shape)
     columns = columns[:, None].expand(values.shape)
     size = 3 * num, gains.numel() * (2 if learn_gains else 1) + num_lens
-    jacobian = sparse.csr_matrix((values.flatten(), (rows.flatten(), columns.flatten())), size)
+    jacobian = scipy.sparse.csr_matrix((values.flatten(), (rows.flatten(), columns.flatten())), size)
 
     weight, total, direction = (tensor.cpu() for tensor in (weight.double(), total.double(), direction))
     root = np.repeat(weight.sqrt().numpy(), 3)  # W^1/2
     sky_weights = np.repeat((weight / total[direction].sqrt()).numpy(), 3)
     channels = (3 * direction[:, None] + torch.arange(3)).flatten()
     # (1^T W 1)^-1/2 1^T W
-    eliminated = sparse.csr_matrix((sky_weights, (channels, np.arange(3 * num))), (3 * num_directions, 3 * num))
-    weighted, common = sparse.diags(root) @ jacobian, eliminated @ jacobian
+    eliminated = scipy.sparse.csr_matrix((sky_weights, (channels, np.arange(3 * num))), (3 * num_directions, 3 * num))
+    weighted, common = scipy.sparse.diags(root) @ jacobian, eliminated @ jacobian
     matrix = torch.from_numpy((weighted.T @ weighted - common.T @ common).toarray())
     residual = root * error.double().cpu().flatten().numpy()
     variance = float(residual @ residual / (root @ root))

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 from jaxtyping import Float, Int
-from scipy.spatial.transform import Rotation
 
 from nerfro.core.errors import NerfroError, warn
 from nerfro.core.lens import coefficients, opencv_coefficients
@@ -284,7 +284,7 @@ def _image(
     if not (np.isfinite(norm) and np.isfinite(shift).all()) or abs(norm - 1) > 1e-3:
         raise NerfroError(f"{path}: image {name} has no valid pose (quaternion {quaternion}); export the model again")
     # COLMAP stores world-to-camera poses, with the scalar part of the quaternion first.
-    inverse = Rotation.from_quat([*quaternion[1:], quaternion[0]]).inv()
+    inverse = scipy.spatial.transform.Rotation.from_quat([*quaternion[1:], quaternion[0]]).inv()
     return ColmapImage(number, name, camera, np.column_stack([inverse.as_matrix(), -inverse.apply(shift)]))
 
 

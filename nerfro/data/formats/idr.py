@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import scipy.linalg
+import scipy
 from jaxtyping import Float
 
 from nerfro.core.errors import NerfroError

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import trimesh
 from jaxtyping import Float
 
 from nerfro.core.errors import NerfroError
@@ -33,6 +32,8 @@ class BoxSurface(Surface):
             raise NerfroError(f"surface.rounding={rounding} is not allowed; give at most half of the shortest side")
         self.bounds = np.stack([self._centre - self._half, self._centre + self._half])
         if not rounding:
+            import trimesh  # takes half a second
+
             box = trimesh.creation.box(bounds=self.bounds)
             self.mesh = TriangleMesh(np.array(box.vertices), np.array(box.faces), facets=np.arange(len(box.faces)))
 
