@@ -81,7 +81,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         limit = f"trainer.max_time=00:00:{arguments.seconds // 60:02d}:{arguments.seconds % 60:02d}"
         options = ["viewer=true", "viewer_port=0", limit, "evaluation.every=0", "evaluation.split=null", "logger=none"]
-        sys.argv = ["nerfro.train", *options, *arguments.options, f"hydra.run.dir={folder}/run"]
+        sys.argv = ["nerfro.train", *arguments.options, *options, f"hydra.run.dir={folder}/run"]
         try:
             train()
         finally:

@@ -37,6 +37,7 @@ def test_bakes_take_a_bounded_share_of_the_time(scene: TrainedScene, server: Pag
     def version() -> int:
         return json.loads(server.state(0))["version"]
 
+    clock[0] += 5
     page.update()
     assert version() == 0, "nobody looks"
     page.update()
