@@ -166,11 +166,14 @@ def test_example_of_several_bodies_matches_closed_form(
         assert traced == pytest.approx(exact, abs=1e-4)
 
 
-NOTEBOOKS = sorted((PACKAGE_DIR.parent / "docs" / "notebooks").glob("*.ipynb"))
+NOTEBOOKS = [
+    pytest.param(path, id=path.stem, marks=pytest.mark.slow if path.stem == "deformed_lens" else ())
+    for path in sorted((PACKAGE_DIR.parent / "docs" / "notebooks").glob("*.ipynb"))
+]
 
 
 @pytest.mark.skipif(not NOTEBOOKS, reason="there is no checkout with docs")
-@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
+@pytest.mark.parametrize("notebook", NOTEBOOKS)
 def test_notebook_runs(notebook: Path, trained_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import matplotlib.pyplot as plt
 

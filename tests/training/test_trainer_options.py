@@ -150,7 +150,10 @@ def test_minimum_number_of_steps_exceeds_the_limit_of_time(train: Runner, tmp_pa
     assert 3 <= checkpoint["global_step"] < 3000
 
 
-@pytest.mark.parametrize("options", [["trainer.precision=64-true"], ["batches.size=1"]])
+# Double precision compiles kernels of its own.
+@pytest.mark.parametrize(
+    "options", [pytest.param(["trainer.precision=64-true"], marks=pytest.mark.slow), ["batches.size=1"]]
+)
 def test_unusual_precision_and_size_train(options: list[str], train: Runner, tmp_path: Path) -> None:
     assert "4 steps in" in train(*options, "trainer.max_steps=4", "evaluation=none").out
     assert all(bool(values.isfinite().all()) for values in weights_of(tmp_path / "run").values())
