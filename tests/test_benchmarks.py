@@ -25,9 +25,12 @@ from nerfro.geometry.mesh import TriangleMesh
 from nerfro.kernels import available
 from nerfro.poses.collection import extract_frames
 from nerfro.train import main
+from nerfro.training import run as training_run
+from nerfro.viewing import server
 from tests import ball_photographs
 from tests.cameras_at import upright_cameras
 from tests.conftest import refused
+from tests.viewing.browser import needs_chromium
 from tests.viewing.test_exports import write
 
 FOLDER = Path(__file__).resolve().parent.parent / "benchmarks"
@@ -65,7 +68,8 @@ def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> R
         monkeypatch.setattr(subprocess, "run", train_here)
         monkeypatch.setattr(sys, "argv", [name, *map(str, arguments)])
         # Benchmarks replace these.
-        for module, attribute in ((timer, "time"), (ball_photographs, "SIZE")):
+        replaced = ((timer, "time"), (ball_photographs, "SIZE"), (training_run, "Viewer"), (server, "_Handler"))
+        for module, attribute in replaced:
             monkeypatch.setattr(module, attribute, getattr(module, attribute))
         capfd.readouterr()
         threads, gradients = torch.get_num_threads(), torch.is_grad_enabled()
@@ -295,6 +299,25 @@ def test_scaling_benchmark_prints_tables_and_draws_its_figure(
     arguments = ("--steps", 2, "--figure", tmp_path / "scaling.png", "pixels=8,16", "--options", *options)
     assert len(table_rows(run("scaling", *arguments))) == 5
     assert (tmp_path / "scaling.png").stat().st_size > 0
+
+
+@pytest.mark.slow
+@needs_chromium
+def test_page_benchmark_counts_fetches_of_each_texture(run: Run, trained_run: Path) -> None:
+    lines = run("page", trained_run, "--views", 0, "--size", 16, "--resolution", 16, "--turns", 1)
+    _, view, mean = table_rows(lines)
+    fetches, coefficients, *others = map(float, view.split("|")[2:7])
+    assert abs(fetches - coefficients - sum(others)) < 3
+    assert view.split("|")[2:] == mean.split("|")[2:]
+    # A search for a root evaluates the signed distance often, and fetches coefficients only in new cells.
+    assert 0 < coefficients < 150
+
+
+@pytest.mark.slow
+@needs_chromium
+def test_live_page_benchmark_prints_the_cost_of_a_browser(run: Run, tiny_default_run: list[str]) -> None:
+    lines = run("live_page", "--seconds", 20, "--window", 5, "--options", *tiny_default_run, "trainer.max_steps=-1")
+    assert len(table_rows(lines)) == 5
 
 
 @pytest.mark.usefixtures("mitsuba")

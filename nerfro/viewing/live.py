@@ -37,8 +37,11 @@ class LivePage:
         self._server, self._scene, self._cameras = server, scene, views.cameras
         self._resolution = resolution
         static = {**static_parts(scene, views.cameras, views.images, split), "version": 0}
-        server.open(assemble_page(scene, static, self._bake(surface=True), live=True))
-        self._next, self._next_point = time.monotonic(), -math.inf
+        start = time.monotonic()
+        parts = self._bake(surface=True)
+        self._adapt_resolution(time.monotonic() - start, least=0.0)
+        server.open(assemble_page(scene, static, parts, live=True))
+        self._next, self._next_point = time.monotonic() + 5.0, -math.inf
 
     def record(self, step: int, loss: Tensor, logged: Mapping[str, Tensor]) -> None:
         """Add a point to the training curves once a second, because on a GPU each point waits for the step.
@@ -67,10 +70,14 @@ class LivePage:
             return
         self.show()
         duration = time.monotonic() - start
-        # Updates take at most 2 % of the time, and the resolution is adapted to an update every 5 seconds.
-        self._next = start + max(duration / 0.02, 5.0)
-        scale = (0.02 * 5.0 / duration) ** (1 / 3)
-        self._resolution = round(min(max(self._resolution * min(max(scale, 0.7), 1.3), 24), 128))
+        # Updates take at most 1.5 % of the time; answers to browsers take little more.
+        self._next = start + max(duration / 0.015, 5.0)
+        self._adapt_resolution(duration, least=0.7)
+
+    def _adapt_resolution(self, duration: float, least: float) -> None:
+        """Change the resolution by a factor of at least `least`, so that an update every 5 seconds takes its share."""
+        scale = (0.015 * 5.0 / duration) ** (1 / 3)
+        self._resolution = round(min(max(self._resolution * min(max(scale, least), 1.3), 24), 128))
 
     def finish(self) -> None:
         """Publish the final model, if a browser shows the page."""

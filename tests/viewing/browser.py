@@ -30,6 +30,9 @@ class Browser:
         folder: folder for temporary files.
         options: further options of the command line.
         size: size of the window in pixels.
+
+    Attributes:
+        pid: number of the process of the browser.
     """
 
     def __init__(self, page: str, folder: Path, *options: str, size: tuple[int, int] = (900, 600)) -> None:
@@ -45,6 +48,7 @@ class Browser:
             pass_fds=(to_browser, from_browser),
             stderr=subprocess.DEVNULL,
         )
+        self.pid = self._browser.pid
         os.close(to_browser)
         os.close(from_browser)
         self._number, self._left = 0, b""

@@ -22,15 +22,16 @@ async function fetchUpdate(page) {
     if (update) await applyUpdate(page, update);
     page.scene.version = version;
     $("message").textContent = "";
-    if (outcome) showOutcome(outcome, final);
+    if (outcome) showOutcome(outcome, final, page);
   } catch (error) {
     // After the end, the page remains as it is; `nerfro demo` answers again when the final page is ready.
     if (!hasEnded) $("message").textContent = `nerfro does not answer (${error.message}); it may have ended.`;
   }
 }
 
-// Show how the training has ended, and a link to the final page if the server has one.
-function showOutcome(outcome, final) {
+// Show how the training has ended, and a link to the final page if the server has one; draw the last model completely.
+function showOutcome(outcome, final, page) {
+  if (!hasEnded) page.changed();
   hasEnded = true;
   // An unchanged text is not set again, because it would be read aloud again.
   if ($("outcome").firstChild?.data !== `${outcome} `) $("outcome").textContent = `${outcome} `;
@@ -50,7 +51,7 @@ async function applyUpdate(page, { scene, arrays }) {
   page.images = images;
   page.scene = { ...page.scene, ...scene };
   page.tracer.load(page.scene, images);
-  page.changed();
+  page.changed(LIVE_MS);
 }
 
 // Set the sliders to the learned refractive indices, except sliders that the user has moved.

@@ -3,6 +3,7 @@
 const $ = (id) => document.getElementById(id);
 const MAX_RAYS = 64; // rays per pixel of a view that does not change
 const MOVING_MS = 30, STILL_MS = 100; // target duration of a draft while the view changes, and of a part of a pass afterwards
+const LIVE_MS = 100; // duration of drawing after an update of a training, from which a browser on the same machine takes time
 const MIN_PIXELS = 2048; // of a part of a pass, because every part waits for the browser once
 const SCALES = { min: 0.12, max: 1 }; // sides of a draft, as fractions of the sides of the canvas
 
@@ -15,6 +16,7 @@ class Page {
     this.orbit = new Orbit(scene.orbit);
     this.camera = null; // index of the shown camera of the data set; null for the orbit
     this.maxRays = MAX_RAYS;
+    this.budget = Infinity; // milliseconds of drawing until the next change
     this.motion = null; // of the orbit, see setMotion
     this.lastChange = -Infinity; // time, milliseconds
     this.pixelDuration = 5e-3; // milliseconds per pixel, a running mean; the initial value is that of a slow machine
@@ -36,9 +38,10 @@ class Page {
     this.tracer.show({ stride: 1, done: 1 });
   }
 
-  // Restart drawing after a change of view, scene or settings.
-  changed() {
+  // Restart drawing after a change of view, scene or settings; `budget` limits the duration of drawing, milliseconds.
+  changed(budget = Infinity) {
     this.restart();
+    this.budget = budget;
     this.onChange?.();
     this.lastChange = performance.now();
     this.requestFrame();
@@ -82,7 +85,7 @@ class Page {
     if (this.motion) this.move(now);
     if (!this.drafted) this.drawDraft();
     else if (now - this.lastChange >= 250) {
-      if (this.rays >= this.maxRays) return;
+      if (this.rays >= this.maxRays || this.budget <= 0) return;
       this.drawRows();
     }
     this.requestFrame();
@@ -94,10 +97,12 @@ class Page {
     if (gl.getSyncParameter(this.sync, gl.SYNC_STATUS) !== gl.SIGNALED) return true;
     gl.deleteSync(this.sync);
     this.sync = null;
+    const duration = performance.now() - this.frameStart;
+    this.budget -= duration;
     // The first draft includes the compilation of the shader.
     if (this.isWarm) {
       // A part of the image may take longer than the previous ones, which must not happen twice.
-      const change = (performance.now() - this.frameStart) / this.numPixels - this.pixelDuration;
+      const change = duration / this.numPixels - this.pixelDuration;
       this.pixelDuration += (change > 0 ? 0.7 : 0.2) * change;
     }
     this.isWarm = true;
@@ -419,7 +424,7 @@ async function start() {
     initFilm(page);
     initState(page);
     initSaving(page);
-    new ResizeObserver(() => page.changed()).observe($("stage"));
+    new ResizeObserver(() => page.changed(scene.live ? LIVE_MS : Infinity)).observe($("stage"));
     page.step(performance.now()); // immediately, so that the poster is followed by an image of the scene
   }
   document.body.removeAttribute("data-loading");

@@ -76,6 +76,11 @@ vec3 cellsPerUnit(int body) {
   return vec3(numVertices - 1) / (gridHigh[body] - gridLow[body]);
 }
 
+// Coefficients around the last position whose signed distance was computed. The search for a root takes most of its steps
+// between the same coefficients.
+ivec3 windowCorner = ivec3(-1);
+mat3 window[3];  // by z, y and x
+
 // Returns the gradient and value of the signed distance to a body; outside of its box a lower bound
 // (media/distance_grid.py).
 vec4 signedDistance(int body, vec3 x) {
@@ -84,37 +89,42 @@ vec4 signedDistance(int body, vec3 x) {
   vec3 gridPosition = (nearest - gridLow[body]) * scale;
   ivec3 centre = clamp(ivec3(floor(gridPosition + 0.5)), ivec3(1), numVertices - 2);
   vec3 t = clamp(gridPosition - vec3(centre), -1.5, 1.5);
-  vec3 weight[3] = vec3[3](0.5 * (0.5 - t) * (0.5 - t), 0.75 - t * t, 0.5 * (0.5 + t) * (0.5 + t));
-  vec3 slope[3] = vec3[3](t - 0.5, -2.0 * t, t + 0.5);
+  // Weights and their slopes of three vertices along each axis.
+  mat3 weight = transpose(mat3(0.5 * (0.5 - t) * (0.5 - t), 0.75 - t * t, 0.5 * (0.5 + t) * (0.5 + t)));
+  mat3 slope = transpose(mat3(t - 0.5, -2.0 * t, t + 0.5));
   ivec3 corner = centre - 1 + ivec3(0, 0, body * numVertices.z);
+  if (corner != windowCorner) {
+    windowCorner = corner;
+    for (int k = 0; k < 3; ++k) {
+      for (int j = 0; j < 3; ++j) {
+        for (int i = 0; i < 3; ++i) window[k][j][i] = float(texelFetch(coefficients, corner + ivec3(i, j, k), 0).r);
+      }
+    }
+  }
   vec4 sum = vec4(0.0);
   for (int k = 0; k < 3; ++k) {
-    for (int j = 0; j < 3; ++j) {
-      vec2 line = vec2(0.0);
-      for (int i = 0; i < 3; ++i) {
-        float c = float(texelFetch(coefficients, corner + ivec3(i, j, k), 0).r);
-        line += c * vec2(slope[i].x, weight[i].x);
-      }
-      float wy = weight[j].y, wz = weight[k].z;
-      sum += vec4(line.x * wy * wz, line.y * slope[j].y * wz, line.y * wy * slope[k].z, line.y * wy * wz);
-    }
+    vec3 lines = weight[0] * window[k];
+    vec3 plane = vec3(dot(slope[0] * window[k], weight[1]), dot(lines, slope[1]), dot(lines, weight[1]));
+    sum += vec4(plane.xy * weight[2][k], plane.z * vec2(slope[2][k], weight[2][k]));
   }
   vec4 phi = distanceUnit[body] * sum * vec4(scale, 1.0);
   float outside = distance(x, nearest);
   return outside > 0.0 && phi.w > 0.0 ? vec4(normalize(x - nearest), length(vec2(outside, phi.w))) : phi;
 }
 
+// Returns a lower bound of the distance to the surface of a body.
+float clearanceOf(int body, vec3 x) {
+  ivec3 blocks = textureSize(clearance, 0) / ivec3(1, 1, numBodies);
+  vec3 nearest = clamp(x, gridLow[body], gridHigh[body]);
+  ivec3 block = min(ivec3((nearest - gridLow[body]) * cellsPerUnit(body) / blockCells), blocks - 1);
+  float units = float(texelFetch(clearance, block + ivec3(0, 0, body * blocks.z), 0).r);
+  return length(vec2(distance(x, nearest), clearanceUnit[body] * units));
+}
+
 // Returns a lower bound of the distance to the surfaces of all bodies.
 float clearanceAt(vec3 x) {
-  ivec3 blocks = textureSize(clearance, 0);
-  blocks.z /= numBodies;
   float free = FAR;
-  for (int body = 0; body < bodies; ++body) {
-    vec3 nearest = clamp(x, gridLow[body], gridHigh[body]);
-    ivec3 block = min(ivec3((nearest - gridLow[body]) * cellsPerUnit(body) / blockCells), blocks - 1);
-    float units = float(texelFetch(clearance, block + ivec3(0, 0, body * blocks.z), 0).r);
-    free = min(free, length(vec2(distance(x, nearest), clearanceUnit[body] * units)));
-  }
+  for (int body = 0; body < bodies; ++body) free = min(free, clearanceOf(body, x));
   return free;
 }
 
@@ -159,7 +169,8 @@ Hit firstSurface(vec3 x, vec3 d, int inside) {
     vec4 nearest = vec4(FAR);
     int body = 0;
     for (int b = 0; b < bodies; ++b) {
-      vec4 phi = signedDistance(b, p) * ((inside >> b & 1) == 1 ? -1.0 : 1.0);
+      float free = bodies > 1 ? clearanceOf(b, p) : 0.0;  // far from a body, the bound suffices
+      vec4 phi = free > 2.0 * minStep ? vec4(free) : signedDistance(b, p) * ((inside >> b & 1) == 1 ? -1.0 : 1.0);
       if (phi.w < nearest.w) {
         nearest = phi;
         body = b;
@@ -229,6 +240,8 @@ void march(vec3 x, vec3 d, float start, float end, vec3 bodyAbsorption, inout ve
   if (contractionRadius > 0.0) span = vec2(start, min(end, 1e4 * contractionRadius));
   float first = max(span.x, start), last = min(span.y, end);
   vec3 bricks = vec3(textureSize(occupied, 0)), texels = vec3(textureSize(volume, 0));
+  vec3 lastBrick = vec3(-1.0);
+  bool isEmpty = true;
   float transmittance = 1.0;
   if (first < last) {
     // A segment may touch only a corner of the volume. The lower bound keeps t + delta > t in single precision.
@@ -239,7 +252,9 @@ void march(vec3 x, vec3 d, float start, float end, vec3 bodyAbsorption, inout ve
       float scale = contractionScale(here);
       vec3 position = clamp((contract(here) - volumeLow) / size, 0.0, 0.999999);
       vec3 brick = floor(position * bricks);
-      if (texelFetch(occupied, ivec3(brick), 0).r == 0u) {
+      if (brick != lastBrick) isEmpty = texelFetch(occupied, ivec3(brick), 0).r == 0u;
+      lastBrick = brick;
+      if (isEmpty) {
         t += delta / scale * stepsToBrickEnd(position, brick, bricks, here, d, delta);
         continue;
       }
