@@ -82,6 +82,31 @@ def test_directions_behind_the_object_are_learned_through_it(
     assert phase.begin(run) == {}, "a given background stays"
 
 
+def test_directions_that_no_ray_leaves_continue_the_others(begun: Callable[..., TrainingRun]) -> None:
+    run, phase = begun("medium.ior=1.0001"), BackgroundSteps(steps=4, start=8)
+    state, background = phase.begin(run), run.renderer.scene.background
+    assert all(phase.step(run, number, state) for number in range(8))
+    finest = background.levels.sizes[-1]
+    unseen = state["weights"][-finest:] == 0
+    assert unseen.any()
+    assert background.texels[-finest:][unseen].any(-1).all()
+
+
+def test_rays_through_the_object_count_less_the_more_they_diverge(
+    begun: Callable[..., TrainingRun], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, phase, fitted = begun("medium.ior=1.02"), BackgroundSteps(steps=1, start=8), []
+    state, fit, sharp = phase.begin(run), EnvironmentMap.fit, 1 / run.batches.cameras.fx[0]
+    monkeypatch.setattr(EnvironmentMap, "fit", lambda *given: fitted.append(given[1]) or fit(*given))
+    assert all(phase.step(run, number, state) for number in range(2))
+    beside, rays = fitted
+    through = rays[torch.arange(len(rays.widths)) >= len(beside.widths)]
+    assert (beside.weights == phase.settings.direct_weight).all()
+    assert (through.widths > 1.1 * sharp).any()
+    assert (through.weights <= (sharp / through.widths.clamp(min=float(sharp))).square() + 1e-6).all()
+    assert through.weights.max() < 0.5 * beside.weights.min()
+
+
 def test_fits_of_few_pixels_use_the_pixels_of_larger_fits(
     begun: Callable[..., TrainingRun], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -38,6 +38,9 @@ class BackgroundSettings(AlgorithmSettings):
             which bounds the share of the time.
         max_rays: largest number of these rays, which bounds the duration of a step.
         min_background: rays through the object count if at least this fraction of their light is background.
+        direct_weight: weight of a ray beside the object. A ray through the object has at most a weight of 1, because
+            its direction and its radiance depend on surface, index and field.
+        fill_width: width in pixels of the rays that the level of `EnvironmentMap.fill` resolves.
         turns: number of turns between background and exposures in the first step.
     """
 
@@ -46,6 +49,8 @@ class BackgroundSettings(AlgorithmSettings):
     share: float = 0.15
     max_rays: int = 2**19
     min_background: float = 0.7
+    direct_weight: float = 10.0
+    fill_width: float = 2.0
     turns: int = 10
 
 
@@ -57,7 +62,8 @@ class BackgroundSteps(Phase):
     a known background, the first gradients of the field depend on the object. Later passes also use rays through the
     object that cross hardly any content: the pixel minus the rendered light of the field is the background in the exit
     direction. Some directions are visible only through the object. The later passes precede the training steps `start`,
-    2 `start`, 4 `start` and so on, because the field becomes more accurate.
+    2 `start`, 4 `start` and so on, because the field becomes more accurate. At the end of each pass, directions that no
+    ray has shown continue the others smoothly.
 
     A step of Adam changes each texel by about the learning rate, for any number of rays. The mean of all rays, see
     `EnvironmentMap.fit`, is more accurate. Other backgrounds, and backgrounds behind a volume that covers all of space,
@@ -124,14 +130,16 @@ class BackgroundSteps(Phase):
             beside, rays, crossing = _divided(run, pixels, box)
             if number_of_pass == fit == 0 and run.renderer.scene.camera.exposure is not None:
                 for turn in range(settings.turns):
-                    observed_pixels = _observe_beside_object(run, beside, rays, fits_gains=turn > 0)
+                    observed_pixels = _observe_beside_object(run, beside, rays, settings.direct_weight, turn > 0)
                     background.fit(observed_pixels, torch.zeros_like(state["weights"]))
-            observed = [_observe_beside_object(run, beside, rays)]
+            observed = [_observe_beside_object(run, beside, rays, settings.direct_weight)]
             if number_of_pass > 0 and not run.renderer.scene.medium.disperses:
                 used = crossing[:: self._spacing(run, len(crossing) * num_fits, number_of_pass)]
                 chunks = used.split(run.renderer.chunk_size)
                 observed += [_observe_through_object(run, chunk, settings.min_background) for chunk in chunks]
             state["weights"] += background.fit(Observed.joined(observed), state["weights"])
+        if part == self.steps - 1:
+            background.fill(state["weights"], settings.fill_width / float(run.batches.cameras.fx.median()))
         return True
 
     def _spacing(self, run: TrainingRun, num_crossing: int, number_of_pass: int) -> int:
@@ -171,11 +179,15 @@ def _observe_through_object(run: TrainingRun, pixels: Int[Tensor, "Q"], min_back
     rgb = batches.photographed(pixels)
     difference = _photographed(run, rgb, view, rays) - rendering.radiance
     radiance = scene.background(Exits(exits)) + difference / fraction.clamp(min=min_background)
-    observed = Observed(exits, radiance, saturated(rgb), fraction.square().mean(-1), widths / batches.cameras.fx[view])
+    # The width magnifies errors of the direction.
+    weights = fraction.square().mean(-1) / widths.clamp(min=1).square()
+    observed = Observed(exits, radiance, saturated(rgb), weights, widths / batches.cameras.fx[view])
     return observed[fraction.amin(-1) >= min_background]
 
 
-def _observe_beside_object(run: TrainingRun, pixels: Int[Tensor, "Q"], rays: Rays, fits_gains: bool = True) -> Observed:
+def _observe_beside_object(
+    run: TrainingRun, pixels: Int[Tensor, "Q"], rays: Rays, weight: float, fits_gains: bool = True
+) -> Observed:
     """Observe the background along the rays of pixels beside the object, after the exposures are fitted to it."""
     batches, scene = run.batches, run.renderer.scene
     view, rgb, exposure = batches.cameras.view_of(pixels), batches.photographed(pixels), scene.camera.exposure
@@ -183,7 +195,7 @@ def _observe_beside_object(run: TrainingRun, pixels: Int[Tensor, "Q"], rays: Ray
         exposure.fit(view, rays, scene.background(Exits.unbent(rays)), scene.colour_space.to_radiance(rgb))
     widths = 1 / batches.cameras.fx[view]
     seen = Exits.unbent(rays).directions
-    return Observed(seen, _photographed(run, rgb, view, rays), saturated(rgb), torch.ones_like(widths), widths)
+    return Observed(seen, _photographed(run, rgb, view, rays), saturated(rgb), torch.full_like(widths, weight), widths)
 
 
 def _rays(run: TrainingRun, pixels: Int[Tensor, "Q"]) -> Rays:
