@@ -70,13 +70,13 @@ class LivePage:
             return
         self.show()
         duration = time.monotonic() - start
-        # Updates take at most 1.5 % of the time; answers to browsers take little more.
-        self._next = start + max(duration / 0.015, 5.0)
+        # Updates take at most 0.75 % of the time. Their share of the processor time may be larger.
+        self._next = start + max(duration / 0.0075, 5.0)
         self._adapt_resolution(duration, least=0.7)
 
     def _adapt_resolution(self, duration: float, least: float) -> None:
         """Change the resolution by a factor of at least `least`, so that an update every 5 seconds takes its share."""
-        scale = (0.015 * 5.0 / duration) ** (1 / 3)
+        scale = (0.0075 * 5.0 / duration) ** (1 / 3)
         self._resolution = round(min(max(self._resolution * min(max(scale, least), 1.3), 24), 128))
 
     def finish(self) -> None:
