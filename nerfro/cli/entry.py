@@ -130,8 +130,6 @@ def _job(task: Task, command: str, failures: list[Exception]) -> Task:
                 return task(config)
         except Exception as error:
             failures.append(error)
-            with contextlib.suppress(OSError):  # the folder of a refused run is empty
-                Path(HydraConfig.get().runtime.output_dir).rmdir()
             return None
 
     return job
