@@ -195,5 +195,7 @@ class CheckpointFiles(TorchCheckpointIO):
         with atomic_file(path) as stream:
             try:
                 torch.save(checkpoint, stream)
-            except RuntimeError as error:  # PyTorch raises it in place of the error of a full disk
-                raise OSError(error) from error
+            except RuntimeError as error:
+                if isinstance(error.__context__, OSError):  # such as a full disk, which PyTorch hides
+                    raise error.__context__ from None
+                raise

@@ -2,7 +2,6 @@
 
 import errno
 import os
-import resource
 import stat
 import tempfile
 from collections.abc import Callable
@@ -42,14 +41,30 @@ def test_disk_that_fills_up_within_a_checkpoint_keeps_the_old_one(tmp_path: Path
     path = tmp_path / "last.ckpt"
     save_checkpoint(path, "old")
     before = path.read_bytes()
+    resource = pytest.importorskip("resource")
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
     try:
-        refused(r"last\.ckpt.*the old file is unchanged; free some space", save_checkpoint, path, "new" * 100_000)
+        refused(
+            r"last\.ckpt: File too large.*the old file is unchanged; free some space",
+            save_checkpoint,
+            path,
+            "new" * 100_000,
+        )
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_other_error_within_a_checkpoint_stays_as_it_is(tmp_path: Path) -> None:
+    class Broken:
+        def __reduce__(self) -> str:
+            raise RuntimeError("device-side assert")
+
+    with pytest.raises(RuntimeError, match="device-side assert"):
+        CheckpointFiles().save_checkpoint({"content": Broken()}, tmp_path / "last.ckpt")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_text_is_utf8_and_has_the_permissions_of_other_new_files(tmp_path: Path) -> None:
