@@ -85,6 +85,7 @@ def test_georeferenced_data_train_as_at_the_origin(
         f"medium.box_{end}={[x + side for x in UTM]}".replace(" ", "") for end, side in (("min", -1.5), ("max", 1.5))
     ]
     far = [f"data.root={root}", f"medium.mesh={mesh}", *box]
+    train_here(*overrides, *far, "--cfg", "job")  # is not refused
     train_here(*overrides, *far, f"hydra.run.dir={tmp_path / 'far'}")
     psnr = [json.loads((folder / "metrics.json").read_text())["test"]["psnr"] for folder in (run, tmp_path / "far")]
     assert psnr[1] == pytest.approx(psnr[0], abs=0.01)

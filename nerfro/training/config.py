@@ -370,7 +370,10 @@ def require_inputs(config: DictConfig) -> None:
     """
     require_accelerator(config.trainer.accelerator)
     require_data(config)
-    _data(config, np.zeros(3)).load("train")
+    try:
+        _data(config, np.zeros(3)).load("train")  # reading the mesh for its origin takes a second
+    except NerfroError:
+        build_data(config).load("train")
 
 
 def build_data(config: DictConfig) -> DataSource:
