@@ -2,15 +2,16 @@
 
 import shutil
 from collections.abc import Callable
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
+from hydra.errors import HydraException
 from PIL import Image
 
+from nerfro.cli.failures import in_one_line
 from tests.conftest import Runner
 from tests.data.formats import change_json
 
@@ -124,11 +125,6 @@ def test_damaged_data_is_refused(
         (["logger=none", "+logger.x={_target_: os.system, command: 'false'}"], ["'os.system' is not registered"]),
         (["trainer.callbacks=[]"], ["trainer.callbacks=[] is not allowed; choose callbacks by name"]),
         (["+experiment=nope"], ["Could not find 'experiment/nope'", "ablation_noBD", "refractive"]),
-        pytest.param(
-            ["hydra/launcher=ray"],
-            ["Could not find 'hydra/launcher/ray'", "pip install 'nerfro[ray]' adds it"],
-            marks=pytest.mark.skipif(find_spec("ray") is not None, reason="the extra is installed"),
-        ),
         (["data.root=${nope}"], ["Interpolation key 'nope' not found"]),
         (["checkpoint.every_steps=3"], ["set one of checkpoint.every_seconds and checkpoint.every_steps"]),
     ],
@@ -138,6 +134,11 @@ def test_mistake_on_the_command_line_gives_a_one_line_error(
     overrides: list[str], words: list[str], require_refusal: Callable[..., None]
 ) -> None:
     require_refusal(words, *overrides)
+
+
+def test_missing_launcher_names_its_extra() -> None:
+    missing = HydraException("Could not find 'hydra/launcher/ray'")
+    assert in_one_line(missing) == f"{missing}; pip install 'nerfro[ray]' adds it"
 
 
 def test_field_missed_by_all_rays_is_refused_before_training(
