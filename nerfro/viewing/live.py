@@ -76,7 +76,7 @@ class LivePage:
 
     def _adapt_resolution(self, duration: float, least: float) -> None:
         """Change the resolution by a factor of at least `least`, so that an update every 5 seconds takes its share."""
-        scale = (0.0075 * 5.0 / duration) ** (1 / 3)
+        scale = (0.0075 * 5.0 / max(duration, 1e-3)) ** (1 / 3)
         self._resolution = round(min(max(self._resolution * min(max(scale, least), 1.3), 24), 128))
 
     def finish(self) -> None:
