@@ -17,7 +17,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from numba import prange
 from torch import Tensor
 
@@ -92,9 +92,9 @@ def padded_texels(resolution: int) -> Int[Tensor, "6 m m"]:
     n, margin = resolution, torch.ones(resolution + 2, resolution + 2, dtype=torch.bool)
     margin[1:-1, 1:-1] = False
     # In double precision, because texels beside a corner project almost to the border of the neighbouring face.
-    place = margin.nonzero().flip(-1)
-    coordinates = (place - 0.5).double() / n * 2 - 1
-    directions = unproject(torch.arange(6).repeat_interleave(len(place)), coordinates.repeat(6, 1))
+    texels_of_margin = margin.nonzero().flip(-1)
+    coordinates = (texels_of_margin - 0.5).double() / n * 2 - 1
+    directions = unproject(torch.arange(6).repeat_interleave(len(coordinates)), coordinates.repeat(6, 1))
     texels = torch.empty(6, n + 2, n + 2, dtype=torch.int32)
     texels[:, 1:-1, 1:-1] = torch.arange(6 * n * n).view(6, n, n)
     texels[:, margin] = nearest_texel(directions, n).view(6, -1).int()
@@ -106,35 +106,6 @@ def nearest_texel(directions: Float[Tensor, "P 3"], resolution: int) -> Int[Tens
     (face, coordinates), n = project(directions), resolution
     column, row = ((coordinates + 1) / 2 * n).long().clamp(0, n - 1).unbind(-1)
     return (face * n + row) * n + column
-
-
-def continued(values: Float[Tensor, "T 3"], known: Bool[Tensor, "T"], smoothing: int = 8) -> Float[Tensor, "T 3"]:
-    """Return texels of one level whose unknown values continue the known ones smoothly, within their range.
-
-    Half the resolution, where a texel is the mean of its known parts, gives the first values, and so on down to one
-    texel of each face (Gortler et al. 1996, The Lumigraph). Then unknown texels repeatedly become the mean of their
-    four neighbours, which approximates the solution of the Laplace equation.
-
-    Args:
-        values: texels of one level.
-        known: texels that keep their values; at least one.
-        smoothing: number of repetitions at each resolution.
-    """
-    n, unknown = math.isqrt(len(values) // 6), ~known
-    first = (values * known[:, None]).sum(0) / known.sum()
-    if n > 1:
-        half, directions = (n + 1) // 2, texel_directions(n).to(values.device)
-        padded, parts = padded_texels(half).flatten().to(values.device), torch.cat([values, torch.ones_like(values)], 1)
-        sums = parts.new_zeros(6 * half**2, 6).index_add(0, nearest_texel(directions, half), parts * known[:, None])
-        coarse = continued(sums[:, :3] / sums[:, 3:].clamp(min=1), sums[:, 3] > 0, smoothing)
-        first = lookup(*project(directions), coarse, padded, (half,))
-    result = torch.where(known[:, None], values, first)
-    faces = padded_texels(n).to(values.device).long()
-    sides = faces[:, :-2, 1:-1], faces[:, 2:, 1:-1], faces[:, 1:-1, :-2], faces[:, 1:-1, 2:]
-    around = torch.stack([side.flatten() for side in sides], 1)[unknown]
-    for _ in range(smoothing):
-        result[unknown] = result[around].mean(1)
-    return result
 
 
 def _directions(centres: Float[Tensor, "n"]) -> Float[Tensor, "T 3"]:

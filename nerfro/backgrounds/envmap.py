@@ -205,26 +205,6 @@ class EnvironmentMap(Background):
         return torch.cat(total)
 
     @torch.no_grad()
-    def fill(self, weights: Float[Tensor, "T"], width: float) -> None:
-        """Continue the background smoothly into directions that no ray has observed.
-
-        Only texels that contribute to no observed ray change, of the finest level to which rays of a width contribute.
-
-        Args:
-            weights: weight of the observations of each texel, see `fit`.
-            width: width of rays in radians.
-        """
-        count = sum(_MAX_TEXELS * 0.5 * math.pi / n >= width for n in self.levels.resolutions)
-        observed = weights.split(self.levels.sizes)[max(count, 1) - 1] > 0
-        if not observed.any():
-            return
-        resolutions = self.levels.resolutions[: max(count, 1)]
-        values, padded = zip(*self.texels_of_levels()[: len(resolutions)], strict=True)
-        centres = cube_map.project(cube_map.texel_directions(resolutions[-1]).to(weights.device))
-        raw = cube_map.lookup(*centres, torch.cat(values), torch.cat(padded), resolutions)
-        values[-1].add_(cube_map.continued(raw, observed) - raw)
-
-    @torch.no_grad()
     def to_lat_long(self, height: int) -> Float[Tensor, "H 2*H 3"]:
         """Render an equirectangular image of linear radiance: z up, +x in the middle (see `lat_long.directions`)."""
         return self(Exits(lat_long.directions(height).to(self.texels.device)))

@@ -87,44 +87,6 @@ def test_fit_learns_a_sky_from_few_rays(levels: tuple[list[int], list[int] | Non
     assert error < 0.02  # the standard deviation of the sky is 0.15
 
 
-@pytest.mark.parametrize("levels", [([4, 8, 16, 32, 64], None), ([4, 8, 16], [32, 64])])
-@pytest.mark.parametrize(("width", "finest"), [(0.01, 64), (math.radians(6), 16)])
-def test_directions_without_rays_continue_their_border(
-    levels: tuple[list[int], list[int] | None], width: float, finest: int
-) -> None:
-    background, directions = EnvironmentMap(*levels), random_directions(60000)
-    height = directions @ torch.nn.functional.normalize(torch.tensor([0.3, 0.5, 0.8]), dim=-1)
-    seen, hidden = directions[height < math.cos(math.radians(25))], directions[height > math.cos(math.radians(24))]
-    sky, weights = smooth_sky(seen), torch.zeros(background.levels.num_texels)
-    for _ in range(3):
-        observed = Observed(seen, sky, sky >= 1, torch.ones(len(seen)), torch.full((len(seen),), 1e-3))
-        weights += background.fit(observed, weights)
-    texels = torch.cat([values.clone() for values, _ in background.texels_of_levels()])
-    before, without = background(Exits(seen)), (background(Exits(hidden)) - smooth_sky(hidden)).square().mean().sqrt()
-    background.fill(weights, width)
-    filled = background(Exits(hidden))
-    changed = (torch.cat([values for values, _ in background.texels_of_levels()]) != texels).any(-1)
-    assert changed.any()
-    assert not (changed & (weights > 0)).any(), "observed texels keep their values bit for bit"
-    of_level = torch.tensor(background.levels.resolutions).repeat_interleave(torch.tensor(background.levels.sizes))
-    assert (of_level[changed] == finest).all()
-    assert torch.equal(background(Exits(seen)), before)
-    assert (filled - smooth_sky(hidden)).square().mean().sqrt() < 0.6 * without
-
-
-def test_a_plane_is_continued_within_its_range() -> None:
-    directions = cube_map.texel_directions(32)
-    for hole in (5.0, 15.0, 40.0):
-        known = directions[:, 0] < math.cos(math.radians(hole))
-        plane = directions @ torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, -1]])
-        rim = plane[known & (directions[:, 0] > math.cos(math.radians(hole + 6)))]
-        filled = cube_map.continued(torch.where(known[:, None], plane, 100.0), known)
-        assert torch.equal(filled[known], plane[known])
-        assert (filled[~known] >= rim.amin(0) - 1e-6).all()
-        assert (filled[~known] <= rim.amax(0) + 1e-6).all()
-        assert (filled - plane).abs().max() < 0.15 * math.radians(hole)
-
-
 def test_fitted_levels_add_to_the_other_levels_without_gradient() -> None:
     together, apart, directions = EnvironmentMap([4, 8, 16]), EnvironmentMap([4], [8, 16]), random_directions(50)
     torch.nn.init.normal_(together.texels)

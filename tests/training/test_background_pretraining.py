@@ -82,16 +82,6 @@ def test_directions_behind_the_object_are_learned_through_it(
     assert phase.begin(run) == {}, "a given background stays"
 
 
-def test_directions_that_no_ray_leaves_continue_the_others(begun: Callable[..., TrainingRun]) -> None:
-    run, phase = begun("medium.ior=1.0001"), BackgroundSteps(steps=4, start=8)
-    state, background = phase.begin(run), run.renderer.scene.background
-    assert all(phase.step(run, number, state) for number in range(8))
-    finest = background.levels.sizes[-1]
-    unseen = state["weights"][-finest:] == 0
-    assert unseen.any()
-    assert background.texels[-finest:][unseen].any(-1).all()
-
-
 def test_rays_through_the_object_count_less_the_more_they_diverge(
     begun: Callable[..., TrainingRun], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -41,7 +41,6 @@ class BackgroundSettings(AlgorithmSettings):
         min_background: rays through the object count if at least this fraction of their light is background.
         direct_weight: weight of a ray beside the object. A ray through the object has at most a weight of 1, because
             its direction and its radiance depend on surface, index and field.
-        fill_width: width in pixels of the rays that the level of `EnvironmentMap.fill` resolves.
         turns: number of turns between background and exposures in the first step.
     """
 
@@ -51,7 +50,6 @@ class BackgroundSettings(AlgorithmSettings):
     max_rays: int = 2**19
     min_background: float = 0.7
     direct_weight: float = 10.0
-    fill_width: float = 2.0
     turns: int = 10
 
 
@@ -63,8 +61,7 @@ class BackgroundSteps(Phase):
     a known background, the first gradients of the field depend on the object. Later passes also use rays through the
     object that cross hardly any content: the pixel minus the rendered light of the field is the background in the exit
     direction. Some directions are visible only through the object. The later passes precede the training steps `start`,
-    2 `start`, 4 `start` and so on, because the field becomes more accurate. At the end of each pass, directions that no
-    ray has shown continue the others smoothly.
+    2 `start`, 4 `start` and so on, because the field becomes more accurate.
 
     A step of Adam changes each texel by about the learning rate, for any number of rays. The mean of all rays, see
     `EnvironmentMap.fit`, is more accurate. Other backgrounds, and backgrounds behind a volume that covers all of space,
@@ -142,8 +139,6 @@ class BackgroundSteps(Phase):
             observed = Observed.joined(parts)
             del beside, rays, parts  # the fit needs their memory
             state["weights"] += background.fit(observed, state["weights"])
-        if part == self.steps - 1:
-            background.fill(state["weights"], settings.fill_width / float(run.batches.cameras.fx.median()))
         return True
 
     def _spacing(self, run: TrainingRun, num_crossing: int, number_of_pass: int) -> int:
