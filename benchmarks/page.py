@@ -31,30 +31,15 @@ from nerfro.samplers.subdivision import Subdivision
 from nerfro.viewing.page import make_page
 from nerfro.viewing.trained_scene import RenderedViews
 from nerfro.viewing.volume import RESOLUTION
-from tests.viewing.browser import Browser
+from tests.viewing.browser import SHOT, Browser
 
 SHADER = ASSETS_DIR / "_page" / "trace.glsl"
 TEXTURES = ("coefficients", "clearance", "volume", "occupied")
-# Functions of the page, whose results are text.
-SCRIPT = """
-const encode = (numbers) => {
-  const bytes = new Uint8Array(numbers.buffer);
-  let text = "";
-  for (let i = 0; i < bytes.length; i += 8192) text += String.fromCharCode(...bytes.subarray(i, i + 8192));
-  return btoa(text);
-};
-const draw = (camera, size) => {
-  const { gl, canvas } = page.tracer;
-  canvas.width = canvas.height = size;
-  page.camera = camera;
-  page.drawOnce();
-  const pixels = new Uint8Array(4 * size * size);
-  gl.readPixels(0, 0, size, size, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
-  return encode(pixels);
-};
+# A function of the page, see `SHOT`.
+COUNT = """
 const count = (camera, size) => {
   const { gl, targets } = page.tracer;
-  draw(camera, size);
+  shot(camera, size);
   gl.bindFramebuffer(gl.FRAMEBUFFER, targets.traced.buffer);
   const numbers = new Float32Array(4 * size * size);
   gl.readPixels(0, 0, size, size, gl.RGBA, gl.FLOAT, numbers);
@@ -82,7 +67,7 @@ def main() -> None:
         page = original.replace(SHADER.read_text(encoding="utf-8"), shader.read_text(encoding="utf-8"))
         counts, _ = ask(counting(page), "count", views, size, 1)
         fetches = np.stack([decoded(text, np.float32, size) for text in counts]).mean((1, 2))
-        texts, seconds = ask(page, "draw", views, size, arguments.turns)
+        texts, seconds = ask(page, "shot", views, size, arguments.turns)
         shown = [torch.from_numpy(decoded(text, np.uint8, size)[..., :3] / 255).float() for text in texts]
         scores = [region_scores(rgb, expected, number) for number, rgb in enumerate(shown)]
         rows = np.column_stack([fetches.sum(1), fetches, seconds, scores])
@@ -112,10 +97,10 @@ def counting(page: str) -> str:
 
 
 def ask(page: str, function: str, views: list[int], size: int, turns: int) -> tuple[list[str], list[float]]:
-    """Call a function of `SCRIPT` for each view; returns the results, and the processor seconds of the browser."""
+    """Call `shot` or `count` for each view; returns the results, and the processor seconds of the browser."""
     texts, seconds = [], []
     with tempfile.TemporaryDirectory() as folder, Browser(page, Path(folder)) as browser:
-        browser.evaluate(SCRIPT)
+        browser.evaluate(SHOT + COUNT)
         browser.evaluate(f"{function}({views[0]}, {size})")  # includes the compilation of the shader
         for view in views:
             times = [processor_seconds(browser.pid)]
@@ -145,7 +130,7 @@ def processor_seconds(process: int) -> float:
 
 
 def decoded(text: str, kind: type, size: int) -> np.ndarray:
-    """Decode the pixels that a function of `SCRIPT` returns, top row first."""
+    """Decode the pixels that a function of `SHOT` or `COUNT` returns, top row first."""
     return np.frombuffer(base64.b64decode(text), kind).reshape(size, size, 4)[::-1].astype(np.float64)
 
 

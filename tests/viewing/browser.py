@@ -20,6 +20,25 @@ needs_chromium = pytest.mark.skipif(shutil.which("chromium") is None, reason="Ch
 _OPTIONS = ("--headless=new", "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader",
             "--enable-unsafe-swiftshader", "--hide-scrollbars", "--touch-events=enabled",
             "--remote-debugging-pipe")  # fmt: skip
+# `encode` writes an array of numbers as text, and `shot` the picture of the canvas after one ray a pixel of camera
+# `number`, bottom row first.
+SHOT = """
+const encode = (numbers) => {
+  const bytes = new Uint8Array(numbers.buffer);
+  let text = "";
+  for (let i = 0; i < bytes.length; i += 8192) text += String.fromCharCode(...bytes.subarray(i, i + 8192));
+  return btoa(text);
+};
+const shot = (number, size) => {
+  const { gl, canvas } = page.tracer;
+  canvas.width = canvas.height = size;
+  page.camera = number;
+  page.drawOnce();
+  const pixels = new Uint8Array(4 * size * size);
+  gl.readPixels(0, 0, size, size, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
+  return encode(pixels);
+};
+"""
 
 
 class Browser:

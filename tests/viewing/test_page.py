@@ -37,19 +37,10 @@ from nerfro.viewing.trained_scene import TrainedScene
 from tests.closed_forms import Luneburg, sampled
 from tests.conftest import refused
 from tests.media.vessels import GLASS, WATER, spherical_vessel
-from tests.viewing.browser import Browser, needs_chromium
+from tests.viewing.browser import SHOT, Browser, needs_chromium
 from tests.viewing.conftest import IOR, RADIUS, sky_of
 
-# The picture of the canvas after one ray a pixel of camera `number`, bottom row first, as text.
-SHOT = """const shot = (number, size) => {
-  const { gl, canvas } = page.tracer;
-  canvas.width = canvas.height = size;
-  page.camera = number;
-  page.drawOnce();
-  const pixels = new Uint8Array(4 * size * size);
-  gl.readPixels(0, 0, size, size, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
-  return btoa(String.fromCharCode(...pixels));
-};
+SET = """
 const set = (id, value) => {
   if (typeof value === "boolean") $(id).checked = value;
   else $(id).value = value;
@@ -111,7 +102,7 @@ def test_vessel_agrees_with_nerfro(scene: TrainedScene, tmp_path: Path) -> None:
     vessel = spherical_vessel(tmp_path, level=0.9, resolution=64, glass=walls, liquid=water)
     vessel_scene = in_embedded_scene(scene, vessel)
     # Dyed walls of index 1 absorb, another liquid changes the picture, and air has no index to change.
-    code = f"""(() => {{ {SHOT}
+    code = f"""(() => {{ {SHOT}{SET}
       const seen = [shot(0, 64), shot(9, 64)];
       const indices = [...document.querySelectorAll("[id^=ior][type=range]")].map((slider) => slider.id);
       set(indices[0], 1.0);
@@ -212,7 +203,7 @@ def test_controls_change_index_glass_reflection_tint_and_sky(scene: TrainedScene
     write_radiance(tmp_path / "lamp.hdr", lamp.numpy())
     hdr = base64.b64encode((tmp_path / "lamp.hdr").read_bytes()).decode()
     script = f"""(() => {{
-      {SHOT}
+      {SHOT}{SET}
       const shots = {{ start: shot(0, 32) }};
       set("ior0", 1.6); shots.index = shot(0, 32); const said = $("ior0-value").value; set("ior0", {IOR});
       set("straight", 0.5); shots.half = shot(0, 32); set("straight", 1); shots.glass = shot(0, 32); set("straight", 0);

@@ -18,9 +18,9 @@ from nerfro.viewing.camera_paths import CaptureGeometry
 from nerfro.viewing.page import make_page
 from nerfro.viewing.trained_scene import TrainedScene
 from tests.conftest import Runner
-from tests.viewing.browser import Browser, needs_chromium
+from tests.viewing.browser import SHOT, Browser, needs_chromium
 from tests.viewing.conftest import make_scene
-from tests.viewing.test_page import SHOT, one_ray, picture
+from tests.viewing.test_page import one_ray, picture
 
 pytestmark = needs_chromium
 VIEW = "({ azimuth: page.orbit.azimuth, elevation: page.orbit.elevation, radius: page.orbit.radius, " \
