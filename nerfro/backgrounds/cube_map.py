@@ -81,7 +81,10 @@ def unproject(face: Int[Tensor, "P"], coordinates: Float[Tensor, "P 2"]) -> Floa
 
 def texel_directions(resolution: int) -> Float[Tensor, "T 3"]:
     """Return the unit directions of the texel centres of one level."""
-    return _directions((torch.arange(resolution) + 0.5) / resolution * 2 - 1)
+    centres = (torch.arange(resolution) + 0.5) / resolution * 2 - 1
+    face = torch.arange(6).repeat_interleave(resolution**2)
+    row, column = (values.flatten().repeat(6) for values in torch.meshgrid(centres, centres, indexing="ij"))
+    return unproject(face, torch.stack([column, row], dim=-1))
 
 
 def padded_texels(resolution: int) -> Int[Tensor, "6 m m"]:
@@ -106,14 +109,6 @@ def nearest_texel(directions: Float[Tensor, "P 3"], resolution: int) -> Int[Tens
     (face, coordinates), n = project(directions), resolution
     column, row = ((coordinates + 1) / 2 * n).long().clamp(0, n - 1).unbind(-1)
     return (face * n + row) * n + column
-
-
-def _directions(centres: Float[Tensor, "n"]) -> Float[Tensor, "T 3"]:
-    """Return the directions of a grid of coordinates on all faces, ordered by face, row and column."""
-    n = len(centres)
-    face = torch.arange(6).repeat_interleave(n * n)
-    row, column = (place.flatten().repeat(6) for place in torch.meshgrid(centres, centres, indexing="ij"))
-    return unproject(face, torch.stack([column, row], dim=-1))
 
 
 def lookup_in_torch(

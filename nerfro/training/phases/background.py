@@ -14,7 +14,7 @@ from nerfro.backgrounds.envmap import EnvironmentMap, Observed
 from nerfro.core.errors import warn
 from nerfro.core.light import saturated
 from nerfro.core.provenance import AlgorithmSettings
-from nerfro.core.rays import Rays, in_room
+from nerfro.core.rays import Rays
 from nerfro.core.types import Exits
 from nerfro.fields.base import Field
 from nerfro.geometry.interpolation import misses
@@ -193,7 +193,7 @@ def _observe_beside_object(
     if exposure is not None and fits_gains:
         exposure.fit(view, rays, scene.background(Exits.unbent(rays)), scene.colour_space.to_radiance(rgb))
     widths = 1 / batches.cameras.fx[view]
-    seen = in_room(rays.directions, rays.room)
+    seen = Exits.unbent(rays).directions
     return Observed(seen, _photographed(run, rgb, view, rays), saturated(rgb), torch.full_like(widths, weight), widths)
 
 
