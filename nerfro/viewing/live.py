@@ -18,6 +18,9 @@ from nerfro.viewing.page import assemble_page, bake_parts, static_parts
 from nerfro.viewing.server import PageServer
 from nerfro.viewing.trained_scene import TrainedScene
 
+_SHARE = 0.0075  # largest share of updates in the time; their share of the processor time may be larger
+_INTERVAL = 5.0  # shortest time between updates, seconds
+
 
 class LivePage:
     """Keeps the page of a server up to date with a scene. Updates run in the thread of the caller.
@@ -41,7 +44,7 @@ class LivePage:
         parts = self._bake(surface=True)
         self._adapt_resolution(time.monotonic() - start, least=0.0)
         server.open(assemble_page(scene, static, parts, live=True))
-        self._next, self._next_point = time.monotonic() + 5.0, -math.inf
+        self._next, self._next_point = time.monotonic() + _INTERVAL, -math.inf
 
     def record(self, step: int, loss: Tensor, logged: Mapping[str, Tensor]) -> None:
         """Add a point to the training curves once a second, because on a GPU each point waits for the step.
@@ -70,13 +73,12 @@ class LivePage:
             return
         self.show()
         duration = time.monotonic() - start
-        # Updates take at most 0.75 % of the time. Their share of the processor time may be larger.
-        self._next = start + max(duration / 0.0075, 5.0)
+        self._next = start + max(duration / _SHARE, _INTERVAL)
         self._adapt_resolution(duration, least=0.7)
 
     def _adapt_resolution(self, duration: float, least: float) -> None:
-        """Change the resolution by a factor of at least `least`, so that an update every 5 seconds takes its share."""
-        scale = (0.0075 * 5.0 / max(duration, 1e-3)) ** (1 / 3)
+        """Change the resolution by a factor of at least `least`, so that an update in each interval takes its share."""
+        scale = (_SHARE * _INTERVAL / max(duration, 1e-3)) ** (1 / 3)
         self._resolution = round(min(max(self._resolution * min(max(scale, least), 1.3), 24), 128))
 
     def finish(self) -> None:
