@@ -430,7 +430,13 @@ def test_unknown_exports_and_endings_are_refused(what: str, name: str, message: 
 
 @pytest.mark.parametrize(
     ("what", "option"),
-    [("page", "half_depth=1"), ("sky", "gaussians=99"), ("volume", "sky=a.hdr"), ("page", "triangles=500")],
+    [
+        ("page", "half_depth=1"),
+        ("sky", "half_depth=1"),
+        ("sky", "gaussians=99"),
+        ("volume", "sky=a.hdr"),
+        ("page", "triangles=500"),
+    ],
 )
 def test_option_without_effect_on_an_export_is_refused(
     what: str, option: str, run_here: Runner, tmp_path: Path
