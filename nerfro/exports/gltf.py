@@ -17,6 +17,7 @@ from nerfro.core.light import to_linear
 from nerfro.core.optional import optional
 from nerfro.exports.gaussians import HARMONIC_0, Gaussians
 from nerfro.exports.meshes import glass_meshes, inside_mesh, one_mesh
+from nerfro.exports.usd import encode_usdz, require_usd
 from nerfro.files.atomic import write_atomically
 from nerfro.files.lat_long import save_lat_long
 from nerfro.files.templates import fill_template
@@ -29,7 +30,7 @@ from nerfro.viewing.trained_scene import TrainedScene
 if TYPE_CHECKING:
     import trimesh
 
-GLB_TRIANGLES = 20_000  # default limit of a .glb
+DEFAULT_TRIANGLES = 20_000  # limit of files with materials
 _SPLATTING = "KHR_gaussian_splatting"
 # Codes of glTF 2.0, sections 3.6.2.2 and 5.11: types of components, and targets of buffers.
 _CODES = {"<i2": 5122, "<u2": 5123, "<u4": 5125, "<f4": 5126}
@@ -37,15 +38,18 @@ _VERTICES, _INDICES = 34962, 34963
 
 
 def write_mesh(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
-    """Write the surfaces of the glass and of the dense content, as .glb with materials, or as one mesh (.ply, .obj).
+    """Write the surfaces of glass and dense content, with materials (.glb, .usdz) or as one mesh (.ply, .obj).
 
-    A .glb has the training cameras. The sky is written beside the file, and beside a .glb the page that shows both.
+    Files with materials have the training cameras. The sky is written beside the file, and beside a .glb the page that
+    shows both.
     """
     suffix, limit = out.suffix.lower(), options.triangles
+    if suffix == ".usdz":
+        require_usd()
     if limit is not None:
         optional("fast_simplification", "gltf", "triangles= needs fast-simplification")
-    elif suffix == ".glb":
-        limit = GLB_TRIANGLES
+    elif suffix in (".glb", ".usdz"):
+        limit = DEFAULT_TRIANGLES
     glass = glass_meshes(scene, limit)
     rest = None if limit is None else max(limit - sum(len(mesh.faces) for mesh in glass), limit // 2)
     inside = inside_mesh(scene, options.resolution, options.half_depth, rest)
@@ -54,6 +58,8 @@ def write_mesh(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
     if suffix == ".glb":
         write_atomically(out, encode_glb(scene, glass, inside))
         write_atomically(out.with_name(out.stem + "_viewer.html"), _viewer_page(scene, out))
+    elif suffix == ".usdz":
+        write_atomically(out, encode_usdz(scene, glass, inside))
     else:
         write_atomically(out, one_mesh(glass, inside, suffix))
     save_lat_long(out.with_name(out.stem + "_sky.hdr"), scene.sky)
@@ -249,5 +255,8 @@ def _glass_material(
 
 
 EXPORTS["mesh"] = Export(
-    (".glb", ".ply", ".obj"), write_mesh, ("_sky.hdr", "_viewer.html"), ("resolution", "half_depth", "triangles", "sky")
+    (".glb", ".usdz", ".ply", ".obj"),
+    write_mesh,
+    ("_sky.hdr", "_viewer.html"),
+    ("resolution", "half_depth", "triangles", "sky"),
 )

@@ -18,7 +18,7 @@ from nerfro.core.errors import NerfroError
 from nerfro.core.light import to_srgb
 from nerfro.core.progress import track
 from nerfro.exports.gaussians import HARMONIC_0, Gaussians
-from nerfro.exports.gltf import GLB_TRIANGLES, encode_glb
+from nerfro.exports.gltf import DEFAULT_TRIANGLES, encode_glb
 from nerfro.exports.meshes import glass_meshes
 from nerfro.files.atomic import write_atomically
 from nerfro.geometry.normals import fibonacci_lattice
@@ -42,7 +42,7 @@ def write_splats(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
         _require_moderate_units(scene)
     gaussians, psnr = fitted_gaussians(scene, options)
     if suffix == ".glb":
-        content = encode_glb(scene, glass_meshes(scene, options.triangles or GLB_TRIANGLES), None, gaussians)
+        content = encode_glb(scene, glass_meshes(scene, options.triangles or DEFAULT_TRIANGLES), None, gaussians)
     else:
         content = gaussians.to_ply() if suffix == ".ply" else gaussians.to_spz()
     write_atomically(out, content)

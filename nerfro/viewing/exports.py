@@ -32,7 +32,7 @@ class ExportConfig:
         half_depth: length, world units, within which dense content absorbs half the light; the surface is
             extracted at this density. By default a hundredth of the object's longest side.
         triangles: largest number of triangles of a mesh, of which the glass has at most half. By default 20000 in a
-            .glb, and as many as the surfaces have in .ply and .obj.
+            .glb or .usdz, and as many as the surfaces have in .ply and .obj.
         gaussians: number of Gaussians of splats.
         steps: steps of gradient descent that fit Gaussians.
         sky: lat-long image that replaces the sky (.hdr, .exr, .png, .jpg).

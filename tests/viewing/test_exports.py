@@ -4,7 +4,9 @@ import json
 import math
 import shutil
 import subprocess
+import zipfile
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 from xml.etree import ElementTree
@@ -171,6 +173,70 @@ def test_glb_contains_each_body_with_its_material(two_bodies: TrainedScene, tmp_
     transmitted = np.array(volume["attenuationColor"]) ** (1 / volume["attenuationDistance"])
     np.testing.assert_allclose(transmitted, np.exp([-0.5, -0.1, -0.2]), rtol=1e-6)
     assert "KHR_materials_dispersion" in document["extensionsUsed"]
+
+
+def test_usdz_contains_the_scene_as_another_library_reads_it(two_bodies: TrainedScene, tmp_path: Path) -> None:
+    usd = pytest.importorskip("pxr.Usd", reason="install the extra usd")
+    geometry, shading = import_module("pxr.UsdGeom"), import_module("pxr.UsdShade")
+    write(two_bodies, "mesh", tmp_path / "two.usdz")
+    stage = usd.Stage.Open(str(tmp_path / "two.usdz"))
+    # Conditions of Pixar's usdchecker for programs of augmented reality.
+    assert geometry.GetStageUpAxis(stage) == "Y"
+    assert stage.GetDefaultPrim().GetPath() == "/scene"
+    with zipfile.ZipFile(tmp_path / "two.usdz") as package:
+        assert {entry.compress_type for entry in package.infolist()} == {zipfile.ZIP_STORED}
+        names = package.namelist()
+        (tmp_path / "sky.exr").write_bytes(package.read(next(name for name in names if name.endswith(".exr"))))
+    assert names[0].endswith(".usdc")
+    for number, x in enumerate((-0.7, 0.7)):
+        mesh = geometry.Mesh(stage.GetPrimAtPath(f"/scene/glass_{number}"))
+        vertices = np.array(mesh.GetPointsAttr().Get()) @ Z_UP_TO_Y_UP
+        np.testing.assert_allclose(np.linalg.norm(vertices - [x, 0, 0], axis=1), 0.4, atol=4e-3)
+        faces = np.array(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
+        assert trimesh.Trimesh(vertices, faces, process=False).volume > 0, "faces point outwards"
+        normals = np.array(mesh.GetNormalsAttr().Get()) @ Z_UP_TO_Y_UP
+        assert ((vertices - [x, 0, 0]) * normals).sum(-1).min() > 0.39, "and so do normals"
+
+    def surface(name: str, context: str = "") -> dict[str, object]:
+        material = shading.MaterialBindingAPI(stage.GetPrimAtPath(f"/scene/{name}")).ComputeBoundMaterial()[0]
+        shader = material.ComputeSurfaceSource(*([context] if context else []))[0]
+        return {"id": shader.GetShaderId()} | {entry.GetBaseName(): entry.Get() for entry in shader.GetInputs()}
+
+    water, tinted = surface("glass_0", "mtlx"), surface("glass_1", "mtlx")
+    assert water["id"] == "ND_standard_surface_surfaceshader"
+    assert water["specular_IOR"] == pytest.approx(1.3334, abs=1e-4)
+    assert water["transmission_dispersion"] == pytest.approx(55.8, rel=2e-3)
+    assert tinted["transmission_dispersion"] == 0
+    transmitted = np.array(tinted["transmission_color"]) ** (1 / tinted["transmission_depth"])
+    np.testing.assert_allclose(transmitted, np.exp([-0.5, -0.1, -0.2]), rtol=1e-6)
+    assert surface("glass_1")["id"] == "UsdPreviewSurface"
+    assert surface("glass_1")["ior"] == pytest.approx(1.4)
+    # The content emits its radiance.
+    inside = geometry.Mesh(stage.GetPrimAtPath("/scene/inside"))
+    vertices = np.array(inside.GetPointsAttr().Get()) @ Z_UP_TO_Y_UP
+    np.testing.assert_allclose(
+        np.array(inside.GetDisplayColorAttr().Get()), colour(torch.from_numpy(vertices)), atol=1e-4
+    )
+    # Cameras project a point to the pixel at which nerfro sees it.
+    cameras, point = two_bodies.cameras("train"), np.array([0.2, 0.1, -0.3])
+    for view, pose in enumerate(cameras.camera_to_world.double().numpy()):
+        frustum = geometry.Camera(stage.GetPrimAtPath(f"/scene/train_{view:03d}")).GetCamera().frustum
+        seen = frustum.ComputeViewMatrix() * frustum.ComputeProjectionMatrix()
+        x, y, _ = seen.Transform((Z_UP_TO_Y_UP @ point).tolist())
+        local = (point - pose[:, 3]) @ pose[:, :3]
+        column = cameras.cx[view] - cameras.fx[view] * local[0] / local[2]
+        row = cameras.cy[view] + cameras.fy[view] * local[1] / local[2]
+        assert 0.5 * (1 + x) * cameras.width == pytest.approx(float(column), abs=1e-3)
+        assert 0.5 * (1 - y) * cameras.height == pytest.approx(float(row), abs=1e-3)
+    # The centre of an unrotated dome is +z, and -x is to the right of it (OpenEXR, "Environment Maps").
+    sky, height = load_lat_long(tmp_path / "sky.exr"), two_bodies.sky_height
+    turn = geometry.Xformable(stage.GetPrimAtPath("/scene/sky")).GetLocalTransformation()
+    for row, column in ((0, 7), (height // 2, height), (height // 3, 3 * height // 2), (height - 1, 0)):
+        latitude, longitude = math.pi * (0.5 - (row + 0.5) / height), math.pi * (1 - (column + 0.5) / height)
+        flat = math.cos(latitude)
+        local = [math.sin(longitude) * flat, math.sin(latitude), math.cos(longitude) * flat]
+        direction = np.array(turn.TransformDir(local)) @ Z_UP_TO_Y_UP
+        np.testing.assert_allclose(sky[row, column], sky_of(torch.from_numpy(direction)), atol=5e-3)
 
 
 def test_glb_keeps_strong_absorption(scene: TrainedScene, tmp_path: Path) -> None:
