@@ -5,6 +5,7 @@ import re
 import shutil
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
+from urllib.parse import unquote
 
 import numpy as np
 import pytest
@@ -61,7 +62,8 @@ def test_figure_shows_the_view_of_the_median_score(runs: Path) -> None:
     # View 1 has twice the noise; of two views the lower score is the lower median.
     assert pictures.figure.index == 1
     assert [view.index for view in pictures.views] == [0, 1]
-    assert pictures.methods == dict(enumerate(comparison.methods))
+    assert list(pictures.methods.values()) == ["good <b>", "bad"], "the best first"
+    assert all(comparison.methods[number] == title for number, title in pictures.methods.items())
 
 
 def test_small_images_are_embedded_bit_for_bit_and_large_ones_as_jpeg(runs: Path) -> None:
@@ -88,6 +90,16 @@ def test_page_is_self_contained_with_valid_internal_links(runs: Path) -> None:
     assert "x has not been evaluated" in html
     assert "<dt>command</dt>" in html
     assert "max_time: 00:00:00:20" in html
+
+
+def test_page_links_to_the_page_of_each_run(runs: Path, tmp_path: Path) -> None:
+    shutil.copytree(runs, tmp_path / "my runs")
+    (tmp_path / "my runs" / "good" / "index.html").write_text("a run")
+    comparisons = compare(find_runs([str(tmp_path / "my runs")])[0], {}, {})
+    compared = [(comparison, to_table(comparison, PSNR, "full")) for comparison in comparisons]
+    html = report_page(compared, (), Selection(), folder=tmp_path / "report")
+    links = [unquote(link) for link in re.findall(r'href="([^"#:]+)"', html)]
+    assert [(tmp_path / "report" / link).resolve() for link in links] == [tmp_path / "my runs" / "good" / "index.html"]
 
 
 def test_page_shows_further_pictures(runs: Path, tmp_path: Path) -> None:
@@ -141,10 +153,9 @@ def test_each_budget_has_a_table_with_medals_in_text(tmp_path: Path) -> None:
             write_run(tmp_path / f"{name[0]}{time[6:8]}", name, psnr, max_time=time)
     html = page(tmp_path)
     tables = [ElementTree.fromstring(text) for text in re.findall(r"<table>.*?</table>", html, re.DOTALL)]
-    assert [table.findtext("caption", "").split(" on ")[0] for table in tables] == [
-        "Budget: at most 20 s",
-        "Budget: at most 1 min",
-    ]
+    budgets = [text.split(" on ")[0] for text in re.findall(r"<h2[^>]*>(.*)</h2>", html)]
+    assert budgets == ["Budget: at most 20 s", "Budget: at most 1 min"]
+    assert all("Budget" not in table.findtext("caption", "Budget") for table in tables)
     for table in tables:
         assert [(th.text, th.get("colspan")) for th in table.findall(".//th[@scope='colgroup']")] == [("torus", "1")]
         assert [th.text for th in table.findall(".//th[@scope='row']")] == ["a <b>", "b"]

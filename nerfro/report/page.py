@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import torch
 from omegaconf import OmegaConf
@@ -30,6 +32,7 @@ def report_page(
     unfinished: Sequence[str],
     selection: Selection,
     pictures: Sequence[Path] = (),
+    folder: Path | None = None,
 ) -> str:
     """Create the page.
 
@@ -38,14 +41,16 @@ def report_page(
         unfinished: one line about each run without scores.
         selection: images that the page shows.
         pictures: further images, PNG files.
+        folder: folder of the page, from which it links to the pages of the runs; None for no links.
     """
     sections = [
         {
             "id": f"b{number}",
             "title": comparison.budget.title,
             "table": table,
+            "caption": table.title.removeprefix(f"{comparison.budget.title}; "),
             "scenes": _scenes(f"b{number}", comparison, selection),
-            "runs": [_run_origin(comparison, run) for run in comparison.runs],
+            "runs": [_run_origin(comparison, run, folder) for run in comparison.runs],
         }
         for number, (comparison, table) in enumerate(compared)
     ]
@@ -75,8 +80,8 @@ def _scenes(prefix: str, comparison: Comparison, selection: Selection) -> list[d
     return sections
 
 
-def _run_origin(comparison: Comparison, run: EvaluatedRun) -> dict[str, Any]:
-    """Return the origin of a run, as text."""
+def _run_origin(comparison: Comparison, run: EvaluatedRun, folder: Path | None) -> dict[str, Any]:
+    """Return the origin of a run, as text, and the address of its page relative to `folder`, if both exist."""
     cell = next(cell for cell, runs in comparison.cells.items() if run in runs)
     facts, metrics = run.facts, run.metrics
     commit = facts.get("commit") or "not a git checkout"
@@ -92,7 +97,9 @@ def _run_origin(comparison: Comparison, run: EvaluatedRun) -> dict[str, Any]:
     config = OmegaConf.to_yaml(OmegaConf.create(json.loads(json.dumps(run.config))))
     method, scene = cell[0], comparison.scenes[cell[1]]
     origin = {"method": method, "scene": scene, "seed": run.seed, "folder": shown(run.folder)}
-    return {**origin, "facts": texts, "config": config}
+    file = run.folder / "index.html"
+    page = quote(Path(os.path.relpath(file, folder)).as_posix()) if folder is not None and file.is_file() else None
+    return {**origin, "facts": texts, "config": config, "page": page}
 
 
 def _spent(steps: int | None, seconds: float | None, rays_per_second: float | None) -> str:

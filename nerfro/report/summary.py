@@ -112,7 +112,8 @@ def summarize(options: SummaryConfig) -> None:
         print(f"tables: {out}")
         if options.report:
             selection = Selection(options.views, next(iter(metrics)), region)
-            page = report_page(list(zip(comparisons, tables.values(), strict=True)), unfinished, selection, pictures)
+            compared = list(zip(comparisons, tables.values(), strict=True))
+            page = report_page(compared, unfinished, selection, pictures, out)
             write_atomically(out / "report.html", page)
             print(f"report: {out / 'report.html'}, {len(page) / 2**20:.1f} MiB")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -75,7 +76,7 @@ class SceneImages:
         width, height: size of each image in pixels.
         views: views to choose from.
         figure: one of the views, shown as the figure.
-        methods: titles of the methods by index; methods without a run on this scene are absent.
+        methods: titles of the methods by index, the best first; methods without a run on this scene are absent.
         seeds: seeds of the runs that rendered the images.
     """
 
@@ -95,6 +96,13 @@ def scene_images(comparison: Comparison, test_set: EvaluationSet, selection: Sel
     """
     cells = [comparison.cells.get((method, test_set)) for method in comparison.methods]
     runs = {number: cell[0] for number, cell in enumerate(cells) if cell}
+    sign = 1 if image_metrics()[selection.metric].better == "higher" else -1
+
+    def quality(run: EvaluatedRun) -> float:
+        score = run.metrics.result.mean(selection.metric, selection.region)
+        return -math.inf if score is None else sign * score
+
+    runs = dict(sorted(runs.items(), key=lambda item: -quality(item[1])))
     titles = {number: comparison.methods[number] for number in runs}
     first = next(iter(runs.values()))
     references: Views = build_data(relocated(OmegaConf.create(dict(first.config)), first.folder)).load(test_set.split)
