@@ -142,7 +142,7 @@ def test_missing_launcher_names_its_extra() -> None:
 
 
 def test_field_missed_by_all_rays_is_refused_before_training(
-    train_here: Runner, tiny_run: list[str], tmp_path: Path
+    train_here: Runner, tiny_run: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     other = "background=skybox", "background.width=8", "content.space=unbounded"
     run = [text for text in tiny_run if text not in other]
@@ -151,7 +151,11 @@ def test_field_missed_by_all_rays_is_refused_before_training(
     refused = train_here(*run, *away, f"hydra.run.dir={tmp_path / 'away'}", code=1).error
     assert "no ray of the training views meets the field's box from [50.0, 50.0, 50.0]" in refused
     assert "set content.box_min" in refused
-    assert not list((tmp_path / "away").rglob("*"))
+    assert not (tmp_path / "away").exists(), "an empty folder is removed"
+    (tmp_path / "current").mkdir()
+    monkeypatch.chdir(tmp_path / "current")
+    train_here(*run, *away, "hydra.run.dir=.", code=1)
+    assert (tmp_path / "current").is_dir(), "but not the current one"
     small = ["content.box_min=[-0.3,-0.3,-0.3]", "content.box_max=[0.3,0.3,0.3]"]
     finished = train_here(*run, *small, f"hydra.run.dir={tmp_path / 'small'}")
     assert "% of the rays pass the field's box from [-0.3, -0.3, -0.3]" in finished.out

@@ -118,7 +118,8 @@ def _run_by_hydra(composer: Composer, task: Task, flags: Namespace, parser: Argu
 def _job(task: Task, command: str, failures: list[Exception]) -> Task:
     """Return the function that Hydra calls. The error of a single run is appended to `failures`.
 
-    Hydra would print an additional line for an error that is raised.
+    Hydra would print an additional line for an error that is raised. An empty run folder is removed then, unless it is
+    the current one.
     """
 
     @functools.wraps(task)
@@ -130,6 +131,10 @@ def _job(task: Task, command: str, failures: list[Exception]) -> Task:
                 return task(config)
         except Exception as error:
             failures.append(error)
+            folder = Path(HydraConfig.get().runtime.output_dir)
+            with contextlib.suppress(OSError):  # the folder is not empty
+                if folder.resolve() != Path.cwd():
+                    folder.rmdir()
             return None
 
     return job
