@@ -26,7 +26,7 @@ STEP = 100_000
 
 # Rays are traced on the CPU, and travel there and back.
 TRACING = ("kernels/operators.py", "samplers/paths/compiled.py", "paper/compiled.py", "paper/eikonal.py")
-TRACING += ("samplers/paths/snell.py", "samplers/paths/polylines.py", "samplers/paths/wavefront.py")
+TRACING += ("samplers/paths/snell.py", "samplers/paths/polylines.py")
 TRACING += ("geometry/intersection.py", "media/bodies.py")
 
 ADAPTIVE = ["sampler.path.integrator=adaptive", "sampler.path.max_steps=60", "sampler.points.draw=arc_length"]

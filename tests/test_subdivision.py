@@ -16,13 +16,13 @@ from nerfro.models.refractive import RefractiveModel
 from nerfro.paper.hierarchical import Hierarchical
 from nerfro.paper.nerf import NerfField
 from nerfro.rendering import RayTracer
-from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.paths.straight import Straight
 from nerfro.samplers.subdivision import Subdivision, contrast, divergence, neighbour_rays, part_rays, pixel_rays
 from nerfro.testing import example_batch, example_components
 from nerfro.training.pixel_batches import PixelBatches
 from tests.cameras_at import cameras_at, random_poses
 from tests.closed_forms import Ball, RoundedBox
+from tests.reference_tracer import Snell
 
 NUM_VIEWS, HEIGHT, WIDTH = 3, 8, 10
 SIDE, FOCAL = 33, 60.0

@@ -22,7 +22,7 @@ from nerfro.paper.voxel_grid import VoxelGrid
 from nerfro.registry.allowed import Count, OnlyWith, Positive
 from nerfro.registry.registration import register
 from nerfro.samplers.base import PathSampler
-from nerfro.samplers.paths.polylines import PolylineBuilder
+from nerfro.samplers.paths.polylines import distance_to_end
 from nerfro.samplers.paths.replay import Vertices, assembled, is_interior, with_gradient
 
 # Fraction of a step by which a replay may reach the end of a step earlier than the trace.
@@ -116,10 +116,10 @@ class _NewVertices:
     """Vertices of a trace: recorded where a path is far from its last tangent, and at the start of jumps."""
 
     def __init__(self, rays: Rays, tolerance: float) -> None:
-        self.kept = _start(rays)
-        self.lines = PolylineBuilder(len(rays), rays.near)
-        self.lines.append(torch.arange(len(rays), device=rays.near.device), *self.kept)
-        self.tolerance = tolerance
+        self.kept, self.tolerance = _start(rays), tolerance
+        self.counts = torch.zeros(len(rays), dtype=torch.long, device=rays.near.device)
+        self.found: list[Vertices] = []
+        self._keep(torch.arange(len(rays), device=rays.near.device), *_start(rays))
 
     def before_jump(self, rows: Tensor, x: Tensor, d: Tensor, s: Tensor) -> None:
         self._keep(rows[(d[rows] - self.kept[1][rows]).square().sum(-1) > MIN_TURN], x, d, s)
@@ -130,10 +130,24 @@ class _NewVertices:
         self._keep(rows[(x[rows] - tangent).square().sum(-1) > self.tolerance**2], x, d, s)
 
     def _keep(self, rows: Tensor, *state: Tensor) -> None:
-        x, d, s = state
-        self.lines.append(rows, x[rows], d[rows], s[rows])
-        for kept, values in zip(self.kept, state, strict=True):
-            kept[rows] = values[rows]
+        x, d, s = (values[rows] for values in state)
+        self.found.append((rows, self.counts[rows], x, d, s))
+        self.counts[rows] += 1
+        for kept, values in zip(self.kept, (x, d, s), strict=True):
+            kept[rows] = values
+
+    def path(self, rays: Rays, box: Tensor, refracted: Tensor, x: Tensor, d: Tensor, s: Tensor) -> Path:
+        """Return the paths from the last states; short rows repeat the last vertex."""
+        ahead = distance_to_end(rays.far, box, refracted, x, d, s)
+        rows = torch.arange(len(rays), device=s.device)
+        self._keep(rows, x + ahead[:, None] * d, d, s + ahead)
+        vertices = s.new_zeros(len(rays), int(self.counts.max()) if len(rays) else 2, 7)
+        for found, column, *state in self.found:
+            positions, directions, lengths = state
+            vertices[found, column] = torch.cat([positions, directions, lengths[:, None]], -1)
+        index = torch.arange(vertices.shape[1], device=s.device).minimum(self.counts[:, None] - 1)[..., None]
+        positions, directions, lengths = vertices.take_along_dim(index, 1).split((3, 3, 1), -1)
+        return Path.unbranched(positions, directions, lengths[..., 0], refracted, rays.radii)
 
 
 class _KnownVertices:
@@ -166,8 +180,7 @@ def march_adaptive(rays: Rays, medium: Medium, tolerance: float, max_steps: int)
     vertices = _NewVertices(rays, tolerance)
     state, refracted = _march(rays, medium, max_steps, vertices)
     vertices.before_jump(torch.arange(len(rays), device=rays.near.device), *state)
-    vertices.lines.append_ends(rays.far, medium.box, refracted, *state)
-    return vertices.lines.path(rays, refracted)
+    return vertices.path(rays, medium.box, refracted, *state)
 
 
 def replay_adaptive(path: Path, rays: Rays, medium: Medium, max_steps: int) -> Path:

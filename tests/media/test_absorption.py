@@ -11,11 +11,11 @@ from nerfro.core.types import FieldValues, Path, Rays
 from nerfro.models.refractive import RefractiveModel
 from nerfro.paper.eikonal import Eikonal
 from nerfro.rendering import composite
-from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.points.stratified import point_samples
 from nerfro.testing import example_components, example_rays
 from tests.closed_forms import Ball, beam, random_rays
 from tests.conftest import refused
+from tests.reference_tracer import Snell
 from tests.samplers.nested import NestedBalls, nested_grid, nested_mesh
 
 SIGMA = [0.3, 1.0, 2.5]

@@ -17,9 +17,9 @@ from nerfro.media.bodies import Bodies
 from nerfro.media.body_settings import BodySettings, expanded, make_bodies
 from nerfro.media.material import MATERIALS
 from nerfro.paper.eikonal import Eikonal
-from nerfro.samplers.paths.snell import Snell, trace_interfaces
 from tests.closed_forms import angle, ball_exits, make_rays
 from tests.conftest import refused
+from tests.reference_tracer import Snell, trace_interfaces
 
 CENTRES = ((-10.0, 0.0, 0.0), (10.0, 0.0, 0.0))  # of balls of radius 1
 

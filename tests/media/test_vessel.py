@@ -10,11 +10,11 @@ import trimesh
 from nerfro.geometry.mesh import load_mesh
 from nerfro.media.bodies import Bodies
 from nerfro.media.vessel import find_lid, make_vessel
-from nerfro.samplers.paths.snell import Snell, trace_interfaces
 from nerfro.viewing.surface import surface_of
 from tests.closed_forms import angle, make_rays
 from tests.conftest import refused
 from tests.media.vessels import RADIUS, WALL, exit_directions, spherical_vessel
+from tests.reference_tracer import Snell, trace_interfaces
 
 # A glass: its height, its radii below and above, its wall.
 HEIGHT, BELOW, ABOVE, THIN = 1.6, 0.4, 0.55, 0.05

@@ -12,10 +12,10 @@ from nerfro.core.types import Path
 from nerfro.fields.hash_grid import HashGridField
 from nerfro.geometry.space import Box, Contracted, Space
 from nerfro.rendering import composite
-from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.points.density_grid import DensityGridSampler
 from tests.cameras_at import cameras_at
 from tests.closed_forms import Ball
+from tests.reference_tracer import Snell
 
 WALL = 3.0  # half side of the room
 TOY, SIZE = torch.tensor([0.3, 1.2, 0.2]), 0.3

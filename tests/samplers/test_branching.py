@@ -14,8 +14,8 @@ from nerfro.core.types import Path, Rays
 from nerfro.media.bodies import Bodies
 from nerfro.samplers.paths import compiled
 from nerfro.samplers.paths.replay import smallest_cosine
-from nerfro.samplers.paths.snell import Snell, trace_interfaces
 from tests.closed_forms import Ball, FreeBodies, RoundedBox, Slab, beam, make_rays, random_rays
+from tests.reference_tracer import Snell, trace_interfaces
 from tests.samplers.nested import NestedBalls, nested_grid, nested_mesh
 
 BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])

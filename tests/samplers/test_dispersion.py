@@ -11,9 +11,9 @@ from torch import Tensor
 from nerfro.media.bodies import Bodies
 from nerfro.media.body_settings import make_bodies
 from nerfro.paper.eikonal import Eikonal
-from nerfro.samplers.paths.snell import Snell
 from tests.closed_forms import Ball, RoundedBox, angle, beam, make_rays, random_rays
 from tests.conftest import refused
+from tests.reference_tracer import Snell
 from tests.samplers.test_snell import _prism
 
 # Water: n_d and Abbe's number.

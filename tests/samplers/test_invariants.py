@@ -13,7 +13,6 @@ from nerfro.paper.integrators import RayState, kick_drift_kick, leapfrog
 from nerfro.paper.voxel_grid import VoxelGrid
 from nerfro.rendering import composite
 from nerfro.samplers.base import PathSampler, PointSampler
-from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.paths.straight import Straight
 from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import example_rays
@@ -28,6 +27,7 @@ from tests.closed_forms import (
     luneburg,
     sampled,
 )
+from tests.reference_tracer import Snell
 
 SMOOTH = [luneburg, fisheye, fibre]
 

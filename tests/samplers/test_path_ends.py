@@ -14,8 +14,8 @@ from nerfro.media.base import Medium
 from nerfro.media.body_settings import make_bodies
 from nerfro.paper.eikonal import Eikonal
 from nerfro.samplers.base import PathSampler
-from nerfro.samplers.paths.snell import Snell
 from tests.closed_forms import RoundedBox, random_rays
+from tests.reference_tracer import Snell
 
 _rays = functools.partial(random_rays, 200, 1.2, 4)
 # From the camera at distance 3 the near face of the cube is reached, its far one is not.

@@ -20,9 +20,9 @@ from nerfro.paper.eikonal import Eikonal, march_adaptive
 from nerfro.paper.voxel_grid import VoxelGrid
 from nerfro.samplers.base import PathSampler
 from nerfro.samplers.paths.replay import smallest_cosine
-from nerfro.samplers.paths.snell import Snell, trace_interfaces
 from nerfro.samplers.paths.straight import Straight
 from tests.closed_forms import Ball, RoundedBox, beam, grid_points, make_rays, random_rays
+from tests.reference_tracer import Snell, trace_interfaces
 from tests.samplers.nested import NestedBalls, nested_grid, nested_mesh
 
 BOX = torch.tensor([[-1.2] * 3, [1.2] * 3], dtype=torch.float64)

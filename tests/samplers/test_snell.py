@@ -14,7 +14,6 @@ from nerfro.core.errors import NerfroError
 from nerfro.core.types import Rays
 from nerfro.media.bodies import Bodies
 from nerfro.media.body_settings import make_bodies
-from nerfro.samplers.paths.snell import Snell, trace_interfaces
 from nerfro.samplers.paths.snell_law import refract
 from tests.closed_forms import (
     Ball,
@@ -30,6 +29,7 @@ from tests.closed_forms import (
     sampled,
 )
 from tests.conftest import refused
+from tests.reference_tracer import Snell, trace_interfaces
 
 BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
 

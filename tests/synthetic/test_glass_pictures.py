@@ -12,7 +12,6 @@ from nerfro.core.types import Path, Rays
 from nerfro.evaluation.image_metrics import psnr
 from nerfro.media.bodies import Bodies
 from nerfro.media.body_settings import make_bodies
-from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.subdivision import part_rays
 from nerfro.synthetic import path_tracer
 from nerfro.synthetic.path_tracer import PathTracer, Pinhole
@@ -20,6 +19,7 @@ from nerfro.synthetic.surface import SurfaceMesh, rounded_box, sphere
 from nerfro.synthetic.viewpoints import look_at_origin
 from tests.cameras_at import cameras_at
 from tests.closed_forms import Ball, RoundedBox, grid_points, sampled
+from tests.reference_tracer import Snell
 from tests.synthetic.empty_glass import empty_glass
 
 # Sums over a pixel of a cube converge slowly: an edge sees lamps in many directions.

@@ -10,13 +10,13 @@ import torch
 from nerfro.data.base import Views
 from nerfro.models.refractive import RefractiveModel
 from nerfro.rendering import RayTracer
-from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.testing import example_components
 from nerfro.training.pixel_batches import PixelBatches
 from tests.cameras_at import cameras_at, random_poses
 from tests.closed_forms import Ball
 from tests.conftest import refused
+from tests.reference_tracer import Snell
 
 NUM_VIEWS, HEIGHT, WIDTH = 5, 12, 16
 

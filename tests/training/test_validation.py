@@ -18,7 +18,6 @@ from nerfro.data.base import Views
 from nerfro.data.blender import BlenderData
 from nerfro.evaluation.validation import ValidationPixels
 from nerfro.rendering import ColourSpace, RayTracer, Renderer, Scene
-from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.points.stratified import Stratified
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.training.callbacks import OverfittingWarning
@@ -26,6 +25,7 @@ from nerfro.training.data_module import RayDataModule, validation_interval
 from nerfro.training.pixel_batches import PixelBatches
 from tests.closed_forms import Ball
 from tests.conftest import Runner, repaint
+from tests.reference_tracer import Snell
 
 LINE = "the model overfits"
 

@@ -38,7 +38,8 @@ def trace_bodies(
         rays: rays.
         medium: bodies with grids.
         tree: triangles of the bodies; None for the zero levels of the grids.
-        max_events, branching: see `samplers.paths.snell.trace_interfaces`.
+        max_events: largest number of refractions and reflections of a polyline.
+        branching: which parts of light that is partly reflected are followed.
     """
     *solids, nested, shell = medium.packed()
     *triangles, num_layers, offset = tree or (0, 0.0)

@@ -15,21 +15,17 @@ from torch.nn import functional
 
 from nerfro.core.errors import NerfroError
 from nerfro.core.types import Path, Rays
-from nerfro.geometry.interpolation import intersect_box
-from nerfro.kernels.tolerances import MIN_SEARCH_STEP
 from nerfro.media.base import Medium
 from nerfro.media.bodies import Bodies
 from nerfro.registry.allowed import OnlyWith, Positive, Share
 from nerfro.registry.registration import register
 from nerfro.samplers.base import PathSampler
-from nerfro.samplers.paths.branching import ONE_PATH, Branching
+from nerfro.samplers.paths.branching import Branching
 from nerfro.samplers.paths.compiled import trace_bodies
 from nerfro.samplers.paths.polylines import SnellTrace
 from nerfro.samplers.paths.replay import Intersect, intersect_solid, intersect_triangles, replay, smallest_cosine
 from nerfro.samplers.paths.straight import replay_straight, straight_path
-from nerfro.samplers.paths.wavefront import Wavefront
 
-_ROOT_ITERATIONS = 60
 # Training uses no derivatives of paths whose `smallest_cosine` is below this value.
 _STEADY = 0.15
 
@@ -81,13 +77,6 @@ class TriangleTracer(Tracer):
     def intersect(self, path: Path) -> Intersect:
         assert path.record is not None
         return intersect_triangles(self.medium.triangles, path.record.triangle)
-
-
-class ReferenceTracer(Tracer):
-    """Trace zero levels of any signed distances by operators of PyTorch."""
-
-    def trace(self, rays: Rays, max_events: int, branching: Branching) -> SnellTrace:
-        return trace_interfaces(rays, self.medium, max_events, branching)
 
 
 class StraightTracer(Tracer):
@@ -150,7 +139,7 @@ class Snell(PathSampler):
                 "sampler/path=snell needs a medium with a surface; take medium=sdf_grid, or sampler/path=eikonal"
             )
         if self.interface == "sdf":
-            tracer: type[Tracer] = GridTracer if len(bodies.grids) else ReferenceTracer
+            tracer: type[Tracer] = GridTracer
         elif bodies.meshes:
             tracer = TriangleTracer
             bodies.tree  # noqa: B018 (created once, before the variants of all wavelengths share it)
@@ -237,77 +226,3 @@ def _replay_in_bands(path: Path, rays: Rays, tracers: Sequence[Tracer], branchin
     order, names = torch.cat(rows).argsort(), ("positions", "directions", "s", "throughput")
     columns: dict[str, Any] = {name: torch.cat([getattr(part, name) for part in replayed])[order] for name in names}
     return replace(path, **columns)
-
-
-def trace_interfaces(rays: Rays, medium: Bodies, max_events: int, branching: Branching = ONE_PATH) -> SnellTrace:
-    """Trace rays from surface to surface of any solid; the reference implementation of the compiled kernel.
-
-    Sphere tracing finds the surfaces, because a step of the signed distance cannot miss one. A change of sign ends the
-    search, and bisection shrinks the bracket around the surface.
-    """
-    box = medium.box
-    front = Wavefront(rays, medium, box, max_events, branching)
-    front.begin(lambda x: medium.signed_distances(x)[0] < 0)
-    min_step = MIN_SEARCH_STEP * float((box[1] - box[0]).min())
-    while len(rows := front.moving.nonzero()[:, 0]):
-        x, d, inside = front.x[rows], front.d[rows], front.inside[rows]
-        before, after, crossed = _search(medium, x, d, inside, intersect_box(box, x, d)[1], min_step)
-        front.moving[rows] = crossed
-        rows, x, d, inside, before, after = (values[crossed] for values in (rows, x, d, inside, before, after))
-        before, after, body = _first_crossing(medium, x, d, inside, before, after)
-        after, bodies = _closed_gaps(medium, x, d, inside, after, body, min_step)
-        _, normals = medium.signed_distances(x + after[:, None] * d)
-        normal = functional.normalize(normals.take_along_dim(body[:, None, None], 1)[:, 0], dim=-1)
-        front.apply_interface(rows, before, after, bodies, normal)
-    return front.finish(rays)
-
-
-def _search(
-    medium: Bodies, x: Tensor, d: Tensor, inside: Tensor, limit: Tensor, min_step: float
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Trace spheres up to `limit`; returns start and end of the last step, and whether it crosses a surface."""
-    before, after = torch.zeros_like(limit), torch.zeros_like(limit)
-    crossed = torch.zeros_like(limit, dtype=torch.bool)
-    going = torch.arange(len(limit), device=limit.device)
-    while len(going):
-        phi, _ = medium.signed_distances(x[going] + after[going, None] * d[going])
-        crossed[going] = ((phi < 0) != inside[going]).any(-1)
-        more = ~crossed[going] & (after[going] < limit[going])
-        going, phi = going[more], phi[more]
-        before[going] = after[going]
-        step = phi.abs().amin(-1).clamp(min=min_step)
-        after[going] = torch.minimum(after[going] + step, limit[going])
-    return before, after, crossed
-
-
-def _first_crossing(
-    medium: Bodies, x: Tensor, d: Tensor, inside: Tensor, before: Tensor, after: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Bisect each bracket around the first change of sign; returns the bracket and the body whose sign changes."""
-    for _ in range(_ROOT_ITERATIONS):
-        middle = 0.5 * (before + after)
-        phi, _ = medium.signed_distances(x + middle[:, None] * d)
-        changed = ((phi < 0) != inside).any(-1)
-        after = torch.where(changed, middle, after)
-        before = torch.where(changed, before, middle)
-    phi, _ = medium.signed_distances(x + after[:, None] * d)
-    changed = (phi < 0) != inside
-    return before, after, changed.long().argmax(-1)
-
-
-def _closed_gaps(
-    medium: Bodies, x: Tensor, d: Tensor, inside: Tensor, after: Tensor, body: Tensor, min_step: float
-) -> tuple[Tensor, Tensor]:
-    """Close gaps of air between two bodies that are thinner than the shortest step of the search.
-
-    Returns:
-        Distance behind all surfaces that are met, and the bodies with these surfaces [A, L], -1 for none.
-    """
-    if inside.shape[1] == 1:
-        return after, body[:, None]
-    flipped = inside ^ functional.one_hot(body, inside.shape[1]).bool()
-    leaves = (medium.deciding_body(inside) > 0) & (medium.deciding_body(flipped) == 0)
-    phi, _ = medium.signed_distances(x + (after + min_step)[:, None] * d)
-    behind = leaves[:, None] & ((phi < 0) != flipped)
-    others = torch.where(behind, torch.arange(inside.shape[1], device=x.device), -1)
-    return torch.where(behind.any(1), after + min_step, after), torch.cat([body[:, None], others], 1)

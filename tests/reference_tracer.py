@@ -1,8 +1,8 @@
-"""Rays that are traced together from surface to surface, and split where light is partly reflected."""
+"""Reference implementation of the tracer of bodies in PyTorch, for signed distances in closed form, too."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -10,16 +10,87 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from nerfro.core.types import Rays
+from nerfro.core.types import OpticalRecord, Path, Rays
 from nerfro.geometry.interpolation import intersect_box
+from nerfro.kernels.tolerances import MIN_SEARCH_STEP
+from nerfro.media.base import Medium
 from nerfro.media.bodies import Bodies
-from nerfro.samplers.paths.branching import Branching
-from nerfro.samplers.paths.polylines import PolylineBuilder, SnellTrace, split
+from nerfro.samplers.paths import snell
+from nerfro.samplers.paths.branching import ONE_PATH, Branching
+from nerfro.samplers.paths.polylines import SnellTrace, distance_to_end, split
 from nerfro.samplers.paths.replay import indices_of
 from nerfro.samplers.paths.snell_law import reflectance, refract
 
+_ROOT_ITERATIONS = 60
 # Attributes of `Wavefront` with one row for each polyline.
 _COLUMNS = ("x", "d", "s", "inside", "moving", "ray", "weight", "num_events", "exceeded")
+
+
+class PolylineBuilder:
+    """Paths under construction: rows of any number of vertices."""
+
+    def __init__(self, num_rays: int, like: Float[Tensor, "..."]) -> None:
+        self._vertices = like.new_zeros(num_rays, 4, 7)
+        self._crossed = torch.zeros(num_rays, 4, 3, dtype=torch.int8, device=like.device)
+        self.counts = torch.zeros(num_rays, dtype=torch.long, device=like.device)
+
+    def append(
+        self,
+        rows: Int[Tensor, "A"],
+        positions: Float[Tensor, "A 3"],
+        directions: Float[Tensor, "A 3"],
+        s: Float[Tensor, "A"],
+        crossed: Sequence[Int[Tensor, "A"] | int] = (0, 0, 0),
+    ) -> None:
+        """Add one vertex to each of some rows.
+
+        Args:
+            rows: rows, each at most once.
+            positions, directions, s: the vertices.
+            crossed: body, surface and far side of each vertex, see `OpticalRecord`; by default those in air.
+        """
+        if len(rows) and int(self.counts[rows].max()) == self._vertices.shape[1]:
+            self._vertices = torch.cat([self._vertices, torch.zeros_like(self._vertices)], 1)
+            self._crossed = torch.cat([self._crossed, torch.zeros_like(self._crossed)], 1)
+        self._vertices[rows, self.counts[rows]] = torch.cat([positions, directions, s[:, None]], -1)
+        for i, numbers in enumerate(crossed):
+            self._crossed[rows, self.counts[rows], i] = torch.as_tensor(numbers, dtype=torch.int8)
+        self.counts[rows] += 1
+
+    def take(self, rows: Int[Tensor, "T"]) -> None:
+        """Replace all rows by a selection, in which rows may occur several times."""
+        self._vertices, self._crossed, self.counts = self._vertices[rows], self._crossed[rows], self.counts[rows]
+
+    def append_ends(
+        self,
+        far: Float[Tensor, "P"],
+        box: Float[Tensor, "2 3"],
+        refracted: Bool[Tensor, "P"],
+        positions: Float[Tensor, "P 3"],
+        directions: Float[Tensor, "P 3"],
+        s: Float[Tensor, "P"],
+    ) -> None:
+        """Add the last vertex of every row."""
+        ahead = distance_to_end(far, box, refracted, positions, directions, s)
+        rows = torch.arange(len(s), device=s.device)
+        self.append(rows, positions + ahead[:, None] * directions, directions, s + ahead)
+
+    def path(self, rays: Rays, refracted: Bool[Tensor, "P"]) -> Path:
+        """Return the finished paths in the precision and on the device of the rays; short rows repeat the last vertex.
+
+        Args:
+            rays: ray of each row.
+            refracted: whether each row met the medium.
+        """
+        like = rays.origins
+        capacity = int(self.counts.max()) if len(self.counts) else 2
+        index = torch.arange(capacity, device=self.counts.device).minimum(self.counts[:, None] - 1)[..., None]
+        vertices = self._vertices.take_along_dim(index, 1).to(like)
+        crossed = self._crossed.take_along_dim(index, 1).to(like.device)
+        record = OpticalRecord.of_bodies(*crossed.unbind(-1))
+        return Path.unbranched(
+            vertices[..., :3], vertices[..., 3:6], vertices[..., 6], refracted.to(like.device), rays.radii, record
+        )
 
 
 class _Crossing(NamedTuple):
@@ -194,3 +265,96 @@ class Wavefront:
             ray = self.ray.to(device)
             path = split(self.lines.path(rays[ray], refracted), ray, self.weight.to(rays.origins))
         return SnellTrace(path, self.num_events.to(device), self.exceeded.to(device))
+
+
+class Snell(snell.Snell):
+    """The sampler of nerfro, which traces bodies without grids by the reference implementation."""
+
+    def tracers(self, medium: Medium) -> list[snell.Tracer]:
+        """Return the tracers of the base class, or reference tracers for a medium in closed form."""
+        tracers = super().tracers(medium)
+        if medium.bodies is None or len(medium.bodies.grids):
+            return tracers
+        return [ReferenceTracer(tracer.medium) if hasattr(tracer, "medium") else tracer for tracer in tracers]
+
+
+class ReferenceTracer(snell.Tracer):
+    """Trace zero levels of any signed distances by operators of PyTorch."""
+
+    def trace(self, rays: Rays, max_events: int, branching: Branching) -> SnellTrace:
+        """Trace rays without gradients, and count events."""
+        return trace_interfaces(rays, self.medium, max_events, branching)
+
+
+def trace_interfaces(rays: Rays, medium: Bodies, max_events: int, branching: Branching = ONE_PATH) -> SnellTrace:
+    """Trace rays from surface to surface of any solid; the reference implementation of the compiled kernel.
+
+    Sphere tracing finds the surfaces, because a step of the signed distance cannot miss one. A change of sign ends the
+    search, and bisection shrinks the bracket around the surface.
+    """
+    box = medium.box
+    front = Wavefront(rays, medium, box, max_events, branching)
+    front.begin(lambda x: medium.signed_distances(x)[0] < 0)
+    min_step = MIN_SEARCH_STEP * float((box[1] - box[0]).min())
+    while len(rows := front.moving.nonzero()[:, 0]):
+        x, d, inside = front.x[rows], front.d[rows], front.inside[rows]
+        before, after, crossed = _search(medium, x, d, inside, intersect_box(box, x, d)[1], min_step)
+        front.moving[rows] = crossed
+        rows, x, d, inside, before, after = (values[crossed] for values in (rows, x, d, inside, before, after))
+        before, after, body = _first_crossing(medium, x, d, inside, before, after)
+        after, bodies = _closed_gaps(medium, x, d, inside, after, body, min_step)
+        _, normals = medium.signed_distances(x + after[:, None] * d)
+        normal = functional.normalize(normals.take_along_dim(body[:, None, None], 1)[:, 0], dim=-1)
+        front.apply_interface(rows, before, after, bodies, normal)
+    return front.finish(rays)
+
+
+def _search(
+    medium: Bodies, x: Tensor, d: Tensor, inside: Tensor, limit: Tensor, min_step: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Trace spheres up to `limit`; returns start and end of the last step, and whether it crosses a surface."""
+    before, after = torch.zeros_like(limit), torch.zeros_like(limit)
+    crossed = torch.zeros_like(limit, dtype=torch.bool)
+    going = torch.arange(len(limit), device=limit.device)
+    while len(going):
+        phi, _ = medium.signed_distances(x[going] + after[going, None] * d[going])
+        crossed[going] = ((phi < 0) != inside[going]).any(-1)
+        more = ~crossed[going] & (after[going] < limit[going])
+        going, phi = going[more], phi[more]
+        before[going] = after[going]
+        step = phi.abs().amin(-1).clamp(min=min_step)
+        after[going] = torch.minimum(after[going] + step, limit[going])
+    return before, after, crossed
+
+
+def _first_crossing(
+    medium: Bodies, x: Tensor, d: Tensor, inside: Tensor, before: Tensor, after: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Bisect each bracket around the first change of sign; returns the bracket and the body whose sign changes."""
+    for _ in range(_ROOT_ITERATIONS):
+        middle = 0.5 * (before + after)
+        phi, _ = medium.signed_distances(x + middle[:, None] * d)
+        changed = ((phi < 0) != inside).any(-1)
+        after = torch.where(changed, middle, after)
+        before = torch.where(changed, before, middle)
+    phi, _ = medium.signed_distances(x + after[:, None] * d)
+    changed = (phi < 0) != inside
+    return before, after, changed.long().argmax(-1)
+
+
+def _closed_gaps(
+    medium: Bodies, x: Tensor, d: Tensor, inside: Tensor, after: Tensor, body: Tensor, min_step: float
+) -> tuple[Tensor, Tensor]:
+    """Close gaps of air between two bodies that are thinner than the shortest step of the search.
+
+    Returns:
+        Distance behind all surfaces that are met, and the bodies with these surfaces [A, L], -1 for none.
+    """
+    if inside.shape[1] == 1:
+        return after, body[:, None]
+    flipped = inside ^ functional.one_hot(body, inside.shape[1]).bool()
+    leaves = (medium.deciding_body(inside) > 0) & (medium.deciding_body(flipped) == 0)
+    phi, _ = medium.signed_distances(x + (after + min_step)[:, None] * d)
+    behind = leaves[:, None] & ((phi < 0) != flipped)
+    others = torch.where(behind, torch.arange(inside.shape[1], device=x.device), -1)
+    return torch.where(behind.any(1), after + min_step, after), torch.cat([body[:, None], others], 1)
