@@ -24,11 +24,6 @@ from nerfro.geometry.space import Space
 from nerfro.registry.allowed import Count
 from nerfro.registry.registration import register
 
-_BLACK = 1e-3
-# Smallest radiance that `fit` tells apart from black: the step of 8-bit images.
-_DARKEST = 1 / 255 / 12.92
-# Largest width of a ray, in texels of a level to which it contributes.
-_MAX_TEXELS = 2.0
 # Texels along each side of a face of the levels, if neither a list nor photographs define them.
 _RESOLUTIONS = (4, 8, 16, 32, 64, 128, 256)
 # Bounds of the finest level that is derived from photographs.
@@ -183,14 +178,16 @@ class EnvironmentMap(Background):
             Weight of these observations of each texel: the sum over rays of bilinear weight times weight of the ray.
         """
         face, coordinates = cube_map.project(observed.directions.float())
-        residual = _raw(observed.radiance.clamp(min=_DARKEST)) - self._raw_at(face, coordinates)
+        # Darker radiance counts as that of the smallest step of 8-bit images.
+        residual = _raw(observed.radiance.clamp(min=1 / 255 / 12.92)) - self._raw_at(face, coordinates)
         residual = torch.where(observed.saturated, residual.clamp(min=0), residual)
         total = []
         levels = zip(
             self.levels.resolutions, self.texels_of_levels(), past_weights.split(self.levels.sizes), strict=True
         )
         for n, (values, of_level), earlier in levels:
-            wide = observed.widths > _MAX_TEXELS * 0.5 * math.pi / n
+            # A ray contributes to levels of which it is at most two texels wide.
+            wide = observed.widths > math.pi / n
             weights = observed.weights.masked_fill(wide, 0)[:, None].expand(-1, 3)
             with torch.enable_grad():
                 texels = values.detach().requires_grad_()
@@ -225,5 +222,5 @@ class EnvironmentMap(Background):
 
 def _raw(radiance: Float[Tensor, "rows 3"]) -> Float[Tensor, "rows 3"]:
     """Invert `unbounded_radiance`; the darkest value is slightly above black."""
-    y = (radiance.sqrt() / GREY).clamp(min=_BLACK)
+    y = (radiance.sqrt() / GREY).clamp(min=1e-3)
     return y + torch.log(-torch.expm1(-y))

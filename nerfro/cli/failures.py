@@ -29,8 +29,6 @@ _EXTRAS = {
     "hydra/launcher/ray": "ray",
     "hydra/sweeper/optuna": "optuna",
 }
-EXIT_INTERRUPTED = 130
-EXIT_BROKEN_PIPE = 141  # exit status of a program that SIGPIPE has ended, in a shell
 
 
 @contextlib.contextmanager
@@ -42,10 +40,10 @@ def errors_in_one_line() -> Iterator[None]:
         sys.stdout.flush()
     except BrokenPipeError:  # the reader has closed the pipe, as in `| head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit
-        sys.exit(EXIT_BROKEN_PIPE)
+        sys.exit(141)  # the status of a program that SIGPIPE has ended, in a shell
     except KeyboardInterrupt as interruption:
         print(f"nerfro: interrupted{f'; {interruption}' if str(interruption) else ''}", file=sys.stderr)
-        sys.exit(EXIT_INTERRUPTED)
+        sys.exit(130)  # the status after SIGINT
     except Exception as error:
         if os.environ.get("NERFRO_DEBUG"):
             raise

@@ -41,7 +41,6 @@ _NUMBERS = {
     **dict.fromkeys(("x_fov", "y_fov"), Annotated[float, Gt(0), Lt(180)]),
     **dict.fromkeys(("cx", "cy", *_NAMES), float),
 }
-_SAME_FOCAL = 0.02  # relative difference of two statements of one focal length
 
 
 @dataclass(frozen=True)
@@ -221,7 +220,7 @@ def _focal_length(level: Mapping[str, float], axis: str, side: float, where: str
     if angle is None:
         return stated
     of_angle = 0.5 * side / math.tan(0.5 * angle)
-    if stated is not None and abs(of_angle - stated) > _SAME_FOCAL * stated:
+    if stated is not None and abs(of_angle - stated) > 0.02 * stated:
         _warn_of_contradiction(where.partition(":")[0], axis, stated, angle, side, of_angle)
     return of_angle if stated is None else stated
 

@@ -26,14 +26,10 @@ from nerfro.registry.registration import register
 # Number of features that the density network passes to the colour network.
 _GEOMETRY_FEATURES = 16
 
-# The exponential is clamped at e^15 times the initial density, in value and gradient.
-_MAX_EXPONENT = 15.0
 
 # Cells of the coarsest level along the box's longest side, as in Instant-NGP.
 _COARSEST_RESOLUTION = 16
 
-# A detail of one pixel needs two cells of the finest grid along each side (sampling theorem).
-_CELLS_PER_PIXEL = 2
 # Bounds of the number of cells that is derived from the cameras; memory limits the upper one.
 _MIN_CELLS, _MAX_CELLS = 128, 4096
 
@@ -97,7 +93,8 @@ class HashGridField(Field):
         cameras = views.cameras
         distances = (cameras.camera_to_world[:, :, 3].double() - space.centre).norm(dim=-1)
         pixel = float((distances / cameras.fx.double()).quantile(0.5))
-        cells = math.ceil(_CELLS_PER_PIXEL * space.side / pixel)
+        # A detail of one pixel needs two cells of the finest grid along each side (sampling theorem).
+        cells = math.ceil(2 * space.side / pixel)
         return {"finest_resolution": min(max(cells, _MIN_CELLS), _MAX_CELLS)}
 
     @property
@@ -156,7 +153,8 @@ class HashGridField(Field):
         return (contracted - self.space.box[0]) / self.space.side
 
     def _to_density(self, geometry: Float[Tensor, "points G"]) -> Float[Tensor, " points"]:
-        return self.initial_density * torch.exp(geometry[:, 0].float().clamp(max=_MAX_EXPONENT))
+        # The exponential is clamped at e^15 times the initial density, in value and gradient.
+        return self.initial_density * torch.exp(geometry[:, 0].float().clamp(max=15.0))
 
     def encode(self, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points F"]:
         """Encode contracted positions in single precision."""

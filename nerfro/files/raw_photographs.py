@@ -14,7 +14,6 @@ RAW_SUFFIXES = (
     ".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dng", ".erf", ".iiq", ".nef", ".nrw", ".orf", ".pef", ".raf", ".rw2",
     ".srw", ".x3f",
 )  # fmt: skip
-_SATURATED = 65500  # of 65535
 
 
 def read_raw(path: Path) -> Float[np.ndarray, "H W 3"]:
@@ -29,8 +28,8 @@ def read_raw(path: Path) -> Float[np.ndarray, "H W 3"]:
     with _open(path) as raw:
         options = {"no_auto_bright": True, "adjust_maximum_thr": 0.0, "gamma": (1, 1), "output_bps": 16}
         levels = raw.postprocess(use_camera_wb=True, **options)
-    # The conversion of colours rounds saturated levels to slightly less than the maximum.
-    return np.where(levels >= _SATURATED, np.float32(1), levels / np.float32(65535))
+    # The conversion of colours rounds saturated levels to slightly less than the maximum, 65535.
+    return np.where(levels >= 65500, np.float32(1), levels / np.float32(65535))
 
 
 def raw_size(path: Path) -> tuple[int, int]:

@@ -13,8 +13,6 @@ from nerfro.geometry.mesh import TriangleMesh
 from nerfro.geometry.orientation import area_vectors
 
 _MARGIN = 1e-3  # fraction of an edge; surfaces that touch at the ends of an edge do not cross
-_NUM_POINTS = 4096  # on the surface, at which winding numbers are computed
-_MOST_BURIED = 0.002  # share of a surface inside itself that is accepted, such as folds of a scan
 _TOUCHING = 1e-5  # fraction of the mesh's extent; points closer to a surface along a line lie on the surface
 
 
@@ -59,7 +57,7 @@ def require_simple(mesh: TriangleMesh) -> None:
     Args:
         mesh: world units; the outer surface faces outwards, and the surface of a cavity faces the cavity.
     """
-    points, inwards = points_below(mesh, _NUM_POINTS)
+    points, inwards = points_below(mesh, 4096)  # on the surface, at which winding numbers are computed
     extent = np.ptp(mesh.bounds, axis=0).max()
     try:
         triangles = MeshIntersector((mesh.triangles - mesh.bounds.mean(0)) / extent)
@@ -75,7 +73,7 @@ def require_simple(mesh: TriangleMesh) -> None:
         return
     windings = windings * total.sign()  # the front of most of the surface may be inside
     share = ((windings < 0) | (windings > 1)).all(1).any(0).double().mean().item()
-    if share > _MOST_BURIED:
+    if share > 0.002:  # folds of a scan are accepted
         raise NerfroError(
             f"the surface of the mesh crosses itself: {share:.1%} of the surface bounds a part that is inside twice, "
             "which would act as a cavity, or inside out; unite the parts (boolean union, or voxel remesh in Blender), "

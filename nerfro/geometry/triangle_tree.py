@@ -10,7 +10,6 @@ from jaxtyping import Float, Int
 
 from nerfro.geometry.intersection import Triangles
 
-_LEAF_SIZE = 3  # triangles of a leaf; leaves have less than twice as many
 _MARGIN = 1e-9  # of boxes, so that rounding errors miss no triangle, as a fraction of the extent
 
 
@@ -36,7 +35,8 @@ class TriangleTree(NamedTuple):
         """Build the tree by splitting the triangles of each node in halves along the longest side of their centres."""
         corners, levels = triangles.corners.numpy(), []
         number = len(corners)
-        num_leaves = 1 << max(0, math.floor(math.log2(number / _LEAF_SIZE)))
+        # A leaf has at least three triangles, and less than twice as many.
+        num_leaves = 1 << max(0, math.floor(math.log2(number / 3)))
         num_entries = -(-number // num_leaves) * num_leaves
         order = (np.arange(num_entries) * number // num_entries)[None]
         while True:

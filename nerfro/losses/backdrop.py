@@ -19,10 +19,6 @@ from nerfro.losses.base import Loss
 from nerfro.registry.registration import register
 from nerfro.rendering import Scene
 
-# Tolerance of one level of 255, plus rounding errors.
-_NEAR = 1.5 / 255
-# Number of images in which a backdrop is searched.
-_NUM_IMAGES = 8
 # Least fraction of the border of an image that shows the backdrop, of such images, and of all pixels that show the
 # backdrop. The dark corners of a lens are smaller, and the border of a photographed room has several colours.
 _OF_BORDER, _OF_IMAGES, _OF_PIXELS = 0.9, 0.8, 0.3
@@ -30,7 +26,8 @@ _OF_BORDER, _OF_IMAGES, _OF_PIXELS = 0.9, 0.8, 0.3
 
 def shows(rgb: Float[Tensor, "*batch 3"], backdrop: Float[Tensor, "3"]) -> Bool[Tensor, "*batch"]:
     """Return which pixels have the colour of the backdrop."""
-    return ((rgb - backdrop).abs() < _NEAR).all(-1)
+    # The tolerance is one level of 255, plus rounding errors.
+    return ((rgb - backdrop).abs() < 1.5 / 255).all(-1)
 
 
 @register("loss", "backdrop")
@@ -69,7 +66,7 @@ class Backdrop(Loss):
 
 def find_backdrop(images: LazyImages | Float[Tensor, "V H W 3"]) -> list[float] | None:
     """Return the colour (sRGB in [0, 1]) of the plain backdrop of nearly all images, or None."""
-    step = max(1, len(images) // _NUM_IMAGES)
+    step = max(1, len(images) // 8)  # a backdrop is searched in eight images or a few more
     examined = [images[view] for view in range(0, len(images), step)]
     borders = [image[_border(*image.shape[:2])] for image in examined]
     colour = torch.stack([of_one.median(0).values for of_one in borders]).median(0).values

@@ -21,8 +21,6 @@ from nerfro.rendering import Scene
 
 # Random pairs of directions for each step.
 _NUM_PAIRS = 1024
-# Angle between two directions, in texels or details of the background.
-_NUM_DETAILS = 2
 
 
 @register("loss", "photometric")
@@ -111,7 +109,8 @@ class TotalVariation(Loss):
     def forward(self, renderings: list[Rendering], batch: Batch, scene: Scene) -> Float[Tensor, ""]:
         # 150 small operators, which the CPU takes while a GPU is busy.
         numbers = batch.draws.uniform(torch.arange(_NUM_PAIRS), 3, "total variation")
-        angle = _NUM_DETAILS * scene.background.detail if self.angle is None else self.angle
+        # Two directions are two texels or details of the background apart.
+        angle = 2 * scene.background.detail if self.angle is None else self.angle
         first, second = direction_pairs(numbers, math.radians(angle))
         directions = torch.cat([first, second]).to(batch.rgb.device, non_blocking=True)
         rgb = scene.colour_space.to_srgb(scene.background(Exits(directions)))

@@ -20,8 +20,6 @@ from nerfro.masks.outline_hull import AGREES, MAX_SIDE, MIN_VIEWS, OutlineHull, 
 from nerfro.poses.opencv import opencv
 from nerfro.silhouettes.silhouettes import intersection_over_union
 
-_NUM_COMPONENTS = 5  # mixture components per region in OpenCV's GrabCut
-
 
 @dataclass(frozen=True)
 class SegmentationSettings(AlgorithmSettings):
@@ -84,8 +82,8 @@ def grab_cut(
     if certain is not None:
         labels[shrink(certain & possible)] = cv2.GC_FGD
     num_inside = int((labels & 1).sum())
-    if not (labels == cv2.GC_BGD).any() or min(num_inside, labels.size - num_inside) < _NUM_COMPONENTS:
-        return likely & possible  # too few samples for one of the two colour models
+    if not (labels == cv2.GC_BGD).any() or min(num_inside, labels.size - num_inside) < 5:
+        return likely & possible  # too few samples for the five mixture components of one of the two regions
     cv2.setRNGSeed(0)
     pixels = cv2.resize(np.ascontiguousarray(image[window]), small, interpolation=cv2.INTER_AREA)
     # GrabCut does not depend on the order of the channels.

@@ -18,9 +18,6 @@ from nerfro.geometry.mesh import TriangleMesh
 Scalars = Float[Tensor, "*batch"]
 Vectors = Float[Tensor, "*batch 3"]
 
-# Steps along the diagonal of a medium that does not override `step_length`.
-_STEPS_PER_DIAGONAL = 512
-
 
 class Medium(nn.Module, ABC):
     """Refractive index in space.
@@ -130,4 +127,4 @@ class Medium(nn.Module, ABC):
             gradients: grad n where the rays are, per world unit.
         """
         diagonal = torch.linalg.vector_norm(self.box[1] - self.box[0])
-        return (diagonal / _STEPS_PER_DIAGONAL).expand(directions.shape[:-1])
+        return (diagonal / 512).expand(directions.shape[:-1])

@@ -36,9 +36,6 @@ if TYPE_CHECKING:
 
 _RESOLUTION = 128  # vertices along each side of a grid without thin walls
 _AIR = 4  # voxels around a body if the box of its grid is not given
-# The search for the next triangle begins at this share of the box's diagonal from the last one. Triangles of touching
-# bodies within this distance count as met together.
-_SEARCH_OFFSET = 1e-6
 COLOURS = ("red", "green", "blue")
 # Paths record bodies as 8-bit integers.
 _MAX_BODIES = 127
@@ -272,7 +269,9 @@ class Bodies(Medium):
     def tree(self) -> TriangleTree:
         """Tree of `triangles` for the tracer."""
         assert self.outline is not None
-        offset = _SEARCH_OFFSET * float(torch.linalg.vector_norm(self.box.double().diff(dim=0)))
+        # The search for the next triangle begins at this share of the box's diagonal from the last one. Triangles of
+        # touching bodies within this distance count as met together.
+        offset = 1e-6 * float(torch.linalg.vector_norm(self.box.double().diff(dim=0)))
         return TriangleTree.of(self.triangles, layers(self.triangles.corners, self.outline.faces), offset)
 
     @property

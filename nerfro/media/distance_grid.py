@@ -25,10 +25,6 @@ BAND = 3.0
 # blocks of the kernels, which store whether they may contain a surface. docs/lab/rendering_speed.md has times for 3 and
 # 4 cells.
 BLOCK, SURFACE_BLOCK = 4, 3
-# A quadratic spline that is extrapolated by half a cell at a corner is a sum of coefficients whose positive weights add
-# up to 2.19 and whose negative weights to -1.19. It is positive if the largest coefficient is less than 1.84 times the
-# smallest.
-_CONTINUED = 1.8
 
 
 class DistanceGrid(nn.Module):
@@ -121,7 +117,10 @@ class DistanceGrid(nn.Module):
         coefficients. This does not hold at the border of the grid, where splines are extrapolated.
         """
         lowest, highest = _extremes(self._coefficients_of_blocks(), [SURFACE_BLOCK + 3] * 3)
-        outside = lowest > torch.where(self._border_blocks(), highest / _CONTINUED, 0)
+        # A quadratic spline that is extrapolated by half a cell at a corner is a sum of coefficients whose positive
+        # weights add up to 2.19 and whose negative weights to -1.19. It is positive if the largest coefficient is less
+        # than 1.84 times the smallest.
+        outside = lowest > torch.where(self._border_blocks(), highest / 1.8, 0)
         inside = (highest < 0) & ~self._border_blocks()
         distance = (
             scipy.ndimage.distance_transform_cdt((outside | inside).numpy(), "chessboard").clip(0, 127).astype(np.int8)

@@ -22,9 +22,6 @@ from nerfro.registry.allowed import NotNegative, OnlyWith, Positive, validated
 # Whether training learns a quantity of the medium, which only some path samplers trace.
 Learns = Annotated[bool, OnlyWith("sampler.path", attribute="needs_medium")]
 
-# Initial optical depth of a learned absorption across half of the body. With a larger value, the absorption would
-# explain the content.
-_ALMOST_CLEAR = 0.02
 # Wavelengths of the lines d, F and C, nm.
 _LINE_D, _LINE_F, _LINE_C = 587.56, 486.13, 656.27
 
@@ -213,7 +210,8 @@ class Material(nn.Module):
             length: half of the longest side of the body, world units.
         """
         if isinstance(self._absorption, nn.Parameter):
-            depth = (self._initial_absorption * length).clamp(min=_ALMOST_CLEAR)
+            # With a larger initial optical depth across half of the body, the absorption would explain the content.
+            depth = (self._initial_absorption * length).clamp(min=0.02)
             self._absorption.copy_(depth + torch.log(-torch.expm1(-depth)))  # inverse of softplus
             self.absorption_length.fill_(length)
 

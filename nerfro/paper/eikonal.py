@@ -25,9 +25,6 @@ from nerfro.samplers.base import PathSampler
 from nerfro.samplers.paths.polylines import distance_to_end
 from nerfro.samplers.paths.replay import Vertices, assembled, is_interior, with_gradient
 
-# Fraction of a step by which a replay may reach the end of a step earlier than the trace.
-_ROUNDING = 0.01
-
 
 @register("sampler/path", "eikonal")
 class Eikonal(PathSampler):
@@ -164,7 +161,7 @@ class _KnownVertices:
     def after_step(self, rows: Tensor, length: Tensor, x: Tensor, d: Tensor, s: Tensor) -> None:
         column = self.next[rows]
         # A vertex lies at the end of a step; rounding errors must not move the vertex to the next step.
-        due = (column <= self.last[rows]) & (s[rows] >= self.s[rows, column] - _ROUNDING * length)
+        due = (column <= self.last[rows]) & (s[rows] >= self.s[rows, column] - 0.01 * length)
         rows, column = rows[due], column[due]
         self.found.append((rows, column, x[rows], d[rows], s[rows]))
         self.next[rows] += 1

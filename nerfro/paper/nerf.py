@@ -18,9 +18,6 @@ from nerfro.paper.mlp import RadianceMLP, in_blocks
 from nerfro.registry.allowed import Depth, Positive, Width
 from nerfro.registry.registration import register
 
-# Distance from near to far in the scenes of NeRF, for whose world unit its encoding of positions is made.
-_RANGE_OF_RAYS = 4.0
-
 
 class EncodedField(Field):
     """A field that evaluates an MLP on encodings of positions in world coordinates, and of directions.
@@ -58,7 +55,8 @@ class EncodedField(Field):
     @classmethod
     def derive(cls, settings: DictConfig, views: Views, space: Space) -> dict[str, Any]:
         views.refuse_linear_light("the networks of NeRF and mip-NeRF")
-        return {"unit": (views.cameras.far - views.cameras.near) / _RANGE_OF_RAYS}
+        # From near to far are 4 units in the scenes of NeRF, for which its encoding of positions is made.
+        return {"unit": (views.cameras.far - views.cameras.near) / 4.0}
 
     @property
     def bounds(self) -> Float[Tensor, "2 3"] | None:

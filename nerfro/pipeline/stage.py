@@ -19,7 +19,6 @@ from nerfro.cli.failures import in_one_line
 from nerfro.cli.overrides import command_line
 from nerfro.core.errors import Interrupted, NerfroError
 
-_SEED = 67280421310721  # of torch in a new process
 Value = TypeVar("Value")
 
 
@@ -63,7 +62,7 @@ class Stage:
         print(f"\n{self.command}: {command_line(self.command, self.options)}", flush=True)
         try:
             with torch.random.fork_rng(devices=[]):  # a stage depends on no random numbers of earlier stages
-                torch.manual_seed(_SEED)
+                torch.manual_seed(67280421310721)  # that of torch in a new process
                 value = work()
             if not self.result.is_file():
                 raise NerfroError(f"{self.result} was not written")

@@ -14,11 +14,8 @@ from nerfro.core.types import Batch
 from nerfro.kernels.available import available_bytes, number_in
 from nerfro.rendering.renderer import Renderer
 
-_PROBED_RAYS = 128
 # Peak memory of a training step and of an evaluation, relative to the tensors that autograd saves for the same rays.
 _STEP, _EVALUATION = 2.0, 0.5
-# Memory of compiled kernels, programs of matrix products, logging and metrics, and fragmentation.
-_LATER_BYTES = 250e6
 
 
 def require_memory(
@@ -48,8 +45,9 @@ def require_memory(
     num_rays = len(batch.rays) / share
     # Gradients and the two moments of Adam, in addition to the weights.
     step = 3 * learned + kept * max(_STEP * num_rays, _EVALUATION * renderer.chunk_size)
-    # A checkpoint is built in main memory before it is written: the state, and the moments.
-    host = _LATER_BYTES + sum(tensor.nbytes for tensor in renderer.state_dict().values()) + 2 * learned
+    # A checkpoint is built in main memory before it is written: the state, and the moments. Another 250 MB are for
+    # compiled kernels, programs of matrix products, logging and metrics, and fragmentation.
+    host = 250e6 + sum(tensor.nbytes for tensor in renderer.state_dict().values()) + 2 * learned
     per_ray = f"{kept / 1e3:.0f} kB"
     advice = f"{per_ray} are for each ray: take a smaller batches.size or evaluation.chunk_size"
     if device.type == "cuda":
@@ -82,7 +80,7 @@ def _kept_bytes(renderer: Renderer, batch: Batch, device: torch.device) -> float
             kept[storage.data_ptr()] = storage.nbytes()
         return tensor
 
-    rays = batch.rays[:: max(len(batch.rays) // _PROBED_RAYS, 1)].to(device)
+    rays = batch.rays[:: max(len(batch.rays) // 128, 1)].to(device)
     every = torch.arange(len(rays), device=device)
     no_view, draws = torch.zeros_like(every), Draws(0, 0, every)
     probed = Batch(rays, every, every, no_view, torch.zeros_like(rays.origins), every >= 0, batch.cameras, draws)

@@ -23,11 +23,6 @@ from nerfro.media.surface import make_surface
 from nerfro.registry.allowed import NotNegative, OnlyWith, Positive
 from nerfro.registry.registration import find, plugin_of
 
-# Radius of the uncontracted ball, as a fraction of the median distance from the cameras to the point they face.
-_RADIUS_SHARE = 0.5
-# Samples begin at this fraction of the distance of the nearest camera. Few rays cross the space close to a camera, so
-# that density there explains the photograph of that camera alone.
-_NEAR_SHARE = 0.3
 # Smallest eigenvalue with which the point nearest to all optical axes is determined along an eigenvector.
 _PARALLEL = 0.01
 _WITH_BALL = OnlyWith("space", ("all",))
@@ -147,14 +142,17 @@ def _ball(
     depth = 2 / (1 / max(cameras.near, 1e-3 * cameras.far) + 1 / cameras.far)
     middle = common_target(centres, forward, depth) if box is None else box.mean(0)
     distances = np.linalg.norm(centres - middle, axis=1)
-    radius = _RADIUS_SHARE * float(np.median(distances)) if content.radius is None else content.radius
+    # The uncontracted ball reaches half of the median distance from the point that the cameras face to the cameras.
+    radius = 0.5 * float(np.median(distances)) if content.radius is None else content.radius
     if not radius > 0:
         raise NerfroError("the cameras lie at the point that they face; give content.radius, in units of the poses")
     radius, near = float(f"{radius:.4g}"), content.near
     if box is None:
         corners = middle + np.array([[-1.0], [1.0]]) * radius
         box = np.array([[float(f"{x:.6g}") for x in corner] for corner in corners])
-    near = float(f"{_NEAR_SHARE * distances.min():.4g}") if near is None else near
+    # Samples begin at a fraction of the distance of the nearest camera. Few rays cross the space close to a camera, so
+    # that density there explains the photograph of that camera alone.
+    near = float(f"{0.3 * distances.min():.4g}") if near is None else near
     return box, radius, near
 
 

@@ -23,10 +23,6 @@ from nerfro.samplers.subdivision import Subdivision
 from nerfro.training.module import TrainingModule
 from nerfro.training.pixel_batches import PixelBatches
 
-# Number of validations for each validation image, so that the curve has more points; each costs a few steps.
-_VALIDATIONS_PER_IMAGE = 5
-# Steps of an epoch without validation.
-_STEPS_OF_EPOCH = 100
 # Weights of linear layers; the default field has 9,000, the networks of the paper 1.2 million.
 _LARGE = 100_000
 
@@ -85,7 +81,7 @@ class RayDataModule(LightningDataModule):
         # Lightning calls this method after restoring a checkpoint, so a resumed run continues with the next batch.
         trainer: Any = self.trainer
         if trainer.check_val_every_n_epoch is not None and isinstance(trainer.val_check_interval, float):
-            return Epoch(self.trainer, validation_interval(self.every) or _STEPS_OF_EPOCH)
+            return Epoch(self.trainer, validation_interval(self.every) or 100)  # any number without validation
         return itertools.count(self.trainer.global_step)
 
     def batches_of(self, trainer: Trainer) -> PixelBatches:
@@ -223,4 +219,5 @@ def can_prefetch(renderer: Renderer) -> bool:
 
 def validation_interval(every: int) -> int:
     """Return the number of steps between two validations, given the number between two images; 0 for never."""
-    return 0 if every == 0 else max(1, every // _VALIDATIONS_PER_IMAGE)
+    # There are five validations for each image, so that the curve has more points; each costs a few steps.
+    return 0 if every == 0 else max(1, every // 5)

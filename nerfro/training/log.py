@@ -26,9 +26,7 @@ from nerfro.files.reading import reading
 from nerfro.rendering import Scene
 from nerfro.training.module import TrainingModule
 
-_SKY_HEIGHT = 128  # rows of the image of the background
 _NUM_RAYS = 128  # largest number of rays for the histograms
-_NUM_PATHS = 12  # number of paths in the plot of paths
 # Charts of TensorBoard's page "Custom Scalars".
 _LAYOUT = {
     "training": {
@@ -112,7 +110,7 @@ class TrainingLog(Callback):
             "val/sky": sky(renderer.scene),
         }
         if not renderer.scene.medium.is_vacuum:
-            shown = torch.linspace(0, len(rays) - 1, min(_NUM_PATHS, len(rays))).long().to(rays.origins.device)
+            shown = torch.linspace(0, len(rays) - 1, min(12, len(rays))).long().to(rays.origins.device)
             images["val/paths"] = image_of_paths(renderings[-1].path.select_rays(shown), renderer.scene.medium)
         for logger in loggers:
             _log_images(logger, images, trainer.global_step)
@@ -141,7 +139,7 @@ def sky(scene: Scene) -> UInt8[np.ndarray, "H 2*H 3"]:
     was_training = scene.background.training
     scene.background.eval()
     try:
-        return _to_8bit(scene.colour_space.to_srgb(scene.background(Exits(directions(_SKY_HEIGHT).to(scene.device)))))
+        return _to_8bit(scene.colour_space.to_srgb(scene.background(Exits(directions(128).to(scene.device)))))  # rows
     finally:
         scene.background.train(was_training)
 

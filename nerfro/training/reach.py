@@ -15,10 +15,6 @@ from nerfro.geometry.interpolation import intersect_box
 from nerfro.rendering import RayTracer, Renderer
 from nerfro.training.pixel_batches import PixelBatches
 
-# Fraction of rays that may miss the field without a warning if the background does not learn.
-_FEW = 0.1
-
-
 # Number of rays that are checked, and bounds of the number of their steps.
 CHECKED_RAYS = 4096
 _MIN_STEPS, _MAX_STEPS = 16, 1024
@@ -61,7 +57,7 @@ def require_reach(renderer: Renderer, batches: PixelBatches, tracer: RayTracer, 
             f"no ray of the training views meets {box}, and nothing is outside of it; check that unit, axes and place "
             f"of the object are those of the cameras, or {advice}"
         )
-    if missed > _FEW and isinstance(renderer.scene.background, ConstantBackground):
+    if missed > 0.1 and isinstance(renderer.scene.background, ConstantBackground):
         warn(f"{missed:.0%} of the rays pass {box} and see background=constant alone, which learns nothing; {advice}")
 
 

@@ -55,7 +55,6 @@ _REQUIRED_KEYS = {
     "global_step": int,
     "loops": dict,
 }
-_SPARE_BYTES = 64 * 2**20  # images and logs, in addition to checkpoints
 
 
 @contextmanager
@@ -127,7 +126,7 @@ def next_steps(folder: Path, split: str | None) -> str:
 def needed_bytes(renderer: Renderer) -> int:
     """Estimate the size of a run: weights and two moments of Adam, in an old and a new checkpoint."""
     weights = sum(parameter.numel() * parameter.element_size() for parameter in renderer.parameters())
-    return 2 * 3 * weights + _SPARE_BYTES
+    return 2 * 3 * weights + 64 * 2**20  # the last are images and logs
 
 
 def record(folder: Path, config: DictConfig) -> None:

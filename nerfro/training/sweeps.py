@@ -28,10 +28,6 @@ from nerfro.training.inputs import file_hashes
 from nerfro.training.run_folder import CELL_FILE, CONFIG_FILE, in_sweep
 from nerfro.training.settings import RESULT, first_difference, settings, with_values
 
-# Larger data files are identified by name and size, because reading them would take minutes.
-_MAX_HASHED = 64 * 2**20  # bytes
-
-
 # For `hydra.sweep.subdir` in conf/train.yaml.
 OmegaConf.register_new_resolver("scene_name", scene_name, replace=True)
 
@@ -113,7 +109,8 @@ def _hash_of_files(root: Path, sweep: Path | None) -> str:
     for file in sorted(_visible_files(root, sweep)):
         num_bytes = file.stat().st_size
         digest.update(f"{file.relative_to(root).as_posix()}:{num_bytes};".encode())
-        if file.suffix.lower() not in VIEW_SUFFIXES and num_bytes <= _MAX_HASHED:
+        # Larger data files are identified by name and size, because reading them would take minutes.
+        if file.suffix.lower() not in VIEW_SUFFIXES and num_bytes <= 64 * 2**20:
             digest.update(file.read_bytes())
     return digest.hexdigest()[:16]
 

@@ -30,7 +30,6 @@ from nerfro.viewing.volume import MIN_OPTICAL_DEPTH, RESOLUTION, sample_field
 _TEMPLATES = ASSETS_DIR / "_page"
 _MAX_PHOTOGRAPHS = 24  # photographs on the page, spread evenly over the cameras
 _PHOTOGRAPH_SIDE = 256  # maximum size of the longer side, pixels
-_POSTER_SIDE = 384  # maximum size of the longer side, pixels
 _SEARCH_RESOLUTION = 64  # grid vertices per side for the search for the content of an unbounded field
 _SPLITS = ("test", "val", "train")  # the cameras are those of the first split that the data set has
 
@@ -142,7 +141,7 @@ def static_parts(
 def _poster(scene: TrainedScene, cameras: Cameras) -> str:
     """Render the first camera as a small picture."""
     longest = max(cameras.width, cameras.height)
-    scale = min(2.0, _POSTER_SIDE / longest)
+    scale = min(2.0, 384 / longest)  # at most 384 pixels
     size = [max(1, round(scale * side)) for side in (cameras.width, cameras.height)]
     rgb = scene.render(cameras.select([0]).resized(*size), Subdivision()).rgb[0]
     return data_uri(to_8bit(rgb).cpu().numpy(), "JPEG", quality=85)

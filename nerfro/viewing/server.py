@@ -20,7 +20,6 @@ from urllib.parse import parse_qs, urlsplit
 from nerfro.core.errors import NerfroError
 
 _WATCHED_SECONDS = 10.0  # a page counts as watched for so long after a request
-_DELIVERY_SECONDS = 5.0  # a browser asks for the state every two seconds
 # Placeholder until the page is complete; browsers reload the placeholder every two seconds.
 _PLACEHOLDER = (
     b'<!DOCTYPE html><html lang="en"><meta charset="utf-8"><meta http-equiv="refresh" content="2"><title>nerfro</title>'
@@ -115,7 +114,7 @@ class PageServer:
         with self._lock:
             self.outcome = outcome
         if self.watched:
-            self.outcome_sent.wait(_DELIVERY_SECONDS)
+            self.outcome_sent.wait(5.0)  # a browser asks for the state every two seconds
 
     def page(self) -> bytes:
         return self._page

@@ -25,9 +25,6 @@ from nerfro.samplers.paths.branching import ONE_PATH, Branching
 from nerfro.samplers.paths.polylines import distance_to_end
 from nerfro.samplers.paths.snell_law import reflectance, refract, turning_normals
 
-# Lower bound of the cosine between ray and normal in a division, so that gradients stay finite.
-_MIN_COSINE = 1e-6
-
 # Intersects rays with the recorded surfaces. Arguments: rows and column of the vertices, positions and directions of
 # the previous vertices, and traced distances. Results, with gradients: distances and unit normals.
 Intersect = Callable[[Tensor, int, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
@@ -160,7 +157,8 @@ def intersect_solid(medium: Bodies, surface: Int[Tensor, "P S"]) -> Intersect:
         body = surface[rows, column].long()[:, None, None] - 1
         phi, gradients = medium.signed_distances(x + length[:, None] * d)
         slope = (gradients.take_along_dim(body, 1)[:, 0] * d).sum(-1).detach()
-        slope = torch.copysign(slope.abs().clamp(min=_MIN_COSINE), slope)
+        # The cosine between ray and normal has a lower bound, so that gradients stay finite.
+        slope = torch.copysign(slope.abs().clamp(min=1e-6), slope)
         length = with_gradient(length, length - phi.gather(-1, body[:, 0])[:, 0] / slope)
         _, gradients = medium.signed_distances(x + length[:, None] * d)
         return length, functional.normalize(gradients.take_along_dim(body, 1)[:, 0], dim=-1)

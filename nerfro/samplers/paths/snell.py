@@ -26,9 +26,6 @@ from nerfro.samplers.paths.polylines import SnellTrace
 from nerfro.samplers.paths.replay import Intersect, intersect_solid, intersect_triangles, replay, smallest_cosine
 from nerfro.samplers.paths.straight import replay_straight, straight_path
 
-# Training uses no derivatives of paths whose `smallest_cosine` is below this value.
-_STEADY = 0.15
-
 
 class Tracer(ABC):
     """Trace rays from surface to surface of bodies at one wavelength.
@@ -172,7 +169,7 @@ class Snell(PathSampler):
         return _replay_in_bands(path, rays, tracers, self.branching)
 
     def steady(self, path: Path, medium: Medium) -> Bool[Tensor, "P"]:
-        return smallest_cosine(path, medium) > _STEADY
+        return smallest_cosine(path, medium) > 0.15
 
     def releases_gil(self, medium: Medium) -> bool:
         return self.tracers(medium)[0].releases_gil

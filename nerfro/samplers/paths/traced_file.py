@@ -20,9 +20,6 @@ from nerfro.geometry.interpolation import intersect_box
 from nerfro.media.base import Medium
 from nerfro.registry.allowed import Coordinate, Distance, check
 
-# Without `far`, paths end this number of diagonals beyond the box of the medium, because reflected paths are long.
-_DIAGONALS = 2
-
 
 @dataclass
 class TraceSamplerConfig:
@@ -74,7 +71,8 @@ def make_rays(
     if far is None:
         centre, diagonal = medium.box.mean(0), float(torch.linalg.vector_norm(medium.box[1] - medium.box[0]))
         distance = float(torch.linalg.vector_norm(origins.detach() - centre, dim=-1).max())
-        far = max(distance, near) + (_DIAGONALS + 0.5) * diagonal
+        # Paths end two diagonals beyond the box of the medium, because reflected paths are long.
+        far = max(distance, near) + 2.5 * diagonal
     if not 0 <= near < far:
         raise NerfroError(f"near={near}, far={far} is no range; near must be at least 0 and below far")
     ones = torch.ones(len(origins), dtype=dtype)

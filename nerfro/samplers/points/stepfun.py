@@ -9,9 +9,6 @@ from torch import Tensor
 from nerfro.core.draws import Draws
 from nerfro.core.types import Path
 
-# Rays with a smaller total weight are sampled uniformly, as in the code of mip-NeRF.
-_MIN_TOTAL_WEIGHT = 1e-5
-
 
 def volume_weights(
     density: Float[Tensor, "P N"], deltas: Float[Tensor, "P N"]
@@ -61,7 +58,8 @@ def invert_cdf(
     """
     num_bins = weights.shape[-1]
     total = weights.sum(-1, keepdim=True)
-    padding = (_MIN_TOTAL_WEIGHT - total).clamp(min=0)
+    # Rays with a smaller total weight are sampled uniformly, as in the code of mip-NeRF.
+    padding = (1e-5 - total).clamp(min=0)
     pdf = (weights + padding / num_bins) / (total + padding)
     cdf = pdf[..., :-1].cumsum(-1).clamp(max=1.0)
     cdf = torch.cat([torch.zeros_like(total), cdf, torch.ones_like(total)], dim=-1)
