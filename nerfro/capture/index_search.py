@@ -10,7 +10,6 @@ of half the radius by 0.27 degrees.
 from __future__ import annotations
 
 import itertools
-import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -26,7 +25,7 @@ from nerfro.core.errors import NerfroError, warn
 from nerfro.core.progress import counting_bar
 from nerfro.core.provenance import AlgorithmSettings
 from nerfro.core.robust import geman_mcclure, geman_mcclure_weight
-from nerfro.files.atomic import write_atomically
+from nerfro.files.atomic import write_json
 from nerfro.media.base import Medium
 from nerfro.media.bodies import Bodies
 from nerfro.media.body_settings import expanded
@@ -398,7 +397,7 @@ def find_medium(request: Request, observations: Observations, medium: Medium) ->
     origin = Provenance(standard_error=estimate.written_errors, doubts=estimate.doubts)
     values = [round(value, 5) for value in estimate.values.tolist()]
     figures = {"ior": values, "standard_error": origin.standard_error, "doubts": origin.doubts}
-    write_atomically(request.out / INDEX, json.dumps(figures, indent=1) + "\n")
+    write_json(request.out / INDEX, figures)
     searched = bodies.with_indices(torch.from_numpy(estimate.values))
     settings = index_settings(request.config.medium, bodies.names, estimate.values)
     return FoundMedium(searched, origin, settings)

@@ -16,7 +16,6 @@ descent, because a visual hull is as rough as its voxels.
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
@@ -36,7 +35,7 @@ from nerfro.core.progress import counting_bar
 from nerfro.core.provenance import AlgorithmSettings
 from nerfro.core.robust import geman_mcclure
 from nerfro.core.types import Exits, Path
-from nerfro.files.atomic import write_atomically
+from nerfro.files.atomic import write_json
 from nerfro.geometry.interpolation import bspline_basis, smooth
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.media.base import Medium
@@ -235,7 +234,7 @@ def refine(
         moved = float(torch.from_numpy(refined.mesh.vertices - start.vertices).norm(dim=-1).median())
         print(f"surface refined and used: {change}; median displacement {moved:.2g} world units")
     figures = {"steps": refined.steps, "validation_error": [round(error, 5) for error in refined.errors]}
-    write_atomically(folder / FIGURES, json.dumps(figures, indent=1) + "\n")
+    write_json(folder / FIGURES, figures)
     return mesh
 
 

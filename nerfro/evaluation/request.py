@@ -94,19 +94,6 @@ def record(folder: Path, options: EvaluateConfig) -> None:
     write_atomically(folder / REQUEST_FILE, OmegaConf.to_yaml(OmegaConf.create(dataclasses.asdict(options))))
 
 
-def report_unused_gpu(option: str) -> None:
-    """Print a line if the machine has a GPU, which `device=auto` does not use because compiled kernels are for CPUs.
-
-    Args:
-        option: option that selects the GPU.
-    """
-    if find_gpu() is not None:
-        warn(
-            "the CPU is used, because nerfro has no GPU kernels and its speed on a GPU is unknown; "
-            f"set {option} to use the GPU nevertheless"
-        )
-
-
 def find_device(name: str) -> torch.device:
     """Return the device of a name; `auto` means the CPU, as in training.
 
@@ -115,7 +102,11 @@ def find_device(name: str) -> torch.device:
     """
     if name == "auto":
         name = "cpu"
-        report_unused_gpu("device=cuda")
+        if find_gpu() is not None:
+            warn(
+                "the CPU is used, because nerfro has no GPU kernels and its speed on a GPU is unknown; "
+                "set device=cuda to use the GPU nevertheless"
+            )
     try:
         device = torch.device(name)
         torch.zeros(1, device=device)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import secrets
 import shutil
@@ -74,3 +75,8 @@ def require_room(folder: Path, needed_bytes: int, option: str) -> None:
             f"{folder} has {free / 2**20:,.0f} MiB free and this run needs {needed_bytes / 2**20:,.0f}; free some or "
             f"choose another {option}"
         )
+
+
+def write_json(path: Path | str, content: object, indent: int = 1) -> None:
+    """Write a value as JSON atomically."""
+    write_atomically(path, json.dumps(content, indent=indent) + "\n")

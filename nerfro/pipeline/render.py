@@ -11,8 +11,7 @@ from nerfro.files.folder_lock import lock_folder
 from nerfro.kernels.available import keep_freed_memory
 from nerfro.training.load import checkpoint_of, load
 from nerfro.training.run import Run
-from nerfro.viewing.film import find_ffmpeg, write_film
-from nerfro.viewing.frames import render_frames
+from nerfro.viewing.film import find_ffmpeg, render_frames, write_film
 from nerfro.viewing.layers import LAYERS
 from nerfro.viewing.render_request import RenderConfig, check_request, find_shots, prepared
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from jaxtyping import Float
 
 from nerfro.core.cameras import up_direction
 from nerfro.core.paths import relative_path
-from nerfro.files.atomic import write_atomically
+from nerfro.files.atomic import write_atomically, write_json
 from nerfro.geometry.lines import nearest_point
 from nerfro.geometry.normals import axes_along
 from nerfro.poses.calibration import Calibration
@@ -72,7 +71,7 @@ def write_calibrated(
         for name in names:
             matrix = [*calibration.poses[name].camera_to_world.tolist(), [0.0, 0.0, 0.0, 1.0]]
             frames.append({"file_path": relative_path(files[name], out), "transform_matrix": matrix})
-        write_atomically(path, json.dumps(document | {"frames": frames}, indent=1) + "\n")
+        write_json(path, document | {"frames": frames})
         written.append(f"{path} ({len(names)} views)")
     report = {
         "target": target,
@@ -90,7 +89,7 @@ def write_calibrated(
         "skipped": calibration.skipped,
         "num_outliers": calibration.num_outliers,
     }
-    write_atomically(out / REPORT, json.dumps(report, indent=1) + "\n")
+    write_json(out / REPORT, report)
     poses = list(calibration.poses.values())
     matrices, errors = np.stack([pose.camera_to_world for pose in poses]), [pose.error for pose in poses]
     write_atomically(out / PLOT, _plot_cameras(matrices, np.nan_to_num(errors), *shown))

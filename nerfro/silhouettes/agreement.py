@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from torch import Tensor
 from nerfro.core.errors import NerfroError, first_of, warn
 from nerfro.core.provenance import AlgorithmSettings
 from nerfro.data.base import Views
-from nerfro.files.atomic import write_atomically
+from nerfro.files.atomic import write_json
 from nerfro.files.drawing import sheet
 from nerfro.files.images import save_image
 from nerfro.geometry.mesh import TriangleMesh
@@ -182,7 +181,7 @@ def report_overlaps(
     _draw_overlays(views, mesh, overlaps, folder)
     by_view = dict(zip(views.names, (round(float(x), 4) for x in overlaps), strict=True))
     figures = {"mean": round(float(overlaps.mean()), 4), "views": by_view}
-    write_atomically(folder / REPORT, json.dumps(figures, indent=1) + "\n")
+    write_json(folder / REPORT, figures)
 
 
 def _warn_of_bad(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import importlib.metadata
-import json
 import platform
 from abc import ABC, abstractmethod
 from dataclasses import asdict, dataclass
@@ -21,7 +20,7 @@ from nerfro.core.errors import NerfroError
 from nerfro.core.light import to_srgb
 from nerfro.data.base import SPLITS
 from nerfro.files import lat_long
-from nerfro.files.atomic import write_atomically
+from nerfro.files.atomic import write_json
 from nerfro.files.deep_images import write_radiance
 from nerfro.files.folder_lock import require_only
 from nerfro.files.images import save_image
@@ -240,7 +239,3 @@ def write_image(path: Path, image: np.ndarray) -> None:
     """Write sRGB [H, W, 3] or coverage [H, W], clipped to [0, 1], as an 8-bit PNG, or bool [H, W] as a 1-bit PNG."""
     levels = image if image.dtype == bool else np.rint(np.clip(image, 0.0, 1.0) * 255).astype(np.uint8)
     save_image(path, Image.fromarray(levels), optimize=True)
-
-
-def write_json(path: Path, content: dict[str, Any]) -> None:
-    write_atomically(path, json.dumps(content, indent=1) + "\n")

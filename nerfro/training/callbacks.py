@@ -232,9 +232,7 @@ class StopOnSignal(Callback):
         except ValueError:  # not the main thread (a launcher's worker): signals are not ours to handle
             self._previous = {}
 
-    def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: Batch, batch_idx: int
-    ) -> None:
+    def on_train_batch_end(self, trainer: Trainer, *_: Any, **__: Any) -> None:
         self.stop(trainer)
 
     def stop(self, trainer: Trainer) -> bool:

@@ -18,7 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from nerfro.core.cameras import Cameras
-from nerfro.core.types import Batch, Exits, Rays, Rendering
+from nerfro.core.types import Exits, Rays, Rendering
 from nerfro.evaluation.error_maps import triptych
 from nerfro.evaluation.path_plot import image_of_paths
 from nerfro.files.lat_long import directions
@@ -73,9 +73,7 @@ class TrainingLog(Callback):
             if isinstance(logger, WandbLogger):
                 logger.log_hyperparams(OmegaConf.to_container(self._config, resolve=True))  # type: ignore[arg-type]
 
-    def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: Batch, batch_idx: int
-    ) -> None:
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any, **__: Any) -> None:
         for group in trainer.optimizers[0].param_groups:
             pl_module.log(f"optimizer/learning_rate/{group.get('name', 'common')}", group["lr"])
         pl_module.log("train/peak_memory_gib", peak_memory(pl_module.device) / 2**30)
@@ -85,13 +83,7 @@ class TrainingLog(Callback):
                 logger.log_metrics(first, 0)
 
     def on_validation_batch_end(
-        self,
-        trainer: Trainer,
-        pl_module: LightningModule,
-        outputs: Any,
-        batch: int,
-        batch_idx: int,
-        dataloader_idx: int = 0,
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, *_: Any, **__: Any
     ) -> None:
         if not outputs:
             return

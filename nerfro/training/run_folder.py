@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import pickle
 import platform
 import shlex
@@ -23,7 +22,7 @@ from nerfro.core.errors import Interrupted, NerfroError, first_of, warn
 from nerfro.core.paths import PACKAGE_DIR, user_path
 from nerfro.core.provenance import AlgorithmSettings, command_of_process, versions
 from nerfro.data.base import Views
-from nerfro.files.atomic import require_room, write_atomically
+from nerfro.files.atomic import require_room, write_atomically, write_json
 from nerfro.files.folder_lock import lock_folder, require_only
 from nerfro.files.foreign_config import foreign_config, read_foreign_config
 from nerfro.files.reading import reading
@@ -146,7 +145,7 @@ def record(folder: Path, config: DictConfig) -> None:
         "versions": versions(),
         "algorithms": list(AlgorithmSettings.used.values()),
     }
-    write_atomically(folder / "run.json", json.dumps(facts, indent=2) + "\n")
+    write_json(folder / "run.json", facts, indent=2)
     if diff:
         write_atomically(folder / "git.diff", diff + "\n")
 

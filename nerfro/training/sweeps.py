@@ -7,7 +7,6 @@ so that repeating the command of a sweep continues the sweep.
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -21,7 +20,7 @@ from nerfro.core.errors import NerfroError
 from nerfro.core.paths import resolve_path, scene_name
 from nerfro.data.image_files import VIEW_SUFFIXES
 from nerfro.evaluation.results import RunMetrics, read_metrics_json
-from nerfro.files.atomic import write_atomically
+from nerfro.files.atomic import write_json
 from nerfro.files.folder_lock import lock_folder
 from nerfro.files.reading import read_json
 from nerfro.training.inputs import file_hashes
@@ -75,7 +74,7 @@ def run_cell(config: DictConfig, folder: Path, train: Callable[[DictConfig], Run
 
 
 def _record(folder: Path, record: Mapping[str, Any]) -> None:
-    write_atomically(folder / CELL_FILE, json.dumps(record, indent=2) + "\n")
+    write_json(folder / CELL_FILE, record, indent=2)
 
 
 def _require_same_cell(folder: Path, identity: Mapping[str, Any]) -> None:

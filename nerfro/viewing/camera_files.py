@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -24,7 +23,7 @@ from nerfro.data.frames import check_pose
 from nerfro.data.image_files import read_size
 from nerfro.data.lenses import Lens, check_lenses, lens_tensors, read_lens
 from nerfro.data.transforms import existing_image
-from nerfro.files.atomic import write_atomically
+from nerfro.files.atomic import write_json
 from nerfro.files.reading import is_number, parse_matrix, read_json
 from nerfro.viewing.camera_paths import CaptureGeometry
 
@@ -134,7 +133,7 @@ def write_cameras(file: Path, camera: CameraModel, views: Views, origin: Float[n
         entry |= {"turned_degrees": turned[view], "shifted": shifted[view]}
         if gains is not None:
             entry["gain"] = gains[view]
-    write_atomically(file, json.dumps(document, indent=1) + "\n")
+    write_json(file, document)
 
 
 def transforms_document(

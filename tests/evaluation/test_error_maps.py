@@ -5,10 +5,9 @@ import torch
 
 from nerfro.evaluation.error_maps import squared_error_map, triptych
 from nerfro.evaluation.error_sheets import error_maps, write_error_sheet
-from nerfro.evaluation.image_metrics import build_metrics, psnr
+from nerfro.evaluation.image_metrics import build_metrics, psnr, ssim
 from nerfro.evaluation.perceptual.flip import flip
 from nerfro.evaluation.perceptual.lpips import LpipsNetwork, published_weights
-from nerfro.evaluation.ssim import ssim
 from nerfro.files.drawing import magma
 from nerfro.files.images import load_png, round_to_8bit
 from nerfro.registry.registration import discover

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Annotated, Any, Literal
@@ -20,60 +19,35 @@ from nerfro.media.bodies import Bodies
 from nerfro.registry.allowed import OnlyWith, Positive, Share
 from nerfro.registry.registration import register
 from nerfro.samplers.base import PathSampler
-from nerfro.samplers.paths.branching import Branching
 from nerfro.samplers.paths.compiled import trace_bodies
-from nerfro.samplers.paths.polylines import SnellTrace
-from nerfro.samplers.paths.replay import Intersect, intersect_solid, intersect_triangles, replay, smallest_cosine
+from nerfro.samplers.paths.polylines import Branching, SnellTrace
+from nerfro.samplers.paths.replay import intersect_solid, intersect_triangles, replay, smallest_cosine
 from nerfro.samplers.paths.straight import replay_straight, straight_path
 
 
-class Tracer(ABC):
-    """Trace rays from surface to surface of bodies at one wavelength.
+class Tracer:
+    """Trace rays from surface to surface of bodies at one wavelength, by the compiled kernel.
 
-    Attributes:
+    Args:
         medium: the bodies, with one index for all wavelengths in a call of `trace` or `replay`.
-        releases_gil: whether tracing on the CPU releases the global interpreter lock.
+        triangles: whether rays intersect the triangles of the meshes instead of the zero levels of the grids.
     """
 
-    releases_gil = False
+    def __init__(self, medium: Bodies, triangles: bool = False) -> None:
+        self.medium, self.triangles = medium, triangles
 
-    def __init__(self, medium: Bodies) -> None:
-        self.medium = medium
-
-    @abstractmethod
     def trace(self, rays: Rays, max_events: int, branching: Branching) -> SnellTrace:
         """Trace rays without gradients, and count events."""
+        return trace_bodies(rays, self.medium, self.medium.tree if self.triangles else None, max_events, branching)
 
     def replay(self, path: Path, rays: Rays, branching: Branching) -> Path:
         """Return a traced path with gradients; see `samplers.paths.replay`."""
-        return replay(path, rays, self.medium, self.intersect(path), branching)
-
-    def intersect(self, path: Path) -> Intersect:
-        """Return the intersection of rays with the recorded surfaces of a path."""
         assert path.record is not None
-        return intersect_solid(self.medium, path.record.surface_body)
-
-
-class GridTracer(Tracer):
-    """Trace zero levels of distance grids by the compiled kernel."""
-
-    releases_gil = True
-
-    def trace(self, rays: Rays, max_events: int, branching: Branching) -> SnellTrace:
-        return trace_bodies(rays, self.medium, None, max_events, branching)
-
-
-class TriangleTracer(Tracer):
-    """Trace triangles of meshes by the compiled kernel."""
-
-    releases_gil = True
-
-    def trace(self, rays: Rays, max_events: int, branching: Branching) -> SnellTrace:
-        return trace_bodies(rays, self.medium, self.medium.tree, max_events, branching)
-
-    def intersect(self, path: Path) -> Intersect:
-        assert path.record is not None
-        return intersect_triangles(self.medium.triangles, path.record.triangle)
+        if self.triangles:
+            intersect = intersect_triangles(self.medium.triangles, path.record.triangle)
+        else:
+            intersect = intersect_solid(self.medium, path.record.surface_body)
+        return replay(path, rays, self.medium, intersect, branching)
 
 
 class StraightTracer(Tracer):
@@ -135,19 +109,15 @@ class Snell(PathSampler):
             raise NerfroError(
                 "sampler/path=snell needs a medium with a surface; take medium=sdf_grid, or sampler/path=eikonal"
             )
-        if self.interface == "sdf":
-            tracer: type[Tracer] = GridTracer
-        elif bodies.meshes:
-            tracer = TriangleTracer
+        if self.traces_triangles:
+            if not bodies.meshes:
+                raise NerfroError(
+                    "sampler.path.interface=mesh needs a medium made of meshes; give each body of medium=sdf_grid a "
+                    "mesh, or set sampler.path.interface=sdf"
+                )
             bodies.tree  # noqa: B018 (created once, before the variants of all wavelengths share it)
-        else:
-            raise NerfroError(
-                "sampler.path.interface=mesh needs a medium made of meshes; give each body of medium=sdf_grid a "
-                "mesh, or set sampler.path.interface=sdf"
-            )
-        if not bodies.disperses:
-            return [tracer(bodies)]
-        return [tracer(bodies.at_wavelength(wavelength)) for wavelength in self.wavelengths]
+        media = [bodies.at_wavelength(w) for w in self.wavelengths] if bodies.disperses else [bodies]
+        return [Tracer(medium, self.traces_triangles) for medium in media]
 
     @torch.no_grad()
     def forward(self, rays: Rays, medium: Medium) -> Path:
@@ -172,7 +142,7 @@ class Snell(PathSampler):
         return smallest_cosine(path, medium) > 0.15
 
     def releases_gil(self, medium: Medium) -> bool:
-        return self.tracers(medium)[0].releases_gil
+        return not medium.is_vacuum
 
     @torch.no_grad()
     def trace(self, rays: Rays, medium: Medium, branching: Branching | None = None) -> SnellTrace:

@@ -18,7 +18,7 @@ from numba import prange
 
 from nerfro.kernels.compilation import compiled, compiled_parallel
 from nerfro.kernels.lookup import body_distance, box_span, distance_out, grid_of, spline_value_gradient
-from nerfro.samplers.paths.branching import Branching
+from nerfro.samplers.paths.polylines import Branching
 from nerfro.samplers.paths.surface_search_cpu import Line, advance, first_surface
 from nerfro.samplers.paths.triangle_search_cpu import begin_inside, face_normal, first_triangle
 
@@ -361,7 +361,7 @@ def _trace_ray(solids, tree, line, near, far, settings, scratch, rows):
 
 @compiled_parallel
 def trace_snell(rays, solids, tree, settings, rows, counts):
-    """Trace the polylines of all rays, which may split at their first events (`samplers.paths.branching`).
+    """Trace the polylines of all rays, which may split at their first events (`samplers.paths.polylines`).
 
     Args:
         rays: origins, directions, near and far [R, ...].
