@@ -10,8 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from nerfro.data.lazy_images import LazyImages
-from nerfro.files.cache import content_hash, file_hash
-from nerfro.files.mapped import mapped_array
+from nerfro.files.cache import content_hash, file_hash, mapped_array
 
 # Images that need more bytes than this are memory-mapped from a cache file.
 _MAPPED_FROM = 2**30

@@ -20,9 +20,8 @@ from nerfro.core.light import to_linear, tone_mapped
 from nerfro.core.progress import duration, track
 from nerfro.data.base import Views
 from nerfro.data.image_files import Alpha, is_linear
-from nerfro.evaluation.error_sheets import write_error_sheet
 from nerfro.evaluation.folders import ImagePair
-from nerfro.evaluation.metrics import ImageMetrics
+from nerfro.evaluation.metrics import ImageMetrics, write_error_sheet
 from nerfro.evaluation.render_view import maps_of, render_view
 from nerfro.evaluation.results import AS_GIVEN, EXPOSED, OF_HALVES, TONE_MAPPED, UNEXPOSED, EvaluationResult, ViewScores
 from nerfro.files.images import save_png

@@ -10,9 +10,8 @@ from nerfro.cli.calls import changed_settings, options_of
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import user_path
 from nerfro.data.image_files import Alpha
-from nerfro.evaluation.error_sheets import write_error_sheet
 from nerfro.evaluation.folders import match_folders
-from nerfro.evaluation.metrics import ImageMetrics
+from nerfro.evaluation.metrics import ImageMetrics, write_error_sheet
 from nerfro.evaluation.request import EvaluateConfig, find_device, own_folder, record, require_one_task
 from nerfro.evaluation.results import RunMetrics
 from nerfro.evaluation.scoring import score_folders, score_split

@@ -7,13 +7,16 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
 from lightning.pytorch import Trainer, seed_everything
 from omegaconf import DictConfig
+from torch import Tensor
 
 from nerfro.cli.calls import Composition, composed
 from nerfro.cli.overrides import as_overrides
 from nerfro.core.errors import NerfroError, warn
 from nerfro.data.base import DataSource, Views
+from nerfro.optimizers.config import matches, require_matches
 from nerfro.rendering import RayTracer, Renderer
 from nerfro.rendering.memory import require_memory
 from nerfro.rendering.scene_file import SceneFile, with_scene
@@ -32,10 +35,11 @@ from nerfro.training.config import (
 from nerfro.training.data_module import RayDataModule
 from nerfro.training.derivation import derived
 from nerfro.training.effects import warn_without_effect
-from nerfro.training.init_from import initialize_from
+from nerfro.training.load import checkpoint_of
 from nerfro.training.module import TrainingModule
 from nerfro.training.pixel_batches import PixelBatches
 from nerfro.training.reach import CHECKED_RAYS, require_reach
+from nerfro.training.run_folder import load_run, restore
 from nerfro.training.schedule import Schedule
 
 
@@ -163,3 +167,51 @@ def check_before_training(renderer: Renderer, data: RayDataModule, trainer: Trai
     warn_of_thin_walls(renderer.path_sampler, renderer.scene.medium)
     device = trainer.strategy.root_device
     return require_memory(renderer, first, device, few.batch_size / batches.batch_size, batches.pixel_bytes)
+
+
+def initialize_from(renderer: Renderer, run: str, include: Sequence[str]) -> str:
+    """Copy parameters of another run with the same names and shapes, and the buffers of its fields and background.
+
+    Args:
+        renderer: model that receives the values.
+        run: folder of the other run, or one of its checkpoints.
+        include: patterns of names (`Scene.parameters_by_name`), in which an asterisk stands for any text.
+
+    Returns:
+        A line for each name that matches: loaded, skipped because the other run lacks it, or of another shape.
+
+    Raises:
+        NerfroError: the run cannot be read, a pattern matches no parameter, or nothing was loaded.
+    """
+    own, others = _values(renderer), _values(restore(*load_run(checkpoint_of(run))))
+    require_matches("init_include", include, own)
+    lines, num_loaded = [], 0
+    for name, value in own.items():
+        if not matches(name, include):
+            continue
+        other = others.get(name)
+        if other is None:
+            lines.append(f"  skipped {name}: {run} does not have it")
+        elif other.shape != value.shape:
+            lines.append(f"  skipped {name}: shape {list(value.shape)}, and {list(other.shape)} in {run}")
+        else:
+            with torch.no_grad():
+                value.copy_(other)
+            lines.append(f"  loaded {name}: shape {list(value.shape)}")
+            num_loaded += 1
+    if not num_loaded:
+        raise NerfroError(
+            f"init_from={run} has no parameter of init_include={list(include)} with the shape of this run"
+        )
+    return "\n".join([f"nerfro: {num_loaded} of {len(lines)} values from {run}", *lines])
+
+
+def _values(renderer: Renderer) -> dict[str, Tensor]:
+    """Return the parameters by name, and the stored buffers of fields and background."""
+    parts = {"fields": renderer.scene.fields, "background": renderer.scene.background}
+    stored = {
+        f"{part}.{name}": value
+        for part, module in parts.items()
+        for name, value in module.state_dict(keep_vars=True).items()
+    }
+    return stored | renderer.parameters_by_name()

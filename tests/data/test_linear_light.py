@@ -24,8 +24,8 @@ from nerfro.data.blender import BlenderData
 from nerfro.data.image_files import read_mask, read_rgb, read_size
 from nerfro.data.lazy_images import LazyImages
 from nerfro.data.pixel_store import PixelStore
-from nerfro.evaluation.error_sheets import write_error_sheet
 from nerfro.evaluation.image_metrics import psnr
+from nerfro.evaluation.metrics import write_error_sheet
 from nerfro.files.deep_images import write_radiance
 from nerfro.files.images import round_to_8bit
 from nerfro.geometry.mesh import load_mesh

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from nerfro.evaluation.error_maps import squared_error_map, triptych
-from nerfro.evaluation.error_sheets import error_maps, write_error_sheet
 from nerfro.evaluation.image_metrics import build_metrics, psnr, ssim
+from nerfro.evaluation.metrics import error_maps, write_error_sheet
 from nerfro.evaluation.perceptual.flip import flip
 from nerfro.evaluation.perceptual.lpips import LpipsNetwork, published_weights
 from nerfro.files.drawing import magma

@@ -9,8 +9,7 @@ import pytest
 
 from nerfro.core.errors import NerfroError
 from nerfro.files import cache
-from nerfro.files.cache import cached_arrays, content_hash, save_arrays
-from nerfro.files.mapped import mapped_array
+from nerfro.files.cache import cached_arrays, content_hash, mapped_array, save_arrays
 from nerfro.files.reading import load_arrays
 from tests.conftest import refused
 
