@@ -3,6 +3,7 @@
 import functools
 import os
 import threading
+import time
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
@@ -51,11 +52,21 @@ def test_page_of_a_run(tmp_path: Path) -> None:
         assert browser.findings() == []
 
 
-@pytest.mark.parametrize("page", ["index.html", "guides/export_and_share.html"])
-def test_site(page: str, tmp_path: Path) -> None:
-    site = Path(os.environ.get("NERFRO_SITE", "-"))
-    if not site.is_dir():
+@pytest.fixture(scope="module")
+def site() -> Path:
+    """The site of the documentation, which `.ci/run` builds while the tests run."""
+    if "NERFRO_SITE" not in os.environ:
         pytest.skip("the site is not built: mkdocs build, and set NERFRO_SITE to its folder")
+    folder = Path(os.environ["NERFRO_SITE"])
+    deadline = time.monotonic() + 120
+    while not folder.is_dir():
+        assert time.monotonic() < deadline, f"{folder} does not exist"
+        time.sleep(0.1)
+    return folder
+
+
+@pytest.mark.parametrize("page", ["index.html", "guides/export_and_share.html"])
+def test_site(page: str, site: Path, tmp_path: Path) -> None:
     # The search of the site needs a server.
     files = functools.partial(SimpleHTTPRequestHandler, directory=str(site))
     with ThreadingHTTPServer(("localhost", 0), files) as host:
