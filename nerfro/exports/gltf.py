@@ -17,7 +17,7 @@ from nerfro.core.light import to_linear
 from nerfro.core.optional import optional
 from nerfro.exports.gaussians import HARMONIC_0, Gaussians
 from nerfro.exports.meshes import glass_meshes, inside_mesh, one_mesh
-from nerfro.exports.usd import encode_usdz, require_usd
+from nerfro.exports.usd import encode_usdz, openusd
 from nerfro.files.atomic import write_atomically
 from nerfro.files.lat_long import save_lat_long
 from nerfro.files.templates import fill_template
@@ -45,7 +45,7 @@ def write_mesh(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
     """
     suffix, limit = out.suffix.lower(), options.triangles
     if suffix == ".usdz":
-        require_usd()
+        openusd("Usd")
     if limit is not None:
         optional("fast_simplification", "gltf", "triangles= needs fast-simplification")
     elif suffix in (".glb", ".usdz"):

@@ -26,13 +26,13 @@ _FILM_WIDTH = 0.24  # in tenths of a world unit, as the format states lengths of
 _OPACITY = 0.1  # of glass where light does not bend, so that it remains visible
 
 
-def require_usd() -> None:
-    """Check that OpenUSD is installed.
+def openusd(*modules: str) -> list[Any]:
+    """Import modules of OpenUSD.
 
     Raises:
-        NerfroError: it is not.
+        NerfroError: it is not installed.
     """
-    optional("pxr.Usd", "usd", "a .usdz needs usd-core", ", or write a .glb")
+    return [optional(f"pxr.{name}", "usd", "a .usdz needs usd-core", ", or write a .glb") for name in modules]
 
 
 def encode_usdz(scene: TrainedScene, glass: list[trimesh.Trimesh], inside: trimesh.Trimesh | None) -> bytes:
@@ -42,21 +42,18 @@ def encode_usdz(scene: TrainedScene, glass: list[trimesh.Trimesh], inside: trime
     one that it knows: UsdPreviewSurface is transparent and reflects, and MaterialX's Standard Surface also bends light,
     absorbs and disperses it.
     """
-    require_usd()
-    from pxr import Sdf, Usd, UsdGeom, UsdLux, UsdUtils
-
+    sdf, usd, geometry, lights, utilities = openusd("Sdf", "Usd", "UsdGeom", "UsdLux", "UsdUtils")
     with tempfile.TemporaryDirectory() as folder:
-        stage = Usd.Stage.CreateNew(f"{folder}/scene.usdc")
-        UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
-        UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-        stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/scene").GetPrim())
-        UsdGeom.Scope.Define(stage, "/scene/materials")
+        stage = usd.Stage.CreateNew(f"{folder}/scene.usdc")
+        geometry.SetStageUpAxis(stage, geometry.Tokens.y)
+        geometry.SetStageMetersPerUnit(stage, 1.0)
+        stage.SetDefaultPrim(geometry.Xform.Define(stage, "/scene").GetPrim())
+        geometry.Scope.Define(stage, "/scene/materials")
         bodies = scene.renderer.scene.medium.bodies
+        materials = [] if bodies is None else bodies.materials
         absorptions = absorption_of(scene.renderer.scene)
-        for number, (mesh, absorption) in enumerate(zip(glass, absorptions, strict=True)):
-            assert bodies is not None
-            dispersion = bodies.materials[number].dispersion
-            abbe = 0.0 if dispersion is None else dispersion.abbe
+        for number, (mesh, absorption, material) in enumerate(zip(glass, absorptions, materials, strict=True)):
+            abbe = 0.0 if material.dispersion is None else material.dispersion.abbe
             _add_mesh(stage, f"/scene/glass_{number}", mesh)
             _add_glass(stage, f"/scene/glass_{number}", float(scene.ior[number]), absorption.numpy(), abbe)
         if inside is not None:
@@ -64,30 +61,29 @@ def encode_usdz(scene: TrainedScene, glass: list[trimesh.Trimesh], inside: trime
             _add_emission(stage, "/scene/inside", np.asarray(inside.vertex_attributes["radiance"]))
         _add_cameras(stage, scene.cameras("train").to("cpu"))
         save_lat_long(f"{folder}/sky.exr", scene.sky)
-        dome = UsdLux.DomeLight.Define(stage, "/scene/sky")
-        dome.CreateTextureFileAttr(Sdf.AssetPath("./sky.exr"))
-        dome.CreateTextureFormatAttr(UsdLux.Tokens.latlong)
+        dome = lights.DomeLight.Define(stage, "/scene/sky")
+        dome.CreateTextureFileAttr(sdf.AssetPath("./sky.exr"))
+        dome.CreateTextureFormatAttr(lights.Tokens.latlong)
         # The centre of the image is at +x, and that of an unrotated dome at +z.
         dome.AddRotateYOp().Set(90.0)
         stage.GetRootLayer().Save()
-        UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(f"{folder}/scene.usdc"), f"{folder}/scene.usdz")
+        utilities.CreateNewUsdzPackage(sdf.AssetPath(f"{folder}/scene.usdc"), f"{folder}/scene.usdz")
         return Path(folder, "scene.usdz").read_bytes()
 
 
 def _add_mesh(stage: Any, path: str, mesh: trimesh.Trimesh) -> None:
-    from pxr import UsdGeom, Vt
-
+    geometry, arrays = openusd("UsdGeom", "Vt")
     vertices, normals = (
         (numbers @ Z_UP_TO_Y_UP.T).astype(np.float32) for numbers in (mesh.vertices, mesh.vertex_normals)
     )
-    shape = UsdGeom.Mesh.Define(stage, path)
-    shape.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(vertices))
-    shape.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.stack([vertices.min(0), vertices.max(0)])))
-    shape.CreateFaceVertexCountsAttr(Vt.IntArray(len(mesh.faces), 3))
-    shape.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(mesh.faces.astype(np.int32).ravel()))
-    shape.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(normals))
-    shape.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
-    shape.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    shape = geometry.Mesh.Define(stage, path)
+    shape.CreatePointsAttr(arrays.Vec3fArray.FromNumpy(vertices))
+    shape.CreateExtentAttr(arrays.Vec3fArray.FromNumpy(np.stack([vertices.min(0), vertices.max(0)])))
+    shape.CreateFaceVertexCountsAttr(arrays.IntArray(len(mesh.faces), 3))
+    shape.CreateFaceVertexIndicesAttr(arrays.IntArray.FromNumpy(mesh.faces.astype(np.int32).ravel()))
+    shape.CreateNormalsAttr(arrays.Vec3fArray.FromNumpy(normals))
+    shape.SetNormalsInterpolation(geometry.Tokens.vertex)
+    shape.CreateSubdivisionSchemeAttr(geometry.Tokens.none)
 
 
 def _add_glass(stage: Any, path: str, ior: float, absorption: np.ndarray, abbe: float) -> None:
@@ -106,49 +102,46 @@ def _add_glass(stage: Any, path: str, ior: float, absorption: np.ndarray, abbe: 
 
 def _add_emission(stage: Any, path: str, radiance: np.ndarray) -> None:
     """Let a mesh emit the radiance of its vertices; black otherwise, so that lights do not shade it again."""
-    from pxr import Sdf, UsdGeom, UsdShade, Vt
-
-    mesh = UsdGeom.Mesh(stage.GetPrimAtPath(path))
-    mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(Vt.Vec3fArray.FromNumpy(radiance.astype(np.float32)))
+    sdf, geometry, shading, arrays = openusd("Sdf", "UsdGeom", "UsdShade", "Vt")
+    mesh = geometry.Mesh(stage.GetPrimAtPath(path))
+    mesh.CreateDisplayColorPrimvar(geometry.Tokens.vertex).Set(arrays.Vec3fArray.FromNumpy(radiance.astype(np.float32)))
     preview = {"roughness": 1.0, "metallic": 0.0, "diffuseColor": [0.0] * 3}
     (surface,) = _add_material(stage, path, {"": ("UsdPreviewSurface", preview)})
-    reader = UsdShade.Shader.Define(stage, surface.GetPath().ReplaceName("radiance"))
+    reader = shading.Shader.Define(stage, surface.GetPath().ReplaceName("radiance"))
     reader.CreateIdAttr("UsdPrimvarReader_float3")
-    reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("displayColor")
-    result = reader.CreateOutput("result", Sdf.ValueTypeNames.Float3)
-    surface.CreateInput("emissiveColor", Sdf.ValueTypeNames.Color3f).ConnectToSource(result)
+    reader.CreateInput("varname", sdf.ValueTypeNames.String).Set("displayColor")
+    result = reader.CreateOutput("result", sdf.ValueTypeNames.Float3)
+    surface.CreateInput("emissiveColor", sdf.ValueTypeNames.Color3f).ConnectToSource(result)
 
 
 def _add_material(stage: Any, path: str, shaders: dict[str, tuple[str, dict[str, Any]]]) -> list[Any]:
     """Give a mesh one material with a surface for each render context; returns the shaders."""
-    from pxr import Gf, Sdf, UsdShade
-
+    vectors, sdf, shading = openusd("Gf", "Sdf", "UsdShade")
     prim = stage.GetPrimAtPath(path)
-    material = UsdShade.Material.Define(stage, f"/scene/materials/{prim.GetName()}")
+    material = shading.Material.Define(stage, f"/scene/materials/{prim.GetName()}")
     made = []
     for context, (name, inputs) in shaders.items():
-        made.append(UsdShade.Shader.Define(stage, f"{material.GetPath()}/{context or 'preview'}"))
+        made.append(shading.Shader.Define(stage, f"{material.GetPath()}/{context or 'preview'}"))
         made[-1].CreateIdAttr(name)
         for key, value in inputs.items():
             if isinstance(value, float):
-                made[-1].CreateInput(key, Sdf.ValueTypeNames.Float).Set(value)
+                made[-1].CreateInput(key, sdf.ValueTypeNames.Float).Set(value)
             else:
-                made[-1].CreateInput(key, Sdf.ValueTypeNames.Color3f).Set(Gf.Vec3f(*value))
-        output = made[-1].CreateOutput("surface", Sdf.ValueTypeNames.Token)
+                made[-1].CreateInput(key, sdf.ValueTypeNames.Color3f).Set(vectors.Vec3f(*value))
+        output = made[-1].CreateOutput("surface", sdf.ValueTypeNames.Token)
         material.CreateSurfaceOutput(*([context] if context else [])).ConnectToSource(output)
-    UsdShade.MaterialBindingAPI.Apply(prim).Bind(material)
+    shading.MaterialBindingAPI.Apply(prim).Bind(material)
     return made
 
 
 def _add_cameras(stage: Any, cameras: Cameras) -> None:
     """Add pinhole cameras, whose axes are those of OpenGL; lens distortion is omitted."""
-    from pxr import Gf, UsdGeom
-
+    vectors, geometry = openusd("Gf", "UsdGeom")
     for view, pose in enumerate(cameras.camera_to_world.double().numpy()):
-        camera = UsdGeom.Camera.Define(stage, f"/scene/train_{view:03d}")
+        camera = geometry.Camera.Define(stage, f"/scene/train_{view:03d}")
         matrix = np.eye(4)
         matrix[:3] = Z_UP_TO_Y_UP @ pose
-        camera.AddTransformOp().Set(Gf.Matrix4d(matrix.T.tolist()))  # of row vectors
+        camera.AddTransformOp().Set(vectors.Matrix4d(matrix.T.tolist()))  # of row vectors
         pixel = _FILM_WIDTH / cameras.width
         camera.CreateHorizontalApertureAttr(_FILM_WIDTH)
         camera.CreateVerticalApertureAttr(pixel * cameras.height * float(cameras.fx[view] / cameras.fy[view]))
@@ -157,5 +150,5 @@ def _add_cameras(stage: Any, cameras: Cameras) -> None:
         camera.CreateHorizontalApertureOffsetAttr(pixel * offset[0])
         camera.CreateVerticalApertureOffsetAttr(pixel * offset[1])
         camera.CreateClippingRangeAttr(
-            Gf.Vec2f(max(float(cameras.near), 1e-3 * float(cameras.far)), float(cameras.far))
+            vectors.Vec2f(max(float(cameras.near), 1e-3 * float(cameras.far)), float(cameras.far))
         )
