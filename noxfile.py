@@ -21,6 +21,7 @@ EXTRAS = {
     "ray": ["nerfro", "train", "hydra/launcher=ray", "--cfg", "hydra"],
     "optuna": ["nerfro", "train", "hydra/sweeper=optuna", "--cfg", "hydra"],
     "refref": ["nerfro", "train", "data=refref", "data.root=."],
+    "usd": ["python", "-c", "from nerfro.exports.usd import openusd; openusd('Usd')"],
     "video": [
         "python",
         "-c",

@@ -3,10 +3,10 @@
     python benchmarks/live_page.py
 
 One run trains on the embedded scene. Windows with and without a headless Chromium that shows the live page alternate;
-the first ten seconds of each browser, in which it starts, do not count. All times are processor time, so that they do
-not depend on other programs: that of the training process, and that of the threads in it that make updates and answer
-requests. The browser renders in software (SwiftShader) on the same machine; its own processor time is compared with the
-time that passes.
+the start of each browser, and ten seconds after its start and its end, do not count. All times are processor time, so
+that they do not depend on other programs: that of the training process, and that of the threads in it that make updates
+and answer requests. The browser renders in software (SwiftShader) on the same machine; its own processor time is
+compared with the time that passes.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from nerfro.viewing import server
 from tests.viewing.browser import Browser
 
 SPENT: Counter[str] = Counter()  # seconds, and numbers of steps
-START = 10.0  # seconds of a browser that do not count
+START = 10.0  # seconds after the start and the end of a browser that do not count
 
 
 class MeasuredViewer(Viewer):
@@ -68,8 +68,8 @@ def watch(window: float, done: threading.Event) -> None:
     """Show the page in a browser during every second window of time, seconds."""
     while not done.wait(window):
         if hasattr(MeasuredViewer, "url"):
+            MeasuredViewer.counted = None
             with tempfile.TemporaryDirectory() as folder, Browser(MeasuredViewer.url, Path(folder)) as browser:
-                MeasuredViewer.counted = None
                 done.wait(START)
                 MeasuredViewer.counted, answers = True, SPENT["answers"]
                 start, begun = processor_seconds(browser.pid), time.monotonic()
@@ -78,6 +78,7 @@ def watch(window: float, done: threading.Event) -> None:
                 SPENT["browser"] += processor_seconds(browser.pid) - start
                 SPENT["window"] += time.monotonic() - begun
                 SPENT["counted answers"] += SPENT["answers"] - answers
+            done.wait(START)  # the server regards the page as shown for a while
             MeasuredViewer.counted = False
 
 

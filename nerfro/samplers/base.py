@@ -16,7 +16,8 @@ from nerfro.core.types import Path, Rays, Rendering, Samples
 from nerfro.data.component import Component
 from nerfro.fields.base import Field
 from nerfro.media.base import Medium
-from nerfro.samplers.paths.polylines import ONE_PATH, SnellTrace
+from nerfro.samplers.paths.branching import ONE_PATH
+from nerfro.samplers.paths.polylines import SnellTrace
 
 
 class PathSampler(nn.Module, ABC):

@@ -178,9 +178,12 @@ def test_glb_contains_each_body_with_its_material(two_bodies: TrainedScene, tmp_
 def test_usdz_contains_the_scene_as_another_library_reads_it(two_bodies: TrainedScene, tmp_path: Path) -> None:
     usd = pytest.importorskip("pxr.Usd", reason="install the extra usd")
     geometry, shading = import_module("pxr.UsdGeom"), import_module("pxr.UsdShade")
+    cameras = two_bodies.cameras("train")
+    cameras = replace(cameras, fy=1.3 * cameras.fy, cx=cameras.cx + 3, cy=cameras.cy - 2)
+    two_bodies = replace(two_bodies, training_cameras=cameras)
     write(two_bodies, "mesh", tmp_path / "two.usdz")
     stage = usd.Stage.Open(str(tmp_path / "two.usdz"))
-    # Conditions of Pixar's usdchecker for programs of augmented reality.
+    # Programs for augmented reality require these.
     assert geometry.GetStageUpAxis(stage) == "Y"
     assert stage.GetDefaultPrim().GetPath() == "/scene"
     with zipfile.ZipFile(tmp_path / "two.usdz") as package:
@@ -218,7 +221,7 @@ def test_usdz_contains_the_scene_as_another_library_reads_it(two_bodies: Trained
         np.array(inside.GetDisplayColorAttr().Get()), colour(torch.from_numpy(vertices)), atol=1e-4
     )
     # Cameras project a point to the pixel at which nerfro sees it.
-    cameras, point = two_bodies.cameras("train"), np.array([0.2, 0.1, -0.3])
+    point = np.array([0.2, 0.1, -0.3])
     for view, pose in enumerate(cameras.camera_to_world.double().numpy()):
         frustum = geometry.Camera(stage.GetPrimAtPath(f"/scene/train_{view:03d}")).GetCamera().frustum
         seen = frustum.ComputeViewMatrix() * frustum.ComputeProjectionMatrix()

@@ -15,7 +15,8 @@ from nerfro.geometry.triangle_tree import TriangleTree
 from nerfro.kernels.lookup import Solids
 from nerfro.kernels.operators import arrays, cpu_operator
 from nerfro.kernels.threads import share_parts
-from nerfro.samplers.paths.polylines import Branching, SnellTrace, split
+from nerfro.samplers.paths.branching import Branching
+from nerfro.samplers.paths.polylines import SnellTrace, split
 from nerfro.samplers.paths.snell_cpu import TracedRows, polylines_of_width, trace_snell
 
 if TYPE_CHECKING:

@@ -21,7 +21,8 @@ from nerfro.core.types import Path, Rays
 from nerfro.geometry.intersection import Triangles
 from nerfro.media.base import Medium
 from nerfro.media.bodies import Bodies
-from nerfro.samplers.paths.polylines import ONE_PATH, Branching, distance_to_end
+from nerfro.samplers.paths.branching import ONE_PATH, Branching
+from nerfro.samplers.paths.polylines import distance_to_end
 from nerfro.samplers.paths.snell_law import reflectance, refract, turning_normals
 
 # Intersects rays with the recorded surfaces. Arguments: rows and column of the vertices, positions and directions of

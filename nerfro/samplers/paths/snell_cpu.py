@@ -1,6 +1,6 @@
 """Compiled refraction and reflection at the surfaces of bodies, one thread per ray.
 
-The algorithm is `samplers.paths.snell.trace_interfaces`, for one ray at a time. The surfaces are the zero levels of
+`tests/reference_tracer.py` has the algorithm for all rays at once, in PyTorch. The surfaces are the zero levels of
 distance grids, or the triangles of a `TriangleTree`. A *segment* is the straight part of a
 polyline between two *events*, refractions or reflections at a surface. If light splits, the transmitted part is
 followed first. The reflected part becomes a *pending branch*, which shares the polyline up to the event; pending
@@ -18,7 +18,7 @@ from numba import prange
 
 from nerfro.kernels.compilation import compiled, compiled_parallel
 from nerfro.kernels.lookup import body_distance, box_span, distance_out, grid_of, spline_value_gradient
-from nerfro.samplers.paths.polylines import Branching
+from nerfro.samplers.paths.branching import Branching
 from nerfro.samplers.paths.surface_search_cpu import Line, advance, first_surface
 from nerfro.samplers.paths.triangle_search_cpu import begin_inside, face_normal, first_triangle
 
