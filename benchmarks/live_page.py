@@ -28,7 +28,7 @@ from nerfro.training.viewer import Viewer
 from nerfro.viewing import server
 from tests.viewing.browser import Browser
 
-SPENT: Counter[str] = Counter()  # seconds, and numbers of steps
+SPENT: Counter[str] = Counter()  # seconds
 START = 10.0  # seconds after the start and the end of a browser that do not count
 
 
@@ -51,7 +51,6 @@ class MeasuredViewer(Viewer):
         SPENT[f"updates {watched}"] += time.thread_time() - thread
         before, self.process = self.process, time.process_time()
         SPENT[f"process {watched}"] += self.process - before
-        SPENT[f"steps {watched}"] += 1
         MeasuredViewer.url = self._server.url
 
 
@@ -105,8 +104,6 @@ def main() -> None:
             done.set()
             thread.join()
     print("| | without a browser | with a browser |\n|---|---|---|")
-    rates = [SPENT[f"steps {watched}"] / max(SPENT[f"process {watched}"], 1e-9) for watched in (False, True)]
-    print(f"| steps per second of processor time | {rates[0]:.3f} | {rates[1]:.3f} |")
     shares = [SPENT[f"updates {watched}"] / max(SPENT[f"process {watched}"], 1e-9) for watched in (False, True)]
     print(f"| share of updates and curves in the processor time | {shares[0]:.2%} | {shares[1]:.2%} |")
     answers = SPENT["counted answers"] / max(SPENT["process True"], 1e-9)
