@@ -16,7 +16,7 @@ from nerfro.core.errors import NerfroError
 from nerfro.core.light import to_linear
 from nerfro.core.optional import optional
 from nerfro.exports.gaussians import HARMONIC_0, Gaussians
-from nerfro.exports.meshes import glass_meshes, inside_mesh, one_mesh
+from nerfro.exports.meshes import attenuation, glass_meshes, inside_mesh, one_mesh
 from nerfro.exports.usd import encode_usdz, openusd
 from nerfro.files.atomic import write_atomically
 from nerfro.files.lat_long import save_lat_long
@@ -240,9 +240,7 @@ def _glass_material(
     """Describe glass by the extensions KHR_materials_transmission, _ior, _volume and _dispersion (Khronos)."""
     volume: dict[str, Any] = {"thicknessFactor": float(mesh.extents.min())}
     if absorption.any():
-        # At a distance of 1 / max(absorption), no channel underflows, whatever the world unit.
-        distance = 1 / float(absorption.max())
-        colour = np.exp(-absorption.astype(np.float64) * distance).tolist()
+        distance, colour = attenuation(absorption)
         volume |= {"attenuationDistance": distance, "attenuationColor": colour}
     extensions: dict[str, Any] = {
         "KHR_materials_transmission": {"transmissionFactor": 1.0},

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from torch.nn import functional
 
 from nerfro.core.errors import warn
@@ -49,6 +49,15 @@ def glass_meshes(scene: TrainedScene, triangles: int | None = None) -> list[trim
             mesh if mesh.normals is not None else replace(mesh, normals=corner_normals(mesh)) for mesh in surfaces
         ]
     return [_with_vertex_normals(mesh) for mesh in surfaces]
+
+
+def attenuation(absorption: Float[np.ndarray, "3"]) -> tuple[float, list[float]]:
+    """Return a distance and the share of each channel that is left there, as formats describe absorption that is not 0.
+
+    The distance is 1 / max(absorption), at which no channel underflows, whatever the world unit.
+    """
+    distance = 1 / float(absorption.max())
+    return distance, np.exp(-absorption.astype(np.float64) * distance).tolist()
 
 
 def _divided(sizes: Sequence[int], total: int) -> list[int]:

@@ -14,6 +14,7 @@ import numpy as np
 
 from nerfro.core.cameras import Cameras
 from nerfro.core.optional import optional
+from nerfro.exports.meshes import attenuation
 from nerfro.files.lat_long import save_lat_long
 from nerfro.geometry.gltf import Z_UP_TO_Y_UP
 from nerfro.viewing.changes import absorption_of
@@ -91,9 +92,7 @@ def _add_glass(stage: Any, path: str, ior: float, absorption: np.ndarray, abbe: 
     of_surface: dict[str, Any] = {"base": 0.0, "specular_roughness": 0.0, "specular_IOR": ior, "transmission": 1.0,
                                   "transmission_dispersion": abbe}  # fmt: skip
     if absorption.any():
-        # At a depth of 1 / max(absorption), no channel underflows, whatever the world unit.
-        depth = 1 / float(absorption.max())
-        colour = np.exp(-absorption.astype(np.float64) * depth).tolist()
+        depth, colour = attenuation(absorption)
         of_surface |= {"transmission_depth": depth, "transmission_color": colour}
     of_preview = {"ior": ior, "opacity": _OPACITY, "roughness": 0.0, "metallic": 0.0, "diffuseColor": [1.0] * 3}
     _add_material(stage, path, {"": ("UsdPreviewSurface", of_preview),
