@@ -73,7 +73,7 @@ class NearCamera(Loss):
             of the scene transparent.
     """
 
-    weight = 1e-2
+    weight = 1e-1
     needs_box = True
 
     def __init__(self, reach: Share = 0.5) -> None:
