@@ -22,11 +22,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.camera.refined import refined
-from nerfro.camera.refined.refined import rotation_matrices
-from nerfro.camera.similarity import motion_between
+from nerfro.camera.refined.refined import motion_between, rotation_matrices
 from nerfro.core.cameras import Cameras
 from nerfro.core.paths import resolve_path
-from nerfro.data.blender import BlenderData
+from nerfro.data.formats.transforms import BlenderData
 from nerfro.evaluation.results import read_metrics_json
 from nerfro.registry.registration import discover
 

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerfro.camera.similarity import Similarity, motion_between, similarity
+from nerfro.camera.refined.refined import Similarity, motion_between, similarity
 from nerfro.core.errors import NerfroError
 from nerfro.data.transforms import find_splits, read_manifest
 from nerfro.geometry.mesh import TriangleMesh, load_mesh

@@ -26,12 +26,10 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from nerfro.core.paths import ASSETS_DIR
-from nerfro.evaluation.error_maps import SQUARED_ERROR_LIMIT, squared_error_map
-from nerfro.evaluation.image_metrics import image_metrics
+from nerfro.evaluation.image_metrics import SQUARED_ERROR_LIMIT, image_metrics, squared_error_map
 from nerfro.evaluation.results import RunMetrics, read_metrics_json
 from nerfro.evaluation.tables import Column, Row, Table, to_markdown
-from nerfro.files.drawing import magma, sheet
-from nerfro.files.images import load_png, save_image
+from nerfro.files.images import load_png, magma, save_image, sheet
 
 METHODS = {
     "mipnerf": "mip-NeRF",

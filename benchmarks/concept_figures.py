@@ -21,7 +21,7 @@ from nerfro.capture.surroundings import divide_pixels, learn_surroundings
 from nerfro.core.light import to_srgb
 from nerfro.core.paths import ASSETS_DIR
 from nerfro.core.types import Path as RayPath
-from nerfro.data.blender import BlenderData
+from nerfro.data.formats.transforms import BlenderData
 from nerfro.files import lat_long
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.geometry.space import Box, Contracted

@@ -11,7 +11,7 @@ import torch
 from capture import align_to_truth, transformed, volume_overlap
 from jaxtyping import Float
 
-from nerfro.camera.similarity import Similarity
+from nerfro.camera.refined.refined import Similarity
 from nerfro.core.paths import resolve_path
 from nerfro.data.base import Views
 from nerfro.geometry.mesh import TriangleMesh, load_mesh

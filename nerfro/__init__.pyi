@@ -1,11 +1,11 @@
 # Public names of nerfro, which `lazy_loader` imports on first access.
-from .backgrounds.constant import ConstantBackground
+from .backgrounds.base import ConstantBackground
 from .backgrounds.envmap import EnvironmentMap
 from .capture.preprocess import preprocess
 from .core.cameras import Cameras
 from .core.rays import Rays
-from .data.blender import BlenderData
 from .data.capture import Capture
+from .data.formats.transforms import BlenderData
 from .evaluation.collection import metrics
 from .fields.hash_grid import HashGridField
 from .geometry.space import Box, Contracted
@@ -15,26 +15,25 @@ from .media.bodies import Bodies, Body, GridSettings
 from .media.body_settings import make_bodies
 from .media.material import Material
 from .media.surface import MeshSurface
-from .media.surfaces.ball import BallSurface
+from .media.surfaces import BallSurface
 from .models.refractive import RefractiveModel
 from .optimizers.config import GroupConfig, OptimizerConfig
 from .pipeline.evaluate import evaluate
-from .pipeline.export import export
 from .pipeline.reconstruct import reconstruct
-from .pipeline.render import render
+from .pipeline.scenes import export, render
 from .poses.calibrate import calibrate
 from .rendering.renderer import Components
 from .rendering.scene_file import SceneFile
+from .samplers.base import Straight
 from .samplers.paths.bend import bend, polylines
 from .samplers.paths.snell import Snell
-from .samplers.paths.straight import Straight
 from .samplers.points.stratified import Stratified
 from .training.build import build
 from .training.data_module import RayDataModule
-from .training.load import load
 from .training.module import TrainingModule
 from .training.pixel_batches import PixelBatches
 from .training.run import Run, train
+from .training.run_folder import load
 from .viewing.trained_scene import TrainedScene
 
 __version__: str

@@ -13,8 +13,7 @@ from nerfro.core.errors import NerfroError
 from nerfro.core.paths import resolve_path
 from nerfro.core.types import Batch, Exits, FieldValues, OpticalRecord, Path, Rays, Rendering, Samples
 from nerfro.data.base import DataSource, Views
-from nerfro.evaluation.error_maps import ErrorMap
-from nerfro.evaluation.image_metrics import ImageMetric, ViewMaps
+from nerfro.evaluation.image_metrics import ErrorMap, ImageMetric, ViewMaps
 from nerfro.fields.base import Field
 from nerfro.files.atomic import write_atomically
 from nerfro.files.reading import load_arrays
@@ -30,8 +29,7 @@ from nerfro.registry.allowed import Count, Distance, Natural, NotNegative, Posit
 from nerfro.registry.registration import register
 from nerfro.rendering import Components, Renderer, Scene
 from nerfro.samplers.base import PathSampler, PointSampler
-from nerfro.samplers.points.stepfun import invert_cdf, spread_uniform
-from nerfro.samplers.points.stratified import Stratified, point_samples
+from nerfro.samplers.points.stratified import Stratified, invert_cdf, point_samples, spread_uniform
 from nerfro.training.phases.base import Phase, TrainingRun
 from nerfro.viewing.exports import EXPORTS, Export, ExportConfig
 from nerfro.viewing.trained_scene import TrainedScene

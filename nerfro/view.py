@@ -16,7 +16,7 @@ from omegaconf import MISSING
 
 import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
 from nerfro.cli.entry import entry_point
-from nerfro.training.load import load
+from nerfro.training.run_folder import load
 from nerfro.viewing.page import make_page
 from nerfro.viewing.server import PageServer, open_page
 from nerfro.viewing.volume import RESOLUTION

@@ -2,8 +2,7 @@
 
 from nerfro.paper.eikonal import Eikonal
 from nerfro.paper.hierarchical import Hierarchical
-from nerfro.paper.nerf import NerfField
-from nerfro.paper.skybox import Skybox
+from nerfro.paper.nerf import NerfField, Skybox
 from nerfro.rendering import Components
 from tests.closed_forms import Luneburg
 

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 import pytest
 from annotated_types import Gt, Le
 
-from nerfro.geometry.box import corners_of_box
+from nerfro.geometry.space import corners_of_box
 from nerfro.registry.allowed import Count, Positive, validated
 from nerfro.registry.registration import create, discover, find
 from tests.conftest import refused

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from benchmarks.capture import measure
-from nerfro.data.blender import OpenCVData
+from nerfro.data.formats.transforms import OpenCVData
 from nerfro.geometry.mesh import load_mesh
 from nerfro.registry.registration import discover
 from nerfro.synthetic import path_tracer

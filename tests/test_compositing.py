@@ -7,9 +7,8 @@ import torch
 
 from nerfro.core.types import FieldValues, Path, Samples
 from nerfro.rendering import composite
-from nerfro.samplers.paths.straight import straight_path
-from nerfro.samplers.points.stepfun import volume_weights
-from nerfro.samplers.points.stratified import Stratified
+from nerfro.samplers.base import straight_path
+from nerfro.samplers.points.stratified import Stratified, volume_weights
 from nerfro.testing import NUM_RAYS, example_path, example_rays, example_samples
 from tests.closed_forms import Ball, beam
 from tests.reference_tracer import Snell

@@ -11,7 +11,7 @@ import torch
 from omegaconf import OmegaConf
 from torch import Tensor
 
-from nerfro.backgrounds.constant import ConstantBackground
+from nerfro.backgrounds.base import ConstantBackground
 from nerfro.core.types import FieldValues, Samples
 from nerfro.data.base import Views
 from nerfro.fields.base import Field

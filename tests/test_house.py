@@ -147,7 +147,7 @@ def test_no_module_is_imported_by_a_string() -> None:
         for module, file in FILES.items()
         if re.search(r"\b(import_module|__import__)\(", file.read_text("utf-8"))
     }
-    assert users == {"nerfro.registry.registration", "nerfro.core.optional", "nerfro.cli.entry"}
+    assert users == {"nerfro.registry.registration", "nerfro.core.errors", "nerfro.cli.entry"}
 
 
 @pytest.mark.parametrize("file", sorted(PLUGINS_DIR.rglob("example_*.py")), ids=lambda file: file.stem)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from nerfro.samplers.paths.snell import Snell
-from nerfro.training.load import load
+from nerfro.training.run_folder import load
 from tests.ball_photographs import TRAINING, photographs_of, save, solid
 from tests.conftest import Runner
 

@@ -20,7 +20,7 @@ from nerfro.models.refractive import RefractiveModel
 from nerfro.optimizers.config import GroupConfig, OptimizerConfig
 from nerfro.paper.hierarchical import Hierarchical
 from nerfro.rendering import composite
-from nerfro.samplers.paths.straight import straight_path
+from nerfro.samplers.base import straight_path
 from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import (

@@ -8,9 +8,8 @@ from nerfro.core.types import Path, Rays
 from nerfro.media.base import Medium
 from nerfro.paper.eikonal import Eikonal
 from nerfro.registry.registration import discover, find, register
-from nerfro.samplers.base import PathSampler
+from nerfro.samplers.base import PathSampler, straight_path
 from nerfro.samplers.paths.snell import Snell
-from nerfro.samplers.paths.straight import straight_path
 from nerfro.testing import ContractError, check, check_optics
 from tests.conftest import Runner
 

@@ -20,8 +20,7 @@ from nerfro.losses.base import Loss
 from nerfro.models.refractive import RefractiveModel
 from nerfro.paper.eikonal import Eikonal
 from nerfro.paper.hierarchical import Hierarchical
-from nerfro.paper.nerf import NerfField
-from nerfro.paper.skybox import Skybox
+from nerfro.paper.nerf import NerfField, Skybox
 from nerfro.paper.voxel_grid import VoxelGrid
 from nerfro.registry.registration import create, discover, find
 from nerfro.rendering import Components

@@ -21,7 +21,7 @@ from nerfro.cli.options import Described
 from nerfro.core import types
 from nerfro.core.paths import PLUGINS_DIR
 from nerfro.data.base import DataSource, Views
-from nerfro.data.blender import BlenderData
+from nerfro.data.formats.transforms import BlenderData
 from nerfro.fields.base import Field
 from nerfro.losses.base import Loss
 from nerfro.media.base import Medium
@@ -305,7 +305,7 @@ def test_views_refuse_a_list_of_images() -> None:
 def test_plugin_with_a_taken_name_names_both_modules_and_its_file(write_plugin: Callable[[str, str], Path]) -> None:
     folder = write_plugin("clash", BACKGROUND.format(name="constant"))
     message = refused("background=constant is registered twice", discover, folder)
-    for word in (str(folder / "clash.py"), "nerfro.backgrounds.constant", "nerfro_plugins.clash"):
+    for word in (str(folder / "clash.py"), "nerfro.backgrounds.base", "nerfro_plugins.clash"):
         assert word in message
 
 

@@ -11,12 +11,12 @@ from nerfro.core.cameras import Cameras
 from nerfro.core.types import Batch
 from nerfro.data.base import Views
 from nerfro.evaluation.render_view import render_view
-from nerfro.media.analytic import Vacuum
+from nerfro.media.base import Vacuum
 from nerfro.models.refractive import RefractiveModel
 from nerfro.paper.hierarchical import Hierarchical
 from nerfro.paper.nerf import NerfField
 from nerfro.rendering import RayTracer
-from nerfro.samplers.paths.straight import Straight
+from nerfro.samplers.base import Straight
 from nerfro.samplers.subdivision import Subdivision, contrast, divergence, neighbour_rays, part_rays, pixel_rays
 from nerfro.testing import example_batch, example_components
 from nerfro.training.pixel_batches import PixelBatches

@@ -13,6 +13,7 @@ from nerfro.evaluation.image_metrics import image_metrics
 from nerfro.evaluation.results import EvaluationResult, RunMetrics, ViewScores, write_metrics_json
 from nerfro.evaluation.tables import Table
 from nerfro.files.images import save_png
+from nerfro.registry.registration import find
 from nerfro.report.comparison import compare, to_table
 from nerfro.report.runs import find_runs
 from nerfro.training.run_folder import LAST_CHECKPOINT, record
@@ -38,7 +39,7 @@ def write_run(
     config = {
         "name": name,
         "seed": seed,
-        "data": {"_target_": "nerfro.data.blender.BlenderData", "root": root, "near": 2.0, "far": 6.0, "alpha": "drop"},
+        "data": {"_target_": find("data", "blender").target, "root": root, "near": 2.0, "far": 6.0, "alpha": "drop"},
         "medium": {"mesh": f"{root}/mesh.ply", "cache": seed == 0},
         "field": field or FIELD,
         "batches": {"size": 512},

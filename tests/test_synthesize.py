@@ -13,7 +13,7 @@ from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.core.light import to_linear, to_srgb
 from nerfro.core.paths import ASSETS_DIR
 from nerfro.core.types import Exits
-from nerfro.data.blender import BlenderData
+from nerfro.data.formats.transforms import BlenderData
 from nerfro.files import lat_long
 from nerfro.geometry.mesh import load_mesh
 from nerfro.registry.allowed import validate

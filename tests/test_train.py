@@ -11,7 +11,7 @@ import trimesh
 from omegaconf import OmegaConf
 from PIL import Image
 
-from nerfro.data.blender import BlenderData
+from nerfro.data.formats.transforms import BlenderData
 from tests.conftest import UTM, Runner, moved_mesh, train_in, weights_of
 
 

@@ -12,9 +12,9 @@ import torch
 import nerfro
 from nerfro.core.cameras import room_rotations
 from nerfro.core.types import Exits
-from nerfro.data.blender import BlenderData
-from nerfro.samplers.paths.straight import straight_path
-from nerfro.synthetic.viewpoints import look_at_origin
+from nerfro.data.formats.transforms import BlenderData
+from nerfro.samplers.base import straight_path
+from nerfro.synthetic.dataset import look_at_origin
 from nerfro.training.inputs import INPUTS, inputs_of, recorded_cameras, require_same_inputs
 from tests.cameras_at import cameras_at
 from tests.conftest import Runner, composed, refused, train_in

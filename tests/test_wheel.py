@@ -52,7 +52,7 @@ def test_installed_wheel_composes_and_lists_its_plugins_from_a_foreign_folder(wh
     assert "background=gradient_sky" in listed, "plugins/ travels with it"
     job = python("-m", "nerfro.train", "+experiment=paper_refractive", "--cfg", "job")
     assert "name: paper_refractive" in job
-    source = "from nerfro.data.blender import BlenderData as B; print(len(B().load('val')), B().root)"
+    source = "from nerfro.data.formats.transforms import BlenderData as B; print(len(B().load('val')), B().root)"
     number, root = python("-c", source).split()
     assert int(number) > 0
     assert root.startswith(str(site))

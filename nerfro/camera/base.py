@@ -1,4 +1,4 @@
-"""Interface of the camera model: estimated poses, lens and exposures of the training views."""
+"""Camera models: the interface for estimated poses, lens and exposures, and the model that keeps the cameras."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from torch import Tensor, nn
 from nerfro.camera.exposure import Exposure
 from nerfro.core.cameras import Cameras
 from nerfro.core.rays import Rays
+from nerfro.registry.allowed import Natural
+from nerfro.registry.registration import register
 
 
 class CameraModel(nn.Module, ABC):
@@ -65,3 +67,21 @@ class CameraModel(nn.Module, ABC):
     def measurements(self) -> dict[str, float]:
         """Return estimated physical quantities by name, for the log."""
         return {} if self.exposure is None else {"cameras.gain_spread": self.exposure.spread}
+
+
+@register("camera", "given")
+class GivenCamera(CameraModel):
+    """Keep the cameras of the data set.
+
+    Args:
+        exposure: whether to estimate a gain for each training view and colour channel.
+        appearance: size of the embedding of each training view, from which a smooth gain over its image is learned, in
+            addition to its exposure; 0 for none.
+    """
+
+    def __init__(self, exposure: bool = False, appearance: Natural = 0) -> None:
+        super().__init__(exposure, appearance)
+
+    def forward(self, rays: Rays, view: Int[Tensor, "R"]) -> Rays:
+        """Return the rays unchanged."""
+        return rays

@@ -20,8 +20,8 @@ from nerfro.core.paths import EMBEDDED_PREFIX, resolve_path, user_path
 from nerfro.data.base import DataSource
 from nerfro.data.frames import require_root
 from nerfro.files.atomic import refuse_existing
-from nerfro.geometry.box import corners_of_box
 from nerfro.geometry.mesh import TriangleMesh, load_mesh, local_origin, num_decimals
+from nerfro.geometry.space import corners_of_box
 from nerfro.media.body_settings import expanded
 from nerfro.registry.allowed import Count, Natural, NotNegative, plain, refuse_unused, validate
 from nerfro.registry.registration import build

@@ -30,8 +30,8 @@ from nerfro.geometry.mesh import TriangleMesh
 from nerfro.geometry.space import Contracted
 from nerfro.media.bodies import Bodies
 from nerfro.rendering import composite
+from nerfro.samplers.base import straight_path
 from nerfro.samplers.paths.snell import Snell
-from nerfro.samplers.paths.straight import straight_path
 from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.samplers.subdivision import pixel_rays
 from nerfro.silhouettes.silhouettes import VALIDATION_EVERY, PixelBlocks, mesh_silhouettes

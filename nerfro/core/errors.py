@@ -1,10 +1,12 @@
-"""Exceptions with messages for users, warnings, and lists of names in messages."""
+"""Exceptions with messages for users, warnings, lists of names in messages, and import of optional packages."""
 
 from __future__ import annotations
 
 import difflib
+import importlib
 import re
 from collections.abc import Sequence
+from typing import Any
 
 _SHOWN = 3
 _LONGEST_LINE = 1000  # characters of an error; the middle of longer ones is left out
@@ -43,3 +45,21 @@ def one_line(text: str) -> str:
 def warn(message: str) -> None:
     """Print a warning about an allowed but suspicious input or result."""
     print(f"nerfro: warning: {one_line(message)}")
+
+
+def optional(module: str, extra: str, purpose: str, alternative: str = "") -> Any:
+    """Import a module of an optional package where it is used.
+
+    Args:
+        module: full name of the module, such as `pyarrow.parquet`.
+        extra: extra of nerfro that installs the package.
+        purpose: beginning of the error message, such as "target=colmap needs pycolmap".
+        alternative: end of the error message: what to do instead of the installation.
+
+    Raises:
+        NerfroError: the package cannot be imported.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise NerfroError(f"{purpose} ({error}); pip install 'nerfro[{extra}]'{alternative}") from error

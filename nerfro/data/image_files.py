@@ -4,20 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import scipy
 from jaxtyping import Float, Float32, UInt8, UInt16
 from PIL import Image
 
-from nerfro.core.errors import NerfroError
+from nerfro.core.errors import NerfroError, optional
 from nerfro.core.light import encode_photograph, to_linear
 from nerfro.files.deep_images import is_float_tiff, radiance_size, read_16bit, read_radiance
-from nerfro.files.raw_photographs import RAW_SUFFIXES, raw_size, read_raw
 from nerfro.files.reading import open_image, reading_image
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".jfif", ".webp", ".bmp", ".tif", ".tiff")
+RAW_SUFFIXES = (
+    ".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dng", ".erf", ".iiq", ".nef", ".nrw", ".orf", ".pef", ".raf", ".rw2",
+    ".srw", ".x3f",
+)  # fmt: skip
 VIEW_SUFFIXES = (*IMAGE_SUFFIXES, ".exr", ".hdr", *RAW_SUFFIXES)  # of photographs, but not of masks
 Alpha = Literal["drop", "white", "black"]
 
@@ -205,3 +208,32 @@ def _coverage(count: int, fewer: int) -> scipy.sparse.csr_array:
     middle, length = 0.5 * (edges[1:] + edges[:-1]), np.diff(edges)
     places = (middle * fewer).astype(int), (middle * count).astype(int)
     return scipy.sparse.csr_array((length * fewer, places), shape=(fewer, count))
+
+
+def read_raw(path: Path) -> Float[np.ndarray, "H W 3"]:
+    """Develop a raw photograph to linear radiance with the white balance that the camera has stored.
+
+    The image has sRGB primaries, and is turned as the camera was held. The level at which the sensor saturates is 1 in
+    all channels and equal in all photographs, because the brightness is not adapted to the content.
+
+    Raises:
+        NerfroError: rawpy is missing.
+    """
+    with _open(path) as raw:
+        options = {"no_auto_bright": True, "adjust_maximum_thr": 0.0, "gamma": (1, 1), "output_bps": 16}
+        levels = raw.postprocess(use_camera_wb=True, **options)
+    # The conversion of colours rounds saturated levels to slightly less than the maximum, 65535.
+    return np.where(levels >= 65500, np.float32(1), levels / np.float32(65535))
+
+
+def raw_size(path: Path) -> tuple[int, int]:
+    """Read width and height of the image of `read_raw` from the header of a raw photograph."""
+    with _open(path) as raw:
+        sizes = raw.sizes
+    turned = sizes.flip in (5, 6)  # by a quarter
+    return (sizes.iheight, sizes.iwidth) if turned else (sizes.iwidth, sizes.iheight)
+
+
+def _open(path: Path) -> Any:
+    rawpy = optional("rawpy", "capture", f"{path} needs rawpy", ", or convert the photographs to .exr or 16-bit PNG")
+    return rawpy.imread(str(path))

@@ -1,4 +1,4 @@
-"""Metrics of two images: the base class of plugins of type `metric`, and the built-in metrics."""
+"""Metrics of two images: regions, error maps, the base class of plugins of type `metric`, and the built-in metrics."""
 
 from __future__ import annotations
 
@@ -11,14 +11,101 @@ from typing import ClassVar, Literal
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 from skimage import metrics
 from torch import Tensor, nn
 
 from nerfro.core.errors import NerfroError, nearest_of
-from nerfro.evaluation.error_maps import SQUARED_ERROR_LIMIT, ErrorMap, squared_error_map
-from nerfro.evaluation.regions import mean_over, require_images
+from nerfro.files.images import magma
 from nerfro.registry.registration import CHECKS, create, discover, find, plugins, register
+
+
+def object_pixels(coverage: Float[Tensor, "H W"]) -> Bool[Tensor, "H W"]:
+    """Return the pixels of which the object covers at least half, from the coverage (`Views.masks`)."""
+    return coverage >= 0.5
+
+
+def crop_rectangle(inside: Bool[Tensor, "H W"]) -> tuple[slice, slice]:
+    """Return the bounding rectangle of the dilated mask, the region of the paper's scores on real scenes.
+
+    All pixels of the rectangle count. Dilation by a centred box of 35 pixels moves each side of the bounding rectangle
+    by 17 pixels, up to the border of the image, so the mask itself is not dilated.
+
+    Args:
+        inside: mask of the object, not empty.
+
+    Returns:
+        Slices of rows and columns.
+    """
+    margin = 17
+    occupied = [inside.any(1 - axis).nonzero() for axis in (0, 1)]
+    first, last = [max(int(i.min()) - margin, 0) for i in occupied], [int(i.max()) + margin + 1 for i in occupied]
+    return slice(first[0], min(last[0], inside.shape[0])), slice(first[1], min(last[1], inside.shape[1]))
+
+
+def require_images(
+    prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], inside: Shaped[Tensor, "H W"] | None = None
+) -> None:
+    """Refuse two images, and a mask, that do not fit; a batch of images is not one image.
+
+    Raises:
+        NerfroError: the images are not [H, W, 3] of the same size, or the mask is not [H, W].
+    """
+    if prediction.shape != target.shape or target.ndim != 3 or target.shape[-1] != 3:
+        raise NerfroError(
+            f"cannot compare a prediction {list(prediction.shape)} with a reference {list(target.shape)}; "
+            "both must have the same size [H, W, 3]"
+        )
+    if inside is not None and inside.shape != target.shape[:2]:
+        raise NerfroError(f"a mask {list(inside.shape)} does not fit an image {list(target.shape)}; give [H, W]")
+
+
+def mean_over(values: Float[Tensor, "H W"], inside: Bool[Tensor, "H W"] | None) -> Float[Tensor, ""]:
+    """Average over the pixels of a mask, or over all pixels without a mask; NaN for an empty mask."""
+    return values.mean() if inside is None else values[inside].mean()
+
+
+# Squared error at the end of the colour scale; 0.05 is a difference of 0.22 in every channel.
+SQUARED_ERROR_LIMIT = 0.05
+
+
+@dataclass(frozen=True)
+class ErrorMap:
+    """Error at each pixel of an image.
+
+    Attributes:
+        name: name of the metric, as in file names.
+        title: title of the colour scale.
+        values: error [H, W]; 0 for equal pixels, NaN for pixels without a value.
+        limit: value of the last colour of the scale, equal for all images.
+    """
+
+    name: str
+    title: str
+    values: Float[Tensor, "H W"]
+    limit: float
+
+    def colours(self) -> Float[Tensor, "H W 3"]:
+        """Apply the magma colour map; the result is sRGB in [0, 1]."""
+        return magma(self.values, self.limit)
+
+
+def squared_error_map(prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"]:
+    """Compute the squared error of each pixel, averaged over channels. Its mean over the image determines the PSNR."""
+    require_images(prediction, target)
+    return (prediction - target).square().mean(-1)
+
+
+def squared_error_colours(prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
+    """Draw the squared error of each pixel in the colours of a fixed scale."""
+    return magma(squared_error_map(prediction, target), SQUARED_ERROR_LIMIT)
+
+
+def triptych(prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Float[Tensor, "H 3*W 3"]:
+    """Concatenate prediction, reference and squared error for the training log, on the CPU and without text."""
+    error = squared_error_colours(prediction, target)
+    return torch.cat([prediction.detach().cpu().float().clamp(0, 1), target.detach().cpu().float(), error], dim=1)
+
 
 MAX_PSNR = 100.0  # dB; the infinite PSNR of equal images has no mean and no representation in JSON
 

@@ -12,12 +12,17 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerfro.core.errors import NerfroError
-from nerfro.evaluation.error_maps import ErrorMap
-from nerfro.evaluation.image_metrics import ImageMetric, ViewMaps, build_metrics
-from nerfro.evaluation.regions import crop_rectangle, object_pixels, require_images
+from nerfro.evaluation.image_metrics import (
+    ErrorMap,
+    ImageMetric,
+    ViewMaps,
+    build_metrics,
+    crop_rectangle,
+    object_pixels,
+    require_images,
+)
 from nerfro.evaluation.results import FULL, OBJECT_REGIONS, EvaluationResult, Region, Score, ViewScores
-from nerfro.files.drawing import sheet
-from nerfro.files.images import round_to_8bit, save_image
+from nerfro.files.images import round_to_8bit, save_image, sheet
 
 
 class ImageMetrics(nn.Module):

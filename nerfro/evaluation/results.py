@@ -22,7 +22,7 @@ _Amount = Annotated[float, Ge(0), Lt(TOO_LARGE)]
 Score = float | None  # None if not available; the notes contain the reason
 
 
-Region = Literal["full", "mask", "crop"]  # see nerfro/evaluation/regions.py
+Region = Literal["full", "mask", "crop"]  # see nerfro/evaluation/image_metrics.py
 FULL: Region = "full"
 OBJECT: Region = "mask"
 # Scores with the given cameras and exposure, of tone-mapped images, and of right halves without and with exposures that

@@ -12,9 +12,8 @@ import torch
 from torch.nn import functional
 
 from nerfro.core.cameras import Cameras
-from nerfro.core.errors import NerfroError
+from nerfro.core.errors import NerfroError, optional
 from nerfro.core.light import to_linear
-from nerfro.core.optional import optional
 from nerfro.exports.gaussians import HARMONIC_0, Gaussians
 from nerfro.exports.meshes import attenuation, glass_meshes, inside_mesh, one_mesh
 from nerfro.exports.usd import encode_usdz, openusd

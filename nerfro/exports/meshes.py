@@ -13,9 +13,8 @@ import torch
 from jaxtyping import Float, UInt8
 from torch.nn import functional
 
-from nerfro.core.errors import warn
+from nerfro.core.errors import optional, warn
 from nerfro.core.light import to_srgb
-from nerfro.core.optional import optional
 from nerfro.files.images import to_8bit
 from nerfro.geometry.bodies import bodies_of
 from nerfro.geometry.interpolation import trilinear

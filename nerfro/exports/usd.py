@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from nerfro.core.cameras import Cameras
-from nerfro.core.optional import optional
+from nerfro.core.errors import optional
 from nerfro.exports.meshes import attenuation
 from nerfro.files.lat_long import save_lat_long
 from nerfro.geometry.gltf import Z_UP_TO_Y_UP

@@ -12,9 +12,8 @@ from torch import Tensor, nn
 
 from nerfro.core.cameras import Cameras
 from nerfro.core.light import unbounded_radiance
-from nerfro.core.results import require_results
 from nerfro.core.types import FieldValues, Samples
-from nerfro.data.component import Component
+from nerfro.data.component import Component, require_results
 
 # Activation whose squared sigmoid is 1 / 240 in sRGB.
 _BLACK = -4.0

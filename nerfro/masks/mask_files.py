@@ -21,8 +21,7 @@ from nerfro.core.paths import user_path
 from nerfro.data.base import DataSource, Frame
 from nerfro.data.image_files import read_mask, read_size, to_unit
 from nerfro.data.masks import METHOD, POLYGON, TRACKED, checksum, method_of, without_masks
-from nerfro.files.drawing import sheet
-from nerfro.files.images import save_image, to_8bit
+from nerfro.files.images import save_image, sheet, to_8bit
 from nerfro.files.reading import read_json
 from nerfro.masks.masking import Segmentation, box_region, check_tracked, grab_cut, polygon_mask, propagate
 from nerfro.masks.outline_hull import AGREES, MIN_VIEWS

@@ -12,8 +12,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from nerfro.core.errors import NerfroError
-from nerfro.core.optional import optional
+from nerfro.core.errors import NerfroError, optional
 
 # Mean and standard deviation of the network's input, sRGB, as in its training.
 _MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)

@@ -1,4 +1,4 @@
-"""Base class of media: the refractive index as a function of position."""
+"""Base class of media, the refractive index as a function of position, and the medium without an object."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from nerfro.core.errors import NerfroError
 from nerfro.core.types import WORLD_ORIGIN, Path
 from nerfro.geometry.mesh import TriangleMesh
+from nerfro.registry.registration import register
 
 Scalars = Float[Tensor, "*batch"]
 Vectors = Float[Tensor, "*batch 3"]
@@ -128,3 +129,17 @@ class Medium(nn.Module, ABC):
         """
         diagonal = torch.linalg.vector_norm(self.box[1] - self.box[0])
         return (diagonal / 512).expand(directions.shape[:-1])
+
+
+@register("medium", "vacuum")
+class Vacuum(Medium):
+    """Vacuum: n = 1 everywhere, and every ray is straight."""
+
+    is_vacuum = True
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("box", torch.zeros(2, 3), persistent=False)
+
+    def forward(self, positions: Vectors) -> tuple[Scalars, Vectors]:
+        return torch.ones_like(positions[..., 0]), torch.zeros_like(positions)

@@ -14,8 +14,15 @@ from nerfro.core.types import Path, Rendering, Samples
 from nerfro.geometry.space import Space
 from nerfro.registry.registration import register
 from nerfro.samplers.base import PointSampler
-from nerfro.samplers.points.stepfun import invert_cdf, midpoints, spread_uniform
-from nerfro.samplers.points.stratified import LAST_DELTA, Stratified, cone_samples, point_samples
+from nerfro.samplers.points.stratified import (
+    LAST_DELTA,
+    Stratified,
+    cone_samples,
+    invert_cdf,
+    midpoints,
+    point_samples,
+    spread_uniform,
+)
 
 # Weight that mip-NeRF adds to each bin before sampling.
 _PADDING = 0.01

@@ -12,8 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.core.types import Batch, FieldValues, Path, Rendering, Samples
-from nerfro.paper.encoding import integrated_positional_encoding
-from nerfro.paper.mlp import in_blocks
+from nerfro.paper.mlp import in_blocks, integrated_positional_encoding
 from nerfro.paper.nerf import EncodedField
 from nerfro.registry.allowed import Depth
 from nerfro.registry.registration import register

@@ -1,4 +1,4 @@
-"""The field of NeRF: an MLP on positional encodings of points."""
+"""The field of NeRF, an MLP on positional encodings of points, and the skybox of the paper."""
 
 from __future__ import annotations
 
@@ -9,12 +9,20 @@ from jaxtyping import Float
 from omegaconf import DictConfig
 from torch import Tensor
 
-from nerfro.core.types import FieldValues, Samples
+from nerfro.backgrounds.base import Background
+from nerfro.core.types import Exits, FieldValues, Samples
 from nerfro.data.base import Views
 from nerfro.fields.base import Field, evaluate_selected
 from nerfro.geometry.space import Space, Unbounded
-from nerfro.paper.encoding import DIRECTION_DEGREE, positional_encoding
-from nerfro.paper.mlp import RadianceMLP, in_blocks
+from nerfro.paper.mlp import (
+    DIRECTION_DEGREE,
+    RadianceMLP,
+    SkipMLP,
+    glorot_linear,
+    in_blocks,
+    padded_sigmoid,
+    positional_encoding,
+)
 from nerfro.registry.allowed import Depth, Positive, Width
 from nerfro.registry.registration import register
 
@@ -97,3 +105,29 @@ class NerfField(EncodedField):
         self, positions: Float[Tensor, "points 3"], directions: Float[Tensor, "points 3"]
     ) -> tuple[Float[Tensor, " points"], Float[Tensor, "points 3"]]:
         return self.decode_encoded(positional_encoding(positions / self.unit, self.position_degree), directions)
+
+
+@register("background", "skybox")
+class Skybox(Background):
+    """Represent the background by a 4x128 MLP of the encoded exit direction (paper, Eqn. 5, F_psi).
+
+    The radiance is a sigmoid and at most 1, as in the authors' code. Bright lamps are therefore clipped.
+
+    Args:
+        width: number of units in each hidden layer.
+        depth: number of hidden layers.
+        skip: number of the layer after which the input is concatenated again.
+    """
+
+    def __init__(self, width: Width = 128, depth: Depth = 4, skip: int = 3) -> None:
+        super().__init__()
+        self.trunk = SkipMLP(3 * (1 + 2 * DIRECTION_DEGREE), width, depth, skip)
+        self.rgb = glorot_linear(self.trunk.num_outputs, 3)
+
+    @classmethod
+    def derive(cls, settings: DictConfig, views: Views, space: Space) -> dict[str, Any]:
+        views.refuse_linear_light("background=skybox")
+        return {}
+
+    def forward(self, exits: Exits) -> Float[Tensor, "*batch 3"]:
+        return padded_sigmoid(self.rgb(self.trunk(positional_encoding(exits.directions, DIRECTION_DEGREE))))

@@ -19,9 +19,8 @@ from nerfro.evaluation.tables import write_scores
 from nerfro.files.images import load_png
 from nerfro.training.callbacks import Throughput, steps_by_phase
 from nerfro.training.config import build_data
-from nerfro.training.load import checkpoint_of, scene_of
 from nerfro.training.run import Run
-from nerfro.training.run_folder import CONFIG_FILE, load_run, run_config
+from nerfro.training.run_folder import CONFIG_FILE, checkpoint_of, load_run, run_config, scene_of
 
 
 def evaluate(

@@ -26,9 +26,9 @@ from nerfro.files.atomic import write_atomically
 from nerfro.files.folder_lock import lock_folder
 from nerfro.files.images import save_image
 from nerfro.masks.segment import segment
-from nerfro.pipeline.export import export
 from nerfro.pipeline.hypotheses import Hypothesis, hypotheses, worth_a_trial
 from nerfro.pipeline.options import ReconstructConfig, common_options, have_poses
+from nerfro.pipeline.scenes import export
 from nerfro.pipeline.stage import Stage, is_older, move_aside
 from nerfro.pipeline.trial_picture import PICTURE, draw_trials, validation_views
 from nerfro.pipeline.trials import Trial, decide

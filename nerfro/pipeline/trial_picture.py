@@ -12,10 +12,9 @@ from torch import Tensor
 
 from nerfro.core.errors import NerfroError
 from nerfro.data.base import Views
-from nerfro.evaluation.regions import crop_rectangle, object_pixels
+from nerfro.evaluation.image_metrics import crop_rectangle, object_pixels
 from nerfro.evaluation.results import EXPOSED, FULL, Region
-from nerfro.files.drawing import sheet
-from nerfro.files.images import load_png
+from nerfro.files.images import load_png, sheet
 from nerfro.pipeline.trials import Trial
 from nerfro.training.config import build_data
 from nerfro.training.run_folder import run_config

@@ -9,7 +9,7 @@ from nerfro.capture.object_errors import STRAIGHT
 from nerfro.cli.overrides import command_line, not_given
 from nerfro.core.provenance import AlgorithmSettings
 from nerfro.evaluation.image_metrics import image_metrics
-from nerfro.evaluation.perceptual.lpips import MIN_SIZE
+from nerfro.evaluation.perceptual import MIN_SIZE
 from nerfro.evaluation.results import EXPOSED, FULL, OBJECT, EvaluationResult, Region, RunMetrics, Score
 from nerfro.evaluation.tables import MISSING
 from nerfro.pipeline.hypotheses import Hypothesis

@@ -15,8 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
-from nerfro.core.errors import NerfroError
-from nerfro.core.optional import optional
+from nerfro.core.errors import NerfroError, optional
 from nerfro.files.atomic import atomic_file
 
 Family = Literal["tag36h11", "tagStandard41h12"]

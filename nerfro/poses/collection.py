@@ -13,8 +13,7 @@ from jaxtyping import Float, UInt8
 from omegaconf import DictConfig
 from PIL import ExifTags, Image, ImageOps
 
-from nerfro.core.errors import NerfroError, first_of, warn
-from nerfro.core.optional import optional
+from nerfro.core.errors import NerfroError, first_of, optional, warn
 from nerfro.core.paths import user_path
 from nerfro.core.progress import track
 from nerfro.data.frames import list_images

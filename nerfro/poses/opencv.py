@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from types import ModuleType
 
-from nerfro.core.optional import optional
+from nerfro.core.errors import optional
 
 
 def opencv() -> ModuleType:

@@ -20,8 +20,7 @@ from scipy.ndimage import binary_dilation
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from nerfro.core.errors import NerfroError
-from nerfro.core.optional import optional
+from nerfro.core.errors import NerfroError, optional
 from nerfro.core.paths import user_path
 from nerfro.core.progress import counting_bar, track
 from nerfro.core.provenance import AlgorithmSettings

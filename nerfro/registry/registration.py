@@ -50,8 +50,8 @@ SEVERAL = ("loss", "phase", "callbacks")  # a run may have several plugins of th
 
 # Modules and packages with built-in plugins; `discover` imports all of them.
 _BUILT_IN = (
-    "camera", "camera.refined", "media", "media.surfaces", "samplers.paths", "samplers.points", "fields", "backgrounds",
-    "losses", "models", "paper", "data", "data.formats", "evaluation.image_metrics", "evaluation.perceptual",
+    "camera", "camera.refined", "media", "samplers.paths", "samplers.points", "fields", "backgrounds",
+    "losses", "models", "paper", "data.formats", "evaluation.image_metrics", "evaluation.perceptual",
     "training.lightning_callbacks", "training.phases", "viewing.page", "exports",
 )  # fmt: skip
 ENTRY_POINTS = "nerfro.plugins"

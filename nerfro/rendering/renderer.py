@@ -14,8 +14,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from nerfro.backgrounds.base import Background
-from nerfro.camera.base import CameraModel
-from nerfro.camera.given import GivenCamera
+from nerfro.camera.base import CameraModel, GivenCamera
 from nerfro.core.light import Colour, ColourSpace
 from nerfro.core.rays import Rays
 from nerfro.core.types import Batch, Exits, FieldValues, Path, Rendering, Samples
@@ -28,8 +27,8 @@ from nerfro.media.base import Medium
 from nerfro.registry.allowed import validated
 from nerfro.rendering.scene import Scene
 from nerfro.samplers.base import PathSampler, PointSampler
-from nerfro.samplers.paths.surface_normals import first_normals
-from nerfro.samplers.points.stepfun import volume_weights
+from nerfro.samplers.paths.replay import first_normals
+from nerfro.samplers.points.stratified import volume_weights
 
 Result = TypeVar("Result")
 

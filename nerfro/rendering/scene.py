@@ -8,8 +8,7 @@ import torch
 from torch import nn
 
 from nerfro.backgrounds.base import Background
-from nerfro.camera.base import CameraModel
-from nerfro.camera.given import GivenCamera
+from nerfro.camera.base import CameraModel, GivenCamera
 from nerfro.core.cameras import Cameras
 from nerfro.core.errors import NerfroError
 from nerfro.core.light import ColourSpace

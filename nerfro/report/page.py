@@ -15,10 +15,9 @@ from omegaconf import OmegaConf
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import PACKAGE_DIR, shown
 from nerfro.core.progress import duration
-from nerfro.evaluation.error_maps import SQUARED_ERROR_LIMIT
+from nerfro.evaluation.image_metrics import SQUARED_ERROR_LIMIT
 from nerfro.evaluation.tables import Table
-from nerfro.files.drawing import magma
-from nerfro.files.images import load_png
+from nerfro.files.images import load_png, magma
 from nerfro.files.templates import fill_template
 from nerfro.report.comparison import Comparison
 from nerfro.report.runs import EvaluatedRun, device

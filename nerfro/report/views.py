@@ -14,8 +14,7 @@ from torch import Tensor
 
 from nerfro.core.errors import NerfroError
 from nerfro.data.base import Views
-from nerfro.evaluation.error_maps import squared_error_colours
-from nerfro.evaluation.image_metrics import image_metrics
+from nerfro.evaluation.image_metrics import image_metrics, squared_error_colours
 from nerfro.evaluation.results import FULL, Region, Score
 from nerfro.evaluation.tables import MISSING
 from nerfro.files.images import data_uri, load_png, to_8bit

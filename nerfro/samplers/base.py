@@ -1,9 +1,10 @@
-"""Base classes of path samplers and point samplers."""
+"""Base classes of path samplers and point samplers, and straight paths, as in ordinary radiance fields."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -11,11 +12,11 @@ from jaxtyping import Bool
 from torch import Tensor, nn
 
 from nerfro.core.draws import Draws
-from nerfro.core.results import require_results
 from nerfro.core.types import Path, Rays, Rendering, Samples
-from nerfro.data.component import Component
+from nerfro.data.component import Component, require_results
 from nerfro.fields.base import Field
 from nerfro.media.base import Medium
+from nerfro.registry.registration import register
 from nerfro.samplers.paths.branching import ONE_PATH
 from nerfro.samplers.paths.polylines import SnellTrace
 
@@ -121,3 +122,36 @@ class PointSampler(Component, nn.Module, ABC):
             fields: radiance field of each sampling level after `draws.step` training steps.
             draws: random numbers of the next step.
         """
+
+
+@register("sampler/path", "straight")
+class Straight(PathSampler):
+    """Trace straight rays, o + s d, and ignore the medium."""
+
+    needs_medium = False
+
+    @torch.no_grad()
+    def forward(self, rays: Rays, medium: Medium) -> Path:
+        """Return a path of two vertices for each ray."""
+        return straight_path(rays)
+
+    def releases_gil(self, medium: Medium) -> bool:
+        return True
+
+    def replay(self, path: Path, rays: Rays, medium: Medium) -> Path:
+        return replay_straight(path, rays)
+
+
+def straight_path(rays: Rays) -> Path:
+    """Return paths of two vertices, at near and far."""
+    s = torch.stack([rays.near, rays.far], -1)
+    positions = rays.origins[:, None] + s[..., None] * rays.directions[:, None]
+    directions = rays.directions[:, None].expand_as(positions)
+    refracted = torch.zeros(len(rays), dtype=torch.bool, device=s.device)
+    return Path.unbranched(positions, directions, s, refracted, rays.radii)
+
+
+def replay_straight(path: Path, rays: Rays) -> Path:
+    """Return straight paths with gradients with respect to the rays."""
+    lines = straight_path(rays[path.ray])
+    return replace(path, positions=lines.positions, directions=lines.directions, s=lines.s)

@@ -14,8 +14,7 @@ from nerfro.core.errors import NerfroError, first_of, warn
 from nerfro.core.provenance import AlgorithmSettings
 from nerfro.data.base import Views
 from nerfro.files.atomic import write_json
-from nerfro.files.drawing import sheet
-from nerfro.files.images import save_image
+from nerfro.files.images import save_image, sheet
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.silhouettes.silhouettes import intersection_over_union, mesh_silhouettes, pixel_stride
 from nerfro.silhouettes.visual_hull import Silhouettes, carve_mesh, find_box

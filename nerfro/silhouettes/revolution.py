@@ -18,7 +18,7 @@ from nerfro.core.progress import track
 from nerfro.core.provenance import AlgorithmSettings
 from nerfro.core.robust import geman_mcclure_weight
 from nerfro.geometry.mesh import TriangleMesh
-from nerfro.geometry.revolve import revolve
+from nerfro.media.surfaces import revolve
 from nerfro.silhouettes.upright import body_axis
 from nerfro.silhouettes.visual_hull import Silhouettes
 

@@ -1,4 +1,7 @@
-"""Output folder of a rendered scene: views in Blender format, or photographs; an interrupted rendering resumes."""
+"""Camera poses and output folder of a rendered scene: views in Blender format, or photographs.
+
+An interrupted rendering resumes.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
+import trimesh
 from PIL import Image
 
 from nerfro.cli.overrides import as_overrides, command_line
@@ -25,9 +29,45 @@ from nerfro.files.deep_images import write_radiance
 from nerfro.files.folder_lock import require_only
 from nerfro.files.images import save_image
 from nerfro.files.reading import read_json
+from nerfro.geometry.normals import fibonacci_lattice
 from nerfro.synthetic.path_tracer import Pinhole
 from nerfro.synthetic.scene import SyntheticScene, lat_long_texture
-from nerfro.synthetic.viewpoints import directions_on_ring, directions_on_sphere, look_at_origin
+
+
+def directions_on_sphere(count: int, seed: int, split: int) -> np.ndarray:
+    """Return well-spread unit directions [count, 3]: a Fibonacci lattice, turned at random and jittered.
+
+    Each `split` of the data set of a `seed` gets its own rotation, so no test view repeats a training view.
+    """
+    generator = np.random.default_rng([seed, split])
+    lattice = fibonacci_lattice(count)
+    turn = trimesh.transformations.random_rotation_matrix(generator.random(3))[:3, :3]
+    spacing = np.sqrt(4 * np.pi / count)
+    jittered = lattice @ turn.T + 0.2 * spacing * generator.normal(size=lattice.shape)
+    jittered = jittered / np.linalg.norm(jittered, axis=1, keepdims=True)
+    return generator.permutation(jittered)
+
+
+def directions_on_ring(count: int, seed: int, split: int, elevation: float = 25.0) -> np.ndarray:
+    """Return evenly spaced unit directions [count, 3] at an elevation in degrees, from a random azimuth per split."""
+    turn = np.random.default_rng([seed, split]).random()
+    phi, theta = 2 * np.pi * (np.arange(count) + turn) / count, np.radians(elevation)
+    return np.stack([np.cos(theta) * np.cos(phi), np.cos(theta) * np.sin(phi), np.full(count, np.sin(theta))], -1)
+
+
+def look_at_origin(position: np.ndarray) -> np.ndarray:
+    """Return the camera-to-world matrix [4, 4] (OpenGL axes: x right, y up, looks along -z) of a camera at `position`.
+
+    World z is up in the image, except directly above and below the origin, where world y is up.
+    """
+    backward = position / np.linalg.norm(position)
+    up = np.array([0.0, 0.0, 1.0]) if abs(backward[2]) < 0.999 else np.array([0.0, 1.0, 0.0])
+    right = np.cross(up, backward)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :4] = np.stack([right, np.cross(backward, right), backward, position], -1)
+    return pose
+
 
 CAMERA_ANGLE_X = 0.6911112070083618  # field of view of the NeRF synthetic scenes and of the paper's scenes
 CAMERA_DISTANCE = 4.03

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from typing import Any
 
-from nerfro.core.optional import optional
+from nerfro.core.errors import optional
 from nerfro.synthetic.llvm import PURPOSE
 
 PLUGIN = "transmitting_glass"

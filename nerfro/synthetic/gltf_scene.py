@@ -32,12 +32,11 @@ from nerfro.geometry.intersection import MeshIntersector
 from nerfro.geometry.mesh import merge_vertices
 from nerfro.media.body_settings import BodySettings
 from nerfro.rendering.scene_file import SCENE, SceneFile
-from nerfro.synthetic.dataset import PlannedImage, ViewSplits
+from nerfro.synthetic.dataset import PlannedImage, ViewSplits, look_at_origin
 from nerfro.synthetic.path_tracer import Pinhole
 from nerfro.synthetic.scene import Part, SyntheticScene
 from nerfro.synthetic.scenes import torus
 from nerfro.synthetic.surface import SurfaceMesh, join
-from nerfro.synthetic.viewpoints import look_at_origin
 
 _DISTANCE = 3.1  # of the cameras of an orbit, in half diagonals of the bodies
 # Shares of the cameras of a file for training, validation and test, by the number of the camera.

@@ -15,7 +15,7 @@ import sys
 from collections.abc import Iterable
 from pathlib import Path
 
-from nerfro.core.optional import optional
+from nerfro.core.errors import optional
 
 PURPOSE = "rendering ground truth needs Mitsuba 3"
 MIN_VERSION = 16

@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from nerfro.core.errors import NerfroError
+from nerfro.core.errors import NerfroError, optional
 from nerfro.core.light import to_linear
-from nerfro.core.optional import optional
 from nerfro.files.lat_long import envmap_texture
 from nerfro.synthetic import llvm
 from nerfro.synthetic.glass import EMBEDDED, PLUGIN, register_materials

@@ -8,7 +8,7 @@ from typing import Literal
 
 import torch
 
-from nerfro.backgrounds.constant import ConstantBackground
+from nerfro.backgrounds.base import ConstantBackground
 from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.core.cameras import Cameras
 from nerfro.core.draws import Draws
@@ -19,11 +19,11 @@ from nerfro.geometry.space import Box
 from nerfro.media.base import Medium, Scalars, Vectors
 from nerfro.media.bodies import Bodies, Body, GridSettings
 from nerfro.media.material import Material
-from nerfro.media.surfaces.ball import BallSurface
+from nerfro.media.surfaces import BallSurface
 from nerfro.models.refractive import RefractiveModel
 from nerfro.rendering import Components, RayTracer, composite
+from nerfro.samplers.base import Straight
 from nerfro.samplers.paths.snell import Snell
-from nerfro.samplers.paths.straight import Straight
 from nerfro.samplers.points.stratified import Stratified, point_samples
 from nerfro.training.phases.base import TrainingRun
 from nerfro.training.pixel_batches import PixelBatches

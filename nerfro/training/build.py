@@ -22,6 +22,7 @@ from nerfro.rendering.memory import require_memory
 from nerfro.rendering.scene_file import SceneFile, with_scene
 from nerfro.samplers.paths.thin_walls import warn_of_thin_walls
 from nerfro.samplers.subdivision import Subdivision
+from nerfro.training.checks import CHECKED_RAYS, require_reach
 from nerfro.training.config import (
     TrainConfig,
     build_data,
@@ -35,11 +36,9 @@ from nerfro.training.config import (
 from nerfro.training.data_module import RayDataModule
 from nerfro.training.derivation import derived
 from nerfro.training.effects import warn_without_effect
-from nerfro.training.load import checkpoint_of
 from nerfro.training.module import TrainingModule
 from nerfro.training.pixel_batches import PixelBatches
-from nerfro.training.reach import CHECKED_RAYS, require_reach
-from nerfro.training.run_folder import load_run, restore
+from nerfro.training.run_folder import checkpoint_of, load_run, restore
 from nerfro.training.schedule import Schedule
 
 

@@ -18,13 +18,11 @@ from nerfro.cli.overrides import as_overrides, command_line
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import CONF_DIR, resolve_path, scene_name
 from nerfro.core.progress import clock_time
-from nerfro.data.base import DataSource
-from nerfro.data.validation_views import WithValidationViews
+from nerfro.data.base import DataSource, WithValidationViews
 from nerfro.evaluation.results import Region
-from nerfro.geometry.box import corners_of_box
+from nerfro.geometry.space import corners_of_box
 from nerfro.kernels.available import find_gpu, require_accelerator
-from nerfro.media.analytic import Vacuum
-from nerfro.media.base import Medium
+from nerfro.media.base import Medium, Vacuum
 from nerfro.media.body_settings import origin_of
 from nerfro.optimizers.config import OptimizerConfig
 from nerfro.registry.allowed import (

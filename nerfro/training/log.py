@@ -19,7 +19,7 @@ from torch import Tensor
 
 from nerfro.core.cameras import Cameras
 from nerfro.core.types import Exits, Rays, Rendering
-from nerfro.evaluation.error_maps import triptych
+from nerfro.evaluation.image_metrics import triptych
 from nerfro.evaluation.path_plot import image_of_paths
 from nerfro.files.lat_long import directions
 from nerfro.files.reading import reading

@@ -24,10 +24,10 @@ from nerfro.optimizers.config import OptimizerConfig
 from nerfro.registry.allowed import plain, validate
 from nerfro.registry.registration import discover
 from nerfro.rendering import Renderer, Scene
+from nerfro.training.checks import Updates
 from nerfro.training.config import build_each
 from nerfro.training.inputs import INPUTS, inputs_of
 from nerfro.training.run_folder import load_run, restore
-from nerfro.training.updates import Updates
 
 
 class TrainingModule(LightningModule):

@@ -1,4 +1,4 @@
-"""Folder of a run: lock, records for repeating the run, and checkpoints."""
+"""Folder of a run: lock, records for repeating the run, checkpoints, and the trained scene."""
 
 from __future__ import annotations
 
@@ -22,25 +22,30 @@ from nerfro.core.errors import Interrupted, NerfroError, first_of, warn
 from nerfro.core.paths import PACKAGE_DIR, user_path
 from nerfro.core.provenance import AlgorithmSettings, command_of_process, versions
 from nerfro.data.base import Views
+from nerfro.evaluation.request import find_device
 from nerfro.files.atomic import require_room, write_atomically, write_json
 from nerfro.files.folder_lock import lock_folder, require_only
 from nerfro.files.foreign_config import foreign_config, read_foreign_config
 from nerfro.files.reading import reading
 from nerfro.kernels.available import fast_bfloat16, gpu_name
 from nerfro.optimizers.config import MOMENTS, OPTIMIZERS
+from nerfro.registry.registration import discover
 from nerfro.rendering import Renderer
-from nerfro.training.config import build_model, check_trained, training_device
+from nerfro.samplers.subdivision import Subdivision
+from nerfro.training.config import build_data, build_model, check_trained, training_device
 from nerfro.training.content import describe
 from nerfro.training.derivation import describe_backdrop
 from nerfro.training.inputs import (
     changed_file,
     compared_by_content,
     copy_files,
+    recorded_cameras,
     relocated,
     require_files,
     require_same_inputs,
 )
 from nerfro.training.settings import RESUMING, first_difference, settings
+from nerfro.viewing.trained_scene import TrainedScene
 
 LAST_CHECKPOINT = Path("checkpoints", "last.ckpt")
 CONFIG_FILE, CELL_FILE = "config.yaml", "cell.json"  # configuration of the run; its state in a sweep
@@ -336,3 +341,39 @@ def _command() -> str:
         # In a launcher's worker this process has another main module and other arguments.
         return shlex.join(["python", "-m", "nerfro.train", *HydraConfig.get().overrides.task])
     return command_of_process()
+
+
+def load(run: str | Path, device: str = "auto", root: str | Path | None = None) -> TrainedScene:
+    """Load the trained scene of a run.
+
+    The run folder contains the surface of the object and the training cameras, so the scene can be rendered along a
+    path and exported without the data.
+
+    Args:
+        run: folder of the run, or one of its checkpoints.
+        device: `cpu` or `cuda`; `auto` means the CPU.
+        root: folder of the data, if it has moved since training.
+
+    Raises:
+        NerfroError: the checkpoint cannot be read, or files of the run are missing.
+    """
+    discover()
+    checkpoint, config = load_run(checkpoint_of(run), root)
+    return scene_of(checkpoint, config, find_device(device))
+
+
+def checkpoint_of(run: str | Path) -> Path:
+    """Return the checkpoint of a run: the file itself, or the last checkpoint of a run folder."""
+    path = user_path(run)
+    return path / LAST_CHECKPOINT if path.is_dir() else path
+
+
+def scene_of(checkpoint: dict[str, Any], config: DictConfig, device: torch.device) -> TrainedScene:
+    """Build the scene of a checkpoint from a configuration, whose data and evaluation may differ from training."""
+    renderer, cameras = restore(checkpoint, config).to(device), recorded_cameras(checkpoint)
+    subdivision = Subdivision(**config.evaluation.subdivision)
+    name = config.name
+    if "current_model_state" in checkpoint:  # the latest weights, besides the average
+        name = f"{name}, average of weights"
+        print("weights: moving average over the steps of the run (weight_averaging)", flush=True)
+    return TrainedScene(renderer, build_data(config), subdivision, name, cameras)

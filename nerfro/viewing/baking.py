@@ -1,4 +1,7 @@
-"""Conversion of a model to arrays that a browser traces: signed distances, a cube map of the sky, and a volume."""
+"""Conversion of a model to arrays that a browser traces: signed distances, a cube map of the sky, and a volume.
+
+Arrays are encoded as PNG images in text, which browsers decode and which compress smooth arrays well.
+"""
 
 from __future__ import annotations
 
@@ -10,18 +13,63 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from nerfro.backgrounds.base import Background
 from nerfro.core.errors import NerfroError
 from nerfro.core.light import to_srgb
 from nerfro.core.types import Exits
+from nerfro.files.images import data_uri
 from nerfro.media.distance_grid import BLOCK
 from nerfro.rendering import ColourSpace, Renderer
-from nerfro.viewing import packing
 from nerfro.viewing.changes import absorption_of
 from nerfro.viewing.volume import MIN_OPTICAL_DEPTH, Volume
+
+# Format RGB9_E5: three mantissas with a common exponent (OpenGL ES 3.0, section 3.8.3.2).
+_MANTISSA_BITS, _EXPONENT_BIAS, _MAX_EXPONENT = 9, 15, 31
+_LARGEST = (1 - 0.5**_MANTISSA_BITS) * 2.0 ** (_MAX_EXPONENT - _EXPONENT_BIAS)
+
+
+def pack(voxels: UInt8[np.ndarray, "Z Y X C"], compression: int = 9) -> str:
+    """Encode one, two or three bytes per voxel as the data URI of an image whose tiles are the slices.
+
+    The image is always RGB: some browsers change grey values for display, and multiply colours by alpha.
+    """
+    depth, height, width, channels = voxels.shape
+    columns = math.ceil(math.sqrt(depth))
+    rows = math.ceil(depth / columns)
+    tiles = np.zeros((rows * columns, height, width, 3), np.uint8)
+    tiles[:depth, ..., :channels] = voxels
+    mosaic = tiles.reshape(rows, columns, height, width, 3).swapaxes(1, 2).reshape(rows * height, columns * width, 3)
+    return data_uri(mosaic, "PNG", compress_level=compression)
+
+
+def two_bytes(steps: Int[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape 2"]:
+    """Encode integers from -32768 to 32767, plus 32768, as upper and lower byte."""
+    raised = (steps + 2**15).astype(np.uint16)
+    return np.stack([raised >> 8, raised & 255], -1).astype(np.uint8)
+
+
+def shared_exponent(
+    radiance: Float[np.ndarray, "*shape 3"],
+) -> tuple[UInt8[np.ndarray, "*shape 3"], UInt8[np.ndarray, "*shape 1"]]:
+    """Encode radiance as RGB9_E5: upper eight bits of the mantissas, and exponent (x 8) with the lowest bits."""
+    clipped = np.clip(radiance, 0, _LARGEST)
+    brightest = clipped.max(-1)
+    smallest = 2.0 ** -(_EXPONENT_BIAS + 1)
+    exponent = np.floor(np.log2(np.maximum(brightest, smallest))).astype(np.int64) + 1 + _EXPONENT_BIAS
+    # Rounding may need one more bit.
+    fits = np.round(brightest / _step_size(exponent)) < 2**_MANTISSA_BITS
+    exponent = np.where(fits, exponent, exponent + 1)
+    mantissa = np.round(clipped / _step_size(exponent)[..., None]).astype(np.int64)
+    lowest = ((mantissa & 1) * [1, 2, 4]).sum(-1)
+    return (mantissa >> 1).astype(np.uint8), (exponent * 8 + lowest).astype(np.uint8)[..., None]
+
+
+def _step_size(exponent: Int[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+    """Return the difference between neighbouring mantissas."""
+    return 2.0 ** (exponent.astype(np.float64) - _EXPONENT_BIAS - _MANTISSA_BITS)
 
 
 @dataclass(frozen=True)
@@ -33,7 +81,7 @@ class Baked:
 
     def packed(self, compression: int = 9) -> dict[str, str]:
         """Encode the arrays as data URIs."""
-        return {name: packing.pack(voxels, compression) for name, voxels in self.voxels.items()}
+        return {name: pack(voxels, compression) for name, voxels in self.voxels.items()}
 
 
 def bake_surface(renderer: Renderer) -> Baked:
@@ -92,7 +140,7 @@ def bake_surface(renderer: Renderer) -> Baked:
             "minStep": float(solids.min_step.min()),
             "maxEvents": sampler.max_events,
         },
-        {"distances": packing.two_bytes(slices), "clearance": blocks[..., None].astype(np.uint8)},
+        {"distances": two_bytes(slices), "clearance": blocks[..., None].astype(np.uint8)},
     )
 
 
@@ -102,7 +150,7 @@ def bake_sky(background: Background, device: torch.device) -> Baked:
     size = background.face_resolution
     directions = cube_directions(size).to(device)
     radiance = torch.cat([background(Exits(chunk)).float().cpu() for chunk in directions.split(2**16)])
-    upper, rest = packing.shared_exponent(radiance.view(6, size, size, 3).double().numpy())
+    upper, rest = shared_exponent(radiance.view(6, size, size, 3).double().numpy())
     return Baked({"size": size}, {"sky": upper, "sky_exponent": rest})
 
 

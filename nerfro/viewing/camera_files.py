@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 
 from nerfro.camera.base import CameraModel
-from nerfro.camera.similarity import motion_between
+from nerfro.camera.refined.refined import motion_between
 from nerfro.core.cameras import Cameras
 from nerfro.core.errors import NerfroError, warn
 from nerfro.core.paths import relative_path

@@ -6,16 +6,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from nerfro.backgrounds.constant import ConstantBackground
+from nerfro.backgrounds.base import ConstantBackground
 from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.core.errors import NerfroError
 from nerfro.core.light import to_srgb
 from nerfro.core.types import FieldValues, Samples
 from nerfro.core.variants import variant
 from nerfro.fields.base import Field
-from nerfro.media.analytic import Vacuum
+from nerfro.media.base import Vacuum
 from nerfro.rendering import ColourSpace, Renderer, Scene
-from nerfro.samplers.paths.straight import Straight
+from nerfro.samplers.base import Straight
 
 
 class EmptyField(Field):

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerfro.data.base import Views
-from nerfro.evaluation.error_maps import triptych
+from nerfro.evaluation.image_metrics import triptych
 from nerfro.files.images import data_uri, to_8bit
 from nerfro.viewing.baking import Baked
 from nerfro.viewing.page import assemble_page, bake_parts, static_parts

@@ -9,12 +9,10 @@ from torch import Tensor
 from nerfro.core.types import Path, Rays
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.media.base import Medium
-from nerfro.paper.eikonal import march_uniform
-from nerfro.paper.integrators import Index, RayState
+from nerfro.paper.eikonal import Index, RayState, march_uniform
 from nerfro.registry.allowed import Count
 from nerfro.registry.registration import register
-from nerfro.samplers.base import PathSampler
-from nerfro.samplers.paths.straight import straight_path
+from nerfro.samplers.base import PathSampler, straight_path
 
 
 @register("sampler/path", "box_march")

@@ -10,9 +10,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nerfro.core.paths import resolve_path
-from nerfro.geometry.box import corners_of_box
 from nerfro.geometry.mesh import load_mesh, local_origin
-from nerfro.geometry.space import inside_box
+from nerfro.geometry.space import corners_of_box, inside_box
 from nerfro.media.base import Medium
 from nerfro.registry.allowed import Depth, Natural, Positive, Width
 from nerfro.registry.registration import register

@@ -20,7 +20,7 @@ from nerfro.geometry.space import Space, inside_box
 from nerfro.registry.allowed import Count, Positive, Share
 from nerfro.registry.registration import register
 from nerfro.rendering import Components, Renderer, composite
-from nerfro.samplers.paths.straight import straight_path
+from nerfro.samplers.base import straight_path
 
 from .background import BackgroundGrids
 

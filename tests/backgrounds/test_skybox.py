@@ -2,9 +2,9 @@
 
 import torch
 
-from nerfro.backgrounds.constant import ConstantBackground
+from nerfro.backgrounds.base import ConstantBackground
 from nerfro.core.types import Exits
-from nerfro.paper.skybox import Skybox
+from nerfro.paper.nerf import Skybox
 
 
 def test_published_skybox_has_its_layers() -> None:

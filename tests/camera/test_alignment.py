@@ -13,8 +13,7 @@ from nerfro.camera.refined import gauss_newton
 from nerfro.camera.refined.gauss_newton import PriorInformation
 from nerfro.camera.refined.outlines import align_to_outlines
 from nerfro.camera.refined.panorama import align
-from nerfro.camera.refined.refined import RefinedCamera
-from nerfro.camera.similarity import motion_between
+from nerfro.camera.refined.refined import RefinedCamera, motion_between
 from nerfro.core.cameras import Cameras
 from nerfro.core.light import to_linear, to_srgb
 from nerfro.core.rays import Rays

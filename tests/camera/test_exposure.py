@@ -13,7 +13,7 @@ from nerfro.evaluation.image_metrics import psnr
 from nerfro.losses.radiance import Photometric
 from nerfro.models.refractive import RefractiveModel
 from nerfro.testing import NUM_RAYS, example_batch, example_components
-from nerfro.training.load import load
+from nerfro.training.run_folder import load
 from tests.ball_photographs import TRAINING, cameras, photographs, save
 from tests.conftest import Runner
 

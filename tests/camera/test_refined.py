@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from nerfro.camera.refined import refined
-from nerfro.camera.similarity import Similarity, motion_between, similarity
+from nerfro.camera.refined.refined import Similarity, motion_between, similarity
 from nerfro.core.cameras import Cameras
 from nerfro.core.lens import coefficients
 

@@ -10,17 +10,15 @@ import pytest
 import torch
 
 from benchmarks.cameras import disturbed
-from nerfro.camera.similarity import motion_between
+from nerfro.camera.refined.refined import motion_between
 from nerfro.core.light import to_linear, to_srgb
-from nerfro.data.blender import BlenderData
-from nerfro.data.formats.nerfstudio import NerfstudioData
+from nerfro.data.formats.transforms import BlenderData, NerfstudioData
 from nerfro.evaluation.results import read_metrics_json
 from nerfro.files.images import save_png
 from nerfro.geometry.mesh import load_mesh
 from nerfro.registry.registration import discover
 from nerfro.silhouettes.silhouettes import mesh_silhouettes
-from nerfro.training.load import load
-from nerfro.training.run_folder import load_checkpoint
+from nerfro.training.run_folder import load, load_checkpoint
 from tests.ball_photographs import TRAINING, photographs, save
 from tests.conftest import Runner, weights_of
 

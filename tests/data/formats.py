@@ -16,10 +16,9 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from nerfro.data.base import DataSource, Views
-from nerfro.data.blender import BlenderData, OpenCVData
 from nerfro.data.formats import colmap_model, idr, llff, refref
 from nerfro.data.formats.colmap import ColmapData
-from nerfro.data.formats.nerfstudio import NerfstudioData
+from nerfro.data.formats.transforms import BlenderData, NerfstudioData, OpenCVData
 
 from .photographs import (
     CX,

@@ -17,7 +17,7 @@ from nerfro.core.errors import NerfroError
 from nerfro.data.base import Views
 from nerfro.data.formats import colmap_model
 from nerfro.data.formats.colmap_model import CAMERA_MODELS
-from nerfro.training.load import load as load_run
+from nerfro.training.run_folder import load as load_run
 from tests.conftest import SMALL, refused
 
 from .formats import BROWN, FORMATS, OPENCV, TRAIN, write_colmap

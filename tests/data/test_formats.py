@@ -7,7 +7,7 @@ import pytest
 import torch
 from PIL import Image
 
-from nerfro.data.blender import BlenderData
+from nerfro.data.formats.transforms import BlenderData
 from nerfro.data.frames import list_images
 from tests.conftest import refused
 

@@ -10,8 +10,7 @@ import pytest
 
 from nerfro.camera.base import CameraModel
 from nerfro.core.lens import coefficients, opencv_coefficients
-from nerfro.data.blender import BlenderData
-from nerfro.data.formats.nerfstudio import NerfstudioData
+from nerfro.data.formats.transforms import BlenderData, NerfstudioData
 from nerfro.data.lenses import Lens, check_lenses, read_lens
 from nerfro.viewing.camera_files import write_cameras
 from tests.conftest import refused

@@ -20,7 +20,7 @@ from nerfro.camera.exposure import fit_gain
 from nerfro.capture.surroundings import divide_pixels
 from nerfro.core.light import ColourSpace, encode_photograph, saturated, to_linear, to_srgb, tone_mapped
 from nerfro.core.paths import resolve_path
-from nerfro.data.blender import BlenderData
+from nerfro.data.formats.transforms import BlenderData
 from nerfro.data.image_files import read_mask, read_rgb, read_size
 from nerfro.data.lazy_images import LazyImages
 from nerfro.data.pixel_store import PixelStore

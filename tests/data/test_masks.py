@@ -9,7 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
-from nerfro.data.blender import BlenderData
+from nerfro.data.formats.transforms import BlenderData
 from nerfro.data.masks import find_mask, find_masks, with_other_splits
 from nerfro.data.transforms import existing_image
 from tests.conftest import refused

@@ -14,8 +14,7 @@ from PIL import Image
 
 from nerfro.core.errors import NerfroError
 from nerfro.data.base import Views
-from nerfro.data.blender import BlenderData, OpenCVData
-from nerfro.data.formats.nerfstudio import NerfstudioData
+from nerfro.data.formats.transforms import BlenderData, NerfstudioData, OpenCVData
 from tests.conftest import refused
 
 from .formats import (

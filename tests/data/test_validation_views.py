@@ -6,8 +6,8 @@ import numpy as np
 import torch
 
 import nerfro
-from nerfro.data.blender import BlenderData
-from nerfro.data.validation_views import WithValidationViews, spread
+from nerfro.data.base import WithValidationViews, spread
+from nerfro.data.formats.transforms import BlenderData
 from tests.conftest import Runner
 
 

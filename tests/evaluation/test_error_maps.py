@@ -3,13 +3,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from nerfro.evaluation.error_maps import squared_error_map, triptych
-from nerfro.evaluation.image_metrics import build_metrics, psnr, ssim
+from nerfro.evaluation.image_metrics import build_metrics, psnr, squared_error_map, ssim, triptych
 from nerfro.evaluation.metrics import error_maps, write_error_sheet
-from nerfro.evaluation.perceptual.flip import flip
-from nerfro.evaluation.perceptual.lpips import LpipsNetwork, published_weights
-from nerfro.files.drawing import magma
-from nerfro.files.images import load_png, round_to_8bit
+from nerfro.evaluation.perceptual import LpipsNetwork, flip, published_weights
+from nerfro.files.images import load_png, magma, round_to_8bit
 from nerfro.registry.registration import discover
 
 discover()

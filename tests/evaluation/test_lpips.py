@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfro.evaluation.perceptual.lpips import LpipsNetwork, published_weights
+from nerfro.evaluation.perceptual import LpipsNetwork, published_weights
 from nerfro.files.images import load_png
 from tests.processes import printed_by
 

@@ -13,18 +13,15 @@ from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
 import nerfro
-from nerfro.evaluation.image_metrics import psnr, ssim, ssim_map
+from nerfro.evaluation.image_metrics import crop_rectangle, object_pixels, psnr, ssim, ssim_map
 from nerfro.evaluation.metrics import ImageMetrics
-from nerfro.evaluation.perceptual import flip as flips
-from nerfro.evaluation.perceptual.lpips import Lpips
-from nerfro.evaluation.regions import crop_rectangle, object_pixels
+from nerfro.evaluation.perceptual import Lpips, flip, flip_map
 from nerfro.evaluation.results import EvaluationResult
 from nerfro.files.images import load_png, round_to_8bit, save_png
 from nerfro.registry.registration import discover
 from tests.conftest import refused
 
 discover()
-flip, flip_map = flips.flip, flips.flip_map
 
 
 def pictures(seed: int = 0, height: int = 37, width: int = 45) -> tuple[Tensor, Tensor]:

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from nerfro.core.types import Rays, Samples
-from nerfro.paper.encoding import integrated_positional_encoding, positional_encoding
 from nerfro.paper.mip_nerf import frustum_gaussians
-from nerfro.samplers.paths.straight import straight_path
+from nerfro.paper.mlp import integrated_positional_encoding, positional_encoding
+from nerfro.samplers.base import straight_path
 from nerfro.samplers.points.stratified import cone_samples
 from nerfro.testing import example_path
 

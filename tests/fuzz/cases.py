@@ -36,8 +36,7 @@ from nerfro.geometry.mesh import load_mesh
 from nerfro.masks.mask_files import read_outlines
 from nerfro.rendering.scene_file import with_scene
 from nerfro.samplers.paths.traced_file import read_rays
-from nerfro.training.load import scene_of
-from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
+from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint, scene_of
 from nerfro.training.settings import Role, settings
 from tests.data.formats import FORMATS
 from tests.fuzz.world import World

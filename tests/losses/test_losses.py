@@ -14,7 +14,7 @@ from nerfro.core.light import to_srgb
 from nerfro.core.types import Batch, Rendering
 from nerfro.losses.radiance import BackgroundRegularizer, Photometric, TotalVariation, direction_pairs
 from nerfro.models.refractive import RefractiveModel
-from nerfro.paper.smoothness import Smoothness, tile_roughness
+from nerfro.paper.voxel_grid import Smoothness, tile_roughness
 from nerfro.registry.registration import create, find
 from nerfro.rendering import ColourSpace, Renderer, Scene
 from nerfro.samplers.points.stratified import point_samples

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from nerfro.core.types import FieldValues, Path, Rays, Rendering, Samples
-from nerfro.losses.backdrop import Backdrop
 from nerfro.losses.base import Loss
 from nerfro.losses.density import NearCamera, Opaque
+from nerfro.losses.radiance import Backdrop
 from nerfro.rendering import Scene, composite
-from nerfro.samplers.paths.straight import Straight
+from nerfro.samplers.base import Straight
 from nerfro.testing import example_batch, example_path, example_space
 from tests.closed_forms import Ball
 

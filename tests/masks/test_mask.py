@@ -17,7 +17,7 @@ from scipy.ndimage import gaussian_filter
 pytest.importorskip("cv2")
 
 from nerfro.core.cameras import Cameras
-from nerfro.data.blender import OpenCVData
+from nerfro.data.formats.transforms import OpenCVData
 from nerfro.data.masks import method_of
 from nerfro.masks import mask_files
 from nerfro.masks.masking import polygon_mask, propagate

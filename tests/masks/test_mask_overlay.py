@@ -9,7 +9,7 @@ import torch
 import trimesh
 from PIL import Image
 
-from nerfro.data.blender import BlenderData, OpenCVData
+from nerfro.data.formats.transforms import BlenderData, OpenCVData
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.silhouettes.agreement import overlap
 from nerfro.silhouettes.visual_hull import Silhouettes

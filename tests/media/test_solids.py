@@ -8,8 +8,7 @@ import torch
 import trimesh
 
 from nerfro.core.errors import NerfroError
-from nerfro.media.analytic import Vacuum
-from nerfro.media.base import Medium
+from nerfro.media.base import Medium, Vacuum
 from nerfro.media.bodies import Bodies
 from nerfro.media.body_settings import make_bodies
 from nerfro.media.distance_grid import SURFACE_BLOCK

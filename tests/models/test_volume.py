@@ -4,8 +4,7 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from nerfro.backgrounds.base import Background
-from nerfro.backgrounds.constant import ConstantBackground
+from nerfro.backgrounds.base import Background, ConstantBackground
 from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.core.draws import Draws
 from nerfro.core.types import Path

@@ -12,7 +12,7 @@ from PIL import Image
 pytest.importorskip("cv2")
 pytest.importorskip("pyapriltags")
 
-from nerfro.data.blender import OpenCVData
+from nerfro.data.formats.transforms import OpenCVData
 from nerfro.poses import calibration, photographs
 from nerfro.poses.boards import TagBoard, TagDetections, tag_grid, twelve_faces
 from nerfro.poses.calibration import calibrate_by_tags

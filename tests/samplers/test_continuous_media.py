@@ -15,8 +15,7 @@ from torch import Tensor
 
 from nerfro.core.types import Path, Rays
 from nerfro.media.base import Medium
-from nerfro.paper.eikonal import march_uniform
-from nerfro.paper.integrators import Integrator, euler, leapfrog
+from nerfro.paper.eikonal import Integrator, euler, leapfrog, march_uniform
 from tests.closed_forms import (
     FIBRE_ALPHA,
     FunctionMedium,

@@ -7,8 +7,7 @@ import torch
 
 from nerfro.media.base import Medium
 from nerfro.media.bodies import Bodies
-from nerfro.paper.eikonal import Eikonal, march_adaptive, march_uniform
-from nerfro.paper.integrators import euler
+from nerfro.paper.eikonal import Eikonal, euler, march_adaptive, march_uniform
 from nerfro.paper.voxel_grid import VoxelGrid
 from tests.closed_forms import (
     Ball,

@@ -10,8 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfro.paper.eikonal import march_uniform
-from nerfro.paper.integrators import Integrator, euler, leapfrog
+from nerfro.paper.eikonal import Integrator, euler, leapfrog, march_uniform
 from nerfro.paper.voxel_grid import VoxelGrid
 from nerfro.samplers.paths.snell_law import refract
 from tests.closed_forms import FunctionMedium, Squared, blurred_ball, grid_points, make_rays

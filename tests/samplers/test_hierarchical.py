@@ -10,8 +10,8 @@ from nerfro.core.draws import Draws
 from nerfro.core.types import FieldValues, Path, Rendering
 from nerfro.paper.hierarchical import Hierarchical
 from nerfro.rendering import composite
-from nerfro.samplers.paths.straight import straight_path
-from nerfro.samplers.points.stepfun import midpoints
+from nerfro.samplers.base import straight_path
+from nerfro.samplers.points.stratified import midpoints
 from nerfro.testing import example_draws, example_path, example_rays
 
 

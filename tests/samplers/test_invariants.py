@@ -5,15 +5,12 @@ import torch
 from torch import Tensor
 
 from nerfro.core.types import FieldValues, Path, Rendering
-from nerfro.media.analytic import Vacuum
-from nerfro.media.base import Medium
-from nerfro.paper.eikonal import Eikonal
+from nerfro.media.base import Medium, Vacuum
+from nerfro.paper.eikonal import Eikonal, RayState, kick_drift_kick, leapfrog
 from nerfro.paper.hierarchical import Hierarchical
-from nerfro.paper.integrators import RayState, kick_drift_kick, leapfrog
 from nerfro.paper.voxel_grid import VoxelGrid
 from nerfro.rendering import composite
-from nerfro.samplers.base import PathSampler, PointSampler
-from nerfro.samplers.paths.straight import Straight
+from nerfro.samplers.base import PathSampler, PointSampler, Straight
 from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import example_rays
 from tests.closed_forms import (

@@ -12,15 +12,13 @@ import trimesh
 from torch import Tensor
 
 from nerfro.core.types import Path, Rays
-from nerfro.media.analytic import Vacuum
-from nerfro.media.base import Medium
+from nerfro.media.base import Medium, Vacuum
 from nerfro.media.bodies import Bodies
 from nerfro.media.body_settings import make_bodies
 from nerfro.paper.eikonal import Eikonal, march_adaptive
 from nerfro.paper.voxel_grid import VoxelGrid
-from nerfro.samplers.base import PathSampler
+from nerfro.samplers.base import PathSampler, Straight
 from nerfro.samplers.paths.replay import smallest_cosine
-from nerfro.samplers.paths.straight import Straight
 from tests.closed_forms import Ball, RoundedBox, beam, grid_points, make_rays, random_rays
 from tests.reference_tracer import Snell, trace_interfaces
 from tests.samplers.nested import NestedBalls, nested_grid, nested_mesh

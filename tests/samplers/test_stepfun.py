@@ -7,8 +7,8 @@ from torch import Tensor
 
 from nerfro.core.types import Path
 from nerfro.paper.hierarchical import blur_weights
-from nerfro.samplers.paths.straight import straight_path
-from nerfro.samplers.points.stepfun import invert_cdf, spread_uniform
+from nerfro.samplers.base import straight_path
+from nerfro.samplers.points.stratified import invert_cdf, spread_uniform
 from nerfro.testing import example_draws
 from tests.closed_forms import make_rays
 

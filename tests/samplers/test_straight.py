@@ -3,7 +3,7 @@
 import torch
 
 from nerfro.core.types import Rays
-from nerfro.samplers.paths.straight import Straight
+from nerfro.samplers.base import Straight
 from tests.closed_forms import Ball
 
 

@@ -8,7 +8,7 @@ import torch
 from nerfro.core.errors import NerfroError
 from nerfro.core.types import Path
 from nerfro.paper.eikonal import Eikonal
-from nerfro.samplers.paths.straight import straight_path
+from nerfro.samplers.base import straight_path
 from nerfro.samplers.points.stratified import LAST_FRACTION, Stratified
 from nerfro.testing import example_draws, example_rays
 from tests.closed_forms import Luneburg

@@ -8,8 +8,7 @@ import pytest
 import torch
 import trimesh
 
-from nerfro.geometry.intersection import Triangles
-from nerfro.geometry.triangle_tree import TriangleTree
+from nerfro.geometry.intersection import Triangles, TriangleTree
 from nerfro.kernels.compilation import compiled_parallel
 from nerfro.media.body_settings import make_bodies
 from nerfro.samplers.paths.snell import Snell

@@ -14,9 +14,9 @@ from nerfro.media.bodies import Bodies
 from nerfro.media.body_settings import make_bodies
 from nerfro.samplers.subdivision import part_rays
 from nerfro.synthetic import path_tracer
+from nerfro.synthetic.dataset import look_at_origin
 from nerfro.synthetic.path_tracer import PathTracer, Pinhole
 from nerfro.synthetic.surface import SurfaceMesh, rounded_box, sphere
-from nerfro.synthetic.viewpoints import look_at_origin
 from tests.cameras_at import cameras_at
 from tests.closed_forms import Ball, RoundedBox, grid_points, sampled
 from tests.reference_tracer import Snell

@@ -16,7 +16,7 @@ from nerfro.registry.registration import discover
 discover()
 from nerfro.synthetic.path_tracer import PathTracer, Pinhole
 from nerfro.synthetic.synthesis import find_scene
-from nerfro.synthetic.viewpoints import look_at_origin
+from nerfro.synthetic.dataset import look_at_origin
 tracer = PathTracer(find_scene("torus").build(0.3), False, Pinhole.square(0.7, 2))
 print(tracer.mitsuba.variant(), tracer.render(look_at_origin([0, 0.1, 4]), spp=1, seed=0).mean() > 0)
 """

@@ -7,11 +7,10 @@ import pytest
 
 from nerfro.core.errors import NerfroError
 from nerfro.synthetic import path_tracer
-from nerfro.synthetic.dataset import CAMERA_ANGLE_X, CAMERA_DISTANCE
+from nerfro.synthetic.dataset import CAMERA_ANGLE_X, CAMERA_DISTANCE, directions_on_sphere, look_at_origin
 from nerfro.synthetic.path_tracer import PathTracer, Pinhole, load_mitsuba
 from nerfro.synthetic.surface import rounded_box, sphere, torus_angles
 from nerfro.synthetic.synthesis import find_scene
-from nerfro.synthetic.viewpoints import directions_on_sphere, look_at_origin
 from tests.processes import python
 
 IOR = 1.5

@@ -16,7 +16,7 @@ from torch import Tensor
 from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.core.light import to_srgb
 from nerfro.core.types import Exits
-from nerfro.data.blender import BlenderData
+from nerfro.data.formats.transforms import BlenderData
 from nerfro.evaluation.results import read_metrics_json
 from nerfro.fields.base import Field
 from nerfro.fields.hash_grid import HashGridField

@@ -11,7 +11,7 @@ from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.core.cameras import Cameras
 from nerfro.fields.hash_grid import HashGridField
 from nerfro.geometry.space import Contracted, Unbounded
-from nerfro.media.analytic import Vacuum
+from nerfro.media.base import Vacuum
 from nerfro.registry.allowed import untyped
 from nerfro.testing import example_views
 from nerfro.training.config import TrainConfig

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from nerfro.core.draws import Draws
-from nerfro.data.blender import BlenderData
+from nerfro.data.formats.transforms import BlenderData
 from nerfro.data.pixel_store import PixelStore
 from nerfro.kernels import compilation
 from nerfro.media.bodies import Bodies

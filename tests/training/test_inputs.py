@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 
 from nerfro.core.cameras import Cameras
 from nerfro.data.base import Views
-from nerfro.data.blender import BlenderData
+from nerfro.data.formats.transforms import BlenderData
 from nerfro.training.inputs import (
     INPUTS,
     changed_file,
@@ -23,7 +23,7 @@ from nerfro.training.inputs import (
     require_files,
     require_same_inputs,
 )
-from nerfro.training.load import load
+from nerfro.training.run_folder import load
 from nerfro.viewing.page import page_split
 from nerfro.viewing.trained_scene import TrainedScene
 from tests.conftest import Runner, composed, refused

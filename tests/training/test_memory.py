@@ -7,18 +7,17 @@ from pathlib import Path
 import pytest
 import torch
 
-from nerfro.backgrounds.base import Background
-from nerfro.backgrounds.constant import ConstantBackground
+from nerfro.backgrounds.base import Background, ConstantBackground
 from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.core.errors import NerfroError
 from nerfro.kernels import available
 from nerfro.kernels.available import available_bytes, require_bytes
-from nerfro.media.analytic import Vacuum
+from nerfro.media.base import Vacuum
 from nerfro.models.refractive import RefractiveModel
 from nerfro.paper.nerf import NerfField
 from nerfro.rendering import Components, Renderer, memory
 from nerfro.rendering.memory import require_memory
-from nerfro.samplers.paths.straight import Straight
+from nerfro.samplers.base import Straight
 from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import example_batch
 from tests.conftest import refused

@@ -7,7 +7,7 @@ import torch
 from omegaconf import OmegaConf
 
 from nerfro.backgrounds.envmap import EnvironmentMap
-from nerfro.training.updates import Updates
+from nerfro.training.checks import Updates
 from tests.conftest import Runner, composed
 
 

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 import torch
 
-from nerfro.camera.given import GivenCamera
+from nerfro.camera.base import GivenCamera
 from nerfro.core.light import to_srgb
 from nerfro.core.types import Rays, mean_per_pixel
 from nerfro.data.base import Views
-from nerfro.data.blender import BlenderData
+from nerfro.data.formats.transforms import BlenderData
 from nerfro.evaluation.validation import ValidationPixels
 from nerfro.rendering import ColourSpace, RayTracer, Renderer, Scene
 from nerfro.samplers.points.stratified import Stratified

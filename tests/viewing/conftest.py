@@ -17,7 +17,7 @@ from nerfro.fields.base import Field
 from nerfro.files import lat_long
 from nerfro.media.bodies import Bodies, Body
 from nerfro.media.material import Material
-from nerfro.media.surfaces.ball import BallSurface
+from nerfro.media.surfaces import BallSurface
 from nerfro.models.refractive import RefractiveModel
 from nerfro.registry.registration import discover
 from nerfro.rendering import Components
@@ -56,7 +56,7 @@ class Photographs(DataSource):
     def load(self, split: str) -> Views:
         places = [(4, 0, 1), (0, 4, 0.5), (-3, 2, -1)] if split == "test" else [(4, 0, 0), (0, -4, 0), (-2, 2, 2.8)]
         discover()
-        look_at_origin = import_module("nerfro.synthetic.viewpoints").look_at_origin
+        look_at_origin = import_module("nerfro.synthetic.dataset").look_at_origin
         poses = np.stack([look_at_origin(np.array(place, float))[:3] for place in places])
         size = 32
         cameras = cameras_at(poses, size, size, 0.5 * size / math.tan(0.5 * 0.7))

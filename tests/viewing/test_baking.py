@@ -11,8 +11,7 @@ from PIL import Image
 
 from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.core.types import Exits
-from nerfro.viewing.baking import bake_sky, cube_directions
-from nerfro.viewing.packing import pack, shared_exponent
+from nerfro.viewing.baking import bake_sky, cube_directions, pack, shared_exponent
 
 
 def gl_face(direction: np.ndarray) -> tuple[int, float, float]:

@@ -19,7 +19,7 @@ from nerfro.core.light import to_linear
 from nerfro.core.paths import resolve_path
 from nerfro.core.types import FieldValues, Samples
 from nerfro.core.variants import variant
-from nerfro.data.blender import BlenderData
+from nerfro.data.formats.transforms import BlenderData
 from nerfro.evaluation.image_metrics import psnr
 from nerfro.fields.base import Field
 from nerfro.files import lat_long

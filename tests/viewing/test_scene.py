@@ -22,7 +22,7 @@ from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.testing import example_path, example_samples, example_space
 from nerfro.viewing.changes import NormalsField, with_changed_scene
-from nerfro.viewing.layers import LAYERS
+from nerfro.viewing.film import LAYERS
 from nerfro.viewing.trained_scene import TrainedScene
 from tests.closed_forms import ball_exits
 from tests.conftest import refused

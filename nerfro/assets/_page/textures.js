@@ -1,5 +1,5 @@
 // Arrays are stored as PNG images, which the browser decodes. The tiles of an image are the slices of an array along its
-// last axis; see nerfro/viewing/packing.py.
+// last axis; see nerfro/viewing/baking.py.
 
 // Return red, green, blue and alpha (255) of every voxel, x fastest.
 function unpackVoxels(image, [width, height, depth]) {

@@ -11,7 +11,6 @@ from jaxtyping import Float
 
 from nerfro.core.errors import NerfroError
 from nerfro.data.base import Frame
-from nerfro.data.formats.bounds import find_bounds, image_edges, usable_points
 from nerfro.data.formats.colmap_model import (
     MODEL_FOLDERS,
     ColmapImage,
@@ -20,7 +19,7 @@ from nerfro.data.formats.colmap_model import (
     lens_of,
     read_colmap,
 )
-from nerfro.data.frames import Every, FrameSet, PosedImages
+from nerfro.data.frames import Every, FrameSet, PosedImages, find_bounds, image_edges, usable_points
 from nerfro.data.image_files import read_size
 from nerfro.data.masks import find_mask
 from nerfro.files.reading import as_spelled

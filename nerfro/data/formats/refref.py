@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from nerfro.core.errors import NerfroError
-from nerfro.core.optional import optional
+from nerfro.core.errors import NerfroError, optional
 from nerfro.data.base import SPLITS, Frame, Views
 from nerfro.data.frames import FrameSet, PosedImages, check_pose
 from nerfro.data.image_files import read_size

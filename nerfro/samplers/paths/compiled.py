@@ -11,7 +11,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from nerfro.core.types import OpticalRecord, Path, Rays
-from nerfro.geometry.triangle_tree import TriangleTree
+from nerfro.geometry.intersection import TriangleTree
 from nerfro.kernels.lookup import Solids
 from nerfro.kernels.operators import arrays, cpu_operator
 from nerfro.kernels.threads import share_parts

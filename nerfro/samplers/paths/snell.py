@@ -18,12 +18,11 @@ from nerfro.media.base import Medium
 from nerfro.media.bodies import Bodies
 from nerfro.registry.allowed import OnlyWith, Positive, Share
 from nerfro.registry.registration import register
-from nerfro.samplers.base import PathSampler
+from nerfro.samplers.base import PathSampler, replay_straight, straight_path
 from nerfro.samplers.paths.branching import Branching
 from nerfro.samplers.paths.compiled import trace_bodies
 from nerfro.samplers.paths.polylines import SnellTrace
 from nerfro.samplers.paths.replay import intersect_solid, intersect_triangles, replay, smallest_cosine
-from nerfro.samplers.paths.straight import replay_straight, straight_path
 
 
 class Tracer:

@@ -8,8 +8,7 @@ import numpy as np
 import torch
 
 from nerfro.core.errors import NerfroError, warn
-from nerfro.geometry.bodies import points_below
-from nerfro.geometry.thickness import WallSettings, thickness
+from nerfro.geometry.bodies import WallSettings, points_below, thickness
 from nerfro.media.base import Medium
 from nerfro.media.bodies import Bodies
 from nerfro.samplers.base import PathSampler

@@ -22,7 +22,7 @@ from nerfro.kernels.threads import share_parts
 from nerfro.registry.allowed import Count, Share
 from nerfro.registry.registration import register
 from nerfro.samplers.base import PointSampler
-from nerfro.samplers.points.stepfun import invert_cdf, midpoints, spread_uniform, volume_weights
+from nerfro.samplers.points.stratified import invert_cdf, midpoints, spread_uniform, volume_weights
 
 # Smallest optical depth, predicted by the grid, of samples at which the field is queried.
 _EMPTY = 0.005

@@ -7,8 +7,7 @@ import numpy as np
 from nerfro.core.light import to_linear
 from nerfro.synthetic.scene import SyntheticScene
 from nerfro.synthetic.scenes.distance import ball, capsule, ellipsoid, mirrored, painted, smooth_union
-from nerfro.synthetic.scenes.patterns import chosen, fractal_noise, hashed, mix, smoothstep
-from nerfro.synthetic.scenes.skies import azimuth, elevation, skyline
+from nerfro.synthetic.scenes.patterns import azimuth, chosen, elevation, fractal_noise, hashed, mix, skyline, smoothstep
 from nerfro.synthetic.surface import join, sphere
 
 GLASS_RADIUS, GLASS_SUBDIVISIONS = 0.80, 6

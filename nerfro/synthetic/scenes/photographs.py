@@ -10,10 +10,9 @@ from skimage.transform import resize
 from nerfro.cli.overrides import as_overrides, command_line
 from nerfro.core.light import to_linear, to_srgb
 from nerfro.files.atomic import write_json
-from nerfro.synthetic.dataset import DataSet, PlannedImage, write_image
+from nerfro.synthetic.dataset import DataSet, PlannedImage, look_at_origin, write_image
 from nerfro.synthetic.path_tracer import PathTracer, Pinhole
 from nerfro.synthetic.scene import Panel, SyntheticScene, Vector
-from nerfro.synthetic.viewpoints import look_at_origin
 
 DISTANCE, ELEVATIONS, LAPS = 4.5, (5.0, 68.0), 4
 # Focal length, and offset of the principal point from the centre of the image, relative to the width of the image.

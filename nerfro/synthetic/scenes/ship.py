@@ -9,8 +9,17 @@ import numpy as np
 from nerfro.core.light import to_linear
 from nerfro.synthetic.scene import SyntheticScene
 from nerfro.synthetic.scenes.distance import ball, block, capsule, painted
-from nerfro.synthetic.scenes.patterns import chosen, fractal_noise, hashed, mix, smoothstep
-from nerfro.synthetic.scenes.skies import azimuth, clouds, elevation, skyline
+from nerfro.synthetic.scenes.patterns import (
+    azimuth,
+    chosen,
+    clouds,
+    elevation,
+    fractal_noise,
+    hashed,
+    mix,
+    skyline,
+    smoothstep,
+)
 from nerfro.synthetic.surface import join, rounded_box
 
 HALF_SIDES, EDGE_RADIUS = (0.80, 0.50, 0.66), 0.07

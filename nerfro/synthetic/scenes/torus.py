@@ -8,8 +8,7 @@ import numpy as np
 
 from nerfro.core.light import to_linear
 from nerfro.synthetic.scene import SyntheticScene
-from nerfro.synthetic.scenes.patterns import chosen, hashed, mix, smoothstep
-from nerfro.synthetic.scenes.skies import clouds, elevation, skyline
+from nerfro.synthetic.scenes.patterns import chosen, clouds, elevation, hashed, mix, skyline, smoothstep
 from nerfro.synthetic.surface import rounded_box, torus_angles
 
 HALF_SIDE, EDGE_RADIUS = 0.75, 0.08

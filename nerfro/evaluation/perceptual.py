@@ -1,17 +1,23 @@
-"""Learned perceptual image patch similarity (LPIPS v0.1) with features of AlexNet.
+"""Perceptual metrics of images: LPIPS v0.1 with features of AlexNet, and FLIP; see docs/reference/metrics.md.
 
 The packages torchmetrics and lpips load the network from torchvision, whose published builds do not work beside a CPU
 build of torch, and download 233 MB of weights. Therefore this module implements the network, and nerfro contains the
 five convolutions, in half precision, and the linear heads of the package lpips (see the licences beside the files). The
 values agree with both packages.
 
-Source:
+FLIP is the visibility of the difference between two images that alternate on a screen. The values are computed by the
+authors' package flip-evaluator for low dynamic range (LDR) and its default viewing conditions: 67 pixels per degree,
+that is, a display of 0.7 m width and 3840 pixels at a distance of 0.7 m.
+
+Sources:
     Zhang et al., "The unreasonable effectiveness of deep features as a perceptual metric", CVPR 2018.
+    Andersson et al., "FLIP: a difference evaluator for alternating images", HPG 2020.
 """
 
 from __future__ import annotations
 
 import functools
+import importlib.util
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -23,9 +29,7 @@ from torch import Tensor, nn
 
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import ASSETS_DIR
-from nerfro.evaluation.error_maps import ErrorMap
-from nerfro.evaluation.image_metrics import ImageMetric
-from nerfro.evaluation.regions import mean_over, require_images
+from nerfro.evaluation.image_metrics import ErrorMap, ImageMetric, mean_over, require_images
 from nerfro.registry.registration import register
 
 # Arrays features.<i>.weight and features.<i>.bias of torchvision, and alex<l> of lpips v0.1.
@@ -170,3 +174,56 @@ class Lpips(ImageMetric):
 
     def error_map(self, prediction: Tensor, target: Tensor) -> ErrorMap:
         return ErrorMap("lpips", "LPIPS", self.network.distance_map(prediction, target), 1.0)
+
+
+def flip_is_available() -> bool:
+    """Test whether flip-evaluator is installed; the package has no wheel for Linux on ARM."""
+    return importlib.util.find_spec("flip_evaluator") is not None
+
+
+def flip_map(prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"]:
+    """Compute the visible difference of two images at each pixel.
+
+    Args:
+        prediction: rendered image, sRGB in [0, 1].
+        target: reference image, sRGB in [0, 1].
+
+    Returns:
+        Values in [0, 1], float32; 0 for an invisible difference.
+    """
+    require_images(prediction, target)
+    import flip_evaluator  # not available on every platform, see `flip_is_available`
+
+    images = [image.detach().cpu().float().contiguous().numpy() for image in (target, prediction)]
+    errors, _, _ = flip_evaluator.evaluate(*images, "LDR", applyMagma=False, computeMeanError=False)
+    return torch.from_numpy(errors[..., 0]).to(prediction.device)
+
+
+def flip(
+    prediction: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], inside: Bool[Tensor, "H W"] | None = None
+) -> Float[Tensor, ""]:
+    """Compute the mean of `flip_map`; lower is better.
+
+    Args:
+        prediction: rendered image, sRGB in [0, 1].
+        target: reference image, sRGB in [0, 1].
+        inside: mask of the pixels that count; by default, all pixels count.
+
+    Returns:
+        Mean in [0, 1], without unit; NaN for an empty mask.
+    """
+    require_images(prediction, target, inside)
+    return mean_over(flip_map(prediction, target), inside)
+
+
+@register("metric", "flip")
+class Flip(ImageMetric):
+    """FLIP, the difference that is visible when flipping between two images."""
+
+    title = "FLIP"
+    better = "lower"
+    missing = None if flip_is_available() else "the package flip-evaluator is not installed"
+    forward = staticmethod(flip)
+
+    def error_map(self, prediction: Tensor, target: Tensor) -> ErrorMap:
+        return ErrorMap("flip", "FLIP", flip_map(prediction, target), 1.0)

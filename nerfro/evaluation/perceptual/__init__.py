@@ -1,1 +1,0 @@
-"""Perceptual metrics of images: LPIPS and FLIP; see docs/reference/metrics.md."""

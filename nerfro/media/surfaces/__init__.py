@@ -1,1 +1,0 @@
-"""Surfaces of bodies: balls, boxes, bodies of revolution, distances in files, and offsets of other surfaces."""
