@@ -9,7 +9,7 @@ from .data.formats.transforms import BlenderData
 from .evaluation.collection import metrics
 from .fields.hash_grid import HashGridField
 from .geometry.space import Box, Contracted
-from .losses.radiance import Photometric
+from .losses.terms import Photometric
 from .masks.segment import segment
 from .media.bodies import Bodies, Body, GridSettings
 from .media.body_settings import make_bodies

@@ -14,8 +14,7 @@ from nerfro.core.light import to_linear, to_srgb
 from nerfro.core.types import Exits, FieldValues, Path
 from nerfro.files import lat_long
 from nerfro.losses.base import Loss
-from nerfro.losses.density import Distortion
-from nerfro.losses.radiance import BackgroundRegularizer, Photometric
+from nerfro.losses.terms import BackgroundRegularizer, Distortion, Photometric
 from nerfro.models.refractive import RefractiveModel
 from nerfro.optimizers.config import GroupConfig, OptimizerConfig
 from nerfro.paper.hierarchical import Hierarchical

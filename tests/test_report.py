@@ -18,9 +18,8 @@ from nerfro.evaluation.results import RunMetrics, write_metrics_json
 from nerfro.files.images import load_png, save_png
 from nerfro.registry.registration import discover
 from nerfro.report.comparison import compare, to_table
-from nerfro.report.page import report_page
+from nerfro.report.page import Selection, embed_image, report_page, scene_images
 from nerfro.report.runs import find_runs
-from nerfro.report.views import Selection, embed_image, scene_images
 from tests.conftest import refused
 from tests.test_summary import write_run
 from tests.viewing.browser import Browser, needs_chromium

@@ -15,7 +15,7 @@ from nerfro.core.errors import NerfroError
 from nerfro.core.paths import relative_path
 from nerfro.exports.meshes import colours_of, glass_meshes, inside_mesh
 from nerfro.files.atomic import write_atomically
-from nerfro.viewing.camera_files import transforms_document
+from nerfro.viewing.camera_paths import transforms_document
 from nerfro.viewing.exports import EXPORTS, Export, ExportConfig
 from nerfro.viewing.trained_scene import TrainedScene
 

@@ -18,9 +18,8 @@ from nerfro.files.folder_lock import lock_folder
 from nerfro.files.images import load_png
 from nerfro.registry.allowed import Natural
 from nerfro.report.comparison import compare, to_table
-from nerfro.report.page import report_page
+from nerfro.report.page import Selection, report_page
 from nerfro.report.runs import find_runs
-from nerfro.report.views import Selection
 
 _METHODS = {
     "nerf": "NeRF",

@@ -31,7 +31,7 @@ from nerfro.training.run_folder import LAST_CHECKPOINT, begin, lock_run, next_st
 from nerfro.training.settings import with_values
 from nerfro.training.trainer import finish_logs, fit, make_trainer, print_profile, quieten_lightning
 from nerfro.training.viewer import Viewer
-from nerfro.viewing.camera_files import write_cameras
+from nerfro.viewing.camera_paths import write_cameras
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,15 @@ from nerfro.core.variants import variant
 from nerfro.data.lenses import Lens, check_lenses
 from nerfro.registry.allowed import Count, Positive, refuse_unused
 from nerfro.samplers.subdivision import SubdivisionChanges
-from nerfro.viewing.camera_files import cameras_of_file, stated_seconds
-from nerfro.viewing.camera_paths import PATHS, CaptureGeometry, OrbitPosition, between_keys, path_cameras
+from nerfro.viewing.camera_paths import (
+    PATHS,
+    CaptureGeometry,
+    OrbitPosition,
+    between_keys,
+    cameras_of_file,
+    path_cameras,
+    stated_seconds,
+)
 from nerfro.viewing.trained_scene import TrainedScene
 
 Angle = Annotated[float, Gt(0), Lt(180)]

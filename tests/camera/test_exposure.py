@@ -10,7 +10,7 @@ from torch.nn.functional import mse_loss
 from nerfro.camera.exposure import Appearance, Exposure, fit_gain
 from nerfro.core.light import to_linear, to_srgb
 from nerfro.evaluation.image_metrics import psnr
-from nerfro.losses.radiance import Photometric
+from nerfro.losses.terms import Photometric
 from nerfro.models.refractive import RefractiveModel
 from nerfro.testing import NUM_RAYS, example_batch, example_components
 from nerfro.training.run_folder import load

@@ -12,7 +12,7 @@ from nerfro.camera.base import CameraModel
 from nerfro.core.lens import coefficients, opencv_coefficients
 from nerfro.data.formats.transforms import BlenderData, NerfstudioData
 from nerfro.data.lenses import Lens, check_lenses, read_lens
-from nerfro.viewing.camera_files import write_cameras
+from nerfro.viewing.camera_paths import write_cameras
 from tests.conftest import refused
 
 from .formats import (

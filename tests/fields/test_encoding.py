@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from nerfro.core.types import Rays, Samples
-from nerfro.paper.mip_nerf import frustum_gaussians
 from nerfro.paper.mlp import integrated_positional_encoding, positional_encoding
+from nerfro.paper.nerf import frustum_gaussians
 from nerfro.samplers.base import straight_path
 from nerfro.samplers.points.stratified import cone_samples
 from nerfro.testing import example_path

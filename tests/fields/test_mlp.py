@@ -9,9 +9,8 @@ from nerfro.core.light import to_srgb
 from nerfro.fields.base import radiance
 from nerfro.fields.networks import compile_networks
 from nerfro.geometry.space import Box, inside_box
-from nerfro.paper.mip_nerf import MipNerfField
 from nerfro.paper.mlp import RGB_PADDING, RadianceMLP, SkipMLP, padded_sigmoid
-from nerfro.paper.nerf import NerfField
+from nerfro.paper.nerf import MipNerfField, NerfField
 from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import example_path, example_samples
 from tests.gradients import require_equal_gradients

@@ -13,7 +13,7 @@ from nerfro.core.cameras import Cameras
 from nerfro.data.base import Views
 from nerfro.data.depths import read_depths
 from nerfro.geometry.space import Unbounded
-from nerfro.losses.density import Depth
+from nerfro.losses.terms import Depth
 from nerfro.testing import (
     example_batch,
     example_components,

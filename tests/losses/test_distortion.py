@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from nerfro.core.types import Path, Rendering, Samples
-from nerfro.losses.density import Distortion, distortion
+from nerfro.losses.terms import Distortion, distortion
 from nerfro.registry.registration import discover
 from nerfro.rendering import Scene
 from nerfro.testing import example_batch

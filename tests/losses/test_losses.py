@@ -12,7 +12,7 @@ from torch.nn.functional import conv2d
 from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.core.light import to_srgb
 from nerfro.core.types import Batch, Rendering
-from nerfro.losses.radiance import BackgroundRegularizer, Photometric, TotalVariation, direction_pairs
+from nerfro.losses.terms import BackgroundRegularizer, Photometric, TotalVariation, direction_pairs
 from nerfro.models.refractive import RefractiveModel
 from nerfro.paper.voxel_grid import Smoothness, tile_roughness
 from nerfro.registry.registration import create, find

@@ -8,8 +8,7 @@ import torch
 
 from nerfro.core.types import FieldValues, Path, Rays, Rendering, Samples
 from nerfro.losses.base import Loss
-from nerfro.losses.density import NearCamera, Opaque
-from nerfro.losses.radiance import Backdrop
+from nerfro.losses.terms import Backdrop, NearCamera, Opaque
 from nerfro.rendering import Scene, composite
 from nerfro.samplers.base import Straight
 from nerfro.testing import example_batch, example_path, example_space

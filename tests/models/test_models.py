@@ -9,7 +9,7 @@ from torch import Tensor
 from nerfro.backgrounds.base import Background
 from nerfro.core.types import Exits
 from nerfro.models.refractive import RefractiveModel
-from nerfro.paper.mip_nerf import MipNerfModel
+from nerfro.paper.nerf import MipNerfModel
 from nerfro.rendering import Components
 from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import example_rays

@@ -12,7 +12,7 @@ import torch
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Timer
 
-from nerfro.losses.radiance import BackgroundRegularizer
+from nerfro.losses.terms import BackgroundRegularizer
 from nerfro.optimizers.config import GroupConfig, OptimizerConfig
 from nerfro.registry.allowed import plain, validate
 from nerfro.training.config import BatchesConfig, EvaluationConfig, TrainConfig

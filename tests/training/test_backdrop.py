@@ -7,7 +7,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from nerfro.losses.radiance import find_backdrop
+from nerfro.losses.terms import find_backdrop
 from tests.conftest import QUIET, Runner, repaint
 
 GREY = 102 / 255

@@ -10,8 +10,15 @@ import pytest
 import torch
 from PIL import Image
 
-from nerfro.viewing.camera_files import cameras_of_file, read_cameras
-from nerfro.viewing.camera_paths import PATHS, CaptureGeometry, OrbitPosition, between_keys, path_cameras
+from nerfro.viewing.camera_paths import (
+    PATHS,
+    CaptureGeometry,
+    OrbitPosition,
+    between_keys,
+    cameras_of_file,
+    path_cameras,
+    read_cameras,
+)
 from nerfro.viewing.trained_scene import TrainedScene
 from tests.conftest import refused
 from tests.data.formats import FORMATS

@@ -31,8 +31,7 @@ from nerfro.media.body_settings import make_bodies
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.paths.traced_file import make_rays
 from nerfro.samplers.subdivision import Subdivision
-from nerfro.viewing.camera_files import read_cameras
-from nerfro.viewing.camera_paths import CaptureGeometry
+from nerfro.viewing.camera_paths import CaptureGeometry, read_cameras
 from nerfro.viewing.changes import with_changed_scene
 from nerfro.viewing.exports import ExportConfig, export_of, find_export
 from nerfro.viewing.trained_scene import TrainedScene

@@ -13,8 +13,7 @@ from PIL import Image
 
 from nerfro.evaluation.image_metrics import psnr
 from nerfro.files import lat_long
-from nerfro.viewing.camera_files import read_cameras
-from nerfro.viewing.camera_paths import CaptureGeometry
+from nerfro.viewing.camera_paths import CaptureGeometry, read_cameras
 from nerfro.viewing.page import make_page
 from nerfro.viewing.trained_scene import TrainedScene
 from tests.conftest import Runner

@@ -20,7 +20,7 @@ from nerfro.core.lens import coefficients
 from nerfro.files.lat_long import save_lat_long
 from nerfro.registry.registration import discover
 from nerfro.samplers.subdivision import Subdivision
-from nerfro.viewing.camera_files import transforms_document
+from nerfro.viewing.camera_paths import transforms_document
 from nerfro.viewing.film import write_film
 from nerfro.viewing.render_request import RenderConfig, find_shots
 from nerfro.viewing.trained_scene import TrainedScene
