@@ -33,12 +33,11 @@ from nerfro.evaluation.results import FULL, read_metrics_json
 from nerfro.poses.opencv import opencv
 from nerfro.synthetic.dataset import PlannedImage, write_image
 from nerfro.synthetic.path_tracer import PathTracer, Pinhole, panel_shape, triangle_shape
-from nerfro.synthetic.scene import Panel
+from nerfro.synthetic.scene import Panel, join
+from nerfro.synthetic.scene import SurfaceMesh as Surface
 from nerfro.synthetic.scene import SyntheticScene as Scene
 from nerfro.synthetic.scenes import distance, patterns, photographs
 from nerfro.synthetic.scenes import dolphin_capture as dolphin
-from nerfro.synthetic.surface import SurfaceMesh as Surface
-from nerfro.synthetic.surface import join
 from nerfro.viewing.film import write_film
 
 GLASS, WATER = 1.5, 1.333

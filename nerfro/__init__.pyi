@@ -14,8 +14,7 @@ from .masks.segment import segment
 from .media.bodies import Bodies, Body, GridSettings
 from .media.body_settings import make_bodies
 from .media.material import Material
-from .media.surface import MeshSurface
-from .media.surfaces import BallSurface
+from .media.surfaces import BallSurface, MeshSurface
 from .models.refractive import RefractiveModel
 from .optimizers.config import GroupConfig, OptimizerConfig
 from .pipeline.evaluate import evaluate

@@ -22,7 +22,7 @@ from nerfro.losses.base import Loss
 from nerfro.media.base import Medium, Scalars, Vectors
 from nerfro.media.bodies import Bodies, Body, GridSettings
 from nerfro.media.material import Material
-from nerfro.media.surface import Grid, MeshSurface, Surface
+from nerfro.media.surfaces import Grid, MeshSurface, Surface
 from nerfro.models.refractive import RefractiveModel
 from nerfro.optimizers.config import OPTIMIZERS, SCHEDULERS
 from nerfro.registry.allowed import Count, Distance, Natural, NotNegative, Positive

@@ -25,7 +25,7 @@ from nerfro.data.formats.transforms import BlenderData
 from nerfro.fields.base import Field
 from nerfro.losses.base import Loss
 from nerfro.media.base import Medium
-from nerfro.media.surface import Surface
+from nerfro.media.surfaces import Surface
 from nerfro.registry.registration import KINDS, discover, find, plugins, register
 from nerfro.samplers.base import PathSampler, PointSampler
 from nerfro.testing import (

@@ -27,15 +27,14 @@ from nerfro.data import image_files
 from nerfro.data.base import Views
 from nerfro.data.capture import Capture
 from nerfro.data.masks import find_mask
-from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.results import EvaluationResult, RunMetrics, ViewScores, read_metrics_json
+from nerfro.evaluation.scoring import ImageMetrics
 from nerfro.files.images import load_png, save_png
 from nerfro.files.reading import open_image
 from nerfro.pipeline import reconstruct as chain
 from nerfro.pipeline.hypotheses import Hypothesis, hypotheses, worth_a_trial
 from nerfro.pipeline.stage import terminated_in_one_line
-from nerfro.pipeline.trial_picture import draw_trials
-from nerfro.pipeline.trials import Trial, decide
+from nerfro.pipeline.trials import Trial, decide, draw_trials
 from nerfro.poses import collection
 from nerfro.poses.options import CalibrateConfig
 from nerfro.rendering.scene_file import Provenance, SceneFile, read_scene_file

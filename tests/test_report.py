@@ -13,8 +13,8 @@ import torch
 from PIL import Image
 
 from nerfro.evaluation.image_metrics import image_metrics
-from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.results import RunMetrics, write_metrics_json
+from nerfro.evaluation.scoring import ImageMetrics
 from nerfro.files.images import load_png, save_png
 from nerfro.registry.registration import discover
 from nerfro.report.comparison import compare, to_table

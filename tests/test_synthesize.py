@@ -19,9 +19,8 @@ from nerfro.geometry.mesh import load_mesh
 from nerfro.registry.allowed import validate
 from nerfro.synthetic.dataset import ViewSplits
 from nerfro.synthetic.options import SynthesizeConfig
-from nerfro.synthetic.scene import SyntheticScene
+from nerfro.synthetic.scene import SurfaceMesh, SyntheticScene
 from nerfro.synthetic.scenes.photographs import Photographs
-from nerfro.synthetic.surface import SurfaceMesh
 from nerfro.synthetic.synthesis import synthesize
 from tests.conftest import refused
 from tests.exact_silhouettes import overlaps_of_convex_body

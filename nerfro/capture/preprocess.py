@@ -20,7 +20,7 @@ from nerfro.core.provenance import AlgorithmSettings
 from nerfro.data.base import Views
 from nerfro.data.capture import Capture
 from nerfro.data.masks import EVIDENCE, REVOLUTION, masked_views, method_of, with_other_splits
-from nerfro.files.folder_lock import lock_folder
+from nerfro.files.atomic import lock_folder
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.media.bodies import COLOURS
 from nerfro.rendering.scene_file import Provenance, SceneFile, with_scene

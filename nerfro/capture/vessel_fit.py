@@ -28,7 +28,7 @@ from nerfro.core.provenance import AlgorithmSettings
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.media.bodies import Bodies, GridSettings
 from nerfro.media.material import Material
-from nerfro.media.surface import MeshSurface, direction
+from nerfro.media.surfaces import MeshSurface, direction
 from nerfro.media.vessel import VesselLengths, extent, vessel, with_lengths
 from nerfro.silhouettes.upright import find_up
 

@@ -18,8 +18,7 @@ from nerfro.core.cameras import Cameras, central_window, room_rotations
 from nerfro.core.errors import NerfroError, first_of
 from nerfro.core.paths import refuse_root, resolve_path
 from nerfro.data.base import SPLITS, DataSource, Frame, Views
-from nerfro.data.depths import DEPTH, depths_of_points, read_depths
-from nerfro.data.image_files import VIEW_SUFFIXES, Alpha, read_rgb, suffix_list
+from nerfro.data.image_files import DEPTH, VIEW_SUFFIXES, Alpha, depths_of_points, read_depths, read_rgb, suffix_list
 from nerfro.data.lazy_images import LazyImages
 from nerfro.data.lenses import Lens, check_lenses, lens_tensors
 from nerfro.data.masks import find_mask, find_masks, find_usable, require_used, unused_masks
@@ -112,7 +111,7 @@ class FrameSet:
         near, far: bounds of the rays (arc lengths, world units) that apply where the options leave these open.
         crop: fraction of each side that is kept around the centre.
         usable: masks of the pixels that training may use, one per frame; empty if all pixels are usable.
-        depths: depth images, one per frame; empty if there are none, see `nerfro.data.depths`.
+        depths: depth images, one per frame; empty if there are none, see `nerfro.data.image_files`.
         depth_unit: world units per level of the depth images.
         points: 3-D points that each frame has observed, world units, which give depths; empty if there are none.
         turntable: whether the object turns, or its axis, where the options leave this open; see `turntable_of`.

@@ -14,8 +14,7 @@ from omegaconf import OmegaConf
 
 from nerfro.core.errors import Interrupted, NerfroError, warn
 from nerfro.core.paths import user_path
-from nerfro.files.atomic import refuse_existing, write_atomically
-from nerfro.files.folder_lock import lock_folder, require_only
+from nerfro.files.atomic import lock_folder, refuse_existing, require_only, write_atomically
 from nerfro.kernels.available import find_gpu
 from nerfro.registry.allowed import Natural, NumRays, refuse_unused
 from nerfro.samplers.subdivision import SubdivisionChanges

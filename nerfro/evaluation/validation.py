@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerfro.camera.exposure import fit_gain
+from nerfro.camera.base import fit_gain
 from nerfro.core.cameras import Cameras
 from nerfro.core.types import mean_per_pixel
 from nerfro.data.base import Views

@@ -22,9 +22,8 @@ from nerfro.files.lat_long import save_lat_long
 from nerfro.files.templates import fill_template
 from nerfro.geometry.gltf import QUANTIZATION, Z_UP_TO_Y_UP
 from nerfro.media.material import Dispersion
-from nerfro.viewing.changes import absorption_of
 from nerfro.viewing.exports import EXPORTS, Export, ExportConfig
-from nerfro.viewing.trained_scene import TrainedScene
+from nerfro.viewing.trained_scene import TrainedScene, absorption_of
 
 if TYPE_CHECKING:
     import trimesh

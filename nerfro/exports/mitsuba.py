@@ -16,12 +16,11 @@ from nerfro.core.cameras import Cameras
 from nerfro.core.errors import NerfroError, warn
 from nerfro.exports.meshes import glass_meshes, inside_mesh
 from nerfro.files.atomic import refuse_existing, write_atomically
-from nerfro.files.deep_images import write_radiance
+from nerfro.files.images import write_radiance
 from nerfro.files.lat_long import envmap_texture
-from nerfro.viewing.changes import absorption_of
 from nerfro.viewing.exports import EXPORTS, Export, ExportConfig
 from nerfro.viewing.page import page_split
-from nerfro.viewing.trained_scene import TrainedScene
+from nerfro.viewing.trained_scene import TrainedScene, absorption_of
 
 if TYPE_CHECKING:
     import trimesh

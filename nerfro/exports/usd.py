@@ -17,8 +17,7 @@ from nerfro.core.errors import optional
 from nerfro.exports.meshes import attenuation
 from nerfro.files.lat_long import save_lat_long
 from nerfro.geometry.gltf import Z_UP_TO_Y_UP
-from nerfro.viewing.changes import absorption_of
-from nerfro.viewing.trained_scene import TrainedScene
+from nerfro.viewing.trained_scene import TrainedScene, absorption_of
 
 if TYPE_CHECKING:
     import trimesh

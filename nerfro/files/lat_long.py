@@ -18,8 +18,7 @@ from torch import Tensor
 
 from nerfro.core.errors import NerfroError
 from nerfro.core.light import to_linear, to_srgb
-from nerfro.files.deep_images import read_16bit, read_radiance, write_radiance
-from nerfro.files.images import save_png
+from nerfro.files.images import read_16bit, read_radiance, save_png, write_radiance
 from nerfro.files.reading import open_image, reading
 
 _FORMATS = (".png", ".jpg", ".jpeg", ".hdr", ".exr")

@@ -1,4 +1,4 @@
-"""Readers of untrusted files: images, JSON documents and arrays.
+"""Readers of untrusted files: images, JSON documents, arrays, and configurations of runs.
 
 Decoders raise nearly any exception on a damaged file, allocate what a header asks for, and wait at a pipe. Therefore
 these readers accept regular files of bounded size, and convert any error to one line.
@@ -10,6 +10,7 @@ import contextlib
 import json
 import math
 import os
+import re
 import stat
 import struct
 import threading
@@ -22,10 +23,14 @@ from pathlib import Path
 from typing import Any, BinaryIO, TypeGuard
 
 import numpy as np
+import yaml
 from jaxtyping import Float
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 from PIL import ExifTags, Image, TiffImagePlugin, UnidentifiedImageError
 
 from nerfro.core.errors import NerfroError
+from nerfro.core.trust import require_bounded_yaml
 
 # Pixels of the largest image, 134 million; bytes of the largest JSON document, and of all arrays of a file in memory.
 MAX_PIXELS, MAX_JSON_BYTES, MAX_ARRAY_BYTES = 2**27, 2**27, 2**31
@@ -245,3 +250,27 @@ def same_content(one: Path, other: Path) -> bool:
     if not all(os.path.isfile(file) for file in files):  # False for a name that is too long
         return False
     return one.stat().st_size == other.stat().st_size and one.read_bytes() == other.read_bytes()
+
+
+def foreign_config(text: str, origin: Path) -> DictConfig:
+    """Read the configuration of a run, which nerfro.train writes as plain values.
+
+    Interpolations are refused: `${oc.env:...}` would copy the environment of this machine into a shared page.
+    """
+    require_bounded_yaml(text, origin)
+    try:
+        config = OmegaConf.create(text)
+    except (yaml.YAMLError, OmegaConfBaseException, ValueError, AssertionError) as error:
+        reason = " ".join(str(error).split())
+        raise NerfroError(f"{origin} is not the configuration of a run ({reason}); leave the run out") from error
+    if not isinstance(config, DictConfig):
+        raise NerfroError(f"{origin} is not the configuration of a run; leave the run out")
+    interpolation = re.search(r".*\$\{.*", OmegaConf.to_yaml(config))
+    if interpolation:
+        raise NerfroError(f"{origin} contains an interpolation ({interpolation[0].strip()}); write the value instead")
+    return config
+
+
+def read_foreign_config(path: Path) -> DictConfig:
+    """Read the configuration of a run from a file; see `foreign_config`."""
+    return foreign_config(read_text(path, "repair it, or leave the run out"), path)

@@ -18,7 +18,7 @@ from nerfro.core.distributed import rank_and_size, sum_over_processes
 from nerfro.core.errors import NerfroError
 from nerfro.core.types import Batch, Exits, Rendering
 from nerfro.data.base import Views
-from nerfro.data.depths import DEPTH
+from nerfro.data.image_files import DEPTH
 from nerfro.data.lazy_images import LazyImages
 from nerfro.geometry.space import Space
 from nerfro.losses.base import Loss

@@ -26,8 +26,8 @@ from nerfro.files.reading import read_json
 from nerfro.masks.masking import Segmentation, box_region, check_tracked, grab_cut, polygon_mask, propagate
 from nerfro.masks.outline_hull import AGREES, MIN_VIEWS
 from nerfro.masks.tracking import load_tracker, track_object
+from nerfro.poses.collection import PHOTOGRAPH_SUFFIXES
 from nerfro.poses.opencv import opencv
-from nerfro.poses.photographs import PHOTOGRAPH_SUFFIXES
 from nerfro.poses.structure_from_motion import numeric_order
 
 _SHEET = "masks.png"

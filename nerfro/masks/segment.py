@@ -16,8 +16,7 @@ from nerfro.core.progress import progress_bar
 from nerfro.data.base import DataSource
 from nerfro.data.capture import Capture
 from nerfro.data.frames import require_root
-from nerfro.files.atomic import write_atomically
-from nerfro.files.folder_lock import lock_folder
+from nerfro.files.atomic import lock_folder, write_atomically
 from nerfro.masks.mask_files import MaskTask, read_outlines
 from nerfro.masks.masking import Segmentation
 from nerfro.masks.options import MaskConfig

@@ -26,7 +26,7 @@ from nerfro.kernels.tolerances import MIN_COSINE, SAFE_SHARE, STEPS_PER_SHELL
 from nerfro.media.base import Medium, Scalars, Vectors
 from nerfro.media.distance_grid import DistanceGrid, DistanceGrids
 from nerfro.media.material import Material
-from nerfro.media.surface import Grid, Surface
+from nerfro.media.surfaces import Grid, Surface
 from nerfro.registry.allowed import Positive, Resolution
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from nerfro.geometry.gltf import glass_of_file
 from nerfro.geometry.mesh import local_origin, origin_of_file
 from nerfro.media.bodies import Bodies, Body, GridSettings
 from nerfro.media.material import Abbe, Learns, Material, find_material, learned_quantities
-from nerfro.media.surface import CreaseAngle, Shading, make_surface
+from nerfro.media.surfaces import CreaseAngle, Shading, make_surface
 from nerfro.registry.allowed import NotNegative, Positive, Resolution, validate
 from nerfro.registry.registration import register
 
@@ -177,7 +177,7 @@ def _settings(name: str, values: Any) -> BodySettings:
 
 
 def surface_settings(name: str, body: BodySettings) -> Mapping[str, Any]:
-    """Return name and settings of the surface of a body, for `media.surface.make_surface`."""
+    """Return name and settings of the surface of a body, for `media.surfaces.make_surface`."""
     if body.surface is None:
         if body.mesh is None:
             raise NerfroError(f"bodies.{name} needs a mesh; add bodies.{name}.mesh=FILE")

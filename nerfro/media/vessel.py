@@ -19,7 +19,7 @@ from nerfro.media.bodies import Bodies, Body, GridSettings
 from nerfro.media.body_settings import SHADING, BodySettings, expanded, make_material
 from nerfro.media.distance_grid import DistanceGrid
 from nerfro.media.material import Learns, Material, learned_quantities
-from nerfro.media.surface import CreaseAngle, Grid, MeshSurface, Shading, Surface, cached_distances, direction
+from nerfro.media.surfaces import CreaseAngle, Grid, MeshSurface, Shading, Surface, cached_distances, direction
 from nerfro.registry.allowed import Coordinate, NotNegative, Positive, Resolution
 from nerfro.registry.registration import register
 

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from nerfro.fields.networks import Network
+from nerfro.fields.base import Network
 from nerfro.paper.linear import Linear, linear
 
 # Octaves of the encoded viewing direction in NeRF, mip-NeRF and the paper.

@@ -26,7 +26,7 @@ from nerfro.kernels.operators import arrays
 from nerfro.losses.base import Loss
 from nerfro.media.base import Medium, Scalars, Vectors
 from nerfro.media.bodies import BYTES_PER_VERTEX, check_margin
-from nerfro.media.surface import MeshSurface
+from nerfro.media.surfaces import MeshSurface
 from nerfro.registry.allowed import Positive, Resolution
 from nerfro.registry.registration import register
 from nerfro.rendering import Scene

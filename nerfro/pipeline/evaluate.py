@@ -11,10 +11,9 @@ from nerfro.core.errors import NerfroError
 from nerfro.core.paths import user_path
 from nerfro.data.image_files import Alpha
 from nerfro.evaluation.folders import match_folders
-from nerfro.evaluation.metrics import ImageMetrics, write_error_sheet
 from nerfro.evaluation.request import EvaluateConfig, find_device, own_folder, record, require_one_task
 from nerfro.evaluation.results import RunMetrics
-from nerfro.evaluation.scoring import score_folders, score_split
+from nerfro.evaluation.scoring import ImageMetrics, score_folders, score_split, write_error_sheet
 from nerfro.evaluation.tables import write_scores
 from nerfro.files.images import load_png
 from nerfro.training.callbacks import Throughput, steps_by_phase

@@ -22,16 +22,14 @@ from nerfro.core.paths import resolve_path, user_path
 from nerfro.data.capture import Capture
 from nerfro.data.lazy_images import decoded_once
 from nerfro.evaluation.results import read_metrics_json
-from nerfro.files.atomic import write_atomically
-from nerfro.files.folder_lock import lock_folder
+from nerfro.files.atomic import lock_folder, write_atomically
 from nerfro.files.images import save_image
 from nerfro.masks.segment import segment
 from nerfro.pipeline.hypotheses import Hypothesis, hypotheses, worth_a_trial
 from nerfro.pipeline.options import ReconstructConfig, common_options, have_poses
 from nerfro.pipeline.scenes import export
 from nerfro.pipeline.stage import Stage, is_older, move_aside
-from nerfro.pipeline.trial_picture import PICTURE, draw_trials, validation_views
-from nerfro.pipeline.trials import Trial, decide
+from nerfro.pipeline.trials import PICTURE, Trial, decide, draw_trials, validation_views
 from nerfro.poses.calibrate import calibrate
 from nerfro.poses.calibrated_data import PLOT, REPORT
 from nerfro.poses.collection import collect_photographs

@@ -6,9 +6,8 @@ from pathlib import Path
 
 from nerfro.cli.calls import options_of
 from nerfro.core.paths import user_path
-from nerfro.files.atomic import refuse_existing
+from nerfro.files.atomic import lock_folder, refuse_existing
 from nerfro.files.cache import file_hash
-from nerfro.files.folder_lock import lock_folder
 from nerfro.kernels.available import keep_freed_memory
 from nerfro.registry.allowed import refuse_unused
 from nerfro.training.run import Run

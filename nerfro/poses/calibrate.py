@@ -12,13 +12,12 @@ from nerfro.core.paths import relative_path, user_path
 from nerfro.core.progress import track
 from nerfro.data.capture import Capture
 from nerfro.data.masks import find_mask, require_used
-from nerfro.files.atomic import refuse_existing
-from nerfro.files.folder_lock import lock_folder
+from nerfro.files.atomic import lock_folder, refuse_existing
 from nerfro.poses.boards import TagBoard, print_sheets, tag_grid, twelve_faces
 from nerfro.poses.calibrated_data import FILES, ray_range, split_views, write_calibrated
 from nerfro.poses.calibration import Calibration, calibrate_by_tags
+from nerfro.poses.collection import list_photographs, luminance, outside_mask
 from nerfro.poses.options import CalibrateConfig
-from nerfro.poses.photographs import list_photographs, luminance, outside_mask
 from nerfro.poses.structure_from_motion import SfmSettings, find_model, import_model
 
 # Limits above which a warning is printed: reprojection error in pixels, and relative deviation of the focal length.

@@ -19,8 +19,7 @@ from nerfro.core.errors import NerfroError, first_of
 from nerfro.core.paths import EMBEDDED_PREFIX, refuse_root, scene_name, shown, user_path
 from nerfro.core.progress import duration
 from nerfro.evaluation.results import RunMetrics, read_metrics_json
-from nerfro.files.foreign_config import read_foreign_config
-from nerfro.files.reading import open_image, read_json
+from nerfro.files.reading import open_image, read_foreign_config, read_json
 from nerfro.registry.allowed import Count, check
 from nerfro.training.config import check_trained
 from nerfro.training.run_folder import CELL_FILE, LAST_CHECKPOINT

@@ -13,8 +13,7 @@ from nerfro.core.paths import user_path
 from nerfro.evaluation.image_metrics import image_metrics
 from nerfro.evaluation.results import FULL, Region
 from nerfro.evaluation.tables import FORMATS, Table, to_rich, write_table
-from nerfro.files.atomic import refuse_existing, write_atomically
-from nerfro.files.folder_lock import lock_folder
+from nerfro.files.atomic import lock_folder, refuse_existing, write_atomically
 from nerfro.files.images import load_png
 from nerfro.registry.allowed import Natural
 from nerfro.report.comparison import compare, to_table

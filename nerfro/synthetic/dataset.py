@@ -24,10 +24,8 @@ from nerfro.core.errors import NerfroError
 from nerfro.core.light import to_srgb
 from nerfro.data.base import SPLITS
 from nerfro.files import lat_long
-from nerfro.files.atomic import write_json
-from nerfro.files.deep_images import write_radiance
-from nerfro.files.folder_lock import require_only
-from nerfro.files.images import save_image
+from nerfro.files.atomic import require_only, write_json
+from nerfro.files.images import save_image, write_radiance
 from nerfro.files.reading import read_json
 from nerfro.geometry.normals import fibonacci_lattice
 from nerfro.synthetic.path_tracer import Pinhole

@@ -34,9 +34,8 @@ from nerfro.media.body_settings import BodySettings
 from nerfro.rendering.scene_file import SCENE, SceneFile
 from nerfro.synthetic.dataset import PlannedImage, ViewSplits, look_at_origin
 from nerfro.synthetic.path_tracer import Pinhole
-from nerfro.synthetic.scene import Part, SyntheticScene
+from nerfro.synthetic.scene import Part, SurfaceMesh, SyntheticScene, join
 from nerfro.synthetic.scenes import torus
-from nerfro.synthetic.surface import SurfaceMesh, join
 
 _DISTANCE = 3.1  # of the cameras of an orbit, in half diagonals of the bodies
 # Shares of the cameras of a file for training, validation and test, by the number of the camera.

@@ -15,8 +15,7 @@ from nerfro.core.light import to_linear
 from nerfro.files.lat_long import envmap_texture
 from nerfro.synthetic import llvm
 from nerfro.synthetic.glass import EMBEDDED, PLUGIN, register_materials
-from nerfro.synthetic.scene import Panel, Part, SyntheticScene
-from nerfro.synthetic.surface import SurfaceMesh
+from nerfro.synthetic.scene import Panel, Part, SurfaceMesh, SyntheticScene
 
 VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb", "scalar_rgb")
 # Hammersley points: at most one point lies in each row and column, which edges may be parallel to.

@@ -14,7 +14,7 @@ from nerfro.core.errors import NerfroError
 from nerfro.core.paths import user_path
 from nerfro.core.progress import progress_bar
 from nerfro.files import lat_long
-from nerfro.files.folder_lock import lock_folder
+from nerfro.files.atomic import lock_folder
 from nerfro.geometry.gltf import is_gltf
 from nerfro.synthetic.dataset import DataSet, ViewSplits
 from nerfro.synthetic.gltf_scene import GltfScene

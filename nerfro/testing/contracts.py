@@ -25,7 +25,7 @@ from nerfro.evaluation.image_metrics import ImageMetric, ViewMaps
 from nerfro.fields.base import Field
 from nerfro.losses.base import Loss
 from nerfro.media.base import Medium
-from nerfro.media.surface import Grid, Surface
+from nerfro.media.surfaces import Grid, Surface
 from nerfro.registry.registration import Plugin, build
 from nerfro.rendering import Renderer, composite
 from nerfro.samplers.base import PathSampler, PointSampler

@@ -21,8 +21,7 @@ from nerfro.geometry.mesh import make_mesh
 from nerfro.media.base import Medium
 from nerfro.media.bodies import Bodies, Body, GridSettings
 from nerfro.media.material import Material
-from nerfro.media.surface import MeshSurface, Surface
-from nerfro.media.surfaces import BallSurface
+from nerfro.media.surfaces import BallSurface, MeshSurface, Surface
 from nerfro.samplers.base import PathSampler
 from nerfro.testing.contracts import ContractError
 from nerfro.testing.examples import LuneburgLens

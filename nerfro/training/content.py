@@ -19,7 +19,7 @@ from nerfro.geometry.mesh import local_origin, num_decimals
 from nerfro.geometry.space import Box, Contracted, Space, Unbounded
 from nerfro.media.base import Medium
 from nerfro.media.body_settings import surfaces_of
-from nerfro.media.surface import make_surface
+from nerfro.media.surfaces import make_surface
 from nerfro.registry.allowed import NotNegative, OnlyWith, Positive
 from nerfro.registry.registration import find, plugin_of
 

@@ -13,12 +13,11 @@ from nerfro.cli.calls import Composition
 from nerfro.core.distributed import leave
 from nerfro.core.progress import duration
 from nerfro.core.provenance import AlgorithmSettings
-from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.results import RunMetrics
 from nerfro.evaluation.run_page import write_run_page
-from nerfro.evaluation.scoring import announce_scoring, score_split
+from nerfro.evaluation.scoring import ImageMetrics, announce_scoring, score_split
 from nerfro.evaluation.tables import write_scores
-from nerfro.fields.networks import compile_networks
+from nerfro.fields.base import compile_networks
 from nerfro.kernels.available import require_accelerator
 from nerfro.rendering.scene_file import SceneFile
 from nerfro.samplers.subdivision import Subdivision

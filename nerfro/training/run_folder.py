@@ -23,10 +23,8 @@ from nerfro.core.paths import PACKAGE_DIR, user_path
 from nerfro.core.provenance import AlgorithmSettings, command_of_process, versions
 from nerfro.data.base import Views
 from nerfro.evaluation.request import find_device
-from nerfro.files.atomic import require_room, write_atomically, write_json
-from nerfro.files.folder_lock import lock_folder, require_only
-from nerfro.files.foreign_config import foreign_config, read_foreign_config
-from nerfro.files.reading import reading
+from nerfro.files.atomic import lock_folder, require_only, require_room, write_atomically, write_json
+from nerfro.files.reading import foreign_config, read_foreign_config, reading
 from nerfro.kernels.available import fast_bfloat16, gpu_name
 from nerfro.optimizers.config import MOMENTS, OPTIMIZERS
 from nerfro.registry.registration import discover

@@ -20,8 +20,7 @@ from nerfro.core.errors import NerfroError
 from nerfro.core.paths import resolve_path, scene_name
 from nerfro.data.image_files import VIEW_SUFFIXES
 from nerfro.evaluation.results import RunMetrics, read_metrics_json
-from nerfro.files.atomic import write_json
-from nerfro.files.folder_lock import lock_folder
+from nerfro.files.atomic import lock_folder, write_json
 from nerfro.files.reading import read_json
 from nerfro.training.inputs import file_hashes
 from nerfro.training.run_folder import CELL_FILE, CONFIG_FILE, in_sweep

@@ -23,7 +23,7 @@ from nerfro.core.types import Exits
 from nerfro.files.images import data_uri
 from nerfro.media.distance_grid import BLOCK
 from nerfro.rendering import ColourSpace, Renderer
-from nerfro.viewing.changes import absorption_of
+from nerfro.viewing.trained_scene import absorption_of
 from nerfro.viewing.volume import MIN_OPTICAL_DEPTH, Volume
 
 # Format RGB9_E5: three mantissas with a common exponent (OpenGL ES 3.0, section 3.8.3.2).

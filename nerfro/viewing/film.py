@@ -26,8 +26,7 @@ from nerfro.core.errors import NerfroError, optional
 from nerfro.core.progress import progress_bar
 from nerfro.files.atomic import atomic_file, write_atomically
 from nerfro.files.cache import content_hash
-from nerfro.files.deep_images import write_radiance
-from nerfro.files.images import save_png
+from nerfro.files.images import save_png, write_radiance
 from nerfro.files.reading import read_json
 from nerfro.viewing.render_request import Shots
 from nerfro.viewing.trained_scene import RenderedViews, TrainedScene

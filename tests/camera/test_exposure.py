@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.nn.functional import mse_loss
 
-from nerfro.camera.exposure import Appearance, Exposure, fit_gain
+from nerfro.camera.base import Appearance, Exposure, fit_gain
 from nerfro.core.light import to_linear, to_srgb
 from nerfro.evaluation.image_metrics import psnr
 from nerfro.losses.terms import Photometric

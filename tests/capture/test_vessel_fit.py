@@ -18,7 +18,7 @@ from nerfro.geometry.mesh import load_mesh
 from nerfro.media.bodies import Bodies, GridSettings
 from nerfro.media.body_settings import make_bodies
 from nerfro.media.material import Material
-from nerfro.media.surface import MeshSurface
+from nerfro.media.surfaces import MeshSurface
 from nerfro.media.vessel import VesselLengths, make_vessel, vessel
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.subdivision import pixel_rays

@@ -16,7 +16,7 @@ import tifffile
 import torch
 from PIL import Image
 
-from nerfro.camera.exposure import fit_gain
+from nerfro.camera.base import fit_gain
 from nerfro.capture.surroundings import divide_pixels
 from nerfro.core.light import ColourSpace, encode_photograph, saturated, to_linear, to_srgb, tone_mapped
 from nerfro.core.paths import resolve_path
@@ -25,11 +25,10 @@ from nerfro.data.image_files import read_mask, read_rgb, read_size
 from nerfro.data.lazy_images import LazyImages
 from nerfro.data.pixel_store import PixelStore
 from nerfro.evaluation.image_metrics import psnr
-from nerfro.evaluation.metrics import write_error_sheet
-from nerfro.files.deep_images import write_radiance
-from nerfro.files.images import round_to_8bit
+from nerfro.evaluation.scoring import write_error_sheet
+from nerfro.files.images import round_to_8bit, write_radiance
 from nerfro.geometry.mesh import load_mesh
-from nerfro.poses.photographs import list_photographs
+from nerfro.poses.collection import list_photographs
 from tests.conftest import Runner, refused
 
 RADIANCE = np.random.default_rng(0).lognormal(-1, 2, (12, 16, 3)).astype(np.float32)

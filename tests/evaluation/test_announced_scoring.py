@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from nerfro.evaluation import scoring
-from nerfro.evaluation.metrics import ImageMetrics
+from nerfro.evaluation.scoring import ImageMetrics
 from nerfro.models.refractive import RefractiveModel
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.testing.examples import example_components, example_views

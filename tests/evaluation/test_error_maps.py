@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from nerfro.evaluation.image_metrics import build_metrics, psnr, squared_error_map, ssim, triptych
-from nerfro.evaluation.metrics import error_maps, write_error_sheet
 from nerfro.evaluation.perceptual import LpipsNetwork, flip, published_weights
+from nerfro.evaluation.scoring import error_maps, write_error_sheet
 from nerfro.files.images import load_png, magma, round_to_8bit
 from nerfro.registry.registration import discover
 

@@ -14,9 +14,9 @@ from torchmetrics.functional.image import structural_similarity_index_measure
 
 import nerfro
 from nerfro.evaluation.image_metrics import crop_rectangle, object_pixels, psnr, ssim, ssim_map
-from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.perceptual import Lpips, flip, flip_map
 from nerfro.evaluation.results import EvaluationResult
+from nerfro.evaluation.scoring import ImageMetrics
 from nerfro.files.images import load_png, round_to_8bit, save_png
 from nerfro.registry.registration import discover
 from tests.conftest import refused

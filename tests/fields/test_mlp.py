@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from nerfro.core.light import to_srgb
-from nerfro.fields.base import radiance
-from nerfro.fields.networks import compile_networks
+from nerfro.fields.base import compile_networks, radiance
 from nerfro.geometry.space import Box, inside_box
 from nerfro.paper.mlp import RGB_PADDING, RadianceMLP, SkipMLP, padded_sigmoid
 from nerfro.paper.nerf import MipNerfField, NerfField

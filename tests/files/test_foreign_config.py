@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from nerfro.files.foreign_config import foreign_config
+from nerfro.files.reading import foreign_config
 from nerfro.training.run_folder import load_checkpoint
 from tests.conftest import refused
 

@@ -8,8 +8,7 @@ import pytest
 import torch
 from PIL import Image
 
-from nerfro.files.deep_images import read_radiance, write_radiance
-from nerfro.files.images import load_png, round_to_8bit, save_png
+from nerfro.files.images import load_png, read_radiance, round_to_8bit, save_png, write_radiance
 from tests.conftest import refused
 
 

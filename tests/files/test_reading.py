@@ -13,9 +13,8 @@ from PIL import Image, ImageFile
 
 from nerfro.core.errors import NerfroError
 from nerfro.data.image_files import read_levels, read_rgb, read_size
-from nerfro.files.foreign_config import read_foreign_config
 from nerfro.files.images import load_png
-from nerfro.files.reading import load_array, load_arrays, read_json
+from nerfro.files.reading import load_array, load_arrays, read_foreign_config, read_json
 from nerfro.geometry.mesh import load_mesh
 from nerfro.training.run_folder import load_checkpoint
 from tests.conftest import refused

@@ -30,8 +30,7 @@ from nerfro.data.formats import refref
 from nerfro.data.image_files import read_levels, read_mask
 from nerfro.evaluation.results import EvaluationResult, RunMetrics, ViewScores, read_metrics_json, write_metrics_json
 from nerfro.files import lat_long
-from nerfro.files.foreign_config import read_foreign_config
-from nerfro.files.reading import load_array
+from nerfro.files.reading import load_array, read_foreign_config
 from nerfro.geometry.mesh import load_mesh
 from nerfro.masks.mask_files import read_outlines
 from nerfro.rendering.scene_file import with_scene

@@ -11,7 +11,7 @@ from nerfro.geometry.facets import facets_of
 from nerfro.geometry.mesh import load_mesh
 from nerfro.geometry.normals import corner_normals
 from nerfro.media.body_settings import expanded, make_bodies
-from nerfro.media.surface import MeshSurface
+from nerfro.media.surfaces import MeshSurface
 from nerfro.samplers.paths.bend import bend
 from tests.conftest import refused
 from tests.exact_facets import exit_directions

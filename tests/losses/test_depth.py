@@ -11,7 +11,7 @@ from PIL import Image
 
 from nerfro.core.cameras import Cameras
 from nerfro.data.base import Views
-from nerfro.data.depths import read_depths
+from nerfro.data.image_files import read_depths
 from nerfro.geometry.space import Unbounded
 from nerfro.losses.terms import Depth
 from nerfro.testing import (

@@ -13,10 +13,10 @@ pytest.importorskip("cv2")
 pytest.importorskip("pyapriltags")
 
 from nerfro.data.formats.transforms import OpenCVData
-from nerfro.poses import calibration, photographs
+from nerfro.poses import calibration, collection
 from nerfro.poses.boards import TagBoard, TagDetections, tag_grid, twelve_faces
 from nerfro.poses.calibration import calibrate_by_tags
-from nerfro.poses.photographs import luminance
+from nerfro.poses.collection import luminance
 from tests.sheet_photographs import angle, around, photograph
 
 SIZE = (640, 480)
@@ -217,9 +217,9 @@ def test_omitted_photographs_are_named(tmp_path: Path, capsys: pytest.CaptureFix
     for name in ("a.jpg", "b.jpg"):
         Image.new("RGB", (8, 6)).save(tmp_path / name)
     (tmp_path / "b.HEIC").touch()  # has a converted copy
-    photographs.list_photographs(tmp_path)
+    collection.list_photographs(tmp_path)
     assert capsys.readouterr().out == ""
     (tmp_path / "c.heic").touch()
-    images, _ = photographs.list_photographs(tmp_path)
+    images, _ = collection.list_photographs(tmp_path)
     assert [image.name for image in images] == ["a.jpg", "b.jpg"]
     assert "photographs in HEIC format are left out: c.heic" in capsys.readouterr().out

@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from nerfro.synthetic.scene import SyntheticScene
-from nerfro.synthetic.surface import SurfaceMesh, torus_angles
+from nerfro.synthetic.scene import SurfaceMesh, SyntheticScene, torus_angles
 from nerfro.synthetic.synthesis import find_scene
 
 

@@ -6,7 +6,7 @@ import pytest
 from nerfro.synthetic import glass
 from nerfro.synthetic.dataset import look_at_origin
 from nerfro.synthetic.path_tracer import PathTracer, Pinhole, load_mitsuba
-from nerfro.synthetic.surface import rounded_box
+from nerfro.synthetic.scene import rounded_box
 from tests.synthetic.empty_glass import empty_glass
 
 pytestmark = pytest.mark.usefixtures("mitsuba")

@@ -16,7 +16,7 @@ from nerfro.samplers.subdivision import part_rays
 from nerfro.synthetic import path_tracer
 from nerfro.synthetic.dataset import look_at_origin
 from nerfro.synthetic.path_tracer import PathTracer, Pinhole
-from nerfro.synthetic.surface import SurfaceMesh, rounded_box, sphere
+from nerfro.synthetic.scene import SurfaceMesh, rounded_box, sphere
 from tests.cameras_at import cameras_at
 from tests.closed_forms import Ball, RoundedBox, grid_points, sampled
 from tests.reference_tracer import Snell

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nerfro.core.errors import NerfroError
 from nerfro.synthetic import path_tracer
 from nerfro.synthetic.dataset import CAMERA_ANGLE_X, CAMERA_DISTANCE, directions_on_sphere, look_at_origin
 from nerfro.synthetic.path_tracer import PathTracer, Pinhole, load_mitsuba
-from nerfro.synthetic.surface import rounded_box, sphere, torus_angles
+from nerfro.synthetic.scene import rounded_box, sphere, torus_angles
 from nerfro.synthetic.synthesis import find_scene
+from tests.conftest import refused
 from tests.processes import python
 
 IOR = 1.5
@@ -135,5 +135,4 @@ def test_missing_mitsuba_names_the_extra_to_install():
 
 
 def test_unknown_variant_names_the_known_variants():
-    with pytest.raises(NerfroError, match="choose auto, llvm_ad_rgb"):
-        load_mitsuba("llvm")
+    refused("choose auto, llvm_ad_rgb", load_mitsuba, "llvm")

@@ -6,9 +6,8 @@ import pytest
 from nerfro.core.light import to_srgb
 from nerfro.registry.registration import discover
 from nerfro.synthetic.dataset import directions_on_sphere, look_at_origin
-from nerfro.synthetic.scene import lat_long_texture
+from nerfro.synthetic.scene import lat_long_texture, rounded_box, sphere, torus_angles
 from nerfro.synthetic.scenes import SCENES, distance
-from nerfro.synthetic.surface import rounded_box, sphere, torus_angles
 from nerfro.synthetic.synthesis import find_scene
 
 discover()

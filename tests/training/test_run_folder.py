@@ -12,7 +12,7 @@ import torch
 from omegaconf import OmegaConf
 
 from nerfro.cli.entry import entry_point
-from nerfro.files.folder_lock import hold
+from nerfro.files.atomic import hold
 from nerfro.training.config import TrainConfig
 from nerfro.training.data_module import RayDataModule
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint

@@ -19,7 +19,6 @@ import torch
 import trimesh
 from PIL import Image
 
-from nerfro.core.errors import NerfroError
 from nerfro.core.light import to_linear, to_srgb
 from nerfro.data.formats.colmap_model import lens_of, read_colmap
 from nerfro.exports.meshes import _divided
@@ -32,9 +31,8 @@ from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.paths.traced_file import make_rays
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.viewing.camera_paths import CaptureGeometry, read_cameras
-from nerfro.viewing.changes import with_changed_scene
 from nerfro.viewing.exports import ExportConfig, export_of, find_export
-from nerfro.viewing.trained_scene import TrainedScene
+from nerfro.viewing.trained_scene import TrainedScene, with_changed_scene
 from tests.conftest import Runner, refused
 from tests.viewing.conftest import INSIDE_CENTRE, INSIDE_RADIUS, IOR, RADIUS, Photographs, colour, sky_of
 
@@ -347,8 +345,7 @@ def test_mitsuba_scenes_contain_separate_bodies(two_bodies: TrainedScene, tmp_pa
         np.testing.assert_allclose(trimesh.load(tmp_path / file).bounds.mean(0), [x, 0, 0], atol=1e-2)
     medium = two_bodies.renderer.scene.medium
     medium.grids[1].box.add_(torch.tensor([-1.0, 0, 0]))  # type: ignore[index, operator, union-attr]
-    with pytest.raises(NerfroError, match="inside others or overlap"):
-        write(two_bodies, "mitsuba", tmp_path / "overlapping.xml")
+    refused("inside others or overlap", write, two_bodies, "mitsuba", tmp_path / "overlapping.xml")
 
 
 @pytest.mark.slow
@@ -492,8 +489,7 @@ class Absent(Photographs):
     ],
 )
 def test_unknown_exports_and_endings_are_refused(what: str, name: str, message: str) -> None:
-    with pytest.raises(NerfroError, match=message):
-        find_export(what, Path(name))
+    refused(message, find_export, what, Path(name))
 
 
 @pytest.mark.parametrize(

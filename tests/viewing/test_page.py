@@ -23,7 +23,7 @@ from nerfro.data.formats.transforms import BlenderData
 from nerfro.evaluation.image_metrics import psnr
 from nerfro.fields.base import Field
 from nerfro.files import lat_long
-from nerfro.files.deep_images import write_radiance
+from nerfro.files.images import write_radiance
 from nerfro.geometry.space import Contracted
 from nerfro.media.bodies import Bodies
 from nerfro.media.body_settings import make_bodies
@@ -31,9 +31,8 @@ from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.testing import example_draws
-from nerfro.viewing.changes import with_changed_scene
 from nerfro.viewing.page import make_page
-from nerfro.viewing.trained_scene import TrainedScene
+from nerfro.viewing.trained_scene import TrainedScene, with_changed_scene
 from tests.closed_forms import Luneburg, sampled
 from tests.conftest import refused
 from tests.media.vessels import GLASS, WATER, spherical_vessel

@@ -12,18 +12,16 @@ from nerfro.core.types import FieldValues, Samples
 from nerfro.core.variants import variant
 from nerfro.evaluation.collection import metrics
 from nerfro.evaluation.image_metrics import ImageMetric, ViewMaps
-from nerfro.evaluation.metrics import ImageMetrics
 from nerfro.evaluation.results import read_metrics_json
-from nerfro.evaluation.scoring import score_split
+from nerfro.evaluation.scoring import ImageMetrics, score_split
 from nerfro.fields.hash_grid import HashGridField
 from nerfro.files import lat_long
 from nerfro.registry.registration import register
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.testing import example_path, example_samples, example_space
-from nerfro.viewing.changes import NormalsField, with_changed_scene
 from nerfro.viewing.film import LAYERS
-from nerfro.viewing.trained_scene import TrainedScene
+from nerfro.viewing.trained_scene import NormalsField, TrainedScene, with_changed_scene
 from tests.closed_forms import ball_exits
 from tests.conftest import refused
 from tests.viewing.conftest import INSIDE_CENTRE, INSIDE_RADIUS, IOR, RADIUS, SolidBall, colour, sky_of

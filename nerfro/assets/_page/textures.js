@@ -42,7 +42,7 @@ function sharedExponent(upper, rest) {
 }
 
 // Decode an image in Radiance's .hdr format to width, height and linear radiance, four numbers per pixel; see
-// files/deep_images.py.
+// files/images.py.
 function decodeHdr(bytes) {
   let at = 0;
   const line = () => {

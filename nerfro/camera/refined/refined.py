@@ -15,8 +15,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from nerfro.camera.base import CameraModel
-from nerfro.camera.exposure import PerView
+from nerfro.camera.base import CameraModel, PerView
 from nerfro.core.cameras import Cameras
 from nerfro.core.lens import distort, undistort
 from nerfro.core.rays import Rays

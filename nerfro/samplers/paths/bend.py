@@ -21,7 +21,7 @@ from nerfro.geometry.normals import attached_normals
 from nerfro.media.base import Medium
 from nerfro.media.bodies import Bodies, Body, GridSettings
 from nerfro.media.material import Material
-from nerfro.media.surface import MeshSurface, Shading
+from nerfro.media.surfaces import MeshSurface, Shading
 from nerfro.registry.registration import discover, find
 from nerfro.samplers.paths.replay import intersect_triangles, replay
 from nerfro.samplers.paths.snell import Snell

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from nerfro.core.light import to_linear
-from nerfro.synthetic.scene import SyntheticScene
+from nerfro.synthetic.scene import SyntheticScene, join, sphere
 from nerfro.synthetic.scenes.distance import ball, capsule, ellipsoid, mirrored, painted, smooth_union
 from nerfro.synthetic.scenes.patterns import azimuth, chosen, elevation, fractal_noise, hashed, mix, skyline, smoothstep
-from nerfro.synthetic.surface import join, sphere
 
 GLASS_RADIUS, GLASS_SUBDIVISIONS = 0.80, 6
 MOUND_CENTRE, MOUND_RADIUS, MOUND_TOP = np.array([0.0, 0.0, 0.0]), 0.56, -0.24

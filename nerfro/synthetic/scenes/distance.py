@@ -12,8 +12,7 @@ from dataclasses import replace
 import numpy as np
 from skimage.measure import marching_cubes
 
-from nerfro.synthetic.scene import Vector
-from nerfro.synthetic.surface import SurfaceMesh
+from nerfro.synthetic.scene import SurfaceMesh, Vector
 
 Distance = Callable[[np.ndarray], np.ndarray]
 Colour = Callable[[np.ndarray], np.ndarray]

@@ -11,7 +11,7 @@ import itertools
 import numpy as np
 
 from nerfro.poses.boards import TagBoard, twelve_faces
-from nerfro.synthetic.scene import Panel, SyntheticScene, Vector
+from nerfro.synthetic.scene import Panel, SyntheticScene, Vector, join
 from nerfro.synthetic.scenes import distance, starlamp
 from nerfro.synthetic.scenes.distance import (
     Colour,
@@ -25,7 +25,6 @@ from nerfro.synthetic.scenes.distance import (
 )
 from nerfro.synthetic.scenes.patterns import chosen, fractal_noise, hashed, mix, smoothstep
 from nerfro.synthetic.scenes.photographs import Photographs
-from nerfro.synthetic.surface import join
 
 DATA_SET = Photographs
 

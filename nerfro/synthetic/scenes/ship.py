@@ -7,7 +7,7 @@ import functools
 import numpy as np
 
 from nerfro.core.light import to_linear
-from nerfro.synthetic.scene import SyntheticScene
+from nerfro.synthetic.scene import SyntheticScene, join, rounded_box
 from nerfro.synthetic.scenes.distance import ball, block, capsule, painted
 from nerfro.synthetic.scenes.patterns import (
     azimuth,
@@ -20,7 +20,6 @@ from nerfro.synthetic.scenes.patterns import (
     skyline,
     smoothstep,
 )
-from nerfro.synthetic.surface import join, rounded_box
 
 HALF_SIDES, EDGE_RADIUS = (0.80, 0.50, 0.66), 0.07
 TINT = (0.86, 0.98, 0.90)

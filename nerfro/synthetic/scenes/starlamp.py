@@ -7,10 +7,9 @@ import functools
 import numpy as np
 
 from nerfro.core.light import to_linear
-from nerfro.synthetic.scene import SyntheticScene
+from nerfro.synthetic.scene import SyntheticScene, join
 from nerfro.synthetic.scenes import distance
 from nerfro.synthetic.scenes.patterns import chosen, fractal_noise, hashed, mix, smoothstep
-from nerfro.synthetic.surface import join
 
 OUTER, INNER, HALF_DEPTH, ROUNDING = 0.84, 0.44, 0.34, 0.10
 PLANET_RADIUS, RING_RADII = 0.21, (0.27, 0.37)

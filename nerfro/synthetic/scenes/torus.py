@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from nerfro.core.light import to_linear
-from nerfro.synthetic.scene import SyntheticScene
+from nerfro.synthetic.scene import SyntheticScene, rounded_box, torus_angles
 from nerfro.synthetic.scenes.patterns import chosen, clouds, elevation, hashed, mix, skyline, smoothstep
-from nerfro.synthetic.surface import rounded_box, torus_angles
 
 HALF_SIDE, EDGE_RADIUS = 0.75, 0.08
 MAJOR_RADIUS, MINOR_RADIUS = 0.38, 0.16
