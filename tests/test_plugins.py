@@ -105,22 +105,10 @@ def too_few(_: nn.Module, samples: types.Samples) -> types.FieldValues:
 @pytest.mark.parametrize(
     ("base", "forward", "message"),
     [
-        (
-            Field,
-            tuples,
-            r"Broken\.forward in .*test_plugins\.py returned a tuple; return FieldValues with density \[P, N\]",
-        ),
+        (Field, tuples, r"Broken\.forward in .*test_plugins\.py returned a tuple; return FieldValues with density"),
         (Field, too_few, r"returned a FieldValues of other shapes; return FieldValues with density"),
-        (
-            Background,
-            lambda _, exits: exits.directions[..., :1],
-            r"returned a Tensor of shape .* radiance \[\.\.\., 3\] in",
-        ),
-        (
-            PointSampler,
-            lambda _, path, previous, draws=None: None,
-            "returned a NoneType; return Samples on all polylines",
-        ),
+        (Background, lambda _, exits: exits.directions[..., :1], r"returned a Tensor of shape .*; return radiance"),
+        (PointSampler, lambda _, path, previous, draws=None: None, "returned a NoneType; return Samples on all"),
         (PathSampler, lambda _, rays, medium: example_path(4), "returned a Path of other shapes; return a Path with"),
     ],
 )
@@ -254,12 +242,7 @@ def test_medium_of_varying_index_keeps_its_contract(members: dict[str, object]) 
         ("surface", Surface, ball(lambda d: 0.5 * d), "exact within `grid.band` voxels"),
         ("loss", Loss, {"forward": lambda *_: None}, "forward returned None, not Tensor"),
         ("loss", Loss, loss(lambda r, _: r.opacity), r"a loss is a scalar, and forward returned shape \[24\]"),
-        (
-            "loss",
-            Loss,
-            loss(lambda r, b: (r.radiance - b.rgb).mean()),
-            "pixels with two rays raised RuntimeError: The size",
-        ),
+        ("loss", Loss, loss(lambda r, b: (r.radiance - b.rgb).mean()), "pixels with two rays raised RuntimeError"),
         ("loss", Loss, loss(lambda r, _: (r.weights.sum(-1) - r.opacity).mean()), "rays that split, .* RuntimeError"),
         ("loss", Loss, loss(lambda r, _: r.opacity.log().mean()), "a loss is finite for empty pixels"),
         ("loss", Loss, loss(lambda r, _: r.transmittance.log().mean()), "a loss is finite for opaque pixels"),
@@ -274,18 +257,8 @@ def test_medium_of_varying_index_keeps_its_contract(members: dict[str, object]) 
         ("phase", Phase, phase(overflow), "parameters are finite after a step"),
         ("phase", Phase, phase(noise), "random numbers of a step depend on its number"),
         ("phase", Phase, phase(lambda parameter: parameter.typo), "phase=broken raised AttributeError"),
-        (
-            "sampler/path",
-            PathSampler,
-            {"forward": lambda *_: None},
-            "returned a NoneType; return a Path with a polyline for each ray",
-        ),
-        (
-            "phase",
-            Phase,
-            {"steps_before": lambda _, step: step % 5, "step": None},
-            "steps_before is cumulative: it returned 4 before step 4 and 0 before step 5",
-        ),
+        ("sampler/path", PathSampler, {"forward": lambda *_: None}, "returned a NoneType; return a Path with"),
+        ("phase", Phase, phase(steps_before=lambda _, step: step % 5), "returned 4 before step 4 and 0 before step 5"),
         ("sampler/points", PointSampler, {"forward": outside_of_edges, "num_levels": 1}, "lie between their edges"),
         ("data", DataSource, {"load": None, "splits": ["train"]}, "has the attribute `root`"),
     ],
@@ -483,10 +456,7 @@ def test_list_shows_every_plugin_with_its_fields_defaults_and_summary(run_here: 
 
 @pytest.mark.parametrize(
     ("argument", "message"),
-    [
-        ("colour", "'colour' is not a plugin type; choose one of model, camera, medium"),
-        ("field=x", "no field is called 'x'; known: "),
-    ],
+    [("colour", "'colour' is not a plugin type; choose one of model"), ("field=x", "no field is called 'x'; known: ")],
 )
 def test_list_of_unknown_plugins_is_refused(argument: str, message: str, run_here: Runner) -> None:
     assert message in run_here("plugins", argument, code=1).error
