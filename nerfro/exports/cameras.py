@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ from nerfro.core.cameras import Cameras
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import relative_path
 from nerfro.exports.meshes import colours_of, glass_meshes, inside_mesh
-from nerfro.files.atomic import write_atomically
+from nerfro.files.atomic import write_atomically, write_json
 from nerfro.viewing.camera_paths import transforms_document
 from nerfro.viewing.exports import EXPORTS, Export, ExportConfig
 from nerfro.viewing.trained_scene import TrainedScene
@@ -54,7 +53,7 @@ def write_transforms(scene: TrainedScene, out: Path, options: ExportConfig) -> s
     cameras, images = _training_cameras(scene)
     names = [str(image) if root is None else relative_path(image, out) for image, root in images]
     document = transforms_document(cameras, names, scene.source.origin)
-    write_atomically(out / "transforms.json", json.dumps(document | {"ply_file_path": "points.ply"}, indent=1) + "\n")
+    write_json(out / "transforms.json", document | {"ply_file_path": "points.ply"})
     positions, colours = _points(scene, options)
     import trimesh
 

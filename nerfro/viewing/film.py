@@ -6,7 +6,6 @@ Rendering resumes at the first missing frame after an interruption.
 from __future__ import annotations
 
 import contextlib
-import json
 import shutil
 import subprocess
 import tempfile
@@ -24,7 +23,7 @@ from torch.nn.functional import normalize
 from nerfro.core.cameras import Cameras
 from nerfro.core.errors import NerfroError, optional
 from nerfro.core.progress import progress_bar
-from nerfro.files.atomic import atomic_file, write_atomically
+from nerfro.files.atomic import atomic_file, write_atomically, write_json
 from nerfro.files.cache import content_hash
 from nerfro.files.images import save_png, write_radiance
 from nerfro.files.reading import read_json
@@ -147,7 +146,7 @@ def _remove_other_frames(folder: Path, files: Sequence[Path], suffix: str, finge
             raise NerfroError(f"{existing[0]} belongs to another rendering; give another out=... or overwrite=true")
         for file in existing:
             file.unlink()
-    write_atomically(record, json.dumps({"requests": {**requests, suffix: fingerprint}}) + "\n")
+    write_json(record, {"requests": {**requests, suffix: fingerprint}})
 
 
 def _recorded_requests(record: Path) -> dict[str, object]:
