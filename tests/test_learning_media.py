@@ -3,10 +3,13 @@
 from pathlib import Path
 
 import pytest
+import torch
 
 from nerfro.paper.eikonal import Eikonal
 from nerfro.registry.registration import discover, find
-from tests.ball_photographs import TRAINING, photographs, save
+from nerfro.samplers.paths.snell import Snell
+from nerfro.training.run_folder import load
+from tests.ball_photographs import TRAINING, photographs, photographs_of, save, solid
 from tests.closed_forms import make_rays
 from tests.conftest import Runner, weights_of
 
@@ -37,3 +40,21 @@ def test_training_corrects_a_wrong_index(train_here: Runner, tmp_path: Path) -> 
     assert found.item() == pytest.approx(
         1.45, rel=0.01
     )  # 1.462 from above and from below: the grid's ball is not the photographs'
+
+
+AMBER, CLEAR = (0.1, 0.3, 0.7), (0.0, 0.0, 0.0)  # red, green and blue
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("absorption", [AMBER, CLEAR])
+def test_absorption_is_learned_within_ten_percent(
+    absorption: tuple[float, ...], train_here: Runner, tmp_path: Path
+) -> None:
+    """Dark fog within the ball would explain the part that is common to all colours."""
+    coefficients = torch.tensor([absorption])
+    body = solid([1.45]).with_absorption_coefficients(coefficients)
+    save(photographs_of(body, sampler=Snell(branches="all")), tmp_path / "ball")
+    options = ["experiment=glass", *TRAINING, "trainer.max_steps=300", f"data.root={tmp_path / 'ball'}"]
+    train_here(*options, "evaluation=none", f"hydra.run.dir={tmp_path / 'run'}")
+    learned = load(tmp_path / "run").renderer.scene.medium.absorption
+    torch.testing.assert_close(learned, coefficients, rtol=0.1, atol=0.02)

@@ -1,6 +1,8 @@
-"""Metrics of images against other packages, and scores of views and regions."""
+"""Metrics of images against other packages, error maps, scores of views and regions, and the announced time."""
 
+import itertools
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import flip_evaluator
@@ -13,12 +15,25 @@ from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
 import nerfro
-from nerfro.evaluation.image_metrics import crop_rectangle, object_pixels, psnr, ssim, ssim_map
-from nerfro.evaluation.perceptual import Lpips, flip, flip_map
+from nerfro.evaluation import scoring
+from nerfro.evaluation.image_metrics import (
+    build_metrics,
+    crop_rectangle,
+    object_pixels,
+    psnr,
+    squared_error_map,
+    ssim,
+    ssim_map,
+    triptych,
+)
+from nerfro.evaluation.perceptual import Lpips, LpipsNetwork, flip, flip_map, published_weights
 from nerfro.evaluation.results import EvaluationResult
-from nerfro.evaluation.scoring import ImageMetrics
-from nerfro.files.images import load_png, round_to_8bit, save_png
+from nerfro.evaluation.scoring import ImageMetrics, error_maps, write_error_sheet
+from nerfro.files.images import load_png, magma, round_to_8bit, save_png
+from nerfro.models.refractive import RefractiveModel
 from nerfro.registry.registration import discover
+from nerfro.samplers.subdivision import Subdivision
+from nerfro.testing.examples import example_components, example_views
 from tests.conftest import refused
 
 discover()
@@ -181,3 +196,68 @@ def test_crop_is_the_bounding_rectangle_of_the_mask_dilated_by_seventeen_pixels_
     expected = slice(int(rows.min()), int(rows.max()) + 1), slice(int(columns.min()), int(columns.max()) + 1)
     assert crop_rectangle(inside) == expected
     assert torch.equal(dilated[expected].sum(), dilated.sum())
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_means_of_the_maps_are_the_metrics() -> None:
+    prediction, target = torch.rand(2, 40, 36, 3, generator=torch.Generator().manual_seed(0))
+    maps = {error.name: error for error in error_maps(prediction, target, build_metrics())}
+    assert list(maps) == ["squared_error", "ssim", "lpips", "flip"]
+    assert all(error.values.shape == (40, 36) for error in maps.values())
+    assert -10 * maps["squared_error"].values.mean().log10() == pytest.approx(psnr(prediction, target).item(), abs=1e-5)
+    assert 1 - maps["ssim"].values.nanmean().item() == pytest.approx(ssim(prediction, target).item(), abs=1e-9)
+    assert torch.equal(maps["lpips"].values, LpipsNetwork(published_weights()).distance_map(prediction, target))
+    assert maps["flip"].values.mean().item() == pytest.approx(flip(prediction, target).item(), abs=1e-6)
+
+
+def test_border_without_ssim_window_is_grey() -> None:
+    prediction, target = torch.rand(2, 16, 20, 3, generator=torch.Generator().manual_seed(0))
+    error = error_maps(prediction, target, build_metrics())[1]
+    assert error.values[5:-5, 5:-5].isfinite().all()
+    assert error.values.isnan().sum() == 16 * 20 - 6 * 10
+    colours = error.colours()
+    assert torch.equal(colours[0, 0], colours[4, 7])
+    assert (colours[0, 0] == colours[0, 0, 0]).all()
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_maps_are_omitted_for_small_images() -> None:
+    prediction, target = torch.rand(2, 10, 30, 3, generator=torch.Generator().manual_seed(0))
+    maps = error_maps(prediction, target, build_metrics())
+    assert [error.name for error in maps] == ["squared_error", "flip"]
+
+
+def test_sheet_contains_images_and_maps(tmp_path: Path) -> None:
+    prediction, target = torch.rand(2, 64, 128, 3, generator=torch.Generator().manual_seed(0))
+    write_error_sheet(tmp_path, "a", prediction, target, build_metrics())
+    sheet = load_png(tmp_path / "errors" / "a.png")
+    for column, shown in enumerate((prediction, target, magma(squared_error_map(prediction, target), 0.05))):
+        enlarged = round_to_8bit(shown).repeat_interleave(2, 0).repeat_interleave(2, 1)
+        left = column * (256 + 6)
+        torch.testing.assert_close(sheet[22 : 22 + 128, left : left + 256], enlarged)
+        assert sheet[22 + 128 :, left : left + 256].min() < 0.2, "a caption in ink"
+
+
+def test_triptych_contains_prediction_reference_and_error() -> None:
+    prediction, target = torch.rand(2, 8, 9, 3, generator=torch.Generator().manual_seed(0))
+    parts = triptych(prediction, target).split(9, dim=1)
+    error = magma(squared_error_map(prediction, target), 0.05)
+    for part, expected in zip(parts, (prediction, target, error), strict=True):
+        torch.testing.assert_close(part, expected)
+
+
+@pytest.mark.parametrize(("seconds", "line"), [(1.0, "about 1 min 20 s"), (0.05, "")])
+def test_time_of_scoring_is_announced(
+    seconds: float, line: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Each of 20 views has four times the pixels of the small rendering, which takes `seconds`."""
+    ticks = itertools.count()
+    monkeypatch.setattr(scoring.time, "perf_counter", lambda: seconds * next(ticks))
+    one = example_views().select([0])
+    cameras = type(one.cameras).joined([one.cameras.resized(16, 16)] * 20)
+    views = replace(one, cameras=cameras, images=torch.zeros(20, 16, 16, 3), names=[str(view) for view in range(20)])
+    renderer = RefractiveModel(example_components()).eval()
+    scoring.announce_scoring(renderer, views, ImageMetrics(["psnr"]), Subdivision(1), num_pixels=64)
+    printed = capsys.readouterr().out
+    assert line in printed
+    assert ("trainer.limit_test_batches=5" in printed) == bool(line)

@@ -1,20 +1,22 @@
-"""Untrusted files: damaged, endless or too large files are refused quickly and in one line."""
+"""Untrusted files, and configurations of other users' runs, are refused quickly and in one line."""
 
 import json
 import os
 import struct
 import zlib
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image, ImageFile
 
 from nerfro.core.errors import NerfroError
 from nerfro.data.image_files import read_levels, read_rgb, read_size
 from nerfro.files.images import load_png
-from nerfro.files.reading import load_array, load_arrays, read_foreign_config, read_json
+from nerfro.files.reading import foreign_config, load_array, load_arrays, read_foreign_config, read_json
 from nerfro.geometry.mesh import load_mesh
 from nerfro.training.run_folder import load_checkpoint
 from tests.conftest import refused
@@ -160,3 +162,29 @@ def test_pixels_are_decoded_only_if_metadata_follow_them(tmp_path: Path, monkeyp
     path.write_bytes(content[:place] + chunk(b"tEXt", b"date:create\0today") + content[place:])
     monkeypatch.setattr(ImageFile.ImageFile, "load", lambda image: pytest.fail("decoded"))
     assert read_size(path) == (1, 1, 8)
+
+
+def test_plain_values_are_read_as_they_were_written() -> None:
+    config = foreign_config("name: a\nfield: {scale: 1e-3, sizes: [1, 2]}\n", Path("c.yaml"))
+    assert config == {"name": "a", "field": {"scale": 1e-3, "sizes": [1, 2]}}
+
+
+HOSTILE = [
+    "name: ${oc.env:NERFRO_SECRET}",
+    'field: {widths: [1, "\\x24{oc.env:NERFRO_SECRET}"]}',
+    "${oc.env:NERFRO_SECRET}: 3",
+    "name: ${seed}\nseed: 1",
+]
+
+
+BOMB = "a: &a [1, 2]\n" + "".join(f"{x}: &{x} [{', '.join([f'*{w}'] * 9)}]\n" for w, x in pairwise("abcdefgh"))
+LONG = "a: " + 10**6 * "1"
+OTHERS = ["{[: no yaml", "name: !!python/name:os.system", "- 1", "a: 1\na: 2", BOMB, LONG, "a: &a [*a]", "[" * 3000]
+
+
+@pytest.mark.parametrize("text", [*HOSTILE, *OTHERS])
+def test_content_that_no_run_writes_is_refused(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NERFRO_SECRET", "hunter2")
+    torch.save({"nerfro_config": text}, tmp_path / "last.ckpt")
+    for read in (lambda: foreign_config(text, Path("c.yaml")), lambda: load_checkpoint(tmp_path / "last.ckpt")):
+        assert "hunter2" not in refused(r"c\.yaml|last\.ckpt", read)

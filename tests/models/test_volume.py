@@ -1,19 +1,27 @@
-"""A volume of all space learns a glass ball in a painted room with a toy in front of it."""
+"""Composition of models, and a volume of all space that learns a glass ball in a painted room."""
+
+from dataclasses import replace
 
 import pytest
 import torch
+from torch import Tensor
 from torch.nn.functional import normalize
 
 from nerfro.backgrounds.base import Background, ConstantBackground
 from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.core.draws import Draws
-from nerfro.core.types import Path
+from nerfro.core.types import Exits, Path
 from nerfro.fields.hash_grid import HashGridField
 from nerfro.geometry.space import Box, Contracted, Space
-from nerfro.rendering import composite
+from nerfro.models.refractive import RefractiveModel
+from nerfro.paper.nerf import MipNerfModel
+from nerfro.rendering import Components, composite
 from nerfro.samplers.points.density_grid import DensityGridSampler
+from nerfro.samplers.points.stratified import Stratified
+from nerfro.testing import example_rays
 from tests.cameras_at import cameras_at
 from tests.closed_forms import Ball
+from tests.paper import small_components
 from tests.reference_tracer import Snell
 
 WALL = 3.0  # half side of the room
@@ -94,3 +102,59 @@ def test_volume_of_all_space_learns_a_room_better_than_box_and_environment_map()
     assert volume[0] > sky[0] + 6
     assert volume[1] > sky[1] + 5, "behind the glass"
     assert volume[2] > sky[2] + 5, "a box holds what is in it, and the toy stands before it"
+
+
+class Compass(Background):
+    """Radiance is the direction."""
+
+    def forward(self, exits: Exits) -> Tensor:
+        return 0.5 + 0.5 * exits.directions
+
+
+@pytest.fixture
+def parts() -> Components:
+    return replace(small_components(), chunk_size=7)
+
+
+def test_refractive_model_has_a_field_for_each_level_and_mip_nerf_one_for_all(parts: Components) -> None:
+    assert len(RefractiveModel(parts).scene.fields) == 2
+    assert len(MipNerfModel(parts).scene.fields) == 1
+    assert len(RefractiveModel(replace(parts, point_sampler=Stratified(8))).scene.fields) == 1
+
+
+def test_background_is_evaluated_at_the_exit_or_at_the_last_coarse_sample(parts: Components) -> None:
+    rays, parts = example_rays(), replace(parts, background=Compass())
+    path = parts.path_sampler(rays, parts.medium)
+    leaving = RefractiveModel(parts, "exit").eval()(rays)
+    torch.testing.assert_close(leaving[-1].background_radiance, 0.5 + 0.5 * path.exit_directions)
+    early = RefractiveModel(parts, "last_coarse").eval()(rays)
+    for rendering in early:
+        torch.testing.assert_close(rendering.background_radiance, 0.5 + 0.5 * early[0].samples.directions[:, -1])
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_rendering_uses_evaluation_mode_and_restores_the_mode(training: bool, parts: Components) -> None:
+    model = RefractiveModel(parts).train(training)
+    first, second = model.render(example_rays()), model.render(example_rays())
+    assert torch.equal(first.radiance, second.radiance), "nothing random"
+    assert model.training is training
+    assert model.point_sampler.training is training
+    assert not first.radiance.requires_grad
+
+
+def test_chunk_size_bounds_the_number_of_rays_rendered_at_once(
+    parts: Components, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, sizes = RefractiveModel(parts).eval(), []
+    whole = model(example_rays())  # 24 rays
+    forward = model.path_sampler.forward
+    monkeypatch.setattr(
+        model.path_sampler, "forward", lambda rays, medium: (sizes.append(len(rays)), forward(rays, medium))[1]
+    )
+    rendered = model.render(example_rays())
+    assert sum(sizes) == 24
+    assert max(sizes) <= 7  # several cores share the seven rays
+    torch.testing.assert_close(rendered.radiance, whole[-1].radiance)
+    none = model.render(example_rays()[:0])
+    for name, values in vars(none).items():
+        assert values.shape == (0, *getattr(rendered, name).shape[1:])

@@ -1,4 +1,4 @@
-"""A bent path ends after its last exit from the object, for any `far`."""
+"""A bent path ends after its last exit from the object, for any `far`; straight paths."""
 
 import functools
 from pathlib import Path as FilePath
@@ -8,13 +8,13 @@ import torch
 import trimesh
 from torch import Tensor
 
-from nerfro.core.types import Path
+from nerfro.core.types import Path, Rays
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.media.base import Medium
 from nerfro.media.body_settings import make_bodies
 from nerfro.paper.eikonal import Eikonal
-from nerfro.samplers.base import PathSampler
-from tests.closed_forms import RoundedBox, random_rays
+from nerfro.samplers.base import PathSampler, Straight
+from tests.closed_forms import Ball, RoundedBox, random_rays
 from tests.reference_tracer import Snell
 
 _rays = functools.partial(random_rays, 200, 1.2, 4)
@@ -63,3 +63,18 @@ def _outside(path: Path, medium: Medium) -> Tensor:
     """Whether paths end where nothing of the medium's box lies ahead."""
     _, leave = intersect_box(medium.box, path.end_positions, path.exit_directions)
     return leave <= 0
+
+
+def test_path_is_the_line_from_near_to_far_in_any_medium() -> None:
+    origins = torch.randn(5, 3)
+    directions = torch.nn.functional.normalize(torch.randn(5, 3), dim=-1)
+    near, far = torch.rand(5), 4 + torch.rand(5)
+    path = Straight()(Rays(origins, directions, torch.ones(5), near, far), Ball())
+    torch.testing.assert_close(path.near, near)
+    torch.testing.assert_close(path.far, far)
+    s = torch.linspace(0, 1, 7) * (far - near)[:, None] + near[:, None]
+    positions, along = path.at(s)
+    torch.testing.assert_close(positions, origins[:, None] + s[..., None] * directions[:, None])
+    torch.testing.assert_close(along, directions[:, None].expand(-1, 7, -1))
+    torch.testing.assert_close(path.exit_directions, directions)
+    assert not path.refracted.any()

@@ -1,5 +1,6 @@
 """The search for triangles: against all triangles one by one, on edges, and without Embree."""
 
+import math
 import sys
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from nerfro.kernels.compilation import compiled_parallel
 from nerfro.media.body_settings import make_bodies
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.paths.snell_cpu import Scratch
-from nerfro.samplers.paths.surface_search_cpu import Line
+from nerfro.samplers.paths.surface_search_cpu import Line, end_of_blocks
 from nerfro.samplers.paths.triangle_search_cpu import first_triangle
 from tests.closed_forms import make_rays, random_rays
 
@@ -96,3 +97,15 @@ def test_faces_of_two_bodies_that_almost_coincide_are_met_together(tmp_path: Pat
         exits.append(Snell("mesh")(rays, medium).exit_directions)
     for other in exits[1:]:
         torch.testing.assert_close(other, exits[0])
+
+
+@pytest.mark.parametrize("x", [20.0, 20.5, 21.0, 21.0 + 1e-9])
+def test_line_along_a_face_leaves_its_blocks_at_their_other_end(x: float) -> None:
+    # The last of 21 blocks along x: its face is at 21, where a position may lie by rounding.
+    lengths = math.inf, math.inf, 2.0
+    assert end_of_blocks(20, 3, 3, 1, x, 3.5, 3.5, *lengths) == pytest.approx(1.0)
+    assert end_of_blocks(20, 3, 3, 2, x, 3.5, 3.5, *lengths) == pytest.approx(3.0)
+
+
+def test_blocks_end_at_the_nearest_side() -> None:
+    assert end_of_blocks(2, 2, 2, 1, 2.5, 2.25, 2.5, 1.0, -1.0, 10.0) == pytest.approx(0.25)

@@ -1,6 +1,8 @@
-"""From silhouettes to a surface: outlines, carving, the fit, and the diagnosis of inconsistent silhouettes."""
+"""From silhouettes to a surface: outlines, carving, the fit, and reports of inconsistent silhouettes and meshes."""
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,11 +12,16 @@ from scipy.spatial import cKDTree
 
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import ASSETS_DIR
+from nerfro.data.base import Views
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
+from nerfro.media.body_settings import make_bodies
 from nerfro.silhouettes import surface
 from nerfro.silhouettes.agreement import overlap, require_consistent_poses
+from nerfro.silhouettes.mesh_match import require_match
+from nerfro.silhouettes.moving_mesh import MovingMesh
+from nerfro.silhouettes.rims import Rims, by_pixel_sides, find_rims, outlines_of
 from nerfro.silhouettes.silhouette_fit import fit_surface
-from nerfro.silhouettes.silhouettes import outline_distance
+from nerfro.silhouettes.silhouettes import is_antialiased, outline_distance
 from nerfro.silhouettes.surface import make_mesh
 from nerfro.silhouettes.visual_hull import (
     Silhouettes,
@@ -221,3 +228,113 @@ def test_hull_of_a_cut_object_is_independent_of_the_world_unit(scale: float) -> 
         distances, corner, spacing = carve_grid(silhouettes, unit * np.array([[-1.2] * 3, [1.2] * 3]), 24)
         hulls.append(extract_surface(distances, corner, spacing).vertices / unit)
     np.testing.assert_array_equal(*hulls)
+
+
+RADIUS, MIDDLE = 0.7, np.array([0.11, 0.07, -0.05])
+
+
+def ball(radius: float = RADIUS) -> trimesh.Trimesh:
+    """Beside the point that the cameras look at: each view sees another disc."""
+    return trimesh.creation.icosphere(5, radius).apply_translation(MIDDLE)
+
+
+def seen(radius: float, silhouettes: Silhouettes) -> tuple[Rims, Rims]:
+    """Rims of a ball of another radius, as read off the outlines, and by the sides of pixels."""
+    made = ball(radius)
+    surface = MovingMesh(np.asarray(made.faces)).geometry(np.asarray(made.vertices))
+    rims = find_rims(surface, silhouettes, outlines_of(silhouettes))
+    return rims, by_pixel_sides(rims, silhouettes, 0.16)
+
+
+def pixel(size: int) -> float:
+    """Width of a pixel at the rims of a body in the middle, world units."""
+    return 3.94 / 1.4 / size
+
+
+def mean(rims: Rims) -> float:
+    """Misfit, pixels."""
+    return float(np.average(rims.misfit / rims.width, weights=rims.weight))
+
+
+@pytest.fixture(scope="module")
+def silhouettes() -> Silhouettes:
+    return photographed(ball(), cameras_around(20, 96))
+
+
+def test_correct_surface_is_unchanged(silhouettes: Silhouettes) -> None:
+    """The outlines that are read off the masks want single rims to move by a tenth of a pixel."""
+    read, sides = seen(RADIUS, silhouettes)
+    moves = [np.sqrt(np.average((rims.misfit / rims.width) ** 2, weights=rims.weight)) for rims in (read, sides)]
+    assert abs(mean(sides)) < 0.02
+    assert moves[1] < 0.5 * moves[0]
+
+
+@pytest.mark.parametrize("off", [-0.3, 0.3])
+def test_displaced_surface_moves_to_the_outlines(silhouettes: Silhouettes, off: float) -> None:
+    """In a few steps."""
+    width = pixel(silhouettes.cameras.width)
+    radius = RADIUS + off * width
+    for _ in range(6):
+        radius += width * mean(seen(radius, silhouettes)[1])
+    assert abs(radius - RADIUS) / width < 0.03
+
+
+@pytest.mark.slow
+def test_fitted_surface_has_the_size_of_the_body() -> None:
+    """It is 0.09 pixels too small if the sides of pixels are not looked at."""
+    size, axes = 48, np.array([0.8, 0.6, 0.45])
+    body = trimesh.creation.icosphere(5)
+    body.vertices = axes * body.vertices + MIDDLE
+    silhouettes = photographed(body, cameras_around(20, size))
+    fitted = fit_surface(hull(silhouettes, 24), silhouettes)
+    beyond = axes.mean() * (np.linalg.norm((fitted.vertices - MIDDLE) / axes, axis=1) - 1)
+    assert abs(beyond.mean()) < 0.05 * pixel(size)
+
+
+def test_binary_masks_are_distinguished_from_coverage_masks(silhouettes: Silhouettes) -> None:
+    soft = photographed_softly(ball(), silhouettes.cameras, 4)
+    nearly = Silhouettes.of(silhouettes.cameras, (silhouettes.masks + 0.01).clamp(max=1))  # as JPEG leaves them
+    empty = torch.zeros(1, 8, 8)
+    assert is_antialiased(soft.masks.numpy(), soft.distances.numpy())
+    for masks in (silhouettes, nearly):
+        assert not is_antialiased(masks.masks.numpy(), masks.distances.numpy())
+    assert not is_antialiased(empty.numpy(), Silhouettes.of(silhouettes.cameras.select([0]), empty).distances.numpy())
+
+
+OBJECT = trimesh.util.concatenate(
+    [trimesh.creation.icosphere(2, 0.3), trimesh.creation.box((1, 0.2, 0.2)).apply_translation((0.9, 0, 0.1))]
+)
+SWAPPED = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
+
+
+@pytest.fixture(scope="module")
+def views() -> Views:
+    """Views of the object from all sides, with its silhouettes as masks."""
+    photographs = photographed(OBJECT, cameras_around(9, 32))
+    return Views(photographs.cameras, torch.zeros(9, 32, 32, 3), photographs.masks, [str(i) for i in range(9)])
+
+
+@pytest.mark.parametrize(
+    ("matrix", "shift", "message"),
+    [
+        (np.eye(3), (0, 0, 0), None),
+        (0.01 * np.eye(3), (0, 0, 0), "only to 0%; the mesh scaled by 100 agrees"),
+        (100 * np.eye(3), (0, 0, 0), "all cameras lie inside the object, which is .*; the mesh scaled by 0.01 agrees"),
+        (SWAPPED, (0, 0, 0), r"the mesh with \(x, y, z\) replaced by \(x, z, -y\) agrees"),
+        (np.eye(3), (50, 20, 0), r"the mesh moved by \[-(50|49\.9).*, -(20|19\.9).*, -?0.*\] agrees"),
+    ],
+    ids=["right", "small", "large", "axes", "place"],
+)
+def test_unit_axes_and_position_of_a_mesh_are_compared_with_the_masks(
+    matrix: np.ndarray, shift: tuple[int, ...], message: str | None, views: Views, tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    changed = trimesh.Trimesh(OBJECT.vertices @ matrix.T + shift, OBJECT.faces, process=False)
+    changed.export(tmp_path / "mesh.ply")
+    medium = make_bodies(str(tmp_path / "mesh.ply"), resolution=24, cache=False)
+    try:
+        require_match(medium, views)
+        said = capsys.readouterr().out
+    except NerfroError as error:
+        said = str(error)
+    assert said == "" if message is None else re.search(message, said), said

@@ -1,4 +1,4 @@
-"""Arguments of Lightning's Trainer take effect or are refused with a reason, and callbacks are selected by name."""
+"""Arguments of Lightning's Trainer, callbacks and other settings take effect, or are refused or named with a reason."""
 
 import importlib.util
 import inspect
@@ -21,8 +21,10 @@ from nerfro.registry.allowed import Refused, plain, untyped, validate
 from nerfro.registry.registration import build, find, register
 from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.training.config import TrainConfig, TrainerConfig, resolve_trainer_options
+from nerfro.training.effects import settings_without_effect
 from nerfro.training.pixel_batches import PixelBatches
 from nerfro.training.run_folder import LAST_CHECKPOINT, load_checkpoint
+from nerfro.training.settings import _NAMED, RESUMING, first_difference, settings
 from nerfro.training.trainer import _OWN
 from tests.conftest import Runner, composed, refused, weights_of
 
@@ -261,3 +263,63 @@ def test_loggers_of_lightning_are_options_and_name_a_missing_package(name: str, 
     assert set(config.logger) == {"tensorboard", "csv", name}
     if importlib.util.find_spec(package) is None and importlib.util.find_spec(f"{package}_ml") is None:
         refused(f"needs another package .*{package}.*; install it with pip", build, config.logger[name], save_dir=".")
+
+
+def test_every_setting_that_is_named_exists() -> None:
+    config = composed()
+    trainer = {f"trainer.{name}" for name in inspect.signature(pl.Trainer).parameters}
+    media = {"medium.cache"}  # a field of some
+    for name in set(_NAMED) - trainer - media:
+        assert OmegaConf.select(config, name, default="absent") != "absent", name
+
+
+def test_settings_are_flat_and_their_first_difference_is_named() -> None:
+    flat = {"seed": 1, "field.width": 64, "field.levels": [1, 2], "checkpoints": "no group of watching"}
+    watching = ("logger.csv.name=x", "checkpoint.every_steps=3", "evaluation.every=9", "trainer.profiler=simple")
+    config = OmegaConf.from_dotlist([*(f"{name}={value}" for name, value in flat.items()), *watching])
+    assert settings(config, RESUMING) == flat
+    assert first_difference(flat, dict(flat)) is None
+    assert first_difference(flat, {**flat, "seed": 2, "field.bias": True}) == "field.bias"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["+experiment=straight", "medium.learn_ior=true"], "medium.learn_ior=True .* with sampler/path=straight"),
+        (["+experiment=mipnerf", "medium.learn_absorption=true"], "change sampler/path"),
+        (["sampler.path.least_weight=0.1"], "with sampler.path.branches=none; .* sampler.path.branches=first or all"),
+        (["sampler/path=eikonal", "sampler.path.num_steps=64"], "sampler.path.integrator=euler"),
+        (["phase.cameras.every=20"], "has no effect with camera=given; remove it, or choose camera=refined"),
+        (["phase={cameras: {start: 5}}"], "phase.cameras.start=5 has no effect"),
+        (["+experiment=straight", "phase.background.steps=20"], "content.space=all"),
+        (
+            ["background=skybox", "phase.background.steps=20"],
+            "background=skybox; remove it, or choose background=envmap",
+        ),
+        (["phase.background.steps=0", "phase.background.start=50"], "phase.background.steps=0"),
+        (["content.radius=2"], "content.space=box"),
+        (["batches.precrop_fraction=0.3"], "batches.precrop_steps=0"),
+        (["optimizer.warmup_steps=0", "optimizer.warmup_factor=0.5"], "optimizer.warmup_steps=0"),
+        (["trainer.gradient_clip_algorithm=value"], "trainer.gradient_clip_val=null"),
+    ],
+)
+def test_setting_without_effect_is_reported(overrides: list[str], message: str) -> None:
+    [line] = settings_without_effect(composed(*overrides), overrides)
+    assert re.search(message, line)
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["+experiment=straight", "medium.learn_ior=false", "content.radius=2", "phase.background.steps=0"],
+        ["+experiment=glass_room", "sampler.path.branches=none"],  # the experiment has a value, the user has none
+        ["+experiment=unknown", "medium.learn_ior=true", "sampler.path.least_weight=0.1"],
+        ["sampler/path=eikonal", "sampler.path.integrator=euler", "sampler.path.num_steps=64"],
+        ["camera=refined", "phase.cameras.every=20", "phase.background={steps: 20, start: 100}"],
+        ["optimizer.groups={background.*: {start: 0}}", "loss.background={weight: 0.1, start: 5}", "hydra.run.dir=out"],
+        ["trainer.gradient_clip_algorithm=value", "trainer.gradient_clip_val=0.1", "~phase.cameras"],
+        ["logger=wandb", "logger.wandb.offline=true"],
+    ],
+)
+def test_setting_with_effect_or_in_its_default_state_is_accepted(overrides: list[str]) -> None:
+    assert settings_without_effect(composed(*overrides), overrides) == []
