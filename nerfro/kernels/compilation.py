@@ -21,6 +21,7 @@ from typing import Any, TypeVar, cast
 
 import numba
 import torch
+from numba.core.caching import FunctionCache
 
 from nerfro.core.errors import warn
 from nerfro.core.paths import cache_dir
@@ -84,13 +85,29 @@ def _compile(function: Function, parallel: bool, allocates: bool = True) -> Func
         if shutil.disk_usage(folder).free < _KERNEL_BYTES:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]  # read while the function's cache is made
-        return numba.njit(cache=True, **options)(function)
+        kernel = numba.njit(**options)(function)
+        kernel._cache = _MachineCode(function)
+        return kernel
     except (RuntimeError, OSError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         _warn_of_compiling(base, "NUMBA_CACHE_DIR" if configured else "NERFRO_CACHE", reason)
         return numba.njit(**options)(function)
     finally:
         numba.config.CACHE_DIR = configured  # type: ignore[attr-defined]
+
+
+class _MachineCode(FunctionCache):
+    """Machine code of a function on disk, which is compiled again if a class of its arguments has moved.
+
+    The index of the code names classes with their modules, and a kernel need not import the classes of its arguments.
+    """
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        try:
+            return super().load_overload(sig, target_context)
+        except (ImportError, AttributeError):
+            self.flush()
+            return None
 
 
 @functools.cache

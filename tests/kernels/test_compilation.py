@@ -1,7 +1,10 @@
 """Kernels compile in any installation folder, and again after a change of their sources."""
 
+import math
 import os
 import sys
+import types
+from collections import namedtuple
 from pathlib import Path
 
 import numba
@@ -46,6 +49,22 @@ def test_kernels_work_without_a_writable_folder_with_one_warning(
     assert str(tmp_path / "file" / "below") in line
     assert "set NERFRO_CACHE to a folder that can be written" in line
     assert set(Path(__file__).parent.rglob("*.nbi")) == in_tree
+
+
+def _length(vector: tuple[float, float]) -> float:
+    return math.hypot(vector[0], vector[1])
+
+
+def test_kernel_is_recompiled_if_the_class_of_an_argument_has_moved(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NERFRO_CACHE", str(tmp_path))
+    for name in ("module_before", "module_after"):
+        vector = namedtuple("Vector", ("x", "y"), module=name)
+        with monkeypatch.context() as modules:
+            modules.setitem(sys.modules, name, types.ModuleType(name))
+            modules.setattr(sys.modules[name], "Vector", vector, raising=False)
+            assert compiled(_length)(vector(3.0, 4.0)) == 5.0
 
 
 @pytest.mark.slow
