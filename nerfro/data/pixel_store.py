@@ -27,18 +27,6 @@ class PixelStore:
         levels = images if isinstance(images, Tensor) else torch.from_numpy(self._array)
         self._levels = levels.view(-1, 3)
 
-    def to(self, device: torch.device | str) -> PixelStore:
-        """Move the colours to a device; a store on another device keeps no copy on the host."""
-        moved = object.__new__(PixelStore)
-        moved._levels = self._levels.to(device)
-        moved._array = self._array if moved._levels.device == self._levels.device else None
-        return moved
-
-    @property
-    def nbytes(self) -> int:
-        """Size of all colours in memory."""
-        return self._levels.nbytes
-
     def release_memory(self) -> None:
         """Release the memory of a memory-mapped store. The pages are read again on the next access."""
         if isinstance(self._array, np.memmap) and hasattr(mmap, "MADV_DONTNEED"):

@@ -18,9 +18,7 @@ from nerfro.rendering.renderer import Renderer
 _STEP, _EVALUATION = 2.0, 0.5
 
 
-def require_memory(
-    renderer: Renderer, batch: Batch, device: torch.device, share: float = 1.0, pixel_bytes: int = 0
-) -> str:
+def require_memory(renderer: Renderer, batch: Batch, device: torch.device, share: float = 1.0) -> str:
     """Estimate the peak memory of a run, and refuse runs without enough memory.
 
     A few rays are rendered on the device, and the bytes that autograd keeps of them are counted. They grow with the
@@ -31,7 +29,6 @@ def require_memory(
         batch: part of a training batch.
         device: training device.
         share: fraction of the rays of a training batch that are in `batch`.
-        pixel_bytes: size of the training pixels, which are copied to a GPU. On the CPU they are already in memory.
 
     Returns:
         The estimate in one line.
@@ -52,7 +49,7 @@ def require_memory(
     advice = f"{per_ray} are for each ray: take a smaller batches.size or evaluation.chunk_size"
     if device.type == "cuda":
         _require(host, available_bytes(), "main", "use a machine with more memory")
-        needed, free = step + pixel_bytes, float(torch.cuda.mem_get_info(device)[0])
+        needed, free = step, float(torch.cuda.mem_get_info(device)[0])
     else:
         resident = number_in(Path("/proc/self/status"), r"VmRSS:\s+(\d+)", 1024)
         needed, free = step + host + resident, available_bytes() + resident

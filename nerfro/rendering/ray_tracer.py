@@ -11,7 +11,9 @@ from torch import Tensor
 
 from nerfro.core.cameras import Cameras
 from nerfro.core.rays import Rays
+from nerfro.core.transfer import transfer
 from nerfro.core.types import Batch, Path, Pixels
+from nerfro.rendering.host_renderer import HostRenderer
 from nerfro.rendering.renderer import Renderer
 from nerfro.samplers.subdivision import (
     DIVERGENT,
@@ -61,12 +63,26 @@ class RayTracer:
         self._renderer = renderer
         bends = renderer.path_sampler.needs_medium
         self.subdivision = subdivision if subdivision is not None and bends else Subdivision()
+        self._host: HostRenderer | None = None
 
     def trace(self, pixels: Pixels) -> Batch:
         """Trace the rays of the estimated cameras through the pixels of a step, and choose samples if they are known.
 
-        The rays have gradients if the cameras learn. The paths have none, see `Renderer.trace`.
+        Compiled kernels run on the CPU, and the batch is sent to the device of the model in one copy. The rays have
+        gradients if the cameras learn. The paths have none, see `Renderer.trace`.
+
+        Args:
+            pixels: pixels of a step, on the CPU.
         """
+        tracer = self
+        if self._renderer.kernels_trace and self._renderer.scene.device.type != "cpu":
+            self._host = self._host or HostRenderer(self._renderer)
+            tracer = RayTracer(self._host.updated(), self.subdivision)
+        return transfer(tracer._trace(pixels), self._renderer.scene.device)
+
+    def _trace(self, pixels: Pixels) -> Batch:
+        """Trace the rays of pixels on the device of the model."""
+        pixels = transfer(pixels, self._renderer.scene.device)
         contrasts = None
         if self.subdivision.contrast is not None and pixels.draws.step >= self.subdivision.contrast_start:
             contrasts = lambda rows: contrast(pixels.photographed, pixels.cameras, pixels.number[rows])  # noqa: E731

@@ -201,6 +201,11 @@ class Renderer(Component, nn.Module, ABC):
         parameters = [*self.scene.path_parameters(), *self.path_sampler.parameters()]
         return any(parameter.requires_grad for parameter in parameters)
 
+    @property
+    def kernels_trace(self) -> bool:
+        """Whether compiled kernels trace all paths, which depend on nothing that gradient descent learns."""
+        return not self.paths_learn and self.path_sampler.releases_gil(self.scene.medium)
+
     @torch.inference_mode()
     def render(self, rays: Rays) -> RenderedRays:
         """Render any number of rays in chunks, as in evaluation.

@@ -74,7 +74,10 @@ class PathSampler(nn.Module, ABC):
         return torch.ones_like(path.refracted)
 
     def releases_gil(self, medium: Medium) -> bool:
-        """Return whether tracing on the CPU releases the global interpreter lock, so that other threads can run."""
+        """Return whether compiled kernels trace, which release the global interpreter lock, so that other threads run.
+
+        A training on another device then traces on the CPU, with copies of the medium and of the samplers.
+        """
         return False
 
 

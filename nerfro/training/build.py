@@ -158,14 +158,13 @@ def check_before_training(renderer: Renderer, data: RayDataModule, trainer: Trai
     Returns:
         The estimated memory in one line.
     """
-    # The pixels are not kept, because the data module moves the pixels to the training device.
     batches = data.batches_of(trainer)
     few, tracer = batches.smaller(CHECKED_RAYS), RayTracer(renderer, data.subdivision)
     first = tracer.trace(few.draw(0))
     require_reach(renderer, few, tracer, first)
     warn_of_thin_walls(renderer.path_sampler, renderer.scene.medium)
     device = trainer.strategy.root_device
-    return require_memory(renderer, first, device, few.batch_size / batches.batch_size, batches.pixel_bytes)
+    return require_memory(renderer, first, device, few.batch_size / batches.batch_size)
 
 
 def initialize_from(renderer: Renderer, run: str, include: Sequence[str]) -> str:

@@ -1,4 +1,4 @@
-"""Random training pixels, resident on the training device."""
+"""Random training pixels."""
 
 from __future__ import annotations
 
@@ -29,11 +29,12 @@ Batching = Literal["single_image", "all_images"]
 class PixelBatches:
     """Random training pixels of each step, which depend only on the seed and the step.
 
-    Therefore a resumed run has the same pixels as an undisturbed run. Only usable pixels are drawn. See
-    `training.config.BatchesConfig` for the options.
+    Therefore a resumed run has the same pixels as an undisturbed run. Only usable pixels are drawn. The colours stay in
+    main memory, and so do the pixels of a step, which `RayTracer.trace` sends to the training device together with
+    their paths. See `training.config.BatchesConfig` for the options.
 
     Attributes:
-        cameras: cameras of all views in the data set.
+        cameras: cameras of all views in the data set, on the training device.
     """
 
     def __init__(
@@ -51,7 +52,7 @@ class PixelBatches:
         self.batch_size, self.batching, self.seed = batch_size, batching, seed
         self.precrop_steps = precrop_steps
         self._share = slice(batch_size)
-        self.cameras = cameras = views.cameras
+        self.cameras = self._host_cameras = cameras = views.cameras
         self._pixels = PixelStore(views.images)
         self._maps = {name: values.flatten(0, 2) for name, values in views.maps.items()}
         self._full = central_window(cameras.height, cameras.width, 1.0)
@@ -82,16 +83,10 @@ class PixelBatches:
         return cls(views, options.size, options.batching, config.seed, *precrop, fraction)
 
     def to(self, device: torch.device | str, dtype: torch.dtype | None = None) -> PixelBatches:
-        """Return the same sequence on another device, with cameras in another precision."""
+        """Return the same sequence with cameras on another device and in another precision."""
         moved = copy.copy(self)
-        moved.cameras, moved._pixels = self.cameras.to(device, dtype), self._pixels.to(device)
-        moved._maps = {name: values.to(device) for name, values in self._maps.items()}
+        moved._host_cameras, moved.cameras = self._host_cameras.to("cpu", dtype), self.cameras.to(device, dtype)
         return moved
-
-    @property
-    def pixel_bytes(self) -> int:
-        """Size of the colours and maps of all training pixels in memory."""
-        return self._pixels.nbytes + sum(values.nbytes for values in self._maps.values())
 
     def release_memory(self) -> None:
         """Release the memory of mapped pixels, which are read again on demand."""
@@ -116,20 +111,18 @@ class PixelBatches:
         return few
 
     def draw(self, step: int) -> Pixels:
-        """Draw the pixels of a step, a function of seed and step that is equal on every device."""
-        cameras = self.cameras
+        """Draw the pixels of a step on the CPU, a function of seed and step."""
+        cameras = self._host_cameras
         height, width = cameras.height, cameras.width
         window = self._full if step >= self.precrop_steps else self._crop
         view, pixel = self._draw(np.random.default_rng([self.seed, step]), window)
         row, column = window.top + pixel // window.width, window.left + pixel % window.width
-        # Only the pixel numbers are copied to the device.
-        number = self._to_device(((view * height + row) * width + column)[self._share])
-        slot = torch.arange(self.batch_size, device=cameras.device)[self._share]
+        number = torch.from_numpy(((view * height + row) * width + column)[self._share])
         return Pixels(
             number=number,
             view=cameras.view_of(number),
             rgb=self._pixels[number],
-            draws=Draws(self.seed, step, slot),
+            draws=Draws(self.seed, step, torch.arange(self.batch_size)[self._share]),
             cameras=cameras,
             window=cameras if window == self._full else cameras.crop(window),
             photographed=self.photographed,
@@ -175,7 +168,7 @@ class PixelBatches:
 
     def photographed(self, pixels: Int[Tensor, "Q"]) -> Float[Tensor, "Q 3"]:
         """Return the colours of pixels by number (view, row, column), sRGB in [0, 1]."""
-        return self._pixels[pixels]
+        return self._pixels[pixels.cpu()].to(pixels.device)
 
     def _to_device(self, array: np.ndarray) -> Tensor:
         return torch.from_numpy(array).to(self.cameras.device, non_blocking=True)

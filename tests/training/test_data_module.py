@@ -1,9 +1,7 @@
 """Prefetched batches equal the batches of their steps, and errors of the thread are raised."""
 
-import gc
 import threading
 import time
-import weakref
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -12,8 +10,6 @@ import pytest
 import torch
 
 from nerfro.core.draws import Draws
-from nerfro.data.formats.transforms import BlenderData
-from nerfro.data.pixel_store import PixelStore
 from nerfro.kernels import compilation
 from nerfro.media.bodies import Bodies
 from nerfro.paper.eikonal import Eikonal
@@ -24,7 +20,6 @@ from nerfro.testing import example_space
 from nerfro.training.data_module import Prefetcher, can_prefetch, multiplies_large_matrices
 from tests.closed_forms import grid_points, random_rays, sampled
 from tests.conftest import Runner, weights_of
-from tests.pretended_gpu import GPU, PretendedGpu
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +119,11 @@ def test_paths_are_not_prefetched_if_they_learn_or_need_python(ball: Bodies, mon
     monkeypatch.setattr("os.sched_getaffinity", lambda pid: {0, 1}, raising=False)
 
     def model(path_sampler, learns: bool = False) -> Any:
-        return Mock(spec=Renderer, path_sampler=path_sampler, scene=Mock(spec=Scene, medium=ball), paths_learn=learns)
+        renderer = Mock(
+            spec=Renderer, path_sampler=path_sampler, scene=Mock(spec=Scene, medium=ball), paths_learn=learns
+        )
+        renderer.kernels_trace = Renderer.kernels_trace.fget(renderer)  # type: ignore[attr-defined]
+        return renderer
 
     assert can_prefetch(model(Snell()))
     assert not can_prefetch(model(Snell(), learns=True))
@@ -159,23 +158,3 @@ def test_no_batch_is_made_ahead_if_paths_learn(train: Runner, monkeypatch: pytes
     monkeypatch.setattr("os.sched_getaffinity", lambda pid: {0, 1}, raising=False)
     monkeypatch.setattr(Prefetcher, "__init__", lambda *_: pytest.fail("a thread makes batches"))
     train("trainer.max_steps=2", "evaluation=none", "medium.learn_ior=true")
-
-
-def test_training_pixels_have_one_copy(train: Runner, monkeypatch: pytest.MonkeyPatch) -> None:
-    """They move to the training device once, and steps of the cameras and of the background use them there."""
-    moves, move = [], PixelStore.to
-    monkeypatch.setattr(PixelStore, "to", lambda self, device: moves.append(device) or move(self, device))
-    steps = ["trainer.max_steps=4", "camera=refined", "phase={cameras: {start: 1, every: 1}, background: {steps: 2}}"]
-    train(*steps, "evaluation.every=0")
-    assert len(moves) == 1
-
-
-def test_pixels_on_another_device_keep_no_copy_on_the_host(tiny_scene: Path) -> None:
-    pixels = PixelStore(BlenderData(str(tiny_scene), near=2.0, far=6.0).load("train").images)
-    array, references = weakref.ref(pixels._array), pixels.to("cpu")
-    with PretendedGpu():
-        moved = references.to(GPU)
-    del pixels, references
-    gc.collect()
-    assert array() is None
-    assert moved._levels.device == GPU

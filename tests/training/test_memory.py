@@ -94,11 +94,11 @@ def test_checkpoint_is_counted_with_weights_gradients_and_moments(monkeypatch: p
     assert needed_gigabytes(model, monkeypatch) - small > 6.5 * weights / 1e9
 
 
-def test_memory_of_a_gpu_is_estimated_with_the_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_of_a_gpu_is_compared_with_the_step(monkeypatch: pytest.MonkeyPatch) -> None:
     model, free = model_of(16), 1e9
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (free, free))
     with PretendedGpu():
         assert "memory: about 0.0 GB of 1.0 GB" in require_memory(model, example_batch(), GPU)
-        with pytest.raises(NerfroError, match=r"needs about 2\.\d GB of cuda memory and 1\.0 GB are free"):
-            require_memory(model, example_batch(), GPU, pixel_bytes=int(2e9))
+        with pytest.raises(NerfroError, match=r"needs about \d+\.\d GB of cuda memory and 1\.0 GB are free"):
+            require_memory(model, example_batch(), GPU, share=1e-6)
     assert all(isinstance(parameter, OnGpu) for parameter in model.parameters())
