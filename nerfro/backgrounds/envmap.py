@@ -163,7 +163,7 @@ class EnvironmentMap(Background):
         return list(zip(texels, self.padded.split(self.levels.padded_sizes), strict=True))
 
     @torch.no_grad()
-    def fit(self, observed: Observed, past_weights: Float[Tensor, "T"]) -> Float[Tensor, "T"]:
+    def fit(self, observed: Observed, weights: Float[Tensor, "T"]) -> None:
         """Move the texels towards observed radiance, level by level from coarse to fine.
 
         A texel moves by the weighted mean of the residuals of its rays before the softplus. The mean includes residuals
@@ -172,34 +172,28 @@ class EnvironmentMap(Background):
 
         Args:
             observed: radiance from directions.
-            past_weights: weight of past observations of each texel.
-
-        Returns:
-            Weight of these observations of each texel: the sum over rays of bilinear weight times weight of the ray.
+            weights: weight of past observations of each texel, to which these are added: the sum over rays of bilinear
+                weight times weight of the ray.
         """
         face, coordinates = cube_map.project(observed.directions.float())
         # Darker radiance counts as that of the smallest step of 8-bit images.
         residual = _raw(observed.radiance.clamp(min=1 / 255 / 12.92)) - self._raw_at(face, coordinates)
         residual = torch.where(observed.saturated, residual.clamp(min=0), residual)
-        total = []
-        levels = zip(
-            self.levels.resolutions, self.texels_of_levels(), past_weights.split(self.levels.sizes), strict=True
-        )
-        for n, (values, of_level), earlier in levels:
+        levels = zip(self.levels.resolutions, self.texels_of_levels(), weights.split(self.levels.sizes), strict=True)
+        for n, (values, of_level), total in levels:
             # A ray contributes to levels of which it is at most two texels wide.
-            wide = observed.widths > math.pi / n
-            weights = observed.weights.masked_fill(wide, 0)[:, None].expand(-1, 3)
+            of_rays = observed.weights.masked_fill(observed.widths > math.pi / n, 0)[:, None].expand(-1, 3)
             with torch.enable_grad():
                 texels = values.detach().requires_grad_()
                 interpolated = cube_map.lookup(face, coordinates, texels, of_level, (n,))
             # The finest level has most of the memory of a run, so it exists as few times as possible.
-            counts = torch.autograd.grad(interpolated, texels, weights, retain_graph=True)[0][:, 0].clone()
-            change = torch.autograd.grad(interpolated, texels, weights * residual)[0]
-            change /= (counts + earlier).add_(1)[:, None]
+            total += torch.autograd.grad(interpolated, texels, of_rays, retain_graph=True)[0][:, 0]
+            change = torch.autograd.grad(interpolated, texels, of_rays * residual)[0]
+            for change_of_face, total_of_face in zip(change.chunk(6), total.chunk(6), strict=True):
+                change_of_face /= (total_of_face + 1)[:, None]
             values += change
             residual -= cube_map.lookup(face, coordinates, change, of_level, (n,))
-            total.append(counts)
-        return torch.cat(total)
+            del change
 
     @torch.no_grad()
     def to_lat_long(self, height: int) -> Float[Tensor, "H 2*H 3"]:

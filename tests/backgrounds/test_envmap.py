@@ -39,7 +39,7 @@ def test_fitted_texels_are_the_mean_of_all_rays_and_one_zero_residual() -> None:
     radiance, weights = torch.rand(3, 96, 3, generator=generator), torch.rand(3, 96, generator=generator)
     past = torch.zeros(96)
     for values, of_ray in zip(radiance, weights, strict=True):
-        past += background.fit(Observed(directions, values, values >= 1, of_ray, torch.zeros(96)), past)
+        background.fit(Observed(directions, values, values >= 1, of_ray, torch.zeros(96)), past)
     torch.testing.assert_close(past, weights.sum(0))
     raw = torch.log(torch.expm1(radiance.sqrt() * 2 * math.log(2)))  # of a texel that one ray has seen
     expected = (weights[..., None] * raw).sum(0) / (weights.sum(0) + 1)[:, None]
@@ -56,7 +56,7 @@ def test_fit_has_the_finest_level_in_memory_as_few_times_as_possible() -> None:
     events = [event for event in profile.profiler.kineto_results.events() if event.name() == "[memory]"]
     changes = [event.nbytes() for event in sorted(events, key=lambda event: event.start_ns())]
     assert changes
-    assert max(itertools.accumulate(changes)) < 2 * background.texels.nbytes
+    assert max(itertools.accumulate(changes)) < 1.2 * background.texels.nbytes
 
 
 def test_wide_cones_do_not_change_fine_levels() -> None:

@@ -118,7 +118,6 @@ class BackgroundSteps(Phase):
         state["weights"] = state["weights"].to(background.texels.device)
         if part == 0:
             state["weights"].zero_()
-            return_freed_memory()  # of training steps, because fits have tensors of other sizes
         num_pixels, settings = run.batches.num_pixels, self.settings
         most_pixels = min(num_pixels, settings.max_pixels * background.levels.sizes[-1])
         fits_per_step = math.ceil(most_pixels / (self.steps * settings.max_fitted_pixels))
@@ -137,8 +136,9 @@ class BackgroundSteps(Phase):
                 chunks = used.split(run.renderer.chunk_size)
                 parts += [_observe_through_object(run, chunk, settings.min_background) for chunk in chunks]
             observed = Observed.joined(parts)
-            del beside, rays, parts  # the fit needs their memory
-            state["weights"] += background.fit(observed, state["weights"])
+            del beside, rays, parts
+            return_freed_memory()  # a fit has tensors of other sizes than rays and training steps
+            background.fit(observed, state["weights"])
         return True
 
     def _spacing(self, run: TrainingRun, num_crossing: int, number_of_pass: int) -> int:
