@@ -58,11 +58,10 @@ class CubeLevels:
 
 def project(directions: Float[Tensor, "P 3"]) -> tuple[Int[Tensor, "P"], Float[Tensor, "P 2"]]:
     """Return the face that a direction hits and the texture coordinates in [-1, 1], which are linear in angle."""
-    axis = directions.abs().argmax(-1, keepdim=True)
-    main = directions.gather(-1, axis)
-    across = directions.gather(-1, torch.cat([axis + 1, axis + 2], dim=-1) % 3)
-    face = 2 * axis + (main < 0)
-    return face.squeeze(-1), torch.atan(across / main.abs()) * (4 / math.pi)
+    axis = directions.abs().argmax(-1)
+    order = constant(((0, 1, 2), (1, 2, 0), (2, 0, 1)), directions.device).index_select(0, axis)
+    main, across = directions.gather(-1, order).split((1, 2), -1)
+    return 2 * axis + (main[:, 0] < 0), torch.atan(across / main.abs()) * (4 / math.pi)
 
 
 def unproject(face: Int[Tensor, "P"], coordinates: Float[Tensor, "P 2"]) -> Float[Tensor, "P 3"]:
@@ -130,21 +129,22 @@ def lookup_in_torch(
     """
     levels = CubeLevels(tuple(resolutions))
     padded_offsets = tuple(sum(levels.padded_sizes[:level]) for level in range(len(resolutions)))
-    resolution, offset, padded_offset = (
-        constant(values, texels.device) for values in (levels.resolutions, levels.offsets, padded_offsets)
+    widths, ends = tuple(n + 2 for n in resolutions), tuple(((0, n),) for n in resolutions)
+    width, end, offset, padded_offset = (
+        constant(values, texels.device) for values in (widths, ends, levels.offsets, padded_offsets)
     )
+    half = constant(tuple((0.5 * n,) for n in resolutions), texels.device, coordinates.dtype)
     # Axes are points, levels, and (column, row) or the four texels around a point, of which the first two share a row.
-    position = (coordinates[:, None] + 1) * (0.5 * resolution[:, None]) + 0.5  # in padded texels, with integer centres
-    corner = torch.minimum(position.long().clamp(min=0), resolution[:, None])
+    position = (coordinates[:, None] + 1) * half + 0.5  # in padded texels, with integer centres
+    corner = torch.minimum(position.long().clamp(min=0), end[..., 1])
     fraction, (column, row) = position - corner, corner.unbind(-1)
     sides = torch.stack([1 - fraction, fraction], dim=-1)
     weights = (sides[:, :, 1, :, None] * sides[:, :, 0, None]).flatten(-2)
     # Where three faces meet, the missing fourth texel is the mean of the three.
-    ends = torch.stack([corner == 0, corner == resolution[:, None]], dim=-1)
-    missing = (ends[:, :, 1, :, None] & ends[:, :, 0, None]).flatten(-2)
+    at_end = corner[..., None] == end
+    missing = (at_end[:, :, 1, :, None] & at_end[:, :, 0, None]).flatten(-2)
     absent = (weights * missing).sum(-1, keepdim=True)
     weights = torch.where(missing, 0.0, weights + absent / 3)
-    width = resolution + 2
     first = padded_offset + (face[:, None] * width + row) * width + column
     index = first[..., None] + constant(tuple((0, 1, n + 2, n + 3) for n in levels.resolutions), texels.device)
     texel = padded.index_select(0, index.flatten()).view(index.shape) + offset[:, None]

@@ -149,12 +149,14 @@ class EnvironmentMap(Background):
         return 90 / max(self._groups[0].resolutions)
 
     def _raw_at(self, face: Int[Tensor, "P"], coordinates: Float[Tensor, "P 2"]) -> Float[Tensor, "P 3"]:
-        raw = torch.zeros_like(coordinates[:, :1])
         padded = self.padded.split([levels.num_padded for levels in self._groups])
-        for texels, of_group, levels in zip((self.texels, self.fitted_texels), padded, self._groups, strict=True):
-            if levels.resolutions:
-                raw = raw + cube_map.lookup(face, coordinates, texels, of_group, levels.resolutions)
-        return raw
+        groups = zip((self.texels, self.fitted_texels), padded, self._groups, strict=True)
+        raw, *finer = [
+            cube_map.lookup(face, coordinates, texels, of_group, levels.resolutions)
+            for texels, of_group, levels in groups
+            if levels.resolutions
+        ]
+        return sum(finer, start=raw)
 
     def texels_of_levels(self) -> list[tuple[Float[Tensor, "T 3"], Int[Tensor, " padded"]]]:
         """Return the raw values of each level, and the texels of the faces with margins (`cube_map.padded_texels`)."""
