@@ -176,9 +176,9 @@ FUNCTIONS = [
 MAX_LINES, MAX_ARGUMENTS = 60, 8
 # Objects of other libraries, which have no methods of ours.
 FOREIGN = {
-    "bar", "callback", "ctx", "extraction", "flags", "hydra_config", "log_gain", "logger", "main", "mapping",
-    "matching", "numba", "optimizer", "pairing", "parameter", "parent", "parser", "pycolmap", "reader", "sampled",
-    "session", "spec", "sys", "tensor", "trained", "trainer", "hydra", "BoundedFiles",
+    "bar", "callback", "ctx", "dispatcher", "extraction", "flags", "hydra_config", "log_gain", "logger", "main",
+    "mapping", "matching", "numba", "optimizer", "pairing", "parameter", "parent", "parser", "pycolmap", "reader",
+    "sampled", "session", "spec", "sys", "tensor", "trained", "trainer", "hydra", "BoundedFiles",
 }  # fmt: skip
 
 

@@ -85,9 +85,9 @@ def _compile(function: Function, parallel: bool, allocates: bool = True) -> Func
         if shutil.disk_usage(folder).free < _KERNEL_BYTES:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]  # read while the function's cache is made
-        kernel = numba.njit(**options)(function)
-        kernel._cache = _MachineCode(function)
-        return kernel
+        dispatcher = numba.njit(**options)(function)
+        dispatcher._cache = _MachineCode(function)
+        return dispatcher
     except (RuntimeError, OSError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         _warn_of_compiling(base, "NUMBA_CACHE_DIR" if configured else "NERFRO_CACHE", reason)
