@@ -75,7 +75,7 @@ class RayTracer:
             pixels: pixels of a step, on the CPU.
         """
         tracer = self
-        if self._renderer.kernels_trace and self._renderer.scene.device.type != "cpu":
+        if self._renderer.traces_on_cpu and self._renderer.scene.device.type != "cpu":
             self._host = self._host or HostRenderer(self._renderer)
             tracer = RayTracer(self._host.updated(), self.subdivision)
         return transfer(tracer._trace(pixels), self._renderer.scene.device)

@@ -202,8 +202,8 @@ class Renderer(Component, nn.Module, ABC):
         return any(parameter.requires_grad for parameter in parameters)
 
     @property
-    def kernels_trace(self) -> bool:
-        """Whether compiled kernels trace all paths, which depend on nothing that gradient descent learns."""
+    def traces_on_cpu(self) -> bool:
+        """Whether batches are made on the CPU for any device: paths depend on nothing that gradient descent learns."""
         return not self.paths_learn and self.path_sampler.releases_gil(self.scene.medium)
 
     @torch.inference_mode()

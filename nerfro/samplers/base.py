@@ -74,9 +74,10 @@ class PathSampler(nn.Module, ABC):
         return torch.ones_like(path.refracted)
 
     def releases_gil(self, medium: Medium) -> bool:
-        """Return whether compiled kernels trace, which release the global interpreter lock, so that other threads run.
+        """Return whether tracing on the CPU hardly holds the global interpreter lock, so that other threads run.
 
-        A training on another device then traces on the CPU, with copies of the medium and of the samplers.
+        This is true of compiled kernels and of a few operators. Batches of a training on another device are then made
+        on the CPU, with copies of the medium and of the samplers.
         """
         return False
 
@@ -114,7 +115,8 @@ class PointSampler(Component, nn.Module, ABC):
         """Return the samples of the first level of a traced path, or None to choose them in the step.
 
         A thread may choose the samples of the next step during a step, so they may depend on the state that
-        `update` updates, but on no learned parameter.
+        `update` updates, but on no learned parameter. This state is in buffers, because batches of a training on
+        another device are made by a copy on the CPU.
         """
         return None
 

@@ -30,7 +30,7 @@ _LARGE = 100_000
 class RayDataModule(LightningDataModule):
     """Random training pixels and one validation view at a time.
 
-    All components take training pixels from `batches`, so that there is one copy.
+    All components take training pixels from `batches`.
 
     Each validation (`validation_interval`) evaluates the validation pixels, and every fifth one also renders a view.
 
@@ -213,7 +213,7 @@ def multiplies_large_matrices(renderer: Renderer) -> bool:
 def can_prefetch(renderer: Renderer) -> bool:
     """Return whether a thread can trace the rays of the next step: no parameter changes paths, and a core is free."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return cores > 1 and renderer.kernels_trace
+    return cores > 1 and renderer.traces_on_cpu
 
 
 def validation_interval(every: int) -> int:

@@ -122,7 +122,7 @@ def test_paths_are_not_prefetched_if_they_learn_or_need_python(ball: Bodies, mon
         renderer = Mock(
             spec=Renderer, path_sampler=path_sampler, scene=Mock(spec=Scene, medium=ball), paths_learn=learns
         )
-        renderer.kernels_trace = Renderer.kernels_trace.fget(renderer)  # type: ignore[attr-defined]
+        renderer.traces_on_cpu = Renderer.traces_on_cpu.fget(renderer)  # type: ignore[attr-defined]
         return renderer
 
     assert can_prefetch(model(Snell()))
