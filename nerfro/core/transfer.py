@@ -18,7 +18,7 @@ _ALIGNMENT = 16  # bytes; vectorized kernels load this many at once
 def transfer(value: Value, device: torch.device) -> Value:
     """Send all tensors of nested dataclasses and mappings from the CPU to a device in a single copy.
 
-    The host does not wait for the copy. Tensors that are already on the device are kept.
+    With CUDA, the host does not wait for the copy. Tensors that are already on the device are kept.
 
     Args:
         value: dataclass, mapping or tensor, without gradients on the CPU.
@@ -56,10 +56,12 @@ def _send(tensors: list[Tensor], device: torch.device) -> list[Tensor]:
     dense = [tensor[tuple(slice(None if step else 1) for step in tensor.stride())] for tensor in tensors]
     ends = list(accumulate(-(-tensor.nbytes // _ALIGNMENT) * _ALIGNMENT for tensor in dense))
     parts = [slice(start, start + tensor.nbytes) for start, tensor in zip([0, *ends], dense, strict=False)]
-    buffer = torch.empty(ends[-1], dtype=torch.uint8, pin_memory=torch.cuda.is_available())
+    # The allocator of pinned memory does not use the buffer again before the copy ends. Other devices have none.
+    on_cuda = device.type == "cuda"
+    buffer = torch.empty(ends[-1], dtype=torch.uint8, pin_memory=on_cuda and torch.cuda.is_available())
     for tensor, part in zip(dense, parts, strict=True):
         buffer[part].view(tensor.dtype).view(tensor.shape).copy_(tensor)
-    there = buffer.to(device, non_blocking=True)
+    there = buffer.to(device, non_blocking=on_cuda)
     return [
         there[part].view(own.dtype).view(own.shape).expand(tensor.shape)
         for tensor, own, part in zip(tensors, dense, parts, strict=True)

@@ -17,6 +17,7 @@ from nerfro.core.cameras import Window, central_window
 from nerfro.core.distributed import share_of
 from nerfro.core.draws import Draws
 from nerfro.core.errors import NerfroError, warn
+from nerfro.core.transfer import transfer
 from nerfro.core.types import Pixels
 from nerfro.data.base import Views
 from nerfro.data.pixel_store import PixelStore
@@ -149,7 +150,7 @@ class PixelBatches:
         if usable is not None:
             view, pixel = usable.find(numbers)
             numbers = view * window.height * window.width + pixel
-        return self._to_device(numbers)
+        return transfer(torch.from_numpy(numbers), self.cameras.device)
 
     def of_each_view(self, num_pixels: int, step: int) -> Int[Tensor, "V Q"]:
         """Draw random usable pixels of every view; for a view without usable pixels, the first pixel is returned."""
@@ -164,14 +165,12 @@ class PixelBatches:
             drawn = generator.integers(np.maximum(counts, 1), size=shape) + usable.starts[:-1, None]
             _, within = usable.find(np.minimum(drawn, usable.starts[-1] - 1).ravel())
             within = np.where(counts > 0, within.reshape(shape), 0)
-        return self._to_device(within + size * np.arange(len(cameras))[:, None])
+        numbers = within + size * np.arange(len(cameras))[:, None]
+        return transfer(torch.from_numpy(numbers), cameras.device)
 
     def photographed(self, pixels: Int[Tensor, "Q"]) -> Float[Tensor, "Q 3"]:
         """Return the colours of pixels by number (view, row, column), sRGB in [0, 1]."""
         return self._pixels[pixels.cpu()].to(pixels.device)
-
-    def _to_device(self, array: np.ndarray) -> Tensor:
-        return torch.from_numpy(array).to(self.cameras.device, non_blocking=True)
 
     def _draw(self, generator: np.random.Generator, window: Window) -> tuple[np.ndarray | np.int64, np.ndarray]:
         """Draw views, and pixels of the window by number (row, column)."""
