@@ -21,7 +21,7 @@ from typing import Any, TypeVar, cast
 
 import numba
 import torch
-from numba.core.caching import FunctionCache
+from numba.core.caching import FunctionCache, IndexDataCacheFile
 
 from nerfro.core.errors import warn
 from nerfro.core.paths import cache_dir
@@ -96,18 +96,28 @@ def _compile(function: Function, parallel: bool, allocates: bool = True) -> Func
         numba.config.CACHE_DIR = configured  # type: ignore[attr-defined]
 
 
-class _MachineCode(FunctionCache):
-    """Machine code of a function on disk, which is compiled again if a class of its arguments has moved.
+class _Index(IndexDataCacheFile):
+    """Index of the machine code of a function, which is empty if a class of its arguments has moved.
 
-    The index of the code names classes with their modules, and a kernel need not import the classes of its arguments.
+    The index names classes with their modules, and a kernel need not import the classes of its arguments.
     """
 
-    def load_overload(self, sig: Any, target_context: Any) -> Any:
+    def _load_index(self) -> Any:
         try:
-            return super().load_overload(sig, target_context)
+            return super()._load_index()
         except (ImportError, AttributeError):
-            self.flush()
-            return None
+            return {}
+
+
+class _MachineCode(FunctionCache):
+    """Machine code of a function on disk."""
+
+    def __init__(self, function: Callable) -> None:
+        super().__init__(function)
+        implementation = self._impl
+        self._cache_file = _Index(
+            self._cache_path, implementation.filename_base, implementation.locator.get_source_stamp()
+        )
 
 
 @functools.cache
