@@ -17,7 +17,8 @@ from nerfro.samplers.subdivision import Subdivision, contrast, divergence, neigh
 def render_view(renderer: Renderer, cameras: Cameras, view: int, subdivision: Subdivision) -> RenderedRays:
     """Render all pixels of one view, row by row; radiance is the mean over the rays of divided pixels."""
     rendered = renderer.render(cameras.image_rays(view))
-    if subdivision.side == 1:
+    straight = not renderer.path_sampler.needs_medium  # such rays diverge by at most 1
+    if subdivision.side == 1 or (straight and subdivision.divergence > 1 and subdivision.contrast is None):
         return rendered
     size = cameras.height * cameras.width
     pixels = torch.arange(view * size, (view + 1) * size, device=cameras.device)
