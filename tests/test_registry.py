@@ -92,10 +92,20 @@ def test_missing_required_field_is_named() -> None:
     refused(r"data=opencv needs root; add data\.root=\.\.\.", configure, find("data", "opencv"), {})
 
 
-@pytest.mark.parametrize("target", ["os.system", "nerfro.paper.eikonal.march_uniform", None])
-def test_target_that_is_not_registered_is_not_built(target: str | None, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("target", "advice"),
+    [
+        ("os.system", "; .*nerfro.plugins"),
+        (None, "; .*nerfro.plugins"),
+        (
+            "nerfro.paper.eikonal.march_uniform",
+            " in this version of nerfro; for a run of another version, .*train again",
+        ),
+    ],
+)
+def test_target_that_is_not_registered_is_not_built(target: str | None, advice: str, tmp_path: Path) -> None:
     node = {"_target_": target, "command": f"touch {tmp_path / 'ran'}"}
-    refused(f"'{target}' is not registered; .*nerfro.plugins", build, node)
+    refused(f"'{target}' is not registered{advice}", build, node)
     assert not (tmp_path / "ran").exists()
 
 

@@ -258,6 +258,11 @@ def plugin_of(node: DictConfig) -> Plugin:
     target = str(node.get("_target_"))
     plugin = next((plugin for plugin in _plugins.values() if plugin.target == target), None)
     if plugin is None:
+        if target.startswith("nerfro."):
+            raise NerfroError(
+                f"'{target}' is not registered in this version of nerfro; for a run of another version, install that "
+                "version or train again"
+            )
         raise NerfroError(
             f"'{target}' is not registered; `python -m nerfro.plugins` lists the registered classes; "
             "for a class in a local folder, set NERFRO_PLUGINS=DIR or start beside its plugins/"
