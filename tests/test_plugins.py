@@ -105,10 +105,22 @@ def too_few(_: nn.Module, samples: types.Samples) -> types.FieldValues:
 @pytest.mark.parametrize(
     ("base", "forward", "message"),
     [
-        (Field, tuples, r"Broken\.forward in .*test_plugins\.py returned a tuple; return FieldValues with density"),
+        (
+            Field,
+            tuples,
+            r"Broken\.forward in .*test_plugins\.py returned a tuple; return FieldValues with density \[P, N\]",
+        ),
         (Field, too_few, r"returned a FieldValues of other shapes; return FieldValues with density"),
-        (Background, lambda _, exits: exits.directions[..., :1], r"returned a Tensor of shape .*; return radiance"),
-        (PointSampler, lambda _, path, previous, draws=None: None, "returned a NoneType; return Samples on all"),
+        (
+            Background,
+            lambda _, exits: exits.directions[..., :1],
+            r"returned a Tensor of shape .*; return radiance \[\.\.\., 3\] in",
+        ),
+        (
+            PointSampler,
+            lambda _, path, previous, draws=None: None,
+            "returned a NoneType; return Samples on all polylines",
+        ),
         (PathSampler, lambda _, rays, medium: example_path(4), "returned a Path of other shapes; return a Path with"),
     ],
 )
@@ -257,8 +269,18 @@ def test_medium_of_varying_index_keeps_its_contract(members: dict[str, object]) 
         ("phase", Phase, phase(overflow), "parameters are finite after a step"),
         ("phase", Phase, phase(noise), "random numbers of a step depend on its number"),
         ("phase", Phase, phase(lambda parameter: parameter.typo), "phase=broken raised AttributeError"),
-        ("sampler/path", PathSampler, {"forward": lambda *_: None}, "returned a NoneType; return a Path with"),
-        ("phase", Phase, phase(steps_before=lambda _, step: step % 5), "returned 4 before step 4 and 0 before step 5"),
+        (
+            "sampler/path",
+            PathSampler,
+            {"forward": lambda *_: None},
+            "returned a NoneType; return a Path with a polyline for each ray",
+        ),
+        (
+            "phase",
+            Phase,
+            phase(steps_before=lambda _, step: step % 5),
+            "steps_before is cumulative: it returned 4 before step 4 and 0 before step 5",
+        ),
         ("sampler/points", PointSampler, {"forward": outside_of_edges, "num_levels": 1}, "lie between their edges"),
         ("data", DataSource, {"load": None, "splits": ["train"]}, "has the attribute `root`"),
     ],

@@ -74,7 +74,8 @@ def test_evaluation_draws_the_same_vertex_of_each_group(bent: Path, offset: floa
 
 
 def test_vertices_that_cannot_be_shared_out_evenly_are_refused(bent: Path) -> None:
-    with pytest.raises(NerfroError, match=r"multiple of 7 path vertices, this path has 48"):
+    message = r"multiple of 7 path vertices, this path has 48; set sampler\.path\.num_steps"
+    with pytest.raises(NerfroError, match=message):
         Stratified(7, draw="vertices")(bent, None)
 
 

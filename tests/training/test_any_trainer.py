@@ -61,7 +61,8 @@ def test_score_that_is_never_computed_and_data_that_are_missing_are_refused(
     trainer = lightning.Trainer(max_steps=2, logger=False, callbacks=[EarlyStopping("val/psnr")], **QUIET)
     refused("needs pixels and views; add datamodule=data", trainer.fit, module, [0])
     data.validation = None
-    refused(r"EarlyStopping monitors val/psnr, but the run has no validation", trainer.fit, module, datamodule=data)
+    message = "EarlyStopping monitors val/psnr, but the run has no validation; give"
+    refused(message, trainer.fit, module, datamodule=data)
     data._load_test = None
     refused("the data have no test views", trainer.test, module, datamodule=data, verbose=False)
 

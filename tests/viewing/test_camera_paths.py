@@ -153,7 +153,8 @@ def test_size_without_keys_is_that_of_the_images_or_refused_for_lengths_in_pixel
     file, pose = tmp_path / "transforms.json", torch.eye(4).tolist()
     document = {"fl_x": 80.0, "frames": [{"file_path": "r_0", "transform_matrix": pose}]}
     file.write_text(json.dumps(document))
-    refused("has fl_x in pixels, but neither w and h nor the image of its first frame", read_cameras, file, around)
+    message = "has fl_x in pixels, but neither w and h nor the image of its first frame; add w"
+    refused(message, read_cameras, file, around)
     Image.new("RGB", (64, 36)).save(tmp_path / "r_0.png")
     cameras = read_cameras(file, around)
     assert (cameras.width, cameras.height, float(cameras.fx), float(cameras.cx)) == (64, 36, 80, 32)
