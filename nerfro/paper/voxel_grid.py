@@ -13,7 +13,6 @@ from torch import Tensor
 from torch.nn.functional import max_pool3d
 
 from nerfro.core.errors import NerfroError
-from nerfro.core.types import Batch, Exits, Rendering
 from nerfro.files.cache import cached_arrays, content_hash
 from nerfro.geometry.interpolation import neighbours, smooth, trilinear
 from nerfro.geometry.mesh import local_origin, require_inside
@@ -23,13 +22,11 @@ from nerfro.geometry.space import corners_of_box
 from nerfro.kernels.available import require_bytes
 from nerfro.kernels.constants import constant
 from nerfro.kernels.operators import arrays
-from nerfro.losses.base import Loss
 from nerfro.media.base import Medium, Scalars, Vectors
 from nerfro.media.bodies import BYTES_PER_VERTEX, check_margin
 from nerfro.media.surfaces import MeshSurface
 from nerfro.registry.allowed import Positive, Resolution
 from nerfro.registry.registration import register
-from nerfro.rendering import Scene
 
 # Part of the cache key. Increase it when the same mesh and settings give different fractions.
 _VERSION = 1
@@ -193,28 +190,3 @@ def _clearance_of(
     distance = distance_to_set(varies.numpy(), cell) - np.linalg.norm(cell)
     diagonal = float(torch.linalg.vector_norm(box[1] - box[0]))
     return torch.from_numpy(distance.clip(0, diagonal)).to(table)
-
-
-@register("loss", "smoothness")
-class Smoothness(Loss):
-    """Penalize squared differences of the background colour between neighbouring directions (paper, Eqn. 9).
-
-    Args:
-        tile_size: side in pixels of a random window of a random training view, whose viewing directions are compared.
-    """
-
-    start = 2500
-
-    def __init__(self, tile_size: Annotated[int, Ge(2)] = 128) -> None:
-        super().__init__()
-        self.tile_size = tile_size
-
-    def forward(self, renderings: list[Rendering], batch: Batch, scene: Scene) -> Float[Tensor, ""]:
-        return tile_roughness(
-            scene.colour_space.to_srgb(scene.background(Exits(batch.cameras.tile(self.tile_size, batch.draws))))
-        )
-
-
-def tile_roughness(rgb: Float[Tensor, "H W 3"]) -> Float[Tensor, ""]:
-    """Average the mean squared differences of horizontal and of vertical neighbours."""
-    return 0.5 * (rgb[:, 1:] - rgb[:, :-1]).square().mean() + 0.5 * (rgb[1:] - rgb[:-1]).square().mean()

@@ -21,7 +21,7 @@ from nerfro.losses.terms import (
     distortion,
 )
 from nerfro.models.refractive import RefractiveModel
-from nerfro.paper.voxel_grid import Smoothness, tile_roughness
+from nerfro.paper.losses import Smoothness, tile_roughness
 from nerfro.registry.registration import create, discover, find
 from nerfro.rendering import ColourSpace, Renderer, Scene
 from nerfro.samplers.points.stratified import point_samples
