@@ -5,10 +5,11 @@ import math
 import pytest
 import torch
 
+from nerfro.core.compositing import volume_weights
 from nerfro.core.types import FieldValues, Path, Samples
 from nerfro.rendering import composite
 from nerfro.samplers.base import straight_path
-from nerfro.samplers.points.stratified import Stratified, volume_weights
+from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import NUM_RAYS, example_path, example_rays, example_samples
 from tests.closed_forms import Ball, beam
 from tests.reference_tracer import Snell

@@ -1,4 +1,4 @@
-"""The renderer: traces rays, samples their paths, queries the fields and composites radiance."""
+"""The renderer, which traces rays and samples their paths; models derive from it and render the paths."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from nerfro.backgrounds.base import Background
 from nerfro.camera.base import CameraModel, GivenCamera
 from nerfro.core.light import Colour, ColourSpace
 from nerfro.core.rays import Rays
-from nerfro.core.types import Batch, Exits, FieldValues, Path, Rendering, Samples
+from nerfro.core.types import Batch, Exits, Path, Rendering, Samples
 from nerfro.data.component import Component
 from nerfro.fields.base import Field
 from nerfro.geometry.interpolation import intersect_box
@@ -28,7 +28,6 @@ from nerfro.registry.allowed import validated
 from nerfro.rendering.scene import Scene
 from nerfro.samplers.base import PathSampler, PointSampler
 from nerfro.samplers.paths.replay import first_normals
-from nerfro.samplers.points.stratified import volume_weights
 
 Result = TypeVar("Result")
 
@@ -282,31 +281,3 @@ class Renderer(Component, nn.Module, ABC):
             meets |= (enter <= leave) & (leave >= 0)
         meets[path.ray[path.refracted]] = True
         return meets
-
-
-def composite(
-    samples: Samples, field_values: FieldValues, background_radiance: Float[Tensor, "P 3"], path: Path
-) -> Rendering:
-    """Composite one sampling level: C = sum_i w_i c_i + T_{N+1} C'(d_N) (paper, Eqn. 5).
-
-    The radiance of a ray is the sum over its polylines. In absorbing media, the radiance of samples and of the
-    background is multiplied by the transmittance of the medium.
-
-    Args:
-        samples: N samples on each of P polylines.
-        field_values: density [P, N] per world unit, and radiance [P, N, 3] of the samples.
-        background_radiance: background radiance in the exit direction of each polyline.
-        path: the polylines of R rays.
-
-    Returns:
-        Radiance [R, 3] of the rays, with the weights and the transmittance of the polylines.
-    """
-    # Sums over a ray stay in single precision.
-    density, radiance = field_values.density.float(), field_values.radiance.float()
-    weights, transmittance = volume_weights(density, samples.deltas)
-    background_radiance = background_radiance.float()
-    if path.absorbs:
-        radiance = radiance * path.transmitted(samples.s)
-        background_radiance = background_radiance * path.transmitted(path.far[:, None])[:, 0]
-    radiance = (weights[..., None] * radiance).sum(-2) + transmittance[:, None] * background_radiance
-    return Rendering(path.sum_polylines(radiance), weights, transmittance, background_radiance, samples, path)

@@ -13,6 +13,7 @@ from annotated_types import Ge, Gt, Le
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from nerfro.core.compositing import volume_weights
 from nerfro.core.draws import Draws
 from nerfro.core.types import Path, Rendering, Samples
 from nerfro.fields.base import Field
@@ -22,7 +23,7 @@ from nerfro.kernels.threads import share_parts
 from nerfro.registry.allowed import Count, Share
 from nerfro.registry.registration import register
 from nerfro.samplers.base import PointSampler
-from nerfro.samplers.points.stratified import invert_cdf, midpoints, spread_uniform, volume_weights
+from nerfro.samplers.points.stratified import invert_cdf, midpoints, spread_uniform
 
 # Smallest optical depth, predicted by the grid, of samples at which the field is queried.
 _EMPTY = 0.005

@@ -16,24 +16,10 @@ from nerfro.geometry.space import Space, Unbounded
 from nerfro.registry.registration import register
 from nerfro.samplers.base import PointSampler
 
-
-def volume_weights(
-    density: Float[Tensor, "P N"], deltas: Float[Tensor, "P N"]
-) -> tuple[Float[Tensor, "P N"], Float[Tensor, "P"]]:
-    """Compute the weights w_i = T_i (1 - exp(-sigma_i delta_i)) and the transmittance T_{N+1} (paper, Eqn. 1).
-
-    Args:
-        density: density per world unit.
-        deltas: interval lengths in world units.
-
-    Returns:
-        Weights and transmittance, which sum to one on every ray.
-    """
-    optical_depth = density * deltas
-    total = optical_depth.cumsum(-1)
-    transmittance = torch.exp(-torch.cat([torch.zeros_like(total[:, :1]), total], dim=-1))
-    weights = -torch.expm1(-optical_depth) * transmittance[:, :-1]
-    return weights, transmittance[:, -1]
+# Width of the interval of the last point sample, behind which the background is seen: in world units for
+# `draw=vertices`, as in the authors' code, and relative to the length of the path for other arc lengths.
+LAST_DELTA = 1e-3
+LAST_FRACTION = LAST_DELTA / 4  # rays of the authors' scenes are 4 units long
 
 
 def spread_uniform(path: Path, num_samples: int, draws: Draws | None, stream: str = "samples") -> Float[Tensor, "P N"]:
@@ -80,12 +66,6 @@ def invert_cdf(
 def midpoints(edges: Float[Tensor, "*rows E"]) -> Float[Tensor, "*rows E-1"]:
     """Return the middle of each interval."""
     return 0.5 * (edges[..., 1:] + edges[..., :-1])
-
-
-# Width of the interval of the last point sample, behind which the background is seen: in world units for
-# `draw=vertices`, as in the authors' code, and relative to the length of the path for other arc lengths.
-LAST_DELTA = 1e-3
-LAST_FRACTION = LAST_DELTA / 4  # rays of the authors' scenes are 4 units long
 
 
 @register("sampler/points", "stratified")
