@@ -18,8 +18,9 @@ from .media.surfaces import BallSurface, MeshSurface
 from .models.refractive import RefractiveModel
 from .optimizers.config import GroupConfig, OptimizerConfig
 from .pipeline.evaluate import evaluate
+from .pipeline.export import export
 from .pipeline.reconstruct import reconstruct
-from .pipeline.scenes import export, render
+from .pipeline.render import render
 from .poses.calibrate import calibrate
 from .rendering.renderer import Components
 from .rendering.scene_file import SceneFile

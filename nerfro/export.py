@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
 from nerfro.cli.entry import entry_point
-from nerfro.pipeline.scenes import export
+from nerfro.pipeline.export import export
 from nerfro.viewing.exports import ExportConfig
 
 

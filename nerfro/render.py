@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
 from nerfro.cli.entry import entry_point
-from nerfro.pipeline.scenes import render
+from nerfro.pipeline.render import render
 from nerfro.viewing.render_request import RenderConfig
 
 

@@ -25,9 +25,9 @@ from nerfro.evaluation.results import read_metrics_json
 from nerfro.files.atomic import lock_folder, write_atomically
 from nerfro.files.images import save_image
 from nerfro.masks.segment import segment
+from nerfro.pipeline.export import export
 from nerfro.pipeline.hypotheses import Hypothesis, hypotheses, worth_a_trial
 from nerfro.pipeline.options import ReconstructConfig, common_options, have_poses
-from nerfro.pipeline.scenes import export
 from nerfro.pipeline.stage import Stage, is_older, move_aside
 from nerfro.pipeline.trials import PICTURE, Trial, decide, draw_trials, validation_views
 from nerfro.poses.calibrate import calibrate

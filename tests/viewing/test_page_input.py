@@ -213,7 +213,7 @@ def save(browser: Browser, button: str, file: Path) -> None:
 def test_film_of_key_views_is_played_saved_and_rendered(
     page: str, scene: TrainedScene, run_here: Runner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("nerfro.pipeline.scenes.load", lambda run, device, root: scene)
+    monkeypatch.setattr("nerfro.pipeline.render.load", lambda run, device, root: scene)
     (tmp_path / "a.ckpt").write_bytes(b"scene")
     monkeypatch.chdir(tmp_path)
     with Browser(page, tmp_path, size=(400, 300)) as browser:

@@ -31,7 +31,7 @@ from tests.conftest import Runner, refused
 def render(scene: TrainedScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run_here: Runner) -> Runner:
     """The entry point in this process, on the scene in closed form."""
     (tmp_path / "a.ckpt").write_bytes(b"scene")
-    monkeypatch.setattr("nerfro.pipeline.scenes.load", lambda run, device, root: scene)
+    monkeypatch.setattr("nerfro.pipeline.render.load", lambda run, device, root: scene)
     monkeypatch.chdir(tmp_path)
     return functools.partial(run_here, "render", "checkpoint=a.ckpt", "out=O", "resolution=16", "subdivision.side=1")
 
