@@ -1,4 +1,7 @@
-"""Interface of a data format: `DataSource` loads the `Views` of one split."""
+"""Interface of a data format: `DataSource` loads the `Views` of one split.
+
+`WithValidationViews` takes the validation views of any data set from its training views.
+"""
 
 from __future__ import annotations
 

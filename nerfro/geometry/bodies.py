@@ -1,4 +1,4 @@
-"""Connected closed surfaces of one mesh, and the checks for surfaces that cross each other or themselves."""
+"""Closed surfaces of meshes: connected surfaces, checks for crossings, and the thickness of walls."""
 
 from __future__ import annotations
 

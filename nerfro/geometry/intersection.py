@@ -1,4 +1,7 @@
-"""Intersection of rays and triangles with Embree's bounding volume hierarchy."""
+"""Intersection of rays and triangles: by Embree for calls from Python, and the tree of triangles that kernels search.
+
+Kernels cannot call Embree, so `TriangleTree` is a tree of bounding boxes in arrays.
+"""
 
 from __future__ import annotations
 

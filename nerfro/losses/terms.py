@@ -1,4 +1,4 @@
-"""Losses on the radiance of pixels and of the background, and on the density along paths."""
+"""Losses on the radiance and depth of pixels, on the background, and on the density along paths."""
 
 from __future__ import annotations
 

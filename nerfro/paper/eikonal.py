@@ -1,6 +1,7 @@
 """Paths of rays through a continuous refractive index, by the Eikonal equation d/ds (n dx/ds) = grad n.
 
 With v = n dx/ds the equation is x' = v / n, v' = grad n (paper, Eqn. 4), and |v| = n along every exact solution.
+The module has the integrators of one step, the path sampler, and the tracers with equal and with adaptive steps.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """Description of a scene: a glass body, coloured objects inside, and the surroundings.
 
-Surfaces are triangles with exact normals; some shapes are meshed without a distance field.
+Surfaces are triangles with exact normals. `rounded_box`, `sphere` and `torus_angles` mesh shapes without a distance
+field, and `lat_long_texture` draws the sky.
 """
 
 from __future__ import annotations

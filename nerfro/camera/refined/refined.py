@@ -1,7 +1,7 @@
 """Camera model that refines poses and lens during training, with motions in units of pixels.
 
 A similarity transformation of all cameras and the scene changes no image (gauge freedom). Its motions are removed from
-the refinement of cameras.
+the refinement of cameras, and `similarity` fits the transformation between two sets of cameras.
 """
 
 from __future__ import annotations
