@@ -114,10 +114,7 @@ class _MachineCode(FunctionCache):
 
     def __init__(self, function: Callable) -> None:
         super().__init__(function)
-        implementation = self._impl
-        self._cache_file = _Index(
-            self._cache_path, implementation.filename_base, implementation.locator.get_source_stamp()
-        )
+        self._cache_file = _Index(self._cache_path, self._impl.filename_base, self._impl.locator.get_source_stamp())
 
 
 @functools.cache
