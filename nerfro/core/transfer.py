@@ -24,6 +24,8 @@ def transfer(value: Value, device: torch.device) -> Value:
         value: dataclass, mapping or tensor, without gradients on the CPU.
         device: device of the result.
     """
+    if device.type == "cpu":
+        return value
     sent: dict[int, Tensor] = {}  # by identity, because paths share tensors with their rays
 
     def collect(tensor: Tensor) -> Tensor:
