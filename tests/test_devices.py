@@ -13,7 +13,7 @@ from nerfro.core.transfer import transfer
 from nerfro.core.types import Exits
 from nerfro.data.base import Views
 from nerfro.evaluation.render_view import render_view
-from nerfro.kernels.constants import constant
+from nerfro.kernels.constants import cached_constant
 from nerfro.media.bodies import Bodies
 from nerfro.registry.registration import build
 from nerfro.rendering import RayTracer
@@ -33,7 +33,7 @@ STEP = 100_000
 ADAPTIVE = ["sampler.path.integrator=adaptive", "sampler.path.max_steps=60", "sampler.points.draw=arc_length"]
 
 # A constant is copied to the device once. Fields are asked for samples in the object alone, whose number must be known.
-ONCE = "kernels/constants.py: constant (tensor)"
+ONCE = "kernels/constants.py: _constant (tensor)"
 SELECTED = "fields/base.py: evaluate_selected (nonzero)"
 
 
@@ -68,7 +68,7 @@ def test_training_and_rendering_stay_on_the_gpu(
     renderer = module.renderer
     # What is computed and kept while the model is on the CPU must move with it.
     renderer.render(views.cameras.image_rays(0))
-    constant.cache_clear()
+    cached_constant.cache_clear()
     with PretendedGpu() as gpu, warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*CUDA is not available.*")
         module.to(GPU)

@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import torch
@@ -34,24 +33,24 @@ class CubeLevels:
 
     resolutions: tuple[int, ...]  # texels along a face's side
 
-    @cached_property
+    @property
     def sizes(self) -> tuple[int, ...]:
         return tuple(6 * n * n for n in self.resolutions)
 
-    @cached_property
+    @property
     def padded_sizes(self) -> tuple[int, ...]:
         """Number of texels of each level with margins, see `padded_texels`."""
         return tuple(6 * (n + 2) ** 2 for n in self.resolutions)
 
-    @cached_property
+    @property
     def offsets(self) -> tuple[int, ...]:
         return tuple(sum(self.sizes[:level]) for level in range(len(self.resolutions)))
 
-    @cached_property
+    @property
     def num_texels(self) -> int:
         return sum(self.sizes)
 
-    @cached_property
+    @property
     def num_padded(self) -> int:
         return sum(self.padded_sizes)
 
@@ -253,7 +252,7 @@ def _backward_to_coordinates(face, coordinates, texels, padded, resolutions, gra
 _SCHEMA = "cube_lookup(Tensor face, Tensor coordinates, Tensor texels, Tensor padded, int[] resolutions)"
 _on_cpu = kernel_with_gradients(
     _SCHEMA,
-    lambda face, coordinates, texels, padded, resolutions: texels.new_zeros(len(face), 3),
+    lambda face, coordinates, texels, padded, resolutions: texels.new_zeros(face.shape[0], 3),
     _forward,
     {1: _backward_to_coordinates, 2: _gradient_of_texels},
 )

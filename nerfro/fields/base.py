@@ -1,4 +1,4 @@
-"""Base class of radiance fields, evaluation at selected samples, the activation of radiance, and compilation."""
+"""Base class of radiance fields, evaluation at selected samples, and the activation of radiance."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from nerfro.core.cameras import Cameras
-from nerfro.core.errors import NerfroError
 from nerfro.core.light import unbounded_radiance
 from nerfro.core.types import FieldValues, Samples
 from nerfro.data.component import Component, require_results
@@ -117,17 +116,3 @@ class _ClampBlack(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> Tensor:
         (raw,) = ctx.saved_tensors
         return torch.where((raw < _BLACK) & (gradient > 0), 0.0, gradient)
-
-
-class Network(nn.Module):
-    """Base class of networks that `compile=` compiles as a whole; a `Sequential` needs no base class."""
-
-
-def compile_networks(model: nn.Module, backend: str) -> None:
-    """Compile a model's networks in place with torch.compile, for any number of points."""
-    backends = torch.compiler.list_backends(exclude_tags=())
-    if backend not in backends:
-        raise NerfroError(f"compile={backend} is not a backend of torch.compile; set one of {', '.join(backends)}")
-    for module in model.modules():
-        if isinstance(module, (Network, nn.Sequential)):
-            module.compile(backend=backend, dynamic=True)

@@ -15,7 +15,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import torch
@@ -54,16 +53,16 @@ class GridLevels:
     resolutions: tuple[int, ...]  # cells along the side of the unit cube
     sizes: tuple[int, ...]  # entries of each level; a power of two for hashed levels
 
-    @cached_property
+    @property
     def offsets(self) -> tuple[int, ...]:
         """First entry of each level."""
         return tuple(sum(self.sizes[:level]) for level in range(len(self.sizes)))
 
-    @cached_property
+    @property
     def num_entries(self) -> int:
         return sum(self.sizes)
 
-    @cached_property
+    @property
     def dense(self) -> tuple[bool, ...]:
         return tuple((n + 1) ** 3 <= size for n, size in zip(self.resolutions, self.sizes, strict=True))
 

@@ -74,7 +74,7 @@ class _ReluMLP(torch.autograd.Function):
         ctx.parts, ctx.weight_dtype = [(part.shape[1], part.dtype) for part in parts], weights[0].dtype
         result, *activations = _evaluate(parts, layers, any(ctx.needs_input_grad))
         ctx.save_for_backward(*activations, *layers)
-        return result[: len(parts[0])]
+        return result[: parts[0].shape[0]]
 
     @staticmethod
     @once_differentiable
@@ -93,8 +93,8 @@ class _ReluMLP(torch.autograd.Function):
         return None, None, *of_parts, *gradients[len(widths) :]
 
 
-def _num_rows(parts: list[Tensor]) -> int:
-    return -(-len(parts[0]) // _STEP) * _STEP
+def _num_rows(parts: list[Tensor]) -> int | torch.SymInt:
+    return -(-parts[0].shape[0] // _STEP) * _STEP
 
 
 def _shapes(parts: list[Tensor], layers: list[Tensor], keep: bool) -> list[Tensor]:
@@ -141,7 +141,7 @@ def _shapes_of_gradients(
     parts_learn: list[bool], weights_learn: bool, weight_type: torch.dtype,
 ) -> list[Tensor]:  # fmt: skip
     of_parts = [
-        gradient.new_empty(len(gradient), width if learns else 0)
+        gradient.new_empty(gradient.shape[0], width if learns else 0)
         for width, learns in zip(widths, parts_learn, strict=True)
     ]
     return of_parts + [torch.empty_like(layer, dtype=weight_type) for layer in layers if weights_learn]

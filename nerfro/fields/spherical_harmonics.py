@@ -101,7 +101,7 @@ def _backward(directions, num_bands, gradient, of_directions):
 _SCHEMA = "spherical_harmonics(Tensor directions, int num_bands)"
 _of_rows = kernel_with_gradients(
     _SCHEMA,
-    lambda directions, num_bands: directions.new_empty(len(directions), num_bands**2),
+    lambda directions, num_bands: directions.new_empty(directions.shape[0], num_bands**2),
     _harmonics,
     {0: _backward},
 )

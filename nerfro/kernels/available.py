@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import functools
 import math
 import re
 from collections.abc import Iterator
@@ -92,7 +91,7 @@ def gpu_name(gpu: torch.device) -> str:
     return torch.cuda.get_device_name(gpu) if gpu.type == "cuda" else "Apple GPU"
 
 
-@functools.cache
+@torch.compiler.assume_constant_result
 def fast_bfloat16(device: str) -> bool:
     """Return whether matrix products in bfloat16 are faster than in float32 on a device: `cpu`, `cuda`, ...
 

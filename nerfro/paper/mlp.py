@@ -10,7 +10,6 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from nerfro.fields.base import Network
 from nerfro.paper.linear import Linear, linear
 
 # Octaves of the encoded viewing direction in NeRF, mip-NeRF and the paper.
@@ -81,7 +80,7 @@ class SkipMLP(nn.Module):
         return y.view(*batch, self.num_outputs)
 
 
-class RadianceMLP(Network):
+class RadianceMLP(nn.Module):
     """Map encoded positions and directions to density (softplus of raw - 1) and colour (padded sigmoid).
 
     Args:

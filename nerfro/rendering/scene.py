@@ -97,3 +97,22 @@ class Scene(nn.Module):
     def measurements(self) -> dict[str, float]:
         """Return learned physical quantities, such as refractive indices, by name, for the log."""
         return self.medium.measurements() | self.camera.measurements()
+
+    def compile_radiance(self, backend: str) -> None:
+        """Compile the fields and the background in place by a backend of `torch.compile`, for any number of rays.
+
+        Copies of the scene are not compiled.
+
+        Raises:
+            NerfroError: the backend does not exist, or fails.
+        """
+        backends = torch.compiler.list_backends(exclude_tags=())
+        if backend not in backends:
+            raise NerfroError(f"compile={backend} is not a backend of torch.compile; set one of {', '.join(backends)}")
+        try:
+            torch.compile(torch.neg, backend=backend)(torch.ones(2, device=self.device))
+        except RuntimeError as error:
+            reason = " ".join(str(error).split("\n")[:2])
+            raise NerfroError(f"compile={backend} fails on this machine ({reason}); leave it out") from error
+        for module in (*self.fields, self.background):
+            module.compile(backend=backend, dynamic=True)

@@ -237,8 +237,8 @@ class TrainConfig:
         init_include: patterns of the names of these parameters, such as background.*.
         viewer: serve an interactive page of the model during training, to browsers on this machine.
         viewer_port: port of the page; 0 selects a free port.
-        compile: backend of torch.compile for the networks, such as inductor or cudagraphs on a GPU; None does
-            not compile them. Compilation takes a minute or more at the start.
+        compile: backend of torch.compile for the fields and the background, such as inductor on a GPU; None does
+            not compile them. Compilation takes half a minute or more at the start.
     """
 
     name: str = "refractive"

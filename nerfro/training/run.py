@@ -17,7 +17,6 @@ from nerfro.evaluation.results import RunMetrics
 from nerfro.evaluation.run_page import write_run_page
 from nerfro.evaluation.scoring import ImageMetrics, announce_scoring, score_split
 from nerfro.evaluation.tables import write_scores
-from nerfro.fields.base import compile_networks
 from nerfro.kernels.available import require_accelerator
 from nerfro.rendering.scene_file import SceneFile
 from nerfro.samplers.subdivision import Subdivision
@@ -107,7 +106,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetr
         if split is not None:
             announce_scoring(renderer.to(trainer.strategy.root_device), test, metrics, subdivision)
     if config.compile is not None:
-        compile_networks(renderer, config.compile)
+        renderer.scene.compile_radiance(config.compile)
     fit(trainer, training.module, training.data, checkpoint, throughput)
     trainer.save_checkpoint(folder / LAST_CHECKPOINT)
     print_profile(folder)

@@ -5,7 +5,7 @@ import torch
 
 from nerfro.fields import hash_encoding
 from nerfro.fields.hash_encoding import hash_encode, hash_encode_in_torch
-from nerfro.kernels.constants import constant
+from nerfro.kernels.constants import cached_constant
 from tests.gradients import require_equal_gradients
 
 # Two dense levels and three hashed ones, the last of them much finer than its table.
@@ -71,7 +71,7 @@ def test_kernels_match_the_reference_forward_and_backward(num_points: int) -> No
 
 def test_positions_have_gradients_after_an_evaluation() -> None:
     # Tensors made in inference mode, as pictures are, cannot be saved for a gradient, and constants are kept.
-    constant.cache_clear()
+    cached_constant.cache_clear()
     positions = random_positions(9).requires_grad_()
     with torch.inference_mode():
         hash_encode_in_torch(positions, random_table(), *LAYOUT)

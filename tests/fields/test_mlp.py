@@ -7,7 +7,7 @@ import torch
 
 from nerfro.core.light import to_srgb
 from nerfro.core.types import Rays, Samples
-from nerfro.fields.base import compile_networks, radiance
+from nerfro.fields.base import radiance
 from nerfro.geometry.space import Box, inside_box
 from nerfro.paper.mlp import (
     RGB_PADDING,
@@ -20,7 +20,7 @@ from nerfro.paper.mlp import (
 from nerfro.paper.nerf import MipNerfField, NerfField, frustum_gaussians
 from nerfro.samplers.base import straight_path
 from nerfro.samplers.points.stratified import Stratified, cone_samples
-from nerfro.testing import example_path, example_samples
+from nerfro.testing import example_path
 from tests.gradients import require_equal_gradients
 
 
@@ -105,29 +105,6 @@ def test_field_with_a_box_equals_one_without_inside_and_is_empty_outside(make: t
     torch.testing.assert_close(values.density, expected.density * kept)
     torch.testing.assert_close(values.radiance, expected.radiance * kept[..., None])
     assert everywhere.bounds is None
-
-
-@pytest.mark.usefixtures("unchecked")  # the compiler cannot trace the checks
-def test_compiled_networks_equal_plain_ones_and_keep_weight_names() -> None:
-    plain, compiled = (
-        NerfField(width=16, depth=2, skip=1, view_width=8),
-        NerfField(width=16, depth=2, skip=1, view_width=8),
-    )
-    compiled.load_state_dict(plain.state_dict())
-    calls = []
-
-    def counting(graph: torch.fx.GraphModule, inputs: list) -> torch.fx.GraphModule:
-        calls.append(graph)
-        return graph
-
-    torch._dynamo.register_backend(counting, name="counting")
-    compile_networks(compiled, "counting")
-    samples = example_samples()
-    expected, values = plain(samples), compiled(samples)
-    assert calls
-    torch.testing.assert_close(values.radiance, expected.radiance)
-    torch.testing.assert_close(values.density, expected.density)
-    assert compiled.state_dict().keys() == plain.state_dict().keys()
 
 
 def test_saturated_radiance_has_only_a_brightening_gradient() -> None:

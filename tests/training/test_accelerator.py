@@ -13,8 +13,7 @@ from torch import Tensor
 
 from nerfro.fields import hash_encoding
 from nerfro.kernels import available
-from nerfro.kernels.available import fast_bfloat16
-from nerfro.kernels.constants import constant
+from nerfro.kernels.constants import cached_constant
 from nerfro.kernels.operators import REFERENCES
 from nerfro.training import accelerator
 from nerfro.training.accelerator import Compared, choose_accelerator, compare
@@ -43,13 +42,11 @@ def gpu(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[PretendedGp
     monkeypatch.setattr(accelerator, "find_gpu", lambda: GPU)
     monkeypatch.setattr(accelerator, "milliseconds", lambda module, *_: TIMES[module.device.type])
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda **_: False)
-    fast_bfloat16.cache_clear()
-    constant.cache_clear()
+    cached_constant.cache_clear()
     with PretendedGpu() as pretended, warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*CUDA is not available.*")
         yield pretended
-    fast_bfloat16.cache_clear()
-    constant.cache_clear()
+    cached_constant.cache_clear()
 
 
 def chosen(training: Training) -> str:

@@ -2,7 +2,6 @@
 
 import json
 import math
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -13,7 +12,6 @@ from torch import Tensor
 from nerfro.evaluation.request import find_device
 from nerfro.fields import relu_mlp
 from nerfro.fields.hash_grid import HashGridField
-from nerfro.kernels.available import fast_bfloat16
 from nerfro.testing import example_space
 from nerfro.training.trainer import lightning_precision
 
@@ -38,11 +36,9 @@ def test_evaluation_on_the_cpu_reports_an_unused_gpu(
 
 
 @pytest.fixture(params=[True, False])
-def has_units(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[bool]:
+def has_units(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bool:
     monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: request.param)
-    fast_bfloat16.cache_clear()
-    yield bool(request.param)
-    fast_bfloat16.cache_clear()
+    return bool(request.param)
 
 
 def test_field_uses_bfloat16_if_the_machine_supports_it(has_units: bool, monkeypatch: pytest.MonkeyPatch) -> None:
