@@ -96,10 +96,12 @@ def main() -> None:
     }  # fmt: skip
     compare_results(report, gpu, arguments.options)
     # The GPU comes first, so that slow steps on the CPU do not take its time.
-    devices = [("GPU", gpu, cores), (f"{cores} cores", torch.device("cpu"), cores), ("1 core", torch.device("cpu"), 1)]
-    for title, device, threads in devices if cores > 1 else devices[::2]:
+    cpu = torch.device("cpu")
+    devices = [("GPU", gpu, cores), ("GPU, compiled", gpu, cores), ("1 core", cpu, 1), (f"{cores} cores", cpu, cores)]
+    for title, device, threads in devices if cores > 1 else devices[:-1]:
         for name in arguments.experiments:
-            task = None if device is None else lambda: parts_of_step(name, device, threads, arguments, report)  # noqa: B023
+            values = device, threads, title.endswith("compiled"), arguments, report
+            task = None if device is None else lambda: parts_of_step(name, *values)  # noqa: B023
             report.measure("steps", name, title, task)
     for title, device in (("GPU", gpu), ("CPU", torch.device("cpu"))):
         quality_and_views(report, title, device, arguments)
@@ -151,11 +153,18 @@ def build(experiment: str, *options: str) -> tuple[TrainingModule, Any]:
 
 
 def parts_of_step(
-    experiment: str, device: torch.device, threads: int, arguments: argparse.Namespace, report: Report
+    experiment: str,
+    device: torch.device,
+    threads: int,
+    is_compiled: bool,
+    arguments: argparse.Namespace,
+    report: Report,
 ) -> dict[str, float]:
     """Return milliseconds of the parts of a step, and of a step with rays traced one step ahead if possible."""
     module, data = build(experiment, *arguments.options)
     module.to(device)
+    if is_compiled:
+        module.scene.compile_radiance("inductor")
     optimizer = module.make_optimizer()
     batches, tracer = data.batches.to(device, torch.float32), RayTracer(module.renderer, data.subdivision)
     of_parts, number = dict.fromkeys(("tracing", "forward", "backward", "Adam"), 0.0), 0

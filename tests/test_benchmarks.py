@@ -145,14 +145,14 @@ def test_gpu_benchmark_runs_to_its_end_without_a_gpu(run: Run, tmp_path: Path, m
     short = ("--steps", 1, "--goals", 1, 2, "--sides", 8, "--experiments", "straight", "--options", *SMALL[1:6])
     lines = run("gpu", "--out", tmp_path / "gpu.json", *short, "data.downscale=8", "batches.size=16")
     parts = json.loads((tmp_path / "gpu.json").read_text())
-    assert parts["machine"]["gpu"] == parts["steps"]["straight"]["GPU"] == "n/a: no GPU"
+    assert parts["machine"]["gpu"] == parts["steps"]["straight"]["GPU, compiled"] == "n/a: no GPU"
     assert len(parts["results"]) == 17
     assert {cell for cells in parts["results"].values() for cell in cells.values()} == {"n/a: no GPU"}
     assert parts["steps"]["straight"]["1 core"]["step"] > 0
     assert parts["quality"]["PSNR at the end, dB"]["CPU"] > 2
     assert list(parts["views"]) == ["8x8, one ray a pixel, s", "8x8, supersampled, s"]
     assert parts["quality"]["seconds to 2 dB"] == {"GPU": "n/a: no GPU", "CPU": ANY}
-    assert len(table_rows(lines)) == 31 + (torch.get_num_threads() > 1)
+    assert len(table_rows(lines)) == 32 + (torch.get_num_threads() > 1)
 
 
 def test_processor_time_writes_a_finished_run(run: Run, tiny_default_run: list[str], tmp_path: Path) -> None:
