@@ -6,15 +6,19 @@ import json
 import os
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+import trimesh
 from omegaconf import DictConfig
 from PIL import Image
 from torch import nn
+from torch.nn import functional
 
 from nerfro.backgrounds.base import Background
 from nerfro.cli.options import Described
@@ -22,12 +26,16 @@ from nerfro.core import types
 from nerfro.core.paths import PLUGINS_DIR
 from nerfro.data.base import DataSource, Views
 from nerfro.data.formats.transforms import BlenderData
+from nerfro.evaluation.image_metrics import ImageMetric
 from nerfro.fields.base import Field
+from nerfro.geometry.mesh import TriangleMesh
+from nerfro.geometry.space import Space
 from nerfro.losses.base import Loss
 from nerfro.media.base import Medium
 from nerfro.media.surfaces import Surface
 from nerfro.registry.registration import KINDS, discover, find, plugins, register
 from nerfro.samplers.base import PathSampler, PointSampler
+from nerfro.samplers.paths.snell import Snell
 from nerfro.testing import (
     ContractError,
     check,
@@ -180,6 +188,47 @@ def ball(change: Callable[[np.ndarray], np.ndarray], bounds: np.ndarray = CUBE) 
     return {"bounds": bounds, "distances": lambda _, grid: change(np.linalg.norm(grid.points, axis=-1) - 1)}
 
 
+def sphere(scale: float = 1.0, reverse: bool = False, hole: bool = False) -> dict[str, object]:
+    """Return the members of the surface of a unit ball with triangles, which may be wrong."""
+    mesh = trimesh.creation.icosphere(2, scale)
+    faces = np.asarray(mesh.faces)[int(hole) :, :: -1 if reverse else 1]
+    return {**ball(lambda d: d), "mesh": TriangleMesh(np.asarray(mesh.vertices), faces)}
+
+
+def grid_field(contract: bool = True, scale: bool = True) -> dict[str, object]:
+    """Return the members of a field on a grid over the space, with or without contraction and scale."""
+
+    def init(self: Any, space: Space) -> None:
+        Field.__init__(self)
+        self.space, self.grid = space, nn.Parameter(torch.rand(1, 4, 8, 8, 8))
+
+    def forward(self: Any, samples: types.Samples) -> types.FieldValues:
+        low, high = self.space.box
+        places = self.space.contract(samples.positions) if contract else samples.positions
+        unit = (2 * (places - low) / (high - low) - 1).reshape(1, 1, 1, -1, 3)
+        values = functional.grid_sample(self.grid, unit, align_corners=True).reshape(4, *samples.s.shape).sigmoid()
+        density = values[0] * (self.space.scale(samples.positions) if scale else 1)
+        return types.FieldValues(density, values[1:].movedim(0, -1))
+
+    return {"__init__": init, "forward": forward, "bounds": None, "needs_box": True}
+
+
+def cut_at_far(_: PathSampler, rays: types.Rays, medium: Medium) -> types.Path:
+    path = Snell()(rays, medium)
+    s = path.s.minimum(rays.far[:, None])
+    return replace(path, s=s, positions=path.at(s)[0])
+
+
+def metric(of_errors: Callable[[torch.Tensor, torch.Tensor], torch.Tensor]) -> dict[str, object]:
+    """Return the members of a metric, a function of the errors of all pixels and of the mask."""
+
+    def forward(_: ImageMetric, prediction: torch.Tensor, target: torch.Tensor, inside: Any = None) -> torch.Tensor:
+        errors = (prediction - target).abs().mean(-1)
+        return of_errors(errors, torch.ones_like(errors, dtype=torch.bool) if inside is None else inside)
+
+    return {"forward": forward, "better": "lower"}
+
+
 def outside_of_edges(sampler: PointSampler, path: types.Path, previous: object, draws: object = None) -> types.Samples:
     near, length = path.near[:, None], (path.far - path.near)[:, None]
     s, edges = near + length * torch.linspace(0.4, 0.6, 4), near + length * torch.linspace(0.0, 0.2, 5)
@@ -252,6 +301,19 @@ def test_medium_of_varying_index_keeps_its_contract(members: dict[str, object]) 
         ("surface", Surface, ball(lambda d: d, 0.5 * CUBE), "positive outside of `bounds`"),
         ("surface", Surface, ball(lambda d: 2 * d), "change by at most one per unit of length"),
         ("surface", Surface, ball(lambda d: 0.5 * d), "exact within `grid.band` voxels"),
+        ("surface", Surface, sphere(scale=1.3), "the triangles of `mesh` lie where distances are zero"),
+        ("surface", Surface, sphere(hole=True), "`mesh` is closed"),
+        ("surface", Surface, sphere(reverse=True), "faces of `mesh` are counter-clockwise from outside"),
+        ("field", Field, grid_field(contract=False), "cover all of space, as functions of space.contract"),
+        ("field", Field, grid_field(scale=False), r"density / space\.scale and radiance have limits far away"),
+        ("metric", ImageMetric, metric(lambda e, _: e.mean()), "outside of the mask `inside` do not count"),
+        (
+            "metric",
+            ImageMetric,
+            metric(lambda e, i: e.diff(dim=0)[i[1:]].abs().mean()),
+            "an image of min_size = 1 pixels",
+        ),
+        ("sampler/path", PathSampler, {"forward": cut_at_far}, "bent paths end outside of medium.box"),
         ("loss", Loss, {"forward": lambda *_: None}, "forward returned None, not Tensor"),
         ("loss", Loss, loss(lambda r, _: r.opacity), r"a loss is a scalar, and forward returned shape \[24\]"),
         ("loss", Loss, loss(lambda r, b: (r.radiance - b.rgb).mean()), "pixels with two rays raised RuntimeError"),
@@ -289,6 +351,20 @@ def test_check_names_the_violated_contract(kind: str, base: type, members: dict[
     register(kind, "broken")(type("Broken", (base,), {"__doc__": "Broken.", "__module__": __name__, **members}))
     with pytest.raises(ContractError, match=contract):
         check(find(kind, "broken"))
+
+
+@pytest.mark.parametrize(
+    ("kind", "base", "members"),
+    [
+        ("surface", Surface, sphere()),
+        ("field", Field, grid_field()),
+        ("metric", ImageMetric, metric(lambda e, i: e[i].mean())),
+        ("sampler/path", PathSampler, {"forward": cut_at_far, "ends_at_far": True}),
+    ],
+)
+def test_check_accepts_what_keeps_the_contract(kind: str, base: type, members: dict[str, object]) -> None:
+    register(kind, "kept")(type("Kept", (base,), {"__doc__": "Kept.", "__module__": __name__, **members}))
+    check(find(kind, "kept"))
 
 
 def test_views_refuse_a_list_of_images() -> None:

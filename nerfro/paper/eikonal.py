@@ -130,6 +130,7 @@ class Eikonal(PathSampler):
     ) -> None:
         super().__init__()
         self.integrator, self.num_steps, self.tolerance, self.max_steps = integrator, num_steps, tolerance, max_steps
+        self.ends_at_far = integrator == "euler"
 
     @torch.no_grad()
     def forward(self, rays: Rays, medium: Medium) -> Path:

@@ -26,12 +26,14 @@ class PathSampler(nn.Module, ABC):
 
     Attributes:
         needs_medium: whether the sampler queries the medium; otherwise no medium is built.
+        ends_at_far: whether bent paths end at far even in the medium, as those of some published methods do.
         traces_triangles: whether the sampler intersects the triangles of bodies instead of their signed distances.
         branching: rule that selects the branches of partly reflected light.
         max_events, wavelengths: settings of the interactive page, which traces rays as `snell` does.
     """
 
     needs_medium = True
+    ends_at_far = False
     traces_triangles = False
     branching = ONE_PATH
     max_events = 16
@@ -51,7 +53,8 @@ class PathSampler(nn.Module, ABC):
             medium: refractive index.
 
         Returns:
-            P polylines, at least one for each ray. Bent paths end outside of the medium, beyond far if necessary.
+            P polylines, at least one for each ray. Bent paths end outside of `medium.box`, beyond far if
+                necessary, unless the sampler declares `ends_at_far`.
         """
 
     def trace(self, rays: Rays, medium: Medium) -> SnellTrace:

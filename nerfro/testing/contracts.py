@@ -10,6 +10,7 @@ import pickle
 import tempfile
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -23,12 +24,17 @@ from nerfro.core.types import Exits, FieldValues, Path, Rendering, Samples
 from nerfro.data.base import DataSource
 from nerfro.evaluation.image_metrics import ImageMetric, ViewMaps
 from nerfro.fields.base import Field
+from nerfro.geometry.mesh import TriangleMesh
+from nerfro.geometry.orientation import inward_faces
+from nerfro.geometry.space import Contracted, inside_box
 from nerfro.losses.base import Loss
 from nerfro.media.base import Medium
+from nerfro.media.distance_grid import DistanceGrid
 from nerfro.media.surfaces import Grid, Surface
 from nerfro.registry.registration import Plugin, build
 from nerfro.rendering import Renderer, composite
-from nerfro.samplers.base import PathSampler, PointSampler
+from nerfro.samplers.base import PathSampler, PointSampler, straight_path
+from nerfro.samplers.points.stratified import point_samples
 from nerfro.testing.examples import (
     NUM_RAYS,
     ExampleData,
@@ -36,6 +42,7 @@ from nerfro.testing.examples import (
     example_ball,
     example_batch,
     example_components,
+    example_contracted_space,
     example_draws,
     example_path,
     example_rays,
@@ -74,6 +81,11 @@ def check(plugin: Plugin, fields: Mapping[str, object] | None = None) -> None:
     built = build(node, components=example_components(), space=example_space())
     with _named(f"{plugin.kind}={plugin.name}"):
         check_contract(built)
+        if plugin.kind == "field" and built.needs_box and "space" in plugin.parts:
+            space = example_contracted_space()
+            built = build(node, components=example_components(), space=space)
+            _check_field(built)
+            _check_far_field(built, space)
 
 
 @contextlib.contextmanager
@@ -89,7 +101,7 @@ def _named(plugin: str) -> Iterator[None]:
 
 
 def check_export(name: str) -> None:
-    """Check an export: write a file of a small scene.
+    """Check an export: write a file of a small scene of dense content, with default options.
 
     Args:
         name: name of the export, as in `what=NAME`.
@@ -105,7 +117,8 @@ def check_export(name: str) -> None:
         and (export.is_folder or (len(endings) > 0 and all(e == e.lower() and e[:1] == "." for e in endings))),
         f"suffixes={endings!r} are not a tuple of endings in lower case with a dot, such as ('.csv',), nor ('',)",
     )
-    scene = TrainedScene(example_run().renderer.eval(), ExampleData())
+    # Dense content has a surface, which some exports need.
+    scene = TrainedScene(example_run(initial_depth=400.0).renderer.eval(), ExampleData())
     with tempfile.TemporaryDirectory() as folder:
         out = FilePath(folder, f"scene{endings[0]}")
         options = ExportConfig(checkpoint="-", what=name, out=str(out))
@@ -168,6 +181,17 @@ def _check_surface(surface: Surface) -> None:
     near = np.abs(distances) < grid.band * spacing.min()
     slope = np.linalg.norm(np.gradient(distances, *spacing), axis=0)[near]
     _require(not near.any() or bool(np.median(slope) > 0.9), "distances are exact within `grid.band` voxels")
+    if surface.mesh is not None:
+        _check_triangles(surface.mesh, DistanceGrid(torch.from_numpy(distances), torch.from_numpy(grid.box)))
+
+
+def _check_triangles(mesh: TriangleMesh, grid: DistanceGrid) -> None:
+    points = torch.from_numpy(np.concatenate([mesh.vertices, mesh.triangles.mean(1)]))
+    _require(
+        bool((grid(points)[0].abs() < grid.spacing.max()).all()), "the triangles of `mesh` lie where distances are zero"
+    )
+    _require(mesh.is_closed, "`mesh` is closed, and its triangles share vertices")
+    _require(not inward_faces(mesh.vertices, mesh.faces).any(), "faces of `mesh` are counter-clockwise from outside")
 
 
 def _check_camera(camera: CameraModel) -> None:
@@ -178,7 +202,8 @@ def _check_camera(camera: CameraModel) -> None:
 
 def _check_path_sampler(sampler: PathSampler) -> None:
     rays = example_rays()
-    path = sampler(rays, example_ball())
+    medium: Medium = example_ball()
+    path = sampler(rays, medium)
     num_vertices = path.s.shape[1]
     _require(num_vertices >= 2, "a path has two vertices or more")
     _require(bool((path.ray.diff() >= 0).all()), "polylines are in the order of the rays")
@@ -196,11 +221,18 @@ def _check_path_sampler(sampler: PathSampler) -> None:
         torch.allclose(path.positions[:, :-1] + steps, path.positions[:, 1:], atol=0.05),
         "following a vertex's direction leads to the next vertex",
     )
-    if sampler.needs_medium and torch.allclose(path.exit_directions, path.broadcast_to_polylines(rays.directions)):
-        bent = sampler(rays, LuneburgLens()).exit_directions  # a sampler may need a continuous index
+    if sampler.needs_medium:
+        if torch.allclose(path.exit_directions, path.broadcast_to_polylines(rays.directions)):
+            medium = LuneburgLens()  # a sampler may need a continuous index
+            _require(
+                not torch.allclose(sampler(rays, medium).exit_directions, rays.directions),
+                "rays bend in a ball or in a Luneburg lens; set needs_medium = False if the sampler ignores the medium",
+            )
+        path = sampler(replace(rays, far=torch.full_like(rays.far, 4.0)), medium)  # within the medium
+        after = (path.end_positions + 1e-3 * path.exit_directions)[path.refracted]
         _require(
-            not torch.allclose(bent, rays.directions),
-            "rays bend in a ball or in a Luneburg lens; set needs_medium = False if the sampler ignores the medium",
+            sampler.ends_at_far or not bool(inside_box(after, *medium.box).any()),
+            "bent paths end outside of medium.box, beyond far if necessary",
         )
 
 
@@ -242,6 +274,27 @@ def _check_field(field: Field) -> None:
     _require(bool((values.radiance > -0.01).all()), "radiance is not negative")
     (values.density.sum() + values.radiance.sum()).backward()
     _require_gradients(field)
+
+
+@torch.no_grad()
+def _check_far_field(field: Field, space: Contracted) -> None:
+    """Check a field with a grid over all of space, which varies in it and has a limit along each ray to infinity."""
+    for parameter in field.parameters():  # many fields are constant at first
+        parameter.add_(0.1 * torch.randn_like(parameter))
+    path = straight_path(replace(example_rays(), origins=space.centre.expand(NUM_RAYS, 3)))
+    samples = point_samples(path, space.radius * torch.tensor([30.0, 1e5, 2e5]).expand(NUM_RAYS, 3))
+    values = field(samples)
+    density = values.density / space.scale(samples.positions)
+    close, far, farther = torch.cat([density[..., None], values.radiance], -1).unbind(1)
+    _require(
+        torch.allclose(far, farther, rtol=0.1, atol=1e-3),
+        "density / space.scale and radiance have limits far away, because fields with needs_box are functions of "
+        "space.contract(positions), and densities are per world unit",
+    )
+    varies = (close - far).abs().amax(-1) > 1e-4
+    _require(
+        bool(varies.float().median() > 0), "fields with needs_box cover all of space, as functions of space.contract"
+    )
 
 
 def _check_background(background: Background) -> None:
@@ -306,20 +359,34 @@ def _check_data(source: DataSource) -> None:
 def _check_metric(metric: ImageMetric) -> None:
     if metric.missing is not None:
         return
-    size = max(metric.min_size, 16)
-    target = torch.linspace(0, 1, size * size * 3).view(size, size, 3)
-    values = {name: target for name in ("depth", "opacity", "exit_directions", "normals", *metric.maps)}
-    rendered = values | {"refracted": torch.zeros(size, size, 1)}
-    maps = ViewMaps(values, rendered), ViewMaps(values, {name: value.flip(0) for name, value in rendered.items()})
-    equal, different = (
-        metric(image, target, None, *([of_image] if metric.maps else []))
-        for image, of_image in zip((target, target.flip(0)), maps, strict=True)
-    )
+    size = max(metric.min_size, 32)
+    target = torch.linspace(0.1, 1, size * size * 3).view(size, size, 3)
+    columns = torch.arange(size).expand(size, size)
+    different = target.flip(0)
+    half_different = torch.where((columns < size // 2)[..., None], target, different)
+
+    def score(prediction: torch.Tensor, inside: torch.Tensor | None = None, size: int = size) -> torch.Tensor:
+        data, rendered = (
+            {name: image[:size, :size] for name in ("depth", "opacity", "exit_directions", "normals", *metric.maps)}
+            for image in (target, prediction)
+        )
+        maps = ViewMaps(data, rendered | {"refracted": torch.zeros(size, size, 1)})
+        images = prediction[:size, :size], target[:size, :size]
+        return metric(*images, inside, *([maps] if metric.maps else []))
+
+    def is_better(first: torch.Tensor, second: torch.Tensor) -> bool:
+        return bool(first > second if metric.better == "higher" else first < second)
+
+    equal = score(target)
     _require(equal.shape == () and bool(equal.isfinite()), "a metric returns a finite scalar")
-    _require(bool(equal > different) == (metric.better == "higher"), "equal images score better than different ones")
-    masked = metric.score(target.flip(0), target, torch.ones(size, size, dtype=torch.bool), maps[1])
-    _require(math.isclose(masked, float(different), abs_tol=0.05), "a mask of all pixels does not change the score")
-    errors = metric.error_map(target.flip(0), target)
+    _require(is_better(equal, score(different)), "equal images score better than different ones")
+    masked = score(different, torch.ones(size, size, dtype=torch.bool))
+    _require(math.isclose(masked, score(different), abs_tol=0.05), "a mask of all pixels does not change the score")
+    masked = score(half_different, columns < size // 4)
+    _require(is_better(masked, score(half_different)), "pixels outside of the mask `inside` do not count")
+    smallest = score(different, size=metric.min_size)
+    _require(bool(smallest.isfinite()), f"the score of an image of min_size = {metric.min_size} pixels is finite")
+    errors = metric.error_map(different, target)
     _require(errors is None or errors.values.shape == (size, size), "an error map has one value for each pixel")
 
 

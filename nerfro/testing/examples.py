@@ -15,7 +15,7 @@ from nerfro.core.draws import Draws
 from nerfro.core.types import Batch, FieldValues, Path, Rays, Rendering, Samples
 from nerfro.data.base import DataSource, Views
 from nerfro.fields.hash_grid import HashGridField
-from nerfro.geometry.space import Box
+from nerfro.geometry.space import Box, Contracted
 from nerfro.media.base import Medium, Scalars, Vectors
 from nerfro.media.bodies import Bodies, Body, GridSettings
 from nerfro.media.material import Material
@@ -34,6 +34,11 @@ NUM_RAYS = 24
 def example_space() -> Box:
     """Return a cube of side 2 around the origin."""
     return Box([[-1.0] * 3, [1.0] * 3])
+
+
+def example_contracted_space() -> Contracted:
+    """Return all of space, contracted outside the ball of radius 1 around the origin."""
+    return Contracted([[-1.0] * 3, [1.0] * 3], radius=1.0)
 
 
 def example_rays(num_rays: int = NUM_RAYS) -> Rays:
@@ -104,11 +109,15 @@ def example_batch(num_rays: int = NUM_RAYS, rays_per_pixel: int = 1) -> Batch:
     )
 
 
-def example_run() -> TrainingRun:
-    """Return a small model with a learned background, its batches and its optimizer; equal in every call."""
+def example_run(initial_depth: float = 1.0) -> TrainingRun:
+    """Return a small model with a learned background, its batches and its optimizer; equal in every call.
+
+    Args:
+        initial_depth: optical depth of the content.
+    """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        model = RefractiveModel(replace(example_components(), background=EnvironmentMap([8])))
+        model = RefractiveModel(replace(example_components(initial_depth), background=EnvironmentMap([8])))
     batches = PixelBatches(example_views(), NUM_RAYS, "all_images")
     optimizer = torch.optim.Adam(model.parameters_by_name().values())
     return TrainingRun(model, batches, RayTracer(model), example_views(), optimizer, spent=0.0)
@@ -119,14 +128,19 @@ def example_draws(num_rays: int = NUM_RAYS, step: int = 0) -> Draws:
     return Draws(seed=0, step=step, ray=torch.arange(num_rays))
 
 
-def example_components() -> Components:
-    """Return the components of a small model with straight rays and a black background."""
+def example_components(initial_depth: float = 1.0) -> Components:
+    """Return the components of a small model with straight rays, a black background and uniform content."""
     return Components(
         medium=example_ball(),
         path_sampler=Straight(),
         point_sampler=Stratified(8),
         make_field=lambda: HashGridField(
-            example_space(), num_levels=2, log2_table_size=8, width=16, initial_depth=1.0, precision="float32"
+            example_space(),
+            num_levels=2,
+            log2_table_size=8,
+            width=16,
+            initial_depth=initial_depth,
+            precision="float32",
         ),
         background=ConstantBackground(),
         space=example_space(),

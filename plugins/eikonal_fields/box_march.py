@@ -26,6 +26,8 @@ class BoxMarch(PathSampler):
         num_steps: number of steps inside the box.
     """
 
+    ends_at_far = True
+
     def __init__(self, num_steps: Count = 32) -> None:
         super().__init__()
         self.num_steps = num_steps
