@@ -3,6 +3,7 @@
 Examples:
     nerfro check field=hash_grid
     nerfro check sampler/path=eikonal sampler.path.tolerance=0.001
+    nerfro check export=volume
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from nerfro.cli.calls import values_of
 from nerfro.cli.failures import errors_in_one_line
 from nerfro.core.errors import NerfroError
 from nerfro.registry.registration import KINDS, Plugin, build, discover, find
-from nerfro.testing import ContractError, check, check_optics
+from nerfro.testing import ContractError, check, check_export, check_optics
 
 
 def main() -> None:
@@ -26,10 +27,16 @@ def main() -> None:
     """
     with errors_in_one_line():
         discover()
-        pairs = _selected(sys.argv[1:])
+        exports = [text.partition("=")[2] for text in sys.argv[1:] if text.startswith("export=")]
+        others = [text for text in sys.argv[1:] if not text.startswith("export=")]
+        pairs = _selected(others) if others or not exports else []
         try:
             for plugin, settings in pairs:
                 _check(plugin, settings)
+            for name in exports:
+                print(f"export={name}", flush=True)
+                check_export(name)
+                print("  keeps the contract of exports", flush=True)
         except ContractError as error:
             raise NerfroError(str(error)) from error
 
@@ -49,7 +56,9 @@ def _selected(arguments: Sequence[str]) -> list[tuple[Plugin, Mapping[str, Any]]
     pairs = [(kind, name) for kind, _, name in (text.partition("=") for text in arguments) if kind in KINDS]
     selected = [find(kind, name) for kind, name in pairs]
     if not selected:
-        raise NerfroError(f"name a plugin to check as TYPE=NAME, such as sampler/path=mine; types: {', '.join(KINDS)}")
+        raise NerfroError(
+            f"name a plugin to check as TYPE=NAME, such as sampler/path=mine; types: {', '.join(KINDS)}, export"
+        )
     others = [text for text in arguments if text.partition("=")[0] not in KINDS]
     for text in others:
         if not text.startswith(tuple(plugin.prefix for plugin in selected)):

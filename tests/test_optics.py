@@ -52,9 +52,10 @@ def test_check_refuses_a_sampler_that_ignores_the_medium(restored_registry: None
 
 def test_command_checks_plugins_with_settings(run_here: Runner) -> None:
     discover()
-    out = run_here("check", "sampler/path=snell", "sampler.path.max_events=8", "background=constant").out
+    out = run_here("check", "sampler/path=snell", "sampler.path.max_events=8", "background=constant", "export=sky").out
     assert "sampler/path=snell" in out
     assert "prism    incidence 40" in out
     assert "background=constant" in out
+    assert "keeps the contract of exports" in out
     assert "is no setting of a plugin to check" in run_here("check", "field=nerf", "camera.x=1", code=1).error
     assert "name a plugin to check" in run_here("check", code=1).error
