@@ -190,10 +190,10 @@ def test_allowed_values_pass() -> None:
         ({"count": 0}, "component: count=0 is not allowed; take at least 1"),
         ({"rate": 0}, "rate=0 is not allowed; take more than 0 and at most 2"),
         ({"rate": math.nan}, "rate=nan is not allowed"),
-        ({"radius": math.inf}, "radius=inf is not allowed; take more than 0"),
+        ({"radius": math.inf}, "radius=inf is not allowed; take a finite number, more than 0"),
         ({"sizes": [3, 0]}, r"sizes=\[3, 0\] is not allowed; take at least 1"),
         ({"finite": math.inf}, "finite=inf is not allowed; take a finite number"),
-        ({"rate": 10**400}, "is not allowed; take more than 0"),
+        ({"rate": 10**400}, "is not allowed; take a finite number, more than 0 and at most 2"),
         ({"mode": "slow"}, "mode='slow' is not allowed; choose 'fast', 'exact'"),
     ],
 )

@@ -297,10 +297,9 @@ def _advice(hint: Any, error: Mapping[str, Any]) -> str:
     if error["type"] in (_TEXT, "int_parsing"):
         return "take a number, not text"
     names = {int: "an integer", float: "a finite number", str: "text", bool: "true or false"}
-    is_in_type = error["type"] in _BEYOND_LIMITS or inner is float
     return (
         f"take {limits}"
-        if limits and is_in_type
+        if error["type"] in _BEYOND_LIMITS
         else ", ".join(filter(None, [f"take {names.get(inner, 'a mapping')}", limits]))
     )
 
