@@ -113,6 +113,10 @@ def test_damaged_data_is_refused(
         (["+loss.photometric.weight=1"], ["loss.photometric.weight has a value already", "without a plus sign"]),
         (["callbacks.early_stopping.patience=2"], ["not selected; add +callbacks=early_stopping"]),
         (["field.widht=3"], ["field.widht is not a setting; did you mean width?"]),
+        (
+            ["field=nerf", "+field.log2_table_size=1"],
+            ["field.log2_table_size is not a setting; known: depth, position"],
+        ),
         (["+expriment=mipnerf"], ["expriment is not a setting; did you mean experiment?"]),
         (["+batches.foo=3"], ["batches.foo is not a setting; known: batching, num_validation_views"]),
         (["+sampler.point.num_samples=5"], ["sampler.point is not a setting; did you mean points?"]),

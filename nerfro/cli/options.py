@@ -103,7 +103,8 @@ class Described:
 
     Attributes:
         help: text of `--help`.
-        names: names of the settings in each node that has a fixed set of settings, by the full name of the node.
+        names: names of the settings in each node that has a fixed set of settings, by the full name of the node, and
+            of the settings of each plugin, by texts such as `field=nerf`.
         choices: names of the options of each configuration group.
     """
 
@@ -132,6 +133,8 @@ class Described:
         Raises:
             NerfroError: a setting or an option does not exist.
         """
+        chosen = [text.lstrip("+").replace("/", ".") for text in arguments]
+        plugins = {text.partition("=")[0]: text for text in chosen if "=" in text and text in self.names}
         for argument in arguments:
             key, equals, value = argument.lstrip("+~").partition("=")
             if not equals or not re.fullmatch(r"[\w./]+", key) or key.startswith("hydra"):
@@ -150,7 +153,8 @@ class Described:
                 continue
             parts = key.split(".")
             for depth, name in enumerate(parts):
-                names = self.names.get(".".join(parts[:depth]))
+                node = ".".join(parts[:depth])
+                names = self.names.get(plugins.get(node, node))
                 if names is None:
                     break
                 if name not in names:
@@ -193,7 +197,8 @@ def describe(command: str, schema: type) -> Described:
             names[path] = [plugin.name for plugin in of_kind]
             names |= {f"{path}.{plugin.name}": list(plugin.hints) for plugin in of_kind}
         else:
-            names[path] = sorted({name for plugin in of_kind for name in (*plugin.hints, "_target_")})
+            names |= {f"{path}={plugin.name}": [*plugin.hints, "_target_"] for plugin in of_kind}
+            names[path] = sorted({name for plugin in of_kind for name in names[f"{path}={plugin.name}"]})
         for prefix, node in nodes.items():
             plugin = next((plugin for plugin in of_kind if plugin.target == node.get("_target_")), None)
             node_values = cast(dict[str, Any], OmegaConf.to_container(node))
