@@ -18,8 +18,8 @@ from nerfro.geometry.mesh import local_origin, origin_of_file
 from nerfro.media.bodies import Bodies, Body, GridSettings
 from nerfro.media.material import Abbe, Learns, Material, find_material, learned_quantities
 from nerfro.media.surfaces import CreaseAngle, Shading, make_surface
-from nerfro.registry.allowed import NotNegative, Positive, Resolution, validate
-from nerfro.registry.registration import register
+from nerfro.registry.allowed import NotNegative, Positive, Resolution, require_names, validate
+from nerfro.registry.registration import discover, find, register
 
 _LEARNED = ("ior", "absorption")
 SHADING = ("shading", "crease_degrees")  # settings of a mesh, of a body or of the medium
@@ -187,6 +187,10 @@ def surface_settings(name: str, body: BodySettings) -> Mapping[str, Any]:
         raise NerfroError(f"bodies.{name} needs one of mesh and surface; write surface: {{name: ball, radius: 1}}")
     if body.shading is not None or body.crease_degrees is not None:
         raise NerfroError(f"shading and crease_degrees of bodies.{name} belong to its surface; write them in surface:")
+    if "name" in body.surface:
+        discover()
+        plugin = find("surface", str(body.surface["name"]))
+        require_names(f"bodies.{name}.surface.", ["name", *plugin.hints], body.surface)
     return body.surface
 
 

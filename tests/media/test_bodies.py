@@ -185,6 +185,10 @@ def test_empty_list_of_learned_quantities_keeps_a_body_constant(tmp_path: Path) 
         ({"ior": 1, "learn": ["ior"]}, "has no gradient; start from another value"),
         ({"ior": 1.5, "mesh": None}, r"bodies\.glass needs a mesh"),
         ({"ior": 1.5, "mesh": "missing.ply"}, "missing.ply"),
+        (
+            {"ior": 1.5, "mesh": None, "surface": {"name": "ball", "radus": 1}},
+            r"bodies\.glass\.surface\.radus is not a setting; did you mean radius\?",
+        ),
         (1.5, r"bodies\.glass=1.5 is not a set of settings"),
     ],
 )
