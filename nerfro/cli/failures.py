@@ -75,7 +75,9 @@ def _description(error: Exception) -> str:
         return " ".join(str(error).split())
     if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and _NO_MEMORY.search(str(error))):
         reason = " ".join(str(error).split("\n")[0].split())
-        return f"not enough memory{reason and f' ({reason})'}; take smaller sizes, such as batches.size"
+        place = _place_in_plugin(error)
+        sizes = "batches.size" if place is None else f"those in {place}"
+        return f"not enough memory{reason and f' ({reason})'}; take smaller sizes, such as {sizes}"
     if isinstance(error, (HydraException, OmegaConfBaseException)):
         message = " ".join(_messages(error))
         extras = [extra for option, extra in _EXTRAS.items() if f"Could not find '{option}" in message]
@@ -99,13 +101,21 @@ def _places(error: Exception) -> list[tuple[str, str, int]]:
     return [(frame.f_globals.get("__name__", ""), frame.f_code.co_filename, line) for frame, line in frames]
 
 
+def _place_in_plugin(error: Exception) -> str | None:
+    """Name the file and line of the plugin of others that raised an error; None if a plugin of nerfro raised it."""
+    modules = {plugin.cls.__module__ for plugin in plugins()}
+    frame = next((frame for frame in reversed(_places(error)) if frame[0] in modules), None)
+    if frame is None or frame[0].startswith("nerfro."):
+        return None
+    return f"the plugin {frame[1]}, line {frame[2]}"
+
+
 def _unforeseen(error: Exception) -> str:
     """Write the traceback of a bug to a file and return a message with the name of the file."""
     what = f"{type(error).__name__}: {error}".splitlines()[0]
-    foreign = {plugin.cls.__module__ for plugin in plugins()}
-    frame = next((frame for frame in reversed(_places(error)) if frame[0] in foreign), None)
-    if frame is not None and not frame[0].startswith("nerfro."):
-        return f"{what}; raised in the plugin {frame[1]}, line {frame[2]} (NERFRO_DEBUG=1 shows the traceback)"
+    place = _place_in_plugin(error)
+    if place is not None:
+        return f"{what}; raised in {place} (NERFRO_DEBUG=1 shows the traceback)"
     try:
         with tempfile.NamedTemporaryFile("w", prefix="nerfro_", suffix=".txt", delete=False) as file:
             print(shlex.join(sys.argv), file=file)

@@ -226,15 +226,19 @@ def test_early_stopping_prints_its_step_and_reason(train: Runner) -> None:
 
 
 @pytest.mark.usefixtures("restored_registry")
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [("RuntimeError", "raised in the plugin"), ("MemoryError", "sizes, such as those in the plugin")],
+)
 def test_errors_of_a_plugin_name_its_file_and_line(
-    train: Runner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    error: str, words: str, train: Runner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = tmp_path / "plugins" / "broken_callback.py"
     file.parent.mkdir()
-    file.write_text(CALLBACK)
+    file.write_text(CALLBACK.replace("RuntimeError", error))
     monkeypatch.setenv("NERFRO_PLUGINS", str(file.parent))
     finished = train("trainer.max_steps=2", "+callbacks=broken", code=1)
-    assert f"raised in the plugin {file}, line 10" in finished.err
+    assert f"{words} {file}, line 10" in finished.err
     assert "bug of nerfro" not in finished.err
 
 
