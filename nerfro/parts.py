@@ -17,15 +17,16 @@ from nerfro.evaluation.image_metrics import ErrorMap, ImageMetric, ViewMaps
 from nerfro.fields.base import Field
 from nerfro.files.atomic import write_atomically
 from nerfro.files.reading import load_arrays
+from nerfro.geometry.mesh import TriangleMesh
 from nerfro.geometry.space import Box, Contracted, Space, Unbounded
 from nerfro.losses.base import Loss
 from nerfro.media.base import Medium, Scalars, Vectors
 from nerfro.media.bodies import Bodies, Body, GridSettings
-from nerfro.media.material import Material
+from nerfro.media.material import MATERIALS, Material, Sellmeier
 from nerfro.media.surfaces import Grid, MeshSurface, Surface
 from nerfro.models.refractive import RefractiveModel
 from nerfro.optimizers.config import OPTIMIZERS, SCHEDULERS
-from nerfro.registry.allowed import Count, Distance, Natural, NotNegative, Positive
+from nerfro.registry.allowed import Count, Distance, Natural, NotNegative, OnlyWith, Positive
 from nerfro.registry.registration import register
 from nerfro.rendering import Components, Renderer, Scene
 from nerfro.samplers.base import PathSampler, PointSampler
@@ -35,12 +36,12 @@ from nerfro.viewing.exports import EXPORTS, Export, ExportConfig
 from nerfro.viewing.trained_scene import TrainedScene
 
 __all__ = [
-    "EXPORTS", "OPTIMIZERS", "SCHEDULERS", "Background", "Batch", "Bodies", "Body", "Box", "CameraModel", "Cameras",
-    "Components", "Contracted", "Count", "DataSource", "Distance", "Draws", "ErrorMap", "Exits", "Export",
+    "EXPORTS", "MATERIALS", "OPTIMIZERS", "SCHEDULERS", "Background", "Batch", "Bodies", "Body", "Box", "CameraModel",
+    "Cameras", "Components", "Contracted", "Count", "DataSource", "Distance", "Draws", "ErrorMap", "Exits", "Export",
     "ExportConfig", "Field", "FieldValues", "Ge", "Grid", "GridSettings", "Gt", "ImageMetric", "Le", "Loss", "Lt",
-    "Material", "Medium", "MeshSurface", "Natural", "NerfroError", "NotNegative", "OpticalRecord", "Path",
+    "Material", "Medium", "MeshSurface", "Natural", "NerfroError", "NotNegative", "OnlyWith", "OpticalRecord", "Path",
     "PathSampler", "Phase", "PointSampler", "Positive", "Rays", "RefractiveModel", "Renderer", "Rendering",
-    "Samples", "Scalars", "Scene", "Space", "Stratified", "Surface", "TrainedScene", "TrainingRun", "Unbounded",
-    "Vectors", "ViewMaps", "Views", "invert_cdf", "load_arrays", "point_samples", "register", "resolve_path",
-    "spread_uniform", "write_atomically",
+    "Samples", "Scalars", "Scene", "Sellmeier", "Space", "Stratified", "Surface", "TrainedScene", "TrainingRun",
+    "TriangleMesh", "Unbounded", "Vectors", "ViewMaps", "Views", "invert_cdf", "load_arrays", "point_samples",
+    "register", "resolve_path", "spread_uniform", "write_atomically",
 ]  # fmt: skip

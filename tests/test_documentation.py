@@ -3,6 +3,7 @@
 import ast
 import json
 import linecache
+import pkgutil
 import re
 import runpy
 from pathlib import Path
@@ -13,10 +14,9 @@ import pytest
 import torch
 
 import nerfro
-import nerfro.media.material
 from nerfro.__main__ import commands
 from nerfro.core.paths import PACKAGE_DIR
-from nerfro.media.material import MATERIALS
+from nerfro.media.material import MATERIALS, find_material
 from nerfro.registry.registration import discover, find
 from nerfro.testing import check
 from nerfro.viewing.exports import EXPORTS, ExportConfig, find_export
@@ -137,6 +137,21 @@ def test_links_point_to_existing_files() -> None:
         assert [link for link in missing if (source.parent / link).resolve() not in generated] == [], source
 
 
+def test_named_files_and_objects_exist() -> None:
+    """In all pages but the records of earlier versions, and tutorials, whose reader writes files."""
+    files = {str(file.relative_to(CHECKOUT)) for file in CHECKOUT.rglob("*.py")}
+    folders = "nerfro|tests|plugins|conf|docs|benchmarks"
+    pages = [page for page in CHECKOUT.glob("docs/**/*.md") if not {"lab", "tutorials"} & {*page.parts}]
+    for page in [*pages, CHECKOUT / "README.md", CHECKOUT / "CONTRIBUTING.md"]:
+        text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+        paths = [path for path in re.findall(rf"`((?:{folders})/[\w./-]+)`", text) if not (CHECKOUT / path).exists()]
+        modules = re.findall(r"`([\w./-]+\.py)`", text)
+        modules = [path for path in modules if not any(f"/{file}".endswith(f"/{path}") for file in files)]
+        assert (paths, modules) == ([], []), page
+        for name in re.findall(r"`(nerfro\.[\w.]+\w)`", text):
+            pkgutil.resolve_name(name)
+
+
 def test_code_of_the_library_page_executes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     blocks = python_blocks("docs/guides/library.md")
@@ -156,10 +171,10 @@ def test_example_of_several_bodies_matches_closed_form(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(nerfro.media.material, "MATERIALS", dict(MATERIALS))
+    monkeypatch.setitem(MATERIALS, "silicone", MATERIALS["water"])  # the material ends with the test
     plugin, example = python_blocks("docs/guides/several_bodies.md")
     exec(plugin, {})
-    assert nerfro.media.material.find_material("silicone").ior == pytest.approx(1.4316, abs=1e-4)
+    assert find_material("silicone").ior == pytest.approx(1.4316, abs=1e-4)
     exec(example, {})
     for line in capsys.readouterr().out.splitlines():
         traced, exact = map(float, line.split())
