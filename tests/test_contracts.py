@@ -2,8 +2,9 @@
 
 import pytest
 
-from nerfro.registry.registration import Plugin, discover, plugins
+from nerfro.registry.registration import KINDS, Plugin, discover, plugins
 from nerfro.testing import check
+from nerfro.testing.contracts import _CONTRACTS
 
 discover()
 
@@ -21,6 +22,11 @@ FIELDS: dict[str, dict[str, object]] = {
     "field/mip_nerf": {"width": 16, "depth": 3, "skip": 2, "view_width": 8},
     "loss/smoothness": {"tile_size": 8},
 }
+
+
+def test_types_of_plugins_have_one_abstract_method() -> None:
+    abstract = {kind: len(getattr(base, "__abstractmethods__", ())) for kind, (base, _) in _CONTRACTS.items()}
+    assert abstract == dict.fromkeys(KINDS, 1) | {"phase": 2, "data": 2, "callbacks": 0}
 
 
 @pytest.mark.parametrize("plugin", plugins(), ids=lambda p: f"{p.kind}/{p.name}")
