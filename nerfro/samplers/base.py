@@ -58,7 +58,7 @@ class PathSampler(nn.Module, ABC):
         """
 
     def trace(self, rays: Rays, medium: Medium) -> SnellTrace:
-        """Trace rays, and count the events of each polyline; samplers without sharp surfaces count none."""
+        """Trace rays, and count the events of each polyline; samplers that do not override this method count none."""
         return SnellTrace.without_events(self(rays, medium))
 
     def trace_main(self, rays: Rays, medium: Medium) -> Path:
