@@ -65,7 +65,7 @@ def _options(described: Described) -> Iterator[str]:
     for group, names in described.choices.items():
         yield from (f"{group}={name} " for name in names)
     for node, names in described.names.items():
-        for name in names:
+        for name in () if "=" in node else names:  # those of each plugin are among those of the node
             full_name = f"{node}.{name}".removeprefix(".")
             if full_name not in described.choices and name != "_target_":
                 yield full_name + ("." if full_name in described.names else "=")
