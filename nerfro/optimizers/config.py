@@ -10,6 +10,7 @@ from fnmatch import fnmatchcase
 from typing import Annotated, Any
 
 import torch
+from annotated_types import Ge, Lt
 from torch import nn
 from torch.optim import lr_scheduler
 
@@ -70,7 +71,7 @@ def _default_groups() -> dict[str, GroupConfig]:
 @validated("optimizer")
 @dataclass
 class OptimizerConfig:
-    """Optimizer of PyTorch with a log-linear learning rate and a sine warm-up (authors' code; mip-NeRF, section 4).
+    """Optimizer of PyTorch with a log-linear decay and a sine warm-up (authors' code; mip-NeRF, section 4).
 
     The defaults are those of the default experiment. The experiments `paper_*` have the values of the paper.
 
@@ -82,6 +83,7 @@ class OptimizerConfig:
         scheduler_options: settings of the scheduler, such as {T_max: 1000}.
         learning_rate: initial learning rate.
         final_learning_rate: learning rate at the end of the run.
+        decay_start: fraction of the run after which the learning rate decays; 0 as in the authors' code.
         groups: learning rate and start of parameters by the pattern of their names
             (`Scene.parameters_by_name`), in which an asterisk stands for any text: {bodies.*.material.ior:
             {learning_rate: 1e-3, start: 100}}. The rates have the same decay. Of several matching patterns the
@@ -97,7 +99,8 @@ class OptimizerConfig:
     scheduler: SchedulerName | None = None
     scheduler_options: Annotated[dict[str, Any], OnlyWith("scheduler")] = dataclasses.field(default_factory=dict)
     learning_rate: Positive = 1e-2
-    final_learning_rate: Positive = 5e-4
+    final_learning_rate: Positive = 2e-4
+    decay_start: Annotated[float, Ge(0), Lt(1)] = 0.5
     groups: dict[str, GroupConfig] = dataclasses.field(default_factory=_default_groups)
     warmup_steps: Natural = 20
     warmup_factor: Annotated[NotNegative, OnlyWith("warmup_steps")] = 0.01

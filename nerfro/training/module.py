@@ -301,7 +301,8 @@ def training_progress(trainer: Trainer) -> float:
 
 def learning_rate_factor(step: int, progress: float, config: OptimizerConfig) -> float:
     """Return the factor of the initial learning rates: log-linear decay times the sine warm-up of mip-NeRF."""
-    factor = (config.final_learning_rate / config.learning_rate) ** progress
+    decayed = max(progress - config.decay_start, 0.0) / (1.0 - config.decay_start)
+    factor = (config.final_learning_rate / config.learning_rate) ** decayed
     if config.warmup_steps > 0:
         ascent = math.sin(0.5 * math.pi * min(step / config.warmup_steps, 1.0))
         factor *= config.warmup_factor + (1.0 - config.warmup_factor) * ascent

@@ -19,7 +19,9 @@ from nerfro.training.config import BatchesConfig, EvaluationConfig, TrainConfig
 from nerfro.training.module import learning_rate_factor, training_progress
 from tests.conftest import composed, refused
 
-PAPER = OptimizerConfig(learning_rate=5e-4, final_learning_rate=5e-6, warmup_steps=2500, warmup_factor=0.01)
+PAPER = OptimizerConfig(
+    learning_rate=5e-4, final_learning_rate=5e-6, decay_start=0, warmup_steps=2500, warmup_factor=0.01
+)
 
 
 def rate(step: int, num_steps: int = 200_000) -> float:
@@ -36,6 +38,12 @@ def test_decay_is_linear_in_the_logarithm() -> None:
     logarithms = [math.log(rate(step)) for step in range(10_000, 200_000, 10_000)]
     slopes = [b - a for a, b in itertools.pairwise(logarithms)]
     assert slopes == pytest.approx([math.log(0.01) / 20] * len(slopes))
+
+
+def test_rate_is_constant_until_the_decay_starts() -> None:
+    late = OptimizerConfig(learning_rate=1.0, final_learning_rate=1e-2, decay_start=0.6, warmup_steps=0)
+    rates = [learning_rate_factor(1, progress, late) for progress in (0.0, 0.6, 0.8, 1.0)]
+    assert rates == pytest.approx([1.0, 1.0, 0.1, 1e-2])
 
 
 def test_warm_up_rises_as_a_quarter_of_a_sine() -> None:
