@@ -39,6 +39,11 @@ class PathSampler(nn.Module, ABC):
     max_events = 16
     wavelengths: Sequence[float] = (610.0, 550.0, 465.0)
 
+    @classmethod
+    def derive(cls, medium: Medium) -> dict[str, Any]:
+        """Derive settings that are None in a training from its medium; the keys are constructor parameters."""
+        return {}
+
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
         contract = "a Path with a polyline for each ray, as by Path.unbranched"

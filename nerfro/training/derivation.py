@@ -11,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 from nerfro.core.light import to_linear
 from nerfro.data.base import Views
 from nerfro.media.base import Medium
-from nerfro.registry.registration import find
+from nerfro.registry.registration import find, plugin_of
 from nerfro.training.content import components, content_settings, space_of
 from nerfro.training.settings import with_values
 
@@ -20,7 +20,8 @@ def derived(config: DictConfig, medium: Medium, training: Views) -> DictConfig:
     """Return the configuration of a run with the missing settings that its data define.
 
     Settings of the space come from cameras and object, and each component derives its own settings, see
-    `Component.derive`. The run records the result, so that its model can be built without the data.
+    `Component.derive` and `PathSampler.derive`. The run records the result, so that its model can be built without the
+    data.
 
     Args:
         config: configuration as given, see `TrainConfig`.
@@ -37,6 +38,8 @@ def derived(config: DictConfig, medium: Medium, training: Views) -> DictConfig:
         if OmegaConf.select(config, name) is not None:
             settings = component.derive(config, training, space)
             values |= {f"{name}.{setting}": value for setting, value in settings.items()}
+    of_path = plugin_of(config.sampler.path).cls.derive(medium)  # type: ignore[attr-defined]
+    values |= {f"sampler.path.{setting}": value for setting, value in of_path.items()}
     missing = {name: value for name, value in values.items() if OmegaConf.select(config, name) is None}
     return _with_starts(_with_backdrop(with_values(config, missing)))
 

@@ -1,10 +1,12 @@
 """The space that a run covers, and the resolution of its background."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+import trimesh
 from omegaconf import DictConfig, OmegaConf
 
 from nerfro.backgrounds.envmap import EnvironmentMap
@@ -14,9 +16,11 @@ from nerfro.geometry.space import Contracted, Unbounded
 from nerfro.media.base import Vacuum
 from nerfro.registry.allowed import untyped
 from nerfro.testing import example_views
-from nerfro.training.config import TrainConfig
+from nerfro.training.config import TrainConfig, build_medium
 from nerfro.training.content import common_target, content_settings, describe, space_of
+from nerfro.training.derivation import derived
 from nerfro.training.settings import with_values
+from tests.conftest import composed
 from tests.exact_silhouettes import cameras_around
 
 MIDDLE = np.array([0.4, -2.0, 1.0])
@@ -103,3 +107,21 @@ def test_finest_texel_follows_the_pixel(
     if given is None and side < 4000 and fits:
         pixel = 57.3 / (1.4 * side)
         assert 2**-0.5 < (90 / finest) / pixel < 2**0.5
+
+
+@pytest.mark.parametrize(
+    ("medium", "interface"),
+    [
+        (["medium.mesh={cube}", "medium.ior=1.5"], "mesh"),
+        (["medium.mesh={cube}", "medium.ior=1.5", "sampler.path.interface=sdf"], "sdf"),
+        (["medium.bodies={{ball: {{surface: {{name: ball, radius: 1}}, ior: 1.5}}}}"], "sdf"),  # has no triangles
+        (["medium.bodies={{one: {{mesh: {cube}, ior: 1.5}}, other: {{mesh: {cube}, ior: 1.3}}}}"], "sdf"),
+        (["+experiment=straight"], None),
+    ],
+)
+def test_training_traces_the_triangles_of_a_single_closed_mesh(
+    medium: list[str], interface: str | None, tmp_path: Path
+) -> None:
+    trimesh.creation.box((1.0, 1.0, 1.0)).export(cube := tmp_path / "cube.ply")
+    config = composed(*[option.format(cube=cube) for option in medium])
+    assert derived(config, build_medium(config), example_views()).sampler.path.get("interface") == interface

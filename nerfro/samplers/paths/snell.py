@@ -70,7 +70,7 @@ class Snell(PathSampler):
     Args:
         interface: `sdf` is the zero level of the signed distance, with smooth normals and tolerance of noisy hulls;
             `mesh` is the triangles, with sharp edges, and smooth normals where the triangles sample a smooth surface
-            (`shading` of the body).
+            (`shading` of the body). None is `sdf`; a training takes `mesh` for a single body with a closed mesh.
         max_events: largest number of refractions and reflections of a ray.
         branches: `none` transmits all light that is not totally reflected, as the paper does; `first` adds the
             reflection at the first surface of a ray; `all` adds all reflections.
@@ -81,7 +81,7 @@ class Snell(PathSampler):
 
     def __init__(
         self,
-        interface: Literal["sdf", "mesh"] = "sdf",
+        interface: Literal["sdf", "mesh"] | None = None,
         max_events: Annotated[int, Ge(1), Le(1000)] = 16,
         branches: Literal["none", "first", "all"] = "none",
         least_weight: Annotated[Share, OnlyWith("branches", ("first", "all"))] = 0.02,
@@ -95,6 +95,12 @@ class Snell(PathSampler):
         self.wavelengths = list(wavelengths)
         self.interface, self.max_events, self.traces_triangles = interface, max_events, interface == "mesh"
         self.branching = Branching({"none": 0, "first": 1, "all": max_events}[branches], least_weight)
+
+    @classmethod
+    def derive(cls, medium: Medium) -> dict[str, Any]:
+        # The distances close small gaps between several bodies.
+        meshes = [] if medium.bodies is None else medium.bodies.meshes
+        return {"interface": "mesh" if len(meshes) == 1 and meshes[0].is_closed else "sdf"}
 
     def tracers(self, medium: Medium) -> list[Tracer]:
         """Return the tracers for the surfaces of a medium: one for each wavelength if the medium disperses, else one.
