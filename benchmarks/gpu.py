@@ -97,8 +97,8 @@ def main() -> None:
     compare_results(report, gpu, arguments.options)
     # The GPU comes first, so that slow steps on the CPU do not take its time.
     cpu = torch.device("cpu")
-    devices = [("GPU", gpu, cores), ("GPU, compiled", gpu, cores), ("1 core", cpu, 1), (f"{cores} cores", cpu, cores)]
-    for title, device, threads in devices if cores > 1 else devices[:-1]:
+    devices = [("GPU", gpu, cores), (f"{cores} cores", cpu, cores), ("1 core", cpu, 1), ("GPU, compiled", gpu, cores)]
+    for title, device, threads in devices if cores > 1 else [devices[0], *devices[2:]]:
         for name in arguments.experiments:
             values = device, threads, title.endswith("compiled"), arguments, report
             task = None if device is None else lambda: parts_of_step(name, *values)  # noqa: B023

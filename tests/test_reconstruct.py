@@ -299,7 +299,7 @@ def test_photographs_pass_every_stage_once(
     assert preprocess[:4] == [*data, "medium.resolution=64"]
     assert preprocess[-1] == "keep=1"
     scene = f"scene={pretended.out / 'surface' / 'scene.json'}"
-    assert train == ["+experiment=unknown", "sampler.path.interface=sdf", "camera.exposure=true", "data.downscale=2",
+    assert train == ["+experiment=unknown", "camera.exposure=true", "data.downscale=2",
                      "trainer.max_steps=3", "logger=none", f"hydra.run.dir={pretended.out / 'run'}"]  # fmt: skip
     assert f"python -m nerfro.train {scene} {' '.join(train)}" in done.out
     trials = {"straight_rays": straight, "solid_body": solid, "vessel": vessel}

@@ -18,7 +18,8 @@ _ALIGNMENT = 16  # bytes; vectorized kernels load this many at once
 def transfer(value: Value, device: torch.device) -> Value:
     """Send all tensors of nested dataclasses and mappings from the CPU to a device in a single copy.
 
-    With CUDA, the host does not wait for the copy. Tensors that are already on the device are kept.
+    With CUDA, the host does not wait for the copy. Tensors that are already on the device are kept. A value for the CPU
+    is returned as it is.
 
     Args:
         value: dataclass, mapping or tensor, without gradients on the CPU.

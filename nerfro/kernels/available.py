@@ -86,12 +86,23 @@ def require_accelerator(name: str) -> None:
         )
 
 
+def require_backend(name: str, device: torch.device) -> None:
+    """Refuse a backend of `torch.compile` that does not exist, or that fails on a device."""
+    backends = torch.compiler.list_backends(exclude_tags=())
+    if name not in backends:
+        raise NerfroError(f"compile={name} is not a backend of torch.compile; set one of {', '.join(backends)}")
+    try:
+        torch.compile(torch.neg, backend=name)(torch.ones(2, device=device))
+    except RuntimeError as error:
+        reason = " ".join(str(error).split("\n")[:2])
+        raise NerfroError(f"compile={name} fails on this machine ({reason}); leave it out") from error
+
+
 def gpu_name(gpu: torch.device) -> str:
     """Return the name of a GPU, such as "NVIDIA H200"."""
     return torch.cuda.get_device_name(gpu) if gpu.type == "cuda" else "Apple GPU"
 
 
-@torch.compiler.assume_constant_result
 def fast_bfloat16(device: str) -> bool:
     """Return whether matrix products in bfloat16 are faster than in float32 on a device: `cpu`, `cuda`, ...
 

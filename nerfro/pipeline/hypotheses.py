@@ -71,15 +71,14 @@ def hypotheses(scene: SceneFile) -> list[Hypothesis]:
         return [straight, Hypothesis(VESSEL, [known_materials])]
     if scene.short is None:
         return [straight, Hypothesis("bodies", [known_materials])]
-    # Triangles of a surface from masks are noisier than its distances.
-    of_masks = [f"+experiment={'glass_room' if near else 'unknown'}", "sampler.path.interface=sdf"]
+    body = f"+experiment={'glass_room' if near else 'unknown'}"
     if not scene.provenance.doubts:
         learned = ["medium.learn_absorption=true"] if any(scene.provenance.absorbed) else []
-        bodies = [Hypothesis(SOLID, [*of_masks, *learned])]
+        bodies = [Hypothesis(SOLID, [body, *learned])]
     else:
         doubt = "the photographs do not determine its index"
         bodies = [
-            Hypothesis(f"{SOLID}, {name}", [*of_masks, f"medium.ior={index}", "medium.learn_ior=true"], doubt)
+            Hypothesis(f"{SOLID}, {name}", [body, f"medium.ior={index}", "medium.learn_ior=true"], doubt)
             for name, index in COMMON_INDICES.items()
         ]
     vessel = [Hypothesis(VESSEL, [known_materials, "medium=vessel"])] if scene.vessel else []

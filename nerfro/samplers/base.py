@@ -40,8 +40,8 @@ class PathSampler(nn.Module, ABC):
     wavelengths: Sequence[float] = (610.0, 550.0, 465.0)
 
     @classmethod
-    def derive(cls, medium: Medium) -> dict[str, Any]:
-        """Derive settings that are None in a training from its medium; the keys are constructor parameters."""
+    def settings_for(cls, medium: Medium) -> dict[str, Any]:
+        """Choose values of settings that are None in a training of a medium, by the names of constructor parameters."""
         return {}
 
     def __init_subclass__(cls, **options: Any) -> None:

@@ -229,6 +229,7 @@ def _check_path_sampler(sampler: PathSampler) -> None:
                 "rays bend in a ball or in a Luneburg lens; set needs_medium = False if the sampler ignores the medium",
             )
         path = sampler(replace(rays, far=torch.full_like(rays.far, 4.0)), medium)  # within the medium
+        _require(bool(path.refracted.any()), "`Path.refracted` marks paths that bend")
         after = (path.end_positions + 1e-3 * path.exit_directions)[path.refracted]
         _require(
             sampler.ends_at_far or not bool(inside_box(after, *medium.box).any()),

@@ -20,8 +20,8 @@ def derived(config: DictConfig, medium: Medium, training: Views) -> DictConfig:
     """Return the configuration of a run with the missing settings that its data define.
 
     Settings of the space come from cameras and object, and each component derives its own settings, see
-    `Component.derive` and `PathSampler.derive`. The run records the result, so that its model can be built without the
-    data.
+    `Component.derive` and `PathSampler.settings_for`. The run records the result, so that its model can be built
+    without the data.
 
     Args:
         config: configuration as given, see `TrainConfig`.
@@ -38,8 +38,10 @@ def derived(config: DictConfig, medium: Medium, training: Views) -> DictConfig:
         if OmegaConf.select(config, name) is not None:
             settings = component.derive(config, training, space)
             values |= {f"{name}.{setting}": value for setting, value in settings.items()}
-    of_path = plugin_of(config.sampler.path).cls.derive(medium)  # type: ignore[attr-defined]
-    values |= {f"sampler.path.{setting}": value for setting, value in of_path.items()}
+    path_sampler = plugin_of(config.sampler.path)
+    for setting, value in path_sampler.cls.settings_for(medium).items():  # type: ignore[attr-defined]
+        if setting in path_sampler.hints:  # a derived class may have a constructor of its own
+            values[f"sampler.path.{setting}"] = value
     missing = {name: value for name, value in values.items() if OmegaConf.select(config, name) is None}
     return _with_starts(_with_backdrop(with_values(config, missing)))
 

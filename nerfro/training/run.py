@@ -17,7 +17,7 @@ from nerfro.evaluation.results import RunMetrics
 from nerfro.evaluation.run_page import write_run_page
 from nerfro.evaluation.scoring import ImageMetrics, announce_scoring, score_split
 from nerfro.evaluation.tables import write_scores
-from nerfro.kernels.available import require_accelerator
+from nerfro.kernels.available import require_accelerator, require_backend
 from nerfro.rendering.scene_file import SceneFile
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.silhouettes.mesh_match import require_match
@@ -100,6 +100,8 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetr
     trainer = make_trainer(config, folder, throughput, [interruption, *viewers], num_steps)
     require_match(renderer.scene.medium, training.views)
     memory = check_before_training(renderer, training.data, trainer)
+    if config.compile is not None:
+        require_backend(config.compile, trainer.strategy.root_device)
     if trainer.is_global_zero:
         begin(folder, config, renderer, has_steps=not 0 <= trainer.max_steps <= num_steps)
         print(memory, flush=True)

@@ -114,6 +114,7 @@ def test_finest_texel_follows_the_pixel(
     [
         (["medium.mesh={cube}", "medium.ior=1.5"], "mesh"),
         (["medium.mesh={cube}", "medium.ior=1.5", "sampler.path.interface=sdf"], "sdf"),
+        (["medium.mesh={hole}", "medium.ior=1.5", "medium.accept_open_mesh=true"], "sdf"),
         (["medium.bodies={{ball: {{surface: {{name: ball, radius: 1}}, ior: 1.5}}}}"], "sdf"),  # has no triangles
         (["medium.bodies={{one: {{mesh: {cube}, ior: 1.5}}, other: {{mesh: {cube}, ior: 1.3}}}}"], "sdf"),
         (["+experiment=straight"], None),
@@ -122,6 +123,9 @@ def test_finest_texel_follows_the_pixel(
 def test_training_traces_the_triangles_of_a_single_closed_mesh(
     medium: list[str], interface: str | None, tmp_path: Path
 ) -> None:
-    trimesh.creation.box((1.0, 1.0, 1.0)).export(cube := tmp_path / "cube.ply")
-    config = composed(*[option.format(cube=cube) for option in medium])
+    box = trimesh.creation.box((1.0, 1.0, 1.0))
+    files = {"cube": box, "hole": trimesh.Trimesh(box.vertices, box.faces[1:])}
+    for name, mesh in files.items():
+        mesh.export(tmp_path / f"{name}.ply")
+    config = composed(*[option.format(**{name: tmp_path / f"{name}.ply" for name in files}) for option in medium])
     assert derived(config, build_medium(config), example_views()).sampler.path.get("interface") == interface

@@ -97,7 +97,7 @@ class Snell(PathSampler):
         self.branching = Branching({"none": 0, "first": 1, "all": max_events}[branches], least_weight)
 
     @classmethod
-    def derive(cls, medium: Medium) -> dict[str, Any]:
+    def settings_for(cls, medium: Medium) -> dict[str, Any]:
         # The distances close small gaps between several bodies.
         meshes = [] if medium.bodies is None else medium.bodies.meshes
         return {"interface": "mesh" if len(meshes) == 1 and meshes[0].is_closed else "sdf"}
