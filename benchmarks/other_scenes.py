@@ -38,8 +38,8 @@ GROUND, GAP = -SCALE * MIDDLE, 0.004  # lowest point of the glass, and its dista
 FLOOR_TILES, TILE, TEXELS = 4, 3.0, 160  # tiles of the floor in a row; side of a tile; texels per world unit
 PICTURE = 144  # side of a picture on the mat, texels
 MEDIAN, BRIGHTEST = 0.3, 4.0  # radiance of the panoramas after scaling and clipping
-CAMERA, DISTANCE = Pinhole.square(0.7, 160), 4.0
-VIEWS = {"train": (60, 64), "val": (3, 64), "test": (12, 256)}  # number, and samples per pixel
+ANGLE, DISTANCE = 0.7, 4.0  # width of the images in radians, and distance of the cameras
+SPLITS = "train", "val", "test"
 COVERAGE = [((k + 0.5) / 36, (k * 0.618034) % 1) for k in range(36)]  # points in a pixel
 
 
@@ -163,10 +163,10 @@ def poses(count: int, seed: int, low: float, high: float) -> list[np.ndarray]:
 
 def coverage(tracer: PathTracer, pose: np.ndarray) -> np.ndarray:
     """Return the fraction [H, W] of each pixel that shows a refractive surface; opaque objects hide it."""
-    mi, total = tracer.mitsuba, np.zeros((CAMERA.height, CAMERA.width))
-    rows, columns = np.mgrid[: CAMERA.height, : CAMERA.width]
+    mi, camera = tracer.mitsuba, tracer.camera
+    total, (rows, columns) = np.zeros((camera.height, camera.width)), np.mgrid[: camera.height, : camera.width]
     for x, y in COVERAGE:
-        local = np.stack([columns + x - CAMERA.cx, CAMERA.cy - rows - y, np.full(rows.shape, -CAMERA.focal)], -1)
+        local = np.stack([columns + x - camera.cx, camera.cy - rows - y, np.full(rows.shape, -camera.focal)], -1)
         directions = local.reshape(-1, 3) @ pose[:3, :3].T
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         origin = mi.Point3f(*(mi.Float(np.full(len(directions), value)) for value in pose[:3, 3]))
@@ -176,12 +176,13 @@ def coverage(tracer: PathTracer, pose: np.ndarray) -> np.ndarray:
     return total / len(COVERAGE)
 
 
-def render(name: str, assets: Path, panorama: Path, folder: Path) -> None:
+def render(options: argparse.Namespace) -> None:
     """Render a data set."""
-    scene, nothing, noise = SCENES[name]({part.name: part for part in GltfScene(assets).parts}), join([]), []
-    rendered = SyntheticScene(GLASS, nothing, nothing, scaled_sky(panorama), scene.panels, parts=scene.parts)
-    tracer = PathTracer(rendered, True, CAMERA)
-    for number, (split, (count, spp)) in enumerate(VIEWS.items()):
+    folder, camera, noise = options.folder, Pinhole.square(ANGLE, options.width), []
+    scene, nothing = SCENES[options.scene]({part.name: part for part in GltfScene(options.assets).parts}), join([])
+    rendered = SyntheticScene(GLASS, nothing, nothing, scaled_sky(options.panorama), scene.panels, parts=scene.parts)
+    tracer = PathTracer(rendered, True, camera)
+    for number, (split, count, spp) in enumerate(zip(SPLITS, options.views, options.spp, strict=True)):
         frames = []
         for view, pose in enumerate(track(split, poses(count, number, *scene.heights))):
             halves = [tracer.render(pose, spp // 2, 1000 * number + 2 * view + half) for half in (0, 1)]
@@ -191,15 +192,17 @@ def render(name: str, assets: Path, panorama: Path, folder: Path) -> None:
             write_image(folder / f"{image}.png", mean)
             write_image(folder / mask, coverage(tracer, pose))
             frames.append({"file_path": f"./{image}", "mask_path": f"./{mask}", "transform_matrix": pose.tolist()})
-        lens = {"camera_angle_x": CAMERA.angle_x, "w": CAMERA.width, "h": CAMERA.height}
+        lens = {"camera_angle_x": camera.angle_x, "w": camera.width, "h": camera.height}
         write_json(folder / f"transforms_{split}.json", {**lens, "frames": frames})
     for body in scene.bodies:
         body.surface.save(folder / f"{body.name}.ply")
     meta = {
-        "scene": name,
+        "scene": options.scene,
         "bodies": {body.name: {"ior": body.ior, "absorption": body.absorption} for body in scene.bodies},
-        "panorama": f"{panorama.name}, median radiance {MEDIAN}, clipped at {BRIGHTEST}",
-        "views": {split: {"number": count, "spp": spp} for split, (count, spp) in VIEWS.items()},
+        "panorama": f"{options.panorama.name}, median radiance {MEDIAN}, clipped at {BRIGHTEST}",
+        "views": {
+            split: {"number": n, "spp": spp} for split, n, spp in zip(SPLITS, options.views, options.spp, strict=True)
+        },
         "noise_floor_test_psnr": round(float(-10 * np.log10(np.mean(noise))), 2),
     }
     write_json(folder / "meta.json", meta)
@@ -212,8 +215,10 @@ def main() -> None:
     parser.add_argument("assets", type=Path, help="glass_with_straw.glb")
     parser.add_argument("panorama", type=Path, help="lat-long image (.hdr, .exr)")
     parser.add_argument("folder", type=Path, help="folder of the data set")
-    options = parser.parse_args()
-    render(options.scene, options.assets, options.panorama, options.folder)
+    parser.add_argument("--width", type=int, default=160, help="pixels")
+    parser.add_argument("--views", type=int, nargs=3, default=[60, 3, 12], help="for training, validation and test")
+    parser.add_argument("--spp", type=int, nargs=3, default=[64, 64, 256], help="samples per pixel of these")
+    render(parser.parse_args())
 
 
 if __name__ == "__main__":

@@ -17,11 +17,13 @@ import pytest
 import torch
 import trimesh
 from lightning.pytorch.callbacks import timer
+from trimesh.exchange.gltf import export_glb
 
 import nerfro
 from benchmarks.capture import align_to_truth
 from nerfro.files.images import save_png
-from nerfro.geometry.mesh import TriangleMesh
+from nerfro.geometry.gltf import Z_UP_TO_Y_UP
+from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.kernels import available
 from nerfro.poses.collection import extract_frames
 from nerfro.train import main
@@ -30,6 +32,7 @@ from nerfro.viewing import server
 from tests import ball_photographs
 from tests.cameras_at import upright_cameras
 from tests.conftest import refused
+from tests.synthetic.test_gltf_scene import GLASS, RED
 from tests.viewing.browser import needs_chromium
 from tests.viewing.test_exports import write
 
@@ -330,6 +333,31 @@ def test_mitsuba_export_benchmark_compares_with_mitsuba(run: Run, trained_run: P
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("mitsuba")
+def test_scenes_of_other_people_are_data_sets_with_bodies(run: Run, tmp_path: Path) -> None:
+    profile = [[0.0, 0.0], [0.4, 0.0], [0.5, 1.6], [0.46, 1.6], [0.36, 0.1], [0.0, 0.1]]
+    shapes = {"glass": trimesh.creation.revolve(profile, sections=24)}
+    for name in ("straw", "straw_2", "straw_001", "straw_001_2", "flowers", "cake"):
+        shapes[name] = trimesh.creation.box((0.1, 0.1, 0.3))
+    scene, turn = trimesh.Scene(), np.eye(4)
+    turn[:3, :3] = Z_UP_TO_Y_UP
+    for name, shape in shapes.items():
+        scene.add_geometry(shape, geom_name=name, node_name=name, transform=turn)
+
+    def add(tree: dict[str, Any]) -> None:
+        tree["materials"] = [GLASS, RED]
+        for mesh in tree["meshes"]:
+            mesh["primitives"][0]["material"] = int(mesh["name"] != "glass")
+
+    (tmp_path / "assets.glb").write_bytes(export_glb(scene, tree_postprocessor=add))
+    save_png(tmp_path / "sky.png", torch.rand(8, 16, 3))
+    for name, bodies in {"straw": ["glass", "water"], "amber": ["amber"]}.items():
+        folder, short = tmp_path / name, ("--width", 16, "--views", 2, 1, 1, "--spp", 2, 2, 2)
+        run("other_scenes", name, tmp_path / "assets.glb", tmp_path / "sky.png", folder, *short)
+        assert len(list((folder / "train").iterdir())) == len(list((folder / "train_mask").iterdir())) == 2
+        assert all(load_mesh(folder / f"{body}.ply").is_closed for body in bodies)
+        assert list(json.loads((folder / "meta.json").read_text())["bodies"]) == bodies
+
+
 def test_glassware_benchmark_renders_and_scores_a_perfect_reconstruction(
     run: Run, trained_run: Path, tmp_path: Path
 ) -> None:
