@@ -579,7 +579,7 @@ def test_scene_file_selects_the_experiment(run_here: Runner, pretended: Pretende
     run_here("reconstruct", *asked[:2], *asked[3:], f"out={pretended.out}")
     assert pretended.names[1:] == ["preprocess", "train", "train", "train", "summary", "export"]
     assert pretended.ran[1][1][:4] == ["data=blender", f"data.root={tiny_scene}", "medium=vessel", "medium.wall=0.1"]
-    assert pretended.ran[4][1][0] == "+experiment=glass_room"
+    assert pretended.ran[4][1][:2] == ["+experiment=glass_room", "batches.subdivision.side=1"]
 
 
 @pytest.mark.parametrize(
