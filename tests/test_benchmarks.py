@@ -32,7 +32,7 @@ from nerfro.viewing import server
 from tests import ball_photographs
 from tests.cameras_at import upright_cameras
 from tests.conftest import refused
-from tests.synthetic.test_gltf_scene import GLASS, RED
+from tests.synthetic.test_gltf_scene import set_materials
 from tests.viewing.browser import needs_chromium
 from tests.viewing.test_exports import write
 
@@ -336,19 +336,15 @@ def test_mitsuba_export_benchmark_compares_with_mitsuba(run: Run, trained_run: P
 def test_scenes_of_other_people_are_data_sets_with_bodies(run: Run, tmp_path: Path) -> None:
     profile = [[0.0, 0.0], [0.4, 0.0], [0.5, 1.6], [0.46, 1.6], [0.36, 0.1], [0.0, 0.1]]
     shapes = {"glass": trimesh.creation.revolve(profile, sections=24)}
-    for name in ("straw", "straw_2", "straw_001", "straw_001_2", "flowers", "cake"):
+    opaque = "straw", "straw_2", "straw_001", "straw_001_2", "flowers", "cake"
+    for name in opaque:
         shapes[name] = trimesh.creation.box((0.1, 0.1, 0.3))
     scene, turn = trimesh.Scene(), np.eye(4)
     turn[:3, :3] = Z_UP_TO_Y_UP
     for name, shape in shapes.items():
         scene.add_geometry(shape, geom_name=name, node_name=name, transform=turn)
-
-    def add(tree: dict[str, Any]) -> None:
-        tree["materials"] = [GLASS, RED]
-        for mesh in tree["meshes"]:
-            mesh["primitives"][0]["material"] = int(mesh["name"] != "glass")
-
-    (tmp_path / "assets.glb").write_bytes(export_glb(scene, tree_postprocessor=add))
+    content = export_glb(scene, tree_postprocessor=lambda tree: set_materials(tree, opaque))
+    (tmp_path / "assets.glb").write_bytes(content)
     save_png(tmp_path / "sky.png", torch.rand(8, 16, 3))
     for name, bodies in {"straw": ["glass", "water"], "amber": ["amber"]}.items():
         folder, short = tmp_path / name, ("--width", 16, "--views", 2, 1, 1, "--spp", 2, 2, 2)

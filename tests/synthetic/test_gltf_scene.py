@@ -1,6 +1,7 @@
 """Scenes of glTF files: materials, nodes, cavities, cameras and data sets."""
 
 import json
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,13 @@ CAMERAS = [{"type": "perspective", "perspective": {"yfov": 0.5, "aspectRatio": 2
 EXTENT = np.array([0.5, 0.4, 0.3])
 
 
+def set_materials(tree: dict[str, Any], opaque: Collection[str]) -> None:
+    """Make the meshes of a glTF document of glass, and the opaque ones red."""
+    tree["materials"] = [GLASS, RED]
+    for mesh in tree["meshes"]:
+        mesh["primitives"][0]["material"] = int(mesh["name"] in opaque)
+
+
 def write_scene(path: Path, *, hollow: bool = False) -> Path:
     """Write an ellipsoid of glass around a red cube, in a turned and scaled node, with a camera on the x axis."""
     shape = trimesh.creation.icosphere(3).apply_transform(np.diag([*EXTENT, 1]))
@@ -54,9 +62,7 @@ def write_scene(path: Path, *, hollow: bool = False) -> Path:
         scene.add_geometry(mesh, geom_name=name, node_name=name, transform=turn @ np.diag([2.0, 2.0, 2.0, 1.0]))
 
     def add(tree: dict[str, Any]) -> None:
-        tree["materials"] = [GLASS, RED]
-        for mesh in tree["meshes"]:
-            mesh["primitives"][0]["material"] = int(mesh["name"] == "cube")
+        set_materials(tree, ["cube"])
         tree["cameras"] = CAMERAS
         tree["nodes"].append({"name": "eye", "camera": 0, "translation": [0, 0, 4.0]})
         tree["scenes"][0]["nodes"].append(len(tree["nodes"]) - 1)
@@ -70,12 +76,8 @@ def test_vertex_colours_are_factors_of_the_colour_of_the_material(tmp_path: Path
     cube.visual.vertex_colors = np.tile(np.array([255, 51, 102, 255], np.uint8), (8, 1))
     scene = trimesh.Scene({"drop": trimesh.creation.icosphere(1), "cube": cube})
 
-    def add(tree: dict[str, Any]) -> None:
-        tree["materials"] = [GLASS, RED]
-        for mesh in tree["meshes"]:
-            mesh["primitives"][0]["material"] = int(mesh["name"] == "cube")
-
-    (tmp_path / "colours.glb").write_bytes(export_glb(scene, tree_postprocessor=add))
+    content = export_glb(scene, tree_postprocessor=lambda tree: set_materials(tree, ["cube"]))
+    (tmp_path / "colours.glb").write_bytes(content)
     (part,) = (part for part in GltfScene(tmp_path / "colours.glb").parts if part.ior is None)
     assert part.surface.colours is not None
     expected = to_srgb(np.array([0.8, 0.1, 0.1]) * [1.0, 0.2, 0.4])
