@@ -15,7 +15,7 @@ from nerfro.media.body_settings import make_bodies
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.paths.snell_cpu import Scratch
 from nerfro.samplers.paths.surface_search_cpu import Line, end_of_blocks
-from nerfro.samplers.paths.triangle_search_cpu import first_triangle
+from nerfro.samplers.paths.triangle_search_cpu import FARTHEST, first_triangle
 from tests.closed_forms import make_rays, random_rays
 
 
@@ -23,7 +23,7 @@ from tests.closed_forms import make_rays, random_rays
 def _first_triangles(tree, scratch, origins, directions, lengths):  # type: ignore[no-untyped-def]
     for i in range(len(origins)):
         x, d = origins[i], directions[i]
-        lengths[i] = first_triangle(tree, scratch, Line(x[0], x[1], x[2], d[0], d[1], d[2]))[2]
+        lengths[i] = first_triangle(tree, scratch, Line(x[0], x[1], x[2], d[0], d[1], d[2]), FARTHEST)[2]
 
 
 def _lengths(corners: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:

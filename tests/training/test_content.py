@@ -116,11 +116,18 @@ def test_finest_texel_follows_the_pixel(
         (["medium.mesh={cube}", "medium.ior=1.5", "sampler.path.interface=sdf"], "sdf"),
         (["medium.mesh={hole}", "medium.ior=1.5", "medium.accept_open_mesh=true"], "sdf"),
         (["medium.bodies={{ball: {{surface: {{name: ball, radius: 1}}, ior: 1.5}}}}"], "sdf"),  # has no triangles
-        (["medium.bodies={{one: {{mesh: {cube}, ior: 1.5}}, other: {{mesh: {cube}, ior: 1.3}}}}"], "sdf"),
+        (["medium.bodies={{one: {{mesh: {cube}, ior: 1.5}}, other: {{mesh: {cube}, ior: 1.3}}}}"], "mesh"),
+        (
+            [
+                "medium.accept_open_mesh=true",
+                "medium.bodies={{one: {{mesh: {cube}, ior: 1.5}}, other: {{mesh: {hole}, ior: 1.3}}}}",
+            ],
+            "sdf",
+        ),
         (["+experiment=straight"], None),
     ],
 )
-def test_training_traces_the_triangles_of_a_single_closed_mesh(
+def test_training_traces_the_triangles_of_closed_meshes(
     medium: list[str], interface: str | None, tmp_path: Path
 ) -> None:
     box = trimesh.creation.box((1.0, 1.0, 1.0))

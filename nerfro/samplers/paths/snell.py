@@ -70,7 +70,7 @@ class Snell(PathSampler):
     Args:
         interface: `sdf` is the zero level of the signed distance, with smooth normals and tolerance of noisy hulls;
             `mesh` is the triangles, with sharp edges, and smooth normals where the triangles sample a smooth surface
-            (`shading` of the body). None is `sdf`; a training takes `mesh` for a single body with a closed mesh.
+            (`shading` of the body). None is `sdf`; a training takes `mesh` if each body has a closed mesh.
         max_events: largest number of refractions and reflections of a ray.
         branches: `none` transmits all light that is not totally reflected, as the paper does; `first` adds the
             reflection at the first surface of a ray; `all` adds all reflections.
@@ -98,9 +98,8 @@ class Snell(PathSampler):
 
     @classmethod
     def settings_for(cls, medium: Medium) -> dict[str, Any]:
-        # The distances close small gaps between several bodies.
         meshes = [] if medium.bodies is None else medium.bodies.meshes
-        return {"interface": "mesh" if len(meshes) == 1 and meshes[0].is_closed else "sdf"}
+        return {"interface": "mesh" if meshes and all(mesh.is_closed for mesh in meshes) else "sdf"}
 
     def tracers(self, medium: Medium) -> list[Tracer]:
         """Return the tracers for the surfaces of a medium: one for each wavelength if the medium disperses, else one.

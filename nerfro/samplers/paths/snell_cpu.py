@@ -20,7 +20,7 @@ from nerfro.kernels.compilation import compiled, compiled_parallel
 from nerfro.kernels.lookup import body_distance, box_span, distance_out, grid_of, spline_value_gradient
 from nerfro.samplers.paths.branching import Branching
 from nerfro.samplers.paths.surface_search_cpu import Line, advance, first_surface
-from nerfro.samplers.paths.triangle_search_cpu import begin_inside, face_normal, first_triangle
+from nerfro.samplers.paths.triangle_search_cpu import FARTHEST, begin_inside, face_normal, first_triangle
 
 _BLOCK = 64  # number of rays for which a thread allocates scratch memory once
 _DEPTH = 64  # largest depth of a tree of triangles
@@ -266,9 +266,21 @@ def _next_surface(solids, tree, scratch, body, line):
             return hit, -1, 0, before, after
         across, behind = _cross(solids, scratch, body, hit, after)
         return hit, -1, across, before, behind
-    hit, triangle, before, behind = first_triangle(tree, scratch, line)
+    scratch.crossings[:] = 1.0
+    hit, triangle, before, behind = first_triangle(tree, scratch, line, FARTHEST)
     _flip(scratch)
-    return hit, triangle, _deciding_body(scratch.inside, solids), before, behind
+    across = _deciding_body(scratch.inside, solids)
+    if across == 0 and body > 0 and len(scratch.inside) > 1:
+        # A thin gap of air counts as closed, as in `_cross`.
+        _flip(scratch)
+        thinnest = math.inf
+        for min_step in solids.min_step:
+            thinnest = min(thinnest, min_step)
+        other, _, _, width = first_triangle(tree, scratch, advance(line, behind), thinnest)
+        behind += width if other >= 0 else 0.0
+        _flip(scratch)
+        across = _deciding_body(scratch.inside, solids)
+    return hit, triangle, across, before, behind
 
 
 @compiled

@@ -8,7 +8,7 @@ from nerfro.kernels.compilation import compiled
 from nerfro.kernels.lookup import body_distance
 from nerfro.samplers.paths.surface_search_cpu import advance
 
-_FARTHEST = 1e300  # beyond all triangles; boxes that are missed are at infinity
+FARTHEST = 1e300  # beyond all triangles; boxes that are missed are at infinity
 # Barycentric coordinates beyond which a line misses a triangle: lines through edges meet one of both triangles.
 _TOLERANCE = 1e-9
 
@@ -78,20 +78,20 @@ def _search_leaf(tree, scratch, leaf, line, nearest):
 
 
 @compiled
-def first_triangle(tree, scratch, line):
-    """Find the first triangle on a line.
+def first_triangle(tree, scratch, line, limit):
+    """Find the first triangle on a line, before a limit.
 
     After the call, `scratch.faces` has all triangles at the distance of the first one, because the ray continues behind
-    them, at most one in each layer, and `scratch.crossings` is negative for bodies whose surface is crossed.
+    them, at most one in each layer, and `scratch.crossings` has changed its sign for bodies whose surface is crossed.
 
     Returns:
         Body of the first triangle, -1 for none; the triangle; and the distances of the first and last triangle met.
     """
     nodes, entries = scratch.nodes, scratch.entries
-    scratch.lengths[:], scratch.crossings[:] = math.inf, 1.0
+    scratch.lengths[:] = math.inf
     x, y, z, dx, dy, dz = line
     qx, qy, qz = _inverse(dx), _inverse(dy), _inverse(dz)
-    first_leaf, size, nearest = len(tree.leaves) - 1, 1, _FARTHEST
+    first_leaf, size, nearest = len(tree.leaves) - 1, 1, limit
     nodes[0], entries[0] = 0, _enter(tree.boxes[0], x, y, z, qx, qy, qz)
     while size > 0:
         size -= 1
@@ -109,8 +109,9 @@ def first_triangle(tree, scratch, line):
         nodes[size + 1], entries[size + 1] = (left, near) if is_left else (left + 1, far)
         size += 2
     hit, first, farthest = -1, -1, nearest
+    reach = nearest + tree.offset if nearest < limit else -1.0
     for layer in range(len(scratch.faces)):
-        face = scratch.faces[layer] if scratch.lengths[layer] <= nearest + tree.offset else -1
+        face = scratch.faces[layer] if scratch.lengths[layer] <= reach else -1
         scratch.faces[layer] = face
         if face >= 0:
             farthest = max(farthest, scratch.lengths[layer])
@@ -129,7 +130,7 @@ def begin_inside(solids, tree, scratch, line):
     from the triangles. Therefore, if the distance to the body of the first triangle is less than a voxel, a ray begins
     inside this body if it leaves the body through the triangle.
     """
-    hit, _, length, _ = first_triangle(tree, scratch, line)
+    hit, _, length, _ = first_triangle(tree, scratch, line, FARTHEST)
     half_way = advance(line, 0.5 * length if hit >= 0 else 0.0)
     for body in range(len(scratch.inside)):
         phi = body_distance(solids, body, half_way.x, half_way.y, half_way.z)
