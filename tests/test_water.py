@@ -72,9 +72,8 @@ def test_media_of_the_guide_train(name: str, tiny_default_run: list[str], train_
 
     bodies = str(enlarged(MEDIA[name])).replace("'", "")
     box = ["content.box_min=[-0.8,-0.8,-0.8]", "content.box_max=[0.8,0.8,0.8]"]
-    interface = "sampler.path.interface=mesh"
     grid = "medium.resolution=192" if name == "pane" else "medium.resolution=32"
-    options = f"bodies={bodies}", *box, interface, grid, "trainer.max_steps=2", f"hydra.run.dir={tmp_path}"
+    options = f"bodies={bodies}", *box, grid, "trainer.max_steps=2", f"hydra.run.dir={tmp_path}"
     train_here(*tiny_default_run, *options)
     assert (tmp_path / "metrics.json").is_file()
 
@@ -95,6 +94,6 @@ def test_bodies_of_synthesized_scenes_are_nested(name: str, tmp_path: Path) -> N
 @pytest.mark.parametrize("name", SCENES)
 def test_synthesized_scenes_train(name: str, train_here: Runner, tmp_path: Path) -> None:
     data = synthesize_scene(name, tmp_path / "data", pixels=16, spp=2, num_views=2)
-    options = "sampler.path.interface=mesh", "trainer.max_steps=2", f"hydra.run.dir={tmp_path / 'run'}"
+    options = "trainer.max_steps=2", f"hydra.run.dir={tmp_path / 'run'}"
     train_here(f"scene={data / 'scene.json'}", *SMALL, *options)
     assert (tmp_path / "run" / "metrics.json").is_file()
