@@ -157,7 +157,7 @@ class TriangleTree(NamedTuple):
     body: Int[np.ndarray, "F"]
     layer: Int[np.ndarray, "F"]
     num_layers: int
-    offset: float  # distance from a surface at which the search for the next one begins, world units
+    offset: float  # distance within which triangles count as met together, world units
 
     @classmethod
     def of(cls, triangles: Triangles, layer: Int[np.ndarray, "F"], offset: float) -> TriangleTree:

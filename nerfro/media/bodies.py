@@ -268,8 +268,7 @@ class Bodies(Medium):
     def tree(self) -> TriangleTree:
         """Tree of `triangles` for the tracer."""
         assert self.outline is not None
-        # The search for the next triangle begins at this share of the box's diagonal from the last one. Triangles of
-        # touching bodies within this distance count as met together.
+        # Triangles within this share of the box's diagonal count as met together, as those of touching bodies.
         offset = 1e-6 * float(torch.linalg.vector_norm(self.box.double().diff(dim=0)))
         return TriangleTree.of(self.triangles, layers(self.triangles.corners, self.outline.faces), offset)
 

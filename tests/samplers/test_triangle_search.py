@@ -3,6 +3,7 @@
 import math
 import sys
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -97,6 +98,54 @@ def test_faces_of_two_bodies_that_almost_coincide_are_met_together(tmp_path: Pat
         exits.append(Snell("mesh")(rays, medium).exit_directions)
     for other in exits[1:]:
         torch.testing.assert_close(other, exits[0])
+
+
+@pytest.mark.parametrize("branches", ["none", "all"])
+@pytest.mark.parametrize("gap", [-3e-6, -1e-6, -1e-7, 1e-6, 5e-5])
+@pytest.mark.parametrize("iors", [(1.33, 1.5), (1.05, 1.6), (1.6, 1.05)])
+def test_bodies_that_almost_touch_are_as_bodies_in_contact(
+    iors: tuple[float, float], gap: float, branches: Literal["none", "all"], tmp_path: Path
+) -> None:
+    """Refraction shortens or lengthens the way between their faces, and light may be totally reflected there."""
+    generator = np.random.default_rng(0)
+    directions = generator.normal(size=(2000, 3)) * [1, 1, 0.5] + np.array([0, 0, 2])
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    origins = torch.tensor(generator.uniform(-0.4, 0.4, size=(2000, 3)))
+    weights, exits = [], []
+    for distance in (0.0, gap):
+        bodies = {}
+        for name, z, ior in zip(("lower", "upper"), (0.0, 1 + distance), iors, strict=True):
+            file = tmp_path / f"{name}_{distance}.ply"
+            trimesh.creation.box((1, 1, 1), trimesh.transformations.translation_matrix([0, 0, z])).export(file)
+            bodies[name] = {"mesh": str(file), "ior": ior}
+        medium = make_bodies(bodies=bodies, resolution=16, cache=False)
+        path = Snell("mesh", branches=branches)(make_rays(origins, torch.tensor(directions), 0.0, 9.0), medium)
+        assert (path.record.body.gather(1, (path.s < path.s[:, -1:]).sum(1, keepdim=True)) == 0).all()
+        exits.append(path.main_polyline(path.exit_directions))
+        weights.append(torch.zeros(len(origins)).index_add(0, path.ray, path.throughput.float().mean(-1)))
+    differs = (exits[1] - exits[0]).norm(dim=-1) > 1e-3
+    assert differs.float().mean() < 1e-3  # rays through an edge
+    torch.testing.assert_close(weights[1], weights[0])
+
+
+def test_gap_is_closed_between_the_bodies_beside_it_only(tmp_path: Path) -> None:
+    """Neither a small body far away nor a slit in one body changes which gaps are closed."""
+    slit = 1e-4
+    file = {}
+    for name, sides, centre in (
+        ("lower", (1, 1, 1), (0, 0, -0.5)),
+        ("upper", (1, 1, 1), (0, 0, 0.5 + slit)),
+        ("small", (0.02, 0.02, 0.02), (3, 0, 0)),
+    ):
+        file[name] = tmp_path / f"{name}.ply"
+        trimesh.creation.box(sides, trimesh.transformations.translation_matrix(centre)).export(file[name])
+    file["both"] = tmp_path / "both.ply"
+    trimesh.util.concatenate([trimesh.load(file[name]) for name in ("lower", "upper")]).export(file["both"])
+    ray = make_rays(torch.tensor([[0.1, 0.2, -3.0]]), torch.tensor([[0.0, 0.0, 1.0]]), 0.0, 9.0)
+    for names, expected in ((("lower", "upper", "small"), [0, 1, 2, 0]), (("both", "small"), [0, 1, 0, 1, 0])):
+        bodies = {name: {"mesh": str(file[name]), "ior": 1.5 + 0.1 * i} for i, name in enumerate(names)}
+        path = Snell("mesh")(ray, make_bodies(bodies=bodies, resolution=32, cache=False))
+        assert path.record.body[0, : len(expected)].tolist() == expected
 
 
 @pytest.mark.parametrize("x", [20.0, 20.5, 21.0, 21.0 + 1e-9])

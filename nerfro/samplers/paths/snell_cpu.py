@@ -271,13 +271,15 @@ def _next_surface(solids, tree, scratch, body, line):
     _flip(scratch)
     across = _deciding_body(scratch.inside, solids)
     if across == 0 and body > 0 and len(scratch.inside) > 1:
-        # A thin gap of air counts as closed, as in `_cross`.
+        # A thin gap of air between two bodies counts as closed, as in `_cross`.
         _flip(scratch)
-        thinnest = math.inf
-        for min_step in solids.min_step:
-            thinnest = min(thinnest, min_step)
-        other, _, _, width = first_triangle(tree, scratch, advance(line, behind), thinnest)
-        behind += width if other >= 0 else 0.0
+        start, limit = advance(line, behind), solids.min_step[hit]
+        other, _, _, width = first_triangle(tree, scratch, start, limit)
+        if other >= 0:
+            if other != hit and width <= solids.min_step[other]:
+                behind += width
+            else:
+                first_triangle(tree, scratch, start, limit)  # changes the signs of the crossings back
         _flip(scratch)
         across = _deciding_body(scratch.inside, solids)
     return hit, triangle, across, before, behind

@@ -11,6 +11,9 @@ from nerfro.samplers.paths.surface_search_cpu import advance
 FARTHEST = 1e300  # beyond all triangles; boxes that are missed are at infinity
 # Barycentric coordinates beyond which a line misses a triangle: lines through edges meet one of both triangles.
 _TOLERANCE = 1e-9
+# A ray skips triangles at its start, where it has just met them. Refraction towards the normal shortens the way between
+# triangles that almost coincide, so this is a small share of the distance within which triangles are met together.
+_SKIPPED = 1e-3
 
 
 @compiled
@@ -67,7 +70,7 @@ def _search_leaf(tree, scratch, leaf, line, nearest):
     """Update the first triangle of each layer by the triangles of a leaf; returns the smallest distance so far."""
     for i in range(tree.leaves.shape[1]):
         length, second, third, _ = _meet(tree.leaf_corners[leaf, i], line)
-        if not (min(second, min(third, 1.0 - second - third)) >= -_TOLERANCE and length > tree.offset):
+        if not (min(second, min(third, 1.0 - second - third)) >= -_TOLERANCE and length > _SKIPPED * tree.offset):
             continue
         face = tree.leaves[leaf, i]
         layer = tree.layer[face]
