@@ -20,6 +20,7 @@ from nerfro.files.images import write_radiance
 from nerfro.files.lat_long import envmap_texture
 from nerfro.viewing.exports import EXPORTS, Export, ExportConfig
 from nerfro.viewing.page import page_split
+from nerfro.viewing.surface import surface_of
 from nerfro.viewing.trained_scene import TrainedScene, absorption_of
 
 if TYPE_CHECKING:
@@ -53,7 +54,7 @@ def write_mitsuba(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
     scene.cameras("train").refuse_turntable("what=mitsuba has one sky for all cameras", "take what=mesh and what=sky")
     glass, inside = glass_meshes(scene), inside_mesh(scene, options.resolution, options.half_depth)
     if len(glass) > 1:
-        _require_apart(scene, glass)
+        _require_apart(scene)
     split = page_split(scene)
     cameras, absorption = scene.cameras(split).to("cpu"), absorption_of(scene.renderer.scene)
     glass_file, inside_file, sky_file = (out.with_name(out.stem + ending) for ending in MITSUBA_FILES)
@@ -95,12 +96,13 @@ def write_mitsuba(scene: TrainedScene, out: Path, options: ExportConfig) -> str:
     return f"a scene of {len(cameras)} sensors with {content} inside"
 
 
-def _require_apart(scene: TrainedScene, glass: list[trimesh.Trimesh]) -> None:
+def _require_apart(scene: TrainedScene) -> None:
     """Refuse bodies that lie inside others or overlap, which a `dielectric` of Mitsuba cannot describe."""
     bodies = scene.renderer.scene.medium.bodies
     assert bodies is not None
-    for body, mesh in enumerate(glass):
-        phi, _ = bodies.signed_distances(torch.from_numpy(np.asarray(mesh.vertices)).to(bodies.box))
+    # The triangles of a mesh may be too large for a test of their vertices.
+    for body, mesh in enumerate(surface_of(bodies, triangles=False)):
+        phi, _ = bodies.signed_distances(torch.from_numpy(mesh.vertices).to(bodies.box))
         phi[:, body] = torch.inf
         if (phi < 0).any():
             raise NerfroError(

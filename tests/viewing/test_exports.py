@@ -348,6 +348,19 @@ def test_mitsuba_scenes_contain_separate_bodies(two_bodies: TrainedScene, tmp_pa
     refused("inside others or overlap", write, two_bodies, "mitsuba", tmp_path / "overlapping.xml")
 
 
+def test_crossed_bars_without_vertices_inside_each_other_overlap(scene: TrainedScene, tmp_path: Path) -> None:
+    bodies = {}
+    for name, sides in (("one", (1.4, 0.2, 0.2)), ("other", (0.2, 1.4, 0.2))):
+        trimesh.creation.box(sides).export(tmp_path / f"{name}.ply")
+        bodies[name] = {"mesh": str(tmp_path / f"{name}.ply"), "ior": 1.5}
+    medium = make_bodies(bodies=bodies, resolution=32, cache=False)
+    renderer = with_changed_scene(scene.renderer, medium=medium)
+    renderer.path_sampler = Snell("mesh")
+    refused(
+        "inside others or overlap", write, replace(scene, renderer=renderer), "mitsuba", tmp_path / "overlapping.xml"
+    )
+
+
 @pytest.mark.slow
 def test_mitsuba_sensors_that_differ_from_the_cameras_are_named(
     scene: TrainedScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
