@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 def glass_meshes(scene: TrainedScene, triangles: int | None = None) -> list[trimesh.Trimesh]:
     """Triangulate the surface of each body, with vertex normals; returns an empty list without bodies.
 
-    All surfaces together have at most half of `triangles`. The mesh that a single body was made of is written as it is,
-    if it has so few triangles; other surfaces are simplified.
+    All surfaces together have at most half of `triangles`. Meshes whose triangles rays meet, and the mesh that a single
+    body was made of, are written as they are, if they have so few triangles; other surfaces are simplified.
     """
     bodies = scene.renderer.scene.medium.bodies
     if bodies is None:
