@@ -91,6 +91,7 @@ class OptimizerConfig:
         warmup_steps: length of the warm-up; 0 for none.
         warmup_factor: factor of the learning rate at its first step.
         adam_epsilon: epsilon of adam, adamw and radam.
+        adam_beta: decay of the mean of squared gradients of adam, adamw and radam (beta 2).
         freeze: patterns of the names of parameters that do not learn.
     """
 
@@ -105,6 +106,7 @@ class OptimizerConfig:
     warmup_steps: Natural = 20
     warmup_factor: Annotated[NotNegative, OnlyWith("warmup_steps")] = 0.01
     adam_epsilon: Positive = 1e-15
+    adam_beta: Annotated[float, Ge(0), Lt(1)] = 0.999
     freeze: list[str] = dataclasses.field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -150,7 +152,8 @@ class OptimizerConfig:
         for kind, options, of_kind in self._by_kind(groups):
             if kind == "muon" and any(p.ndim != 2 for group in of_kind for p in group["params"]):
                 raise NerfroError("optimizer muon takes matrices only; name it in optimizer.groups for fields.*.weight")
-            options = ({"eps": self.adam_epsilon} if kind in ("adam", "adamw", "radam") else {}) | options
+            adam = {"eps": self.adam_epsilon, "betas": (0.9, self.adam_beta)}
+            options = (adam if kind in ("adam", "adamw", "radam") else {}) | options
             if kind in ("adam", "adamw") and not {"foreach", "differentiable"} & options.keys():
                 options = {"fused": fused} | options
             optimizers[of_kind[0]["kind"]] = _created(f"optimizer {kind}", OPTIMIZERS[kind], of_kind, options)

@@ -103,8 +103,9 @@ def test_last_matching_pattern_decides_and_unmatched_pattern_is_refused() -> Non
 
 def test_groups_with_several_kinds_of_optimizers_step_like_each_alone_and_resume() -> None:
     config = OptimizerConfig(
-        learning_rate=0.1, groups={"b": GroupConfig(0.5, name="sgd"), "c": GroupConfig(name="radam")}
+        learning_rate=0.1, adam_beta=0.9, groups={"b": GroupConfig(0.5, name="sgd"), "c": GroupConfig(name="radam")}
     )
+    adam = {"eps": config.adam_epsilon, "betas": (0.9, config.adam_beta)}
     kinds = {"a": torch.optim.Adam, "b": torch.optim.SGD, "c": torch.optim.RAdam}
 
     def start() -> tuple[dict[str, torch.nn.Parameter], torch.optim.Optimizer]:
@@ -119,7 +120,7 @@ def test_groups_with_several_kinds_of_optimizers_step_like_each_alone_and_resume
 
     (joint, optimizer), (alone, _) = start(), start()
     separate = [
-        kind([alone[name]], lr=0.5 if name == "b" else 0.1, **({} if name == "b" else {"eps": config.adam_epsilon}))
+        kind([alone[name]], lr=0.5 if name == "b" else 0.1, **({} if name == "b" else adam))
         for name, kind in kinds.items()
     ]
     for _ in range(3):
