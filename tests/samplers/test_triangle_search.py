@@ -10,8 +10,10 @@ import pytest
 import torch
 import trimesh
 
+from nerfro.core.types import Rays
 from nerfro.geometry.intersection import Triangles, TriangleTree
 from nerfro.kernels.compilation import compiled_parallel
+from nerfro.media.bodies import Bodies
 from nerfro.media.body_settings import make_bodies
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.paths.snell_cpu import Scratch
@@ -80,22 +82,30 @@ def test_triangles_are_traced_beside_the_training(tmp_path: Path) -> None:
     assert Snell("mesh").releases_gil(make_bodies(str(tmp_path / "box.ply"), 1.5, resolution=16, cache=False))
 
 
+def _stacked_boxes(folder: Path, gap: float, iors: tuple[float, float]) -> Bodies:
+    bodies = {}
+    for name, z, ior in zip(("lower", "upper"), (0.0, 1 + gap), iors, strict=True):
+        file = folder / f"{name}_{gap}.ply"
+        trimesh.creation.box((1, 1, 1), trimesh.transformations.translation_matrix([0, 0, z])).export(file)
+        bodies[name] = {"mesh": str(file), "ior": ior}
+    return make_bodies(bodies=bodies, resolution=16, cache=False)
+
+
+def _upward_rays(number: int, steepness: float) -> Rays:
+    """Make rays that begin within the lower box of `_stacked_boxes`."""
+    generator = np.random.default_rng(0)
+    directions = generator.normal(size=(number, 3)) * [1, 1, steepness] + np.array([0, 0, 2])
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    origins = torch.tensor(generator.uniform(-0.4, 0.4, size=(number, 3)))
+    return make_rays(origins, torch.tensor(directions), 0.0, 9.0)
+
+
 def test_faces_of_two_bodies_that_almost_coincide_are_met_together(tmp_path: Path) -> None:
     """The gap is smaller than the offset of the search, and refraction lengthens the way through it."""
-    generator = np.random.default_rng(0)
-    directions = generator.normal(size=(4000, 3)) + np.array([0, 0, 2])
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    origins = torch.tensor(generator.uniform(-0.4, 0.4, size=(4000, 3)))
-    exits = []
-    for gap in (0.0, 5e-7, 2e-6):
-        bodies = {}
-        for name, z, ior in (("lower", 0.0, 1.6), ("upper", 1 + gap, 1.05)):
-            shape = trimesh.creation.box((1, 1, 1), trimesh.transformations.translation_matrix([0, 0, z]))
-            bodies[name] = {"mesh": str(tmp_path / f"{name}_{gap}.ply"), "ior": ior}
-            shape.export(tmp_path / f"{name}_{gap}.ply")
-        medium = make_bodies(bodies=bodies, resolution=16, cache=False)
-        rays = make_rays(origins, torch.tensor(directions), 0.0, 9.0)
-        exits.append(Snell("mesh")(rays, medium).exit_directions)
+    rays = _upward_rays(4000, steepness=1)
+    exits = [
+        Snell("mesh")(rays, _stacked_boxes(tmp_path, gap, (1.6, 1.05))).exit_directions for gap in (0.0, 5e-7, 2e-6)
+    ]
     for other in exits[1:]:
         torch.testing.assert_close(other, exits[0])
 
@@ -107,22 +117,15 @@ def test_bodies_that_almost_touch_are_as_bodies_in_contact(
     iors: tuple[float, float], gap: float, branches: Literal["none", "all"], tmp_path: Path
 ) -> None:
     """Refraction shortens or lengthens the way between their faces, and light may be totally reflected there."""
-    generator = np.random.default_rng(0)
-    directions = generator.normal(size=(2000, 3)) * [1, 1, 0.5] + np.array([0, 0, 2])
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    origins = torch.tensor(generator.uniform(-0.4, 0.4, size=(2000, 3)))
-    weights, exits = [], []
+    rays, weights, exits = _upward_rays(2000, steepness=0.5), [], []
     for distance in (0.0, gap):
-        bodies = {}
-        for name, z, ior in zip(("lower", "upper"), (0.0, 1 + distance), iors, strict=True):
-            file = tmp_path / f"{name}_{distance}.ply"
-            trimesh.creation.box((1, 1, 1), trimesh.transformations.translation_matrix([0, 0, z])).export(file)
-            bodies[name] = {"mesh": str(file), "ior": ior}
-        medium = make_bodies(bodies=bodies, resolution=16, cache=False)
-        path = Snell("mesh", branches=branches)(make_rays(origins, torch.tensor(directions), 0.0, 9.0), medium)
-        assert (path.record.body.gather(1, (path.s < path.s[:, -1:]).sum(1, keepdim=True)) == 0).all()
+        trace = Snell("mesh", branches=branches).trace(rays, _stacked_boxes(tmp_path, distance, iors))
+        path = trace.path
+        last = (path.s < path.s[:, -1:]).sum(1) - 1
+        assert path.record is not None
+        assert (path.record.body.take_along_dim(last[:, None], 1)[:, 0][~trace.exceeded] == 0).all(), "ends in air"
         exits.append(path.main_polyline(path.exit_directions))
-        weights.append(torch.zeros(len(origins)).index_add(0, path.ray, path.throughput.float().mean(-1)))
+        weights.append(torch.zeros(len(rays)).index_add(0, path.ray, path.throughput.float().mean(-1)))
     differs = (exits[1] - exits[0]).norm(dim=-1) > 1e-3
     assert differs.float().mean() < 1e-3  # rays through an edge
     torch.testing.assert_close(weights[1], weights[0])
