@@ -71,6 +71,26 @@ def test_gradients_are_finite_differences(shape: Callable[[], trimesh.Trimesh], 
     assert (error < 1e-4).float().mean() > 0.9
 
 
+def test_gradients_where_interpolated_normals_would_turn_rays_to_the_wrong_side() -> None:
+    """Near the outline of a ball of few triangles, where the normals of the triangles replace interpolated ones."""
+    generator, num, step = torch.Generator().manual_seed(0), 2000, 1e-6
+    ball = trimesh.creation.icosphere(1)
+    starts, aside, towards, rows = torch.randn(4, num, 3, generator=generator, dtype=torch.float64)
+    starts = 3 * torch.nn.functional.normalize(starts, dim=-1)
+    aside = torch.nn.functional.normalize(torch.linalg.cross(starts, aside), dim=-1)
+
+    def exits(origins: Tensor) -> Tensor:
+        vertices, faces = torch.tensor(ball.vertices), torch.tensor(ball.faces)
+        return nerfro.bend(vertices, faces, 1.5, origins, 0.93 * aside - starts, shading="smooth").directions
+
+    expected = (exits(starts + step * towards) - exits(starts - step * towards)) / (2 * step)
+    origins = starts.clone().requires_grad_()
+    (gradients,) = torch.autograd.grad((exits(origins) * rows).sum(), origins)
+    error = ((gradients * towards).sum(-1) - (expected * rows).sum(-1)).abs() / (1 + expected.abs().sum(-1))
+    # A ray whose triangles change within the step has no derivative.
+    assert (error < 1e-4).float().mean() > 0.999
+
+
 def test_meshes_in_memory_are_traced_as_files(tmp_path: Path) -> None:
     mesh = lens()
     mesh.export(tmp_path / "lens.ply")

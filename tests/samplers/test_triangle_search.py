@@ -131,6 +131,25 @@ def test_bodies_that_almost_touch_are_as_bodies_in_contact(
     torch.testing.assert_close(weights[1], weights[0])
 
 
+@pytest.mark.parametrize("branches", ["none", "all"])
+def test_interpolated_normals_keep_light_on_its_side(branches: Literal["none", "all"], tmp_path: Path) -> None:
+    """Refracted light leaves behind the plane of its triangle, reflected light before it, even if triangles are few."""
+    trimesh.creation.icosphere(1).export(tmp_path / "ball.ply")
+    medium = make_bodies(str(tmp_path / "ball.ply"), 1.5, resolution=16, cache=False)
+    assert medium.meshes[0].facets is None, "smooth"
+    rays = random_rays(10_000, 1.2, seed=0, far=9).to(torch.float32)
+    trace = Snell("mesh", branches=branches, max_events=12).trace(rays, medium)
+    path = trace.path
+    assert path.record is not None
+    planes = medium.triangles.areas(path.record.triangle.clamp(min=0)[:, 1:].long()).float()
+    before, after = ((d * planes).sum(-1).sign() for d in (path.directions[:, :-1], path.directions[:, 1:]))
+    is_event = path.record.triangle[:, 1:] >= 0
+    is_reflected = path.record.body[:, :-1] == path.record.body[:, 1:]
+    assert (before == torch.where(is_reflected, -after, after))[is_event].all()
+    last = (path.s < path.s[:, -1:]).sum(1) - 1
+    assert (path.record.body.take_along_dim(last[:, None], 1)[:, 0][~trace.exceeded] == 0).all(), "ends in air"
+
+
 def test_gap_is_closed_between_the_bodies_beside_it_only(tmp_path: Path) -> None:
     """Neither a small body far away nor a slit in one body changes which gaps are closed."""
     slit = 1e-4

@@ -26,8 +26,9 @@ from nerfro.samplers.paths.polylines import distance_to_end
 from nerfro.samplers.paths.snell_law import reflectance, refract, turning_normals
 
 # Intersects rays with the recorded surfaces. Arguments: rows and column of the vertices, positions and directions of
-# the previous vertices, and traced distances. Results, with gradients: distances and unit normals.
-Intersect = Callable[[Tensor, int, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
+# the previous vertices, traced distances, and ratios of the index before the surface to the index behind it. Results,
+# with gradients: distances and unit normals.
+Intersect = Callable[[Tensor, int, Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 # Rows and columns of vertices; their positions, directions and arc lengths.
 Vertices = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 
@@ -93,8 +94,8 @@ def replay(path: Path, rays: Rays, medium: Medium, intersect: Intersect, branchi
             (path.positions, x), (path.directions, d), (path.s, s)))  # fmt: skip
         before, after, far_side = (numbers[rows].long() for numbers in (
             record.body[:, i - 1], record.body[:, i], record.far_side[:, i]))  # fmt: skip
-        reflected = after != far_side
-        length, normal = intersect(rows, i, old_x, old_d, path.s[rows, i] - path.s[rows, i - 1])
+        reflected, ratio = after != far_side, (indices[before] / indices[far_side]).detach()
+        length, normal = intersect(rows, i, old_x, old_d, path.s[rows, i] - path.s[rows, i - 1], ratio)
         outgoing, _ = refract(old_d, normal, indices[before], indices[far_side], reflected)
         if (num_events[rows] < branching.max_split_events).any():
             visible = indices[before] != indices[far_side]
@@ -153,7 +154,9 @@ def intersect_solid(medium: Bodies, surface: Int[Tensor, "P S"]) -> Intersect:
         surface: body on whose surface each vertex lies, `OpticalRecord.surface_body`.
     """
 
-    def intersect(rows: Tensor, column: int, x: Tensor, d: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
+    def intersect(
+        rows: Tensor, column: int, x: Tensor, d: Tensor, length: Tensor, ratio: Tensor
+    ) -> tuple[Tensor, Tensor]:
         body = surface[rows, column].long()[:, None, None] - 1
         phi, gradients = medium.signed_distances(x + length[:, None] * d)
         slope = (gradients.take_along_dim(body, 1)[:, 0] * d).sum(-1).detach()
@@ -169,18 +172,37 @@ def intersect_solid(medium: Bodies, surface: Int[Tensor, "P S"]) -> Intersect:
 def intersect_triangles(triangles: Triangles, triangle: Int[Tensor, "P S"]) -> Intersect:
     """Intersect rays with triangles of meshes, on the CPU and in double precision.
 
+    Normals are interpolated, unless reflected light would leave behind a triangle or refracted light before it.
+
     Args:
         triangles: traced triangles.
         triangle: recorded triangle of each vertex.
     """
 
-    def intersect(rows: Tensor, column: int, x: Tensor, d: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
+    def intersect(
+        rows: Tensor, column: int, x: Tensor, d: Tensor, length: Tensor, ratio: Tensor
+    ) -> tuple[Tensor, Tensor]:
         like, face = length, triangle[rows, column].long().cpu()
         x, d = x.cpu().double(), d.cpu().double()
         length = triangles.distance(x, d, face)
-        return length.to(like), triangles.normal(x + length[:, None] * d, face).to(like)
+        smooth = triangles.normal(x + length[:, None] * d, face)
+        own = functional.normalize(triangles.areas(face), dim=-1)
+        normal = torch.where(_stays_on_its_side(d, smooth, own, ratio.to(d))[:, None], smooth, own)
+        return length.to(like), normal.to(like)
 
     return intersect
+
+
+@torch.no_grad()
+def _stays_on_its_side(
+    d: Float[Tensor, "R 3"], normals: Float[Tensor, "R 3"], own: Float[Tensor, "R 3"], ratio: Float[Tensor, "R"]
+) -> Bool[Tensor, "R"]:
+    """Test that reflected light leaves before a triangle with the normal `own`, and refracted light behind it."""
+    n_behind, every = torch.ones_like(ratio), torch.ones_like(ratio, dtype=torch.bool)
+    mirrored, _ = refract(d, normals, ratio, n_behind, every)
+    bent, is_total = refract(d, normals, ratio, n_behind)
+    height, mirrored_height, bent_height = ((directions * own).sum(-1) for directions in (d, mirrored, bent))
+    return (mirrored_height * height < 0) & (is_total | (bent_height * height > 0))
 
 
 def first_normals(path: Path, medium: Medium) -> Float[Tensor, "R 3"]:

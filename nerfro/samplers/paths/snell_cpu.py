@@ -286,10 +286,18 @@ def _next_surface(solids, tree, scratch, body, line):
 
 
 @compiled
-def _normal(solids, tree, hit, triangle, line, far):
-    """Return the unit normal at the next surface; see `_next_surface`, and `far` is the line behind the surface."""
+def _normal(solids, tree, hit, triangle, line, far, ratio):
+    """Return the unit normal at the next surface.
+
+    Args:
+        solids, tree: see `_next_surface`.
+        hit, triangle: body whose surface is met, and its triangle.
+        line: arriving line.
+        far: the line, with its start just behind the surface.
+        ratio: ratio of the index before the surface to the index behind it.
+    """
     if tree is not None:
-        return face_normal(tree, triangle, line)
+        return face_normal(tree, triangle, line, ratio)
     _, nx, ny, nz = spline_value_gradient(solids.coefficients, grid_of(solids, hit), far.x, far.y, far.z)
     norm = math.sqrt(nx * nx + ny * ny + nz * nz)
     return nx / norm, ny / norm, nz / norm
@@ -321,7 +329,7 @@ def _follow(solids, tree, settings, scratch, rows, row, branch, num_pending):
             return branch, True, num_pending
         ratio, weight = n_before / n_across, branch.weight
         arriving = advance(here, before)
-        normal = _normal(solids, tree, hit, triangle, here, far)
+        normal = _normal(solids, tree, hit, triangle, here, far, ratio)
         line, is_reflected, mirrored, share = _event(normal, arriving, far, ratio, branching, branch)
         if share > 0.0:
             if not branching.main_only:

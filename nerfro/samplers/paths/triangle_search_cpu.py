@@ -54,15 +54,50 @@ def _meet(corners, line):
 
 
 @compiled
-def face_normal(tree, face, line):
+def _geometric_normal(corners):
+    """Return the unit normal of a triangle by the right-hand rule."""
+    ux, uy, uz = corners[1, 0] - corners[0, 0], corners[1, 1] - corners[0, 1], corners[1, 2] - corners[0, 2]
+    vx, vy, vz = corners[2, 0] - corners[0, 0], corners[2, 1] - corners[0, 1], corners[2, 2] - corners[0, 2]
+    nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    norm = math.sqrt(nx * nx + ny * ny + nz * nz)
+    return nx / norm, ny / norm, nz / norm
+
+
+@compiled
+def _interpolated_normal(corners, normals, line):
     """Interpolate the normals at the corners of a triangle where it meets a line; returns a unit normal."""
-    _, second, third, _ = _meet(tree.corners[face], line)
+    _, second, third, _ = _meet(corners, line)
     weights = min(max(1.0 - second - third, 0.0), 1.0), min(max(second, 0.0), 1.0), min(max(third, 0.0), 1.0)
-    nx, ny, nz, normals = 0.0, 0.0, 0.0, tree.normals[face]
+    nx, ny, nz = 0.0, 0.0, 0.0
     for i in range(3):
         nx, ny, nz = nx + weights[i] * normals[i, 0], ny + weights[i] * normals[i, 1], nz + weights[i] * normals[i, 2]
     norm = math.sqrt(nx * nx + ny * ny + nz * nz)
     return nx / norm, ny / norm, nz / norm
+
+
+@compiled
+def face_normal(tree, face, line, ratio):
+    """Return the unit normal that turns a line at a triangle.
+
+    Normals at the corners are interpolated, unless reflected light would leave behind the triangle or refracted light
+    before it; then the normal is that of the plane.
+
+    Args:
+        tree: triangles.
+        face: the triangle.
+        line: arriving line.
+        ratio: ratio of the index before the triangle to the index behind it.
+    """
+    nx, ny, nz = _interpolated_normal(tree.corners[face], tree.normals[face], line)
+    gx, gy, gz = _geometric_normal(tree.corners[face])
+    cosine = line.dx * nx + line.dy * ny + line.dz * nz
+    height, tilt = line.dx * gx + line.dy * gy + line.dz * gz, nx * gx + ny * gy + nz * gz
+    reflected = height - 2.0 * cosine * tilt
+    root = math.sqrt(max(1.0 - ratio * ratio * (1.0 - cosine * cosine), 0.0))
+    refracted = ratio * height + (math.copysign(root, cosine) - ratio * cosine) * tilt
+    if reflected * height < 0.0 and (root == 0.0 or refracted * height > 0.0):
+        return nx, ny, nz
+    return gx, gy, gz
 
 
 @compiled
