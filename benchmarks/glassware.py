@@ -130,6 +130,32 @@ def wine() -> list[Part]:
     return [Part(np.r_[above, inside[1:]])]
 
 
+def goblet() -> list[Part]:
+    """Return an empty wine glass with a bowl, a thin stem and a flat foot."""
+    wall = 0.014
+    outer = [
+        (0.0, 0.0),
+        (0.335, 0.0),
+        (0.35, 0.012),
+        (0.335, 0.03),
+        (0.2, 0.045),
+        (0.09, 0.08),
+        (0.05, 0.15),
+        (0.045, 0.25),
+        (0.045, 0.43),
+        (0.055, 0.5),
+        (0.13, 0.56),
+        (0.28, 0.65),
+        (0.37, 0.76),
+        (0.4, 0.9),
+        (0.385, 1.08),
+        (0.33, 1.3),
+    ]
+    upper = [(radius - wall, height) for radius, height in outer[:11:-1]]
+    above, inside = vessel(outer, [*upper, (0.27, 0.665), (0.13, 0.59), (0.06, 0.57), (0.0, 0.565)])
+    return [Part(np.r_[above, inside[1:]])]
+
+
 def tumbler() -> list[Part]:
     """Return a tumbler that is half full of water."""
     outer = [(0.0, 0.0), (0.34, 0.0), (0.36, 0.02), (0.38, 0.3), (0.41, 0.7), (0.43, 1.0)]
@@ -191,7 +217,7 @@ def outer_surface(parts: Sequence[Part], num: int = 600) -> Surface:
     )
 
 
-KINDS = {function.__name__: function for function in (wine, tumbler, jar, bottle)}
+KINDS = {function.__name__: function for function in (wine, goblet, tumbler, jar, bottle)}
 
 
 def mosaic(points: np.ndarray, size: float, seed: int) -> np.ndarray:

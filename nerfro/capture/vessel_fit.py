@@ -42,6 +42,8 @@ class VesselFitSettings(AlgorithmSettings):
     Attributes:
         wall, foot, fillet: lengths of a typical glass, as fractions of its width.
         max_fillet: largest fillet, as a fraction of the width.
+        stem: a slice is part of a stem if it is narrower than this fraction of the widest slices below and above it.
+        num_slices: number of slices in which a stem is searched.
         levels: levels of a liquid that are compared with an empty glass, as fractions of the height.
         max_level: highest level, as a fraction of the height; a level of four digits stays below the height.
         rounds: half width of the grid of candidates in each round: a factor for lengths, and a fraction of the height
@@ -57,6 +59,8 @@ class VesselFitSettings(AlgorithmSettings):
     foot: float = 0.06
     fillet: float = 0.1
     max_fillet: float = 0.4
+    stem: float = 0.3
+    num_slices: int = 48
     levels: tuple[float, ...] = (0.3, 0.5, 0.7, 0.9)
     max_level: float = 0.999
     rounds: tuple[tuple[float, float], ...] = ((2.0, 0.1), (1.5, 0.06), (1.5, 0.03))
@@ -111,7 +115,8 @@ def find_vessel(
         return vessel(outer, lengths, Material(_GLASS), liquid, up, grid=grid)
 
     try:
-        fit = fit_vessel(build, float(np.ptp(across, axis=0).max()), height, observations)
+        width, stem = float(np.ptp(across, axis=0).max()), stem_height(mesh.vertices @ np.array(up), across)
+        fit = fit_vessel(build, width, height, observations, stem)
         rounded = {name: float(f"{length:.4g}") for name, length in fit.lengths.items()}
         fitted = build(VesselLengths(**rounded))
     except NerfroError as error:
@@ -128,11 +133,34 @@ def find_vessel(
     return {"up": up, "ior": _GLASS, "liquid_ior": liquid_ior} | rounded, fitted
 
 
+def stem_height(
+    heights: Float[np.ndarray, " vertices"],
+    across: Float[np.ndarray, "vertices 3"],
+    settings: VesselFitSettings = VesselFitSettings(),
+) -> float:
+    """Return the height of the upper end of a stem above the lowest point; 0 for a vessel without a stem.
+
+    Args:
+        heights: coordinates of the vertices of the outer surface along the axis.
+        across: the vertices without this component.
+        settings: number of slices, and the limit of their width.
+    """
+    count, low, high = settings.num_slices, heights.min(), heights.max()
+    slice_of = ((heights - low) / (high - low) * count).astype(np.int64).clip(0, count - 1)
+    filled = np.unique(slice_of)
+    widths = [float(np.ptp(across[slice_of == number], axis=0).max()) for number in filled]
+    width = np.interp(np.arange(count), filled, widths)
+    below, above = np.maximum.accumulate(width), np.maximum.accumulate(width[::-1])[::-1]
+    stem = np.flatnonzero(width < settings.stem * np.minimum(below, above))
+    return float((stem[-1] + 1) / count * (high - low)) if len(stem) else 0.0
+
+
 def fit_vessel(
     build: Callable[[VesselLengths], Bodies],
     width: float,
     height: float,
     observations: Observations,
+    stem: float = 0.0,
     settings: VesselFitSettings = VesselFitSettings(),
 ) -> VesselFit:
     """Fit wall, foot, fillet and level of an open vessel.
@@ -141,10 +169,12 @@ def fit_vessel(
         build: makes the vessel from its lengths, with water if they have a level.
         width, height: size of the outer surface, world units.
         observations: observations of the object and its surroundings.
+        stem: height of the upper end of a stem. A stem is solid, so that the bottom of the cavity lies above it.
         settings: typical lengths, candidates and limits.
     """
     settings.use()
     typical = {name: getattr(settings, name) * width for name in ("wall", "foot", "fillet")}
+    typical["foot"] = max(typical["foot"], stem + typical["wall"]) if stem else typical["foot"]
     widest = typical | {"fillet": settings.max_fillet * width}  # distances are exact up to this depth
     empty, filled = build(VesselLengths(**widest)), build(VesselLengths(**widest, level=0.5 * height))
     work = 1 + len(settings.levels) + len(settings.rounds) * (len(typical) + 1) * settings.num_candidates
@@ -163,17 +193,17 @@ def fit_vessel(
         offsets = np.linspace(-1, 1, settings.num_candidates)
         for factor, fraction in settings.rounds:
             for name in typical:
-                is_level = name == "level"
-                half_width = fraction * height if is_level else np.log(factor)
-                middle = lengths[name] if is_level else np.log(lengths[name])
+                is_height = name == "level" or (name == "foot" and stem > 0)
+                half_width = fraction * height if is_height else np.log(factor)
+                middle = lengths[name] if is_height else np.log(lengths[name])
                 grid = middle + half_width * offsets
-                values = grid.clip(max=highest) if is_level else np.exp(grid)
+                values = grid.clip(stem, highest) if is_height else np.exp(grid)
                 sums = np.stack([error_of(lengths | {name: value}) for value in values.tolist()])
                 # Robust errors have narrow minima, which a quadratic function through all candidates would miss.
                 minimum = parabola_minimum(grid, mean_errors(sums, search.counts))[0]
                 minima = parabola_minimum(grid, mean_errors(sums, search.counts, search.samples))
                 spread = float(standard_error(minima, search.counts))
-                lengths[name] = float(min(minimum, highest) if is_level else np.exp(minimum))
-                standard_errors[name] = spread if is_level else spread * lengths[name]
+                lengths[name] = float(np.clip(minimum, stem, highest) if is_height else np.exp(minimum))
+                standard_errors[name] = spread if is_height else spread * lengths[name]
     unknown = [name for name in typical if standard_errors[name] > settings.max_standard_error * lengths[name]]
     return VesselFit(lengths | {name: typical[name] for name in unknown}, standard_errors, unknown)

@@ -72,7 +72,7 @@ class RevolutionSettings(AlgorithmSettings):
     max_step: float = 0.03
     min_radius: float = 1e-3
     edge: float = 0.5
-    hidden_slope: float = 0.4
+    hidden_slope: float = 0.6
     edge_ratio: float = 0.6
     ray_samples: int = 48
     closer_samples: int = 12
@@ -153,7 +153,6 @@ def fit_revolution(
     middle, size = start.foot + 0.5 * start.height * start.axis, start.height
     if ((origins - middle) @ start.axis).mean() < 0:  # the axis points towards the cameras
         start = Profile(start.foot + size * start.axis, -start.axis, size, start.radii.flip(0))
-    least_sine = float((normalize(origins - middle, dim=-1) @ start.axis).min())
     across = torch.linalg.svd(start.axis[None])[2][1:]
     pixels = float(size / (width * (origins - middle).norm(dim=-1)).median())  # in the height
 
@@ -189,22 +188,24 @@ def fit_revolution(
         damping = 1e-3 * system.diagonal().mean() * torch.eye(len(numbers)).double()
         step = torch.linalg.solve(system + damping, right)
         numbers = numbers - (step * (settings.max_step / step.abs().max()).clamp(max=1)).float()
-    return _without_hidden_cone(body(numbers), least_sine, settings).mesh()
+    return _without_hidden_cone(body(numbers), origins.unique(dim=0), settings).mesh()
 
 
-def _without_hidden_cone(body: Profile, least_sine: float, settings: RevolutionSettings) -> Profile:
+def _without_hidden_cone(body: Profile, centres: Float[Tensor, "cameras 3"], settings: RevolutionSettings) -> Profile:
     """Cut the part below a sharp edge of the foot that hardly a camera sees as an outline, such as a flat cone.
 
     Args:
         body: fitted body.
-        least_sine: sine of the smallest angle between the lines of sight and the plane of the foot.
+        centres: centres of the cameras. They see the foot at larger angles to its plane than the rest of the body.
         settings: limits of the slopes.
     """
-    if least_sine <= 0:
-        return body
     step = body.height / (len(body.radii) - 1)
     slopes = body.radii.diff()[: len(body.radii) // 3] / step
-    hidden = slopes[:-1] > settings.hidden_slope * (1 / least_sine**2 - 1) ** 0.5
+    heights = step * torch.arange(1, len(slopes))
+    sights = centres - (body.foot + heights[:, None] * body.axis)[:, None]
+    least_sine = (normalize(sights, dim=-1) @ body.axis).amin(1)
+    unseen = torch.where(least_sine > 0, (1 / least_sine.square() - 1).clamp(min=0).sqrt(), torch.inf)
+    hidden = slopes[:-1] > settings.hidden_slope * unseen
     edges = (hidden & (slopes[1:] < settings.edge_ratio * slopes[:-1])).nonzero()
     first = int(edges.max()) + 1 if len(edges) else 0
     foot, height = body.foot + first * step * body.axis, body.height - first * step

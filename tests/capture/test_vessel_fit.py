@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 import trimesh
@@ -11,7 +12,7 @@ from torch import Tensor
 from nerfro.backgrounds.base import Background
 from nerfro.capture.object_errors import unsupported_bodies
 from nerfro.capture.surroundings import Observations, Pixels, Surroundings
-from nerfro.capture.vessel_fit import fit_vessel
+from nerfro.capture.vessel_fit import fit_vessel, stem_height
 from nerfro.core.types import Exits
 from nerfro.data.base import Views
 from nerfro.geometry.mesh import load_mesh
@@ -94,3 +95,18 @@ def test_pixels_support_the_body_that_refracts_their_rays(
     assert unsupported_bodies(observations, solid, False, None) == ([] if ior == 1.333 else ["solid body"])
     observations.__dict__["through"] = observations.through[observations.through.view < 4]
     assert unsupported_bodies(observations, solid, False, None) == ["solid body"], "no decrease is significant"
+
+
+@pytest.mark.parametrize(
+    ("radii", "expected"),
+    [
+        ([0.35, 0.35, 0.05, 0.05, 0.05, 0.4, 0.4, 0.35], 0.57),  # foot, stem and bowl
+        ([0.3, 0.3, 0.3, 0.25, 0.06, 0.06, 0.06, 0.06], 0.0),  # a bottle with a narrow neck
+        ([0.4, 0.35, 0.25, 0.2, 0.2, 0.25, 0.35, 0.4], 0.0),  # a waist
+    ],
+)
+def test_stem_is_a_narrow_part_between_two_wide_ones(radii: list[float], expected: float) -> None:
+    heights, angles = np.linspace(0, 1, 200), np.linspace(0, 2 * np.pi, 40)
+    radius = np.interp(heights, np.linspace(0, 1, len(radii)), radii)[:, None]
+    across = np.stack([radius * np.cos(angles), radius * np.sin(angles), np.zeros((200, 40))], -1).reshape(-1, 3)
+    assert stem_height(heights.repeat(40), across) == pytest.approx(expected, abs=0.06)
