@@ -11,7 +11,6 @@ import scipy
 import torch
 from jaxtyping import Bool, Float, Int8
 from torch import Tensor, nn
-from torch.nn.functional import max_pool3d
 
 from nerfro.geometry.interpolation import quadratic_spline, spline_coefficients
 from nerfro.kernels.constants import constant
@@ -178,5 +177,8 @@ def _flat(values: Iterable[Tensor]) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
 def _extremes(values: Float[Tensor, "X Y Z"], windows: list[int]) -> tuple[Tensor, Tensor]:
     """Return the lowest and highest value [x, y, z] in windows along each axis that are `SURFACE_BLOCK` apart."""
-    lowest, highest = (sign * max_pool3d(sign * values[None], windows, SURFACE_BLOCK)[0] for sign in (-1, 1))
+    lowest = highest = values
+    for axis, window in enumerate(windows):
+        lowest = lowest.unfold(axis, window, SURFACE_BLOCK).amin(-1)
+        highest = highest.unfold(axis, window, SURFACE_BLOCK).amax(-1)
     return lowest, highest
