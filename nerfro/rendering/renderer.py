@@ -230,17 +230,9 @@ class Renderer(Component, nn.Module, ABC):
     def _replayed(self, path: Path, rays: Rays) -> Path:
         """Replay paths with gradients, except for paths whose derivatives are too large."""
         medium = self.scene.medium
-        steady = self.path_sampler.steady(path, medium)
-        if steady.all():
-            return self.path_sampler.replay(path, rays, medium)
-        rows = steady.nonzero()[:, 0]
-        if not len(rows):
-            return path
         # Other paths have many events, and their replay would take most of the time.
-        replayed = self.path_sampler.replay(path[rows], rays[path.ray[rows]], medium)
-        names = ["positions", "directions", "s", *(["throughput"] if path.splits else [])]
-        columns = {name: getattr(path, name).index_copy(0, rows, getattr(replayed, name)) for name in names}
-        return dataclasses.replace(path, **columns)
+        steady = self.path_sampler.steady(path, medium).nonzero()[:, 0]
+        return self.path_sampler.replay_rows(path, rays, medium, steady)
 
     def _in_chunks(self, render: Callable[[Rays], tuple[Tensor, ...]], rays: Rays) -> list[Tensor]:
         """Render `chunk_size` rays at a time, see `map_chunks`, and concatenate the results."""

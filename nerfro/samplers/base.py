@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 from torch import Tensor, nn
 
 from nerfro.core.draws import Draws
@@ -76,6 +76,17 @@ class PathSampler(nn.Module, ABC):
         Moving silhouettes, and events that appear or disappear, have no gradients.
         """
         return path
+
+    def replay_rows(self, path: Path, rays: Rays, medium: Medium, rows: Int[Tensor, " rows"]) -> Path:
+        """Replay some polylines of a traced path; the others keep their values without gradients."""
+        if len(rows) == len(path.s):
+            return self.replay(path, rays, medium)
+        if not len(rows):
+            return path
+        replayed = self.replay(path[rows], rays[path.ray[rows]], medium)
+        names = ["positions", "directions", "s", *(["throughput"] if path.splits else [])]
+        columns = {name: getattr(path, name).index_copy(0, rows, getattr(replayed, name)) for name in names}
+        return replace(path, **columns)
 
     def steady(self, path: Path, medium: Medium) -> Bool[Tensor, "P"]:
         """Return which traced paths have bounded derivatives; training uses no derivatives of the other paths."""
