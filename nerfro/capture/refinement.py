@@ -2,10 +2,11 @@
 
 Pixels inside the silhouette of a clear body show the surroundings in the exit directions of their rays. The surface is
 displaced until the surroundings in the exit directions have the colours of the pixels, with derivatives of the exact
-paths (`samplers.paths.replay`). Three measures make the descent converge:
+paths (`samplers.paths.replay`). Partial reflections are followed if they explain the photographs better. Three measures
+make the descent converge:
 
-- The surroundings are blurred first, because the gradient of a photograph is informative only over the width of its
-  details.
+- The surroundings of inaccurate surfaces are blurred first, because the gradient of a photograph is informative only
+  over the width of its details. Accurate surfaces need small steps and sharp surroundings, and would become worse.
 - The error is robust, because pixels that show opaque objects inside the body have large errors for every surface.
 - The contours of the surface stay in place, because the masks determine the contours. A surface that loses overlap
   with the masks is rejected.
@@ -17,8 +18,10 @@ descent, because a visual hull is as rough as its voxels.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -33,6 +36,7 @@ from nerfro.capture.surroundings import Observations, Pixels, Room, RoomPanorama
 from nerfro.core.errors import NerfroError, warn
 from nerfro.core.progress import counting_bar
 from nerfro.core.provenance import AlgorithmSettings
+from nerfro.core.rays import Rays
 from nerfro.core.robust import geman_mcclure
 from nerfro.core.types import Exits, Path
 from nerfro.files.atomic import write_json
@@ -40,6 +44,7 @@ from nerfro.geometry.interpolation import bspline_basis, smooth
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.media.base import Medium
 from nerfro.media.bodies import Bodies
+from nerfro.samplers.paths.polylines import SnellTrace
 from nerfro.samplers.paths.snell import Snell
 from nerfro.silhouettes.agreement import overlap
 from nerfro.silhouettes.moving_mesh import MovingMesh
@@ -62,16 +67,25 @@ class DescentStage:
     rate: float
     blur: tuple[float, float]
 
+    @property
+    def is_blurred(self) -> bool:
+        """Whether the surroundings are blurred."""
+        return self.blur[0] > 0
+
 
 @dataclass(frozen=True)
 class RefinementSettings(AlgorithmSettings):
     """Settings of the refinement. docs/lab/surface_refinement.md describes how the defaults were chosen.
 
     Attributes:
-        stages: stages of the descent. Each stage starts with the surface of the smallest validation error, and ends
-            early if the validation error exceeds the smallest one by more than `max_increase`.
+        stages: stages of the descent. Each stage starts with the best surface so far, and ends early if the validation
+            error exceeds the smallest one by more than `max_increase`. A stage with blurred surroundings that gains
+            less than `min_gain` is undone, and others are left out: the surface is too accurate for them.
         num_pixels: number of pixels in each step.
         levels: numbers of control points along each side of the splines that displace the surface.
+        least_weight: smallest share of light that is followed separately at a surface that reflects partially.
+        min_known: smallest share of the light of a pixel from known surroundings.
+        min_light: smallest share of the light of a pixel on paths that have derivatives.
         smoothings: standard deviations of the tested smoothings, as fractions of the object's size.
         max_overlap_loss: largest decrease of the mean overlap with the silhouettes, because smoothing decreases the
             error a little even where it cuts edges. Infinite for silhouettes that are no masks.
@@ -93,11 +107,13 @@ class RefinementSettings(AlgorithmSettings):
     stages: tuple[DescentStage, ...] = (
         DescentStage(200, 2e-4, (3.0, 1.4)),
         DescentStage(300, 1.5e-4, (1.4, 0.5)),
-        DescentStage(150, 4e-5, (0.7, 0.35)),
-        DescentStage(100, 1e-5, (0.0, 0.0)),
+        DescentStage(600, 3e-5, (0.0, 0.0)),
     )
-    num_pixels: int = 6000
-    levels: tuple[int, ...] = (12, 24, 48)
+    num_pixels: int = 8000
+    levels: tuple[int, ...] = (12, 24)
+    least_weight: float = 0.02
+    min_known: float = 0.95
+    min_light: float = 0.5
     smoothings: tuple[float, ...] = (0.005, 0.007, 0.01, 0.014)
     max_overlap_loss: float = 0.003
     max_validation_pixels: int = 20_000
@@ -166,28 +182,47 @@ def refine_surface(
     """
     settings.use()
     descent = _Descent(problem, learn_index, settings)
-    error = float(descent.initial_errors.mean())
-    steps, errors, best = [0, 0], [error, descent.start_error], descent.values()
+    first, best = float(descent.initial_errors.mean()), _Candidate(descent.values(), descent.start_error)
+    history, is_rejected = [(0, first), (0, best.error)], False
     with counting_bar("surface", sum(stage.steps for stage in settings.stages)) as advance:
         for number, stage in enumerate(settings.stages):
-            descent.begin(best, seed=number)
-            for step in range(stage.steps):
-                descent.step(stage, step)
-                advance()
-                if (step + 1) % settings.validate_every == 0:
-                    steps.append(steps[-1] + settings.validate_every)
-                    errors.append(descent.validation_error(descent.medium()))
-                    if errors[-1] == min(errors):
-                        best = descent.values()
-                    elif errors[-1] > (1 + settings.max_increase) * min(errors):
-                        advance(stage.steps - step - 1)
-                        break
-        descent.begin(best)
-        refined, smoothed = descent.smoothed(descent.medium(), min(errors))
-    steps, errors = [*steps, steps[-1]], [*errors, smoothed]
-    if smoothed > (1 - settings.min_gain) * error or not descent.keeps_outlines(refined):
+            if is_rejected and stage.is_blurred:
+                advance(stage.steps)
+                continue
+            descent.begin(best.values, seed=number)
+            found = _follow(descent, stage, best, history, advance)
+            is_rejected = stage.is_blurred and found.error > (1 - settings.min_gain) * best.error
+            best = best if is_rejected else found
+        descent.begin(best.values)
+        refined, error = descent.smoothed(descent.medium(), best.error)
+    history.append((history[-1][0], error))
+    steps, errors = map(list, zip(*history, strict=True))
+    if error > (1 - settings.min_gain) * first or not descent.keeps_outlines(refined):
         return Refined(problem.mesh, problem.medium, steps, errors)
     return Refined(_project_onto(problem.mesh, refined), refined, steps, errors)
+
+
+def _follow(
+    descent: _Descent,
+    stage: DescentStage,
+    best: _Candidate,
+    history: list[tuple[int, float]],
+    advance: Callable[..., None],
+) -> _Candidate:
+    """Follow a stage, record its validation errors, and return the best surface of the stage and before it."""
+    settings = descent.settings
+    for step in range(stage.steps):
+        descent.step(stage, step)
+        advance()
+        if (step + 1) % settings.validate_every == 0:
+            error = descent.validation_error(descent.medium())
+            history.append((history[-1][0] + settings.validate_every, error))
+            if error < best.error:
+                best = _Candidate(descent.values(), error)
+            elif error > (1 + settings.max_increase) * best.error:
+                advance(stage.steps - step - 1)
+                break
+    return best
 
 
 def refine(
@@ -272,6 +307,13 @@ class Displacement(nn.Module):
         )
 
 
+class _Candidate(NamedTuple):
+    """Learned values of a descent, and the validation error of their surface."""
+
+    values: list[Tensor]
+    error: float
+
+
 class _Descent:
     """Displacements and indices with their optimizer, training pixels and validation pixels."""
 
@@ -279,14 +321,14 @@ class _Descent:
         self.problem, self.settings = problem, settings
         mesh, medium, silhouettes = problem.mesh, problem.medium, problem.silhouettes
         self.iors = nn.Parameter(medium.iors.clone(), requires_grad=learn_index)
-        # Rays with internal reflections are left out: small errors of the surface turn them far.
-        self.sampler = Snell(max_events=2 * len(medium.iors))
+        # Small errors of the surface turn paths with more internal reflections far.
+        self.max_events = 2 * len(medium.iors) + 1
         self.size = float(np.ptp(mesh.bounds, axis=0).max())
         self.offsets = Displacement(tuple(medium.grids[0].distances.shape), self.size, settings.levels)
         self.learned = [*self.offsets.levels, self.iors]
         self.training, validation = problem.through.split()
         self.validation = validation.some(settings.max_validation_pixels)
-        errors, is_valid = self._validation_errors(medium)
+        self.sampler, errors, is_valid = self._best_sampler(medium)
         if not is_valid.any():
             raise NerfroError("no pixel shows known surroundings through the object; remove refine=true")
         self.validation, self.initial_errors = self.validation[is_valid], errors[is_valid]
@@ -332,11 +374,10 @@ class _Descent:
     def _loss(self) -> Tensor:
         medium, settings = self.medium(), self.settings
         pixels = self.training[torch.randint(len(self.training), (settings.num_pixels,), generator=self.generator)]
-        path, usable = self._traced(pixels, medium)
-        rays = pixels.rays[usable]
-        path = self.sampler.replay(path[usable], rays, medium).in_room_of(rays)
-        residual = self.blurred(path.exits()).clamp(max=1) - pixels.radiance[usable]
-        photometric = geman_mcclure(residual, settings.robust_scale).sum() / max(1, len(rays))
+        path, known = self._traced(pixels.rays, medium)
+        radiance = path.sum_polylines(self.blurred(path.exits())).clamp(max=1)
+        errors = geman_mcclure((radiance - pixels.radiance)[known], settings.robust_scale)
+        photometric = errors.sum() / max(1, len(errors))
         rims = self.rims[torch.randint(len(self.rims), (settings.num_contour_points,), generator=self.generator)]
         current, initial = (solid.grids[0](rims)[0] for solid in (medium, self.problem.medium))
         square = ((current - initial) / self.contour_deviation).square()
@@ -377,20 +418,44 @@ class _Descent:
         errors, is_valid = self._validation_errors(medium)
         return float(torch.where(is_valid, errors, self.initial_errors).mean())
 
+    def _best_sampler(self, medium: Bodies) -> tuple[Snell, Float[Tensor, "Q"], Bool[Tensor, "Q"]]:
+        """Choose between paths with and without partial reflections by the validation pixels.
+
+        Returns:
+            The sampler, and the results of `_validation_errors`.
+        """
+        samplers = [Snell(), Snell(branches="all", least_weight=self.settings.least_weight)]
+        results = []
+        for self.sampler in samplers:
+            results.append(self._validation_errors(medium))
+        both = results[0][1] & results[1][1]
+        means = [float(errors[both].mean()) for errors, _ in results]
+        reflects = means[1] < means[0]
+        return samplers[reflects], *results[reflects]
+
     def _validation_errors(self, medium: Bodies) -> tuple[Float[Tensor, "Q"], Bool[Tensor, "Q"]]:
         """Compute the robust errors of the validation pixels, and whether their surroundings are known."""
         trace = self.sampler.trace(self.validation.rays, medium)
-        radiance, known = self.problem.surroundings.radiance(trace.path.in_room_of(self.validation.rays).exits())
-        errors = geman_mcclure(radiance - self.validation.radiance, self.settings.robust_scale)
-        return errors, known & ~trace.exceeded & trace.path.refracted
+        path = trace.path.in_room_of(self.validation.rays)
+        light, _ = self.problem.surroundings.radiance(path.exits())
+        errors = geman_mcclure(path.sum_polylines(light) - self.validation.radiance, self.settings.robust_scale)
+        return errors, self._shows_known(trace, path)
 
-    @torch.no_grad()
-    def _traced(self, pixels: Pixels, medium: Bodies) -> tuple[Path, Tensor]:
-        """Trace pixels, and select refracted paths with known surroundings and reliable derivatives."""
-        trace = self.sampler.trace(pixels.rays, medium)
-        known = self.problem.surroundings.known(trace.path.in_room_of(pixels.rays).exits())
-        usable = known & ~trace.exceeded & trace.path.refracted
-        return trace.path, usable & self.sampler.steady(trace.path, medium)
+    def _shows_known(self, trace: SnellTrace, path: Path) -> Bool[Tensor, "R"]:
+        """Test which rays meet the object and show known surroundings."""
+        known = self.problem.surroundings.known(path.exits()) & ~trace.exceeded
+        return (path.sum_polylines(known.float()) >= self.settings.min_known) & path.main_polyline(path.refracted)
+
+    def _traced(self, rays: Rays, medium: Bodies) -> tuple[Path, Bool[Tensor, "R"]]:
+        """Trace rays, with derivatives of reliable paths, and test which rays show known surroundings."""
+        with torch.no_grad():
+            trace = self.sampler.trace(rays, medium)
+            path = trace.path.in_room_of(rays)
+            known = self._shows_known(trace, path)
+            is_reliable = self.sampler.steady(path, medium) & (trace.num_events <= self.max_events)
+            is_bright = path.throughput.mean(-1) >= self.settings.min_light
+            rows = (is_reliable & is_bright & path.refracted & path.broadcast_to_polylines(known)).nonzero()[:, 0]
+        return self.sampler.replay_rows(path, rays, medium, rows), known
 
 
 def _blurred(panorama: EnvironmentMap | RoomPanorama, degrees: float, settings: RefinementSettings) -> Background:

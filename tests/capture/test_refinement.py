@@ -44,16 +44,23 @@ SHORT = RefinementSettings((DescentStage(150, 5e-4, (3.0, 1.0)), DescentStage(50
 
 
 @functools.cache
-def shown() -> tuple[Silhouettes, Pixels, Surroundings]:
+def shown(reflects: bool = False) -> tuple[Silhouettes, Pixels, Surroundings]:
     """Outlines of the dented ball, pixels that it fills, and what is around it."""
     outlines = mesh_silhouettes(refinement._project_onto(mesh(), dented()), cameras(), 1)
     silhouettes = Silhouettes.of(cameras(), outlines.float())
-    beside, through = divide_pixels(photographs_of(dented()), mesh())
+    sampler = Snell(branches="all", least_weight=0.02) if reflects else Snell()
+    beside, through = divide_pixels(photographs_of(dented(), sampler=sampler), mesh())
     return silhouettes, through, learn_surroundings(beside, mesh(), False)
 
 
-def refined(start: Bodies, settings: RefinementSettings = SHORT, learn_index: bool = False) -> Refined:
-    return refine_surface(RefinementProblem(mesh(), start, *shown()), learn_index, settings=settings)
+def problem(start: Bodies, reflects: bool = False) -> RefinementProblem:
+    return RefinementProblem(mesh(), start, *shown(reflects))
+
+
+def refined(
+    start: Bodies, settings: RefinementSettings = SHORT, learn_index: bool = False, reflects: bool = False
+) -> Refined:
+    return refine_surface(problem(start, reflects), learn_index, settings=settings)
 
 
 def degrees_off(medium: Bodies, num_views: int = 6) -> float:
@@ -82,11 +89,45 @@ def test_refinement_recovers_a_dent_despite_a_wrong_index() -> None:
 
 
 @pytest.mark.slow
+def test_refinement_of_a_reflecting_body_recovers_a_dent() -> None:
+    before = solid([1.5])
+    found = refined(before, reflects=True)
+    assert degrees_off(found.medium) < 0.4 * degrees_off(before)
+    assert min(found.errors) < 0.6 * found.errors[0]
+
+
+@pytest.mark.parametrize("reflects", [False, True])
+def test_partial_reflections_are_followed_if_photographs_have_them(reflects: bool) -> None:
+    descent = refinement._Descent(problem(dented(), reflects), False, SHORT)
+    assert (descent.sampler.branching.max_split_events > 0) == reflects
+    assert descent.initial_errors.mean() < 0.01, "the body is the true one"
+
+
+@pytest.mark.slow
 def test_refinement_keeps_a_correct_surface() -> None:
     before = dented()
     found = refined(before)
     assert found.medium is before
     assert len(found.errors) > 2  # others were tried
+
+
+def test_blurred_stages_without_gain_are_undone_and_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They would spoil an accurate surface, from which the stage with sharp surroundings starts."""
+    followed = []
+
+    def step(descent: refinement._Descent, stage: DescentStage, number: int) -> None:
+        followed.append(stage)
+        descent.iors += 0.01
+
+    # The first stage gains less than 1 %, and the last one starts where the first one started.
+    monkeypatch.setattr(refinement._Descent, "step", step)
+    monkeypatch.setattr(refinement._Descent, "validation_error", lambda _, medium: 1.51 - 0.2 * float(medium.iors[0]))
+    stages = DescentStage(1, 1.0, (3.0, 1.0)), DescentStage(1, 1.0, (1.0, 0.5)), DescentStage(1, 1.0, (0.0, 0.0))
+    settings = RefinementSettings(stages, smoothings=(), validate_every=1, max_overlap_loss=math.inf)
+    found = refined(solid([1.5]), settings)
+    assert followed == [stages[0], stages[2]]
+    assert found.steps == [0, 0, 1, 2, 2]
+    assert found.errors[2] == found.errors[3]
 
 
 def test_smoothing_is_selected_by_the_validation_error() -> None:
