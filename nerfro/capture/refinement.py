@@ -107,7 +107,7 @@ class RefinementSettings(AlgorithmSettings):
     stages: tuple[DescentStage, ...] = (
         DescentStage(200, 2e-4, (3.0, 1.4)),
         DescentStage(300, 1.5e-4, (1.4, 0.5)),
-        DescentStage(600, 3e-5, (0.0, 0.0)),
+        DescentStage(800, 3e-5, (0.0, 0.0)),
     )
     num_pixels: int = 8000
     levels: tuple[int, ...] = (12, 24)
