@@ -321,14 +321,15 @@ class _Descent:
         self.problem, self.settings = problem, settings
         mesh, medium, silhouettes = problem.mesh, problem.medium, problem.silhouettes
         self.iors = nn.Parameter(medium.iors.clone(), requires_grad=learn_index)
-        # Small errors of the surface turn paths with more internal reflections far.
+        # Paths with more events have no derivatives here, because small errors of the surface turn them far.
         self.max_events = 2 * len(medium.iors) + 1
         self.size = float(np.ptp(mesh.bounds, axis=0).max())
         self.offsets = Displacement(tuple(medium.grids[0].distances.shape), self.size, settings.levels)
         self.learned = [*self.offsets.levels, self.iors]
         self.training, validation = problem.through.split()
         self.validation = validation.some(settings.max_validation_pixels)
-        self.sampler, errors, is_valid = self._best_sampler(medium)
+        self.sampler = self._best_sampler(medium)
+        errors, is_valid = self._validation_errors(medium, self.sampler)
         if not is_valid.any():
             raise NerfroError("no pixel shows known surroundings through the object; remove refine=true")
         self.validation, self.initial_errors = self.validation[is_valid], errors[is_valid]
@@ -415,27 +416,21 @@ class _Descent:
         Pixels with unknown surroundings for the new surface keep their initial error, so that a surface cannot
         lower its error by hiding pixels.
         """
-        errors, is_valid = self._validation_errors(medium)
+        errors, is_valid = self._validation_errors(medium, self.sampler)
         return float(torch.where(is_valid, errors, self.initial_errors).mean())
 
-    def _best_sampler(self, medium: Bodies) -> tuple[Snell, Float[Tensor, "Q"], Bool[Tensor, "Q"]]:
-        """Choose between paths with and without partial reflections by the validation pixels.
+    def _best_sampler(self, medium: Bodies) -> Snell:
+        """Choose between paths without and with partial reflections by the validation pixels that both explain."""
+        through, reflecting = Snell(), Snell(branches="all", least_weight=self.settings.least_weight)
+        (errors, is_valid), (others, are_valid) = (
+            self._validation_errors(medium, sampler) for sampler in (through, reflecting)
+        )
+        both = is_valid & are_valid
+        return reflecting if others[both].mean() < errors[both].mean() else through
 
-        Returns:
-            The sampler, and the results of `_validation_errors`.
-        """
-        samplers = [Snell(), Snell(branches="all", least_weight=self.settings.least_weight)]
-        results = []
-        for self.sampler in samplers:
-            results.append(self._validation_errors(medium))
-        both = results[0][1] & results[1][1]
-        means = [float(errors[both].mean()) for errors, _ in results]
-        reflects = means[1] < means[0]
-        return samplers[reflects], *results[reflects]
-
-    def _validation_errors(self, medium: Bodies) -> tuple[Float[Tensor, "Q"], Bool[Tensor, "Q"]]:
+    def _validation_errors(self, medium: Bodies, sampler: Snell) -> tuple[Float[Tensor, "Q"], Bool[Tensor, "Q"]]:
         """Compute the robust errors of the validation pixels, and whether their surroundings are known."""
-        trace = self.sampler.trace(self.validation.rays, medium)
+        trace = sampler.trace(self.validation.rays, medium)
         path = trace.path.in_room_of(self.validation.rays)
         light, _ = self.problem.surroundings.radiance(path.exits())
         errors = geman_mcclure(path.sum_polylines(light) - self.validation.radiance, self.settings.robust_scale)
