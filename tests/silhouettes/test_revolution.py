@@ -8,7 +8,7 @@ import trimesh
 from nerfro.core.cameras import Cameras
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.silhouettes import surface
-from nerfro.silhouettes.revolution import fit_revolution
+from nerfro.silhouettes.revolution import Profile, RevolutionSettings, _without_hidden_cone, fit_revolution
 from nerfro.silhouettes.silhouettes import mesh_silhouettes
 from nerfro.silhouettes.surface import make_mesh
 from nerfro.silhouettes.visual_hull import Silhouettes
@@ -58,6 +58,20 @@ def test_revolution_fit_recovers_a_glass_with_a_partly_hidden_foot() -> None:
     assert points[:, 2].max() == pytest.approx(1.2, abs=0.04)
     assert radius[np.abs(points[:, 2] - 0.7) < 0.03].max() == pytest.approx(0.322, abs=0.015)
     assert radius.max() == pytest.approx(0.45, abs=0.02)
+
+
+@pytest.mark.parametrize(("slope", "is_cut"), [(2.3, True), (1.5, False)])
+def test_cameras_that_look_down_on_the_foot_do_not_see_a_cone_below(slope: float, is_cut: bool) -> None:
+    # The lines of sight to the foot descend by 0.3, so that no camera sees a cone of more than slope 3.3. Those to the
+    # middle of the body descend by 0.15, and the limit would be 6.7.
+    angle = torch.arange(12) * 2 * np.pi / 12
+    centres = torch.stack([3 * angle.cos(), 3 * angle.sin(), torch.full_like(angle, 0.9)], -1)
+    heights = torch.linspace(-0.1, 1, 56)
+    radii = 0.4 + slope * heights.clamp(max=0)
+    body = Profile(torch.tensor([0.0, 0.0, -0.1]), torch.tensor([0.0, 0.0, 1.0]), torch.tensor(1.1), radii)
+    rest = _without_hidden_cone(body, centres, RevolutionSettings())
+    assert float(rest.foot[2]) == pytest.approx(0 if is_cut else -0.1, abs=1e-6)
+    assert float(rest.foot[2] + rest.height) == pytest.approx(1, abs=1e-6)
 
 
 def test_box_is_no_body_of_revolution(capsys: pytest.CaptureFixture[str]) -> None:
