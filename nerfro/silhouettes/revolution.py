@@ -88,7 +88,7 @@ class Profile:
         axis: unit direction of the axis.
         height: distance between the ends.
         radii: radii at evenly spaced heights.
-        edge: radius by which `distance` rounds the edges of the ends; `distance` needs a positive one.
+        edge: radius by which `distance` rounds the edges of the ends; both distances need a positive one.
     """
 
     foot: Float[Tensor, "3"]
@@ -98,7 +98,20 @@ class Profile:
     edge: float = 0.0
 
     def distance(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
-        """Compute an approximate signed distance, negative inside; exactly zero on the surface except at its edges."""
+        """Compute an approximate signed distance, negative inside, to the body with rounded edges, which is smaller."""
+        return self.edge * torch.logsumexp(self._signed(points) / self.edge, 0)
+
+    def least_distance(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points"]:
+        """Compute the least distance to the body with sharp edges along each ray, where `distance` is least.
+
+        There, the distances to side and ends, weighted by their shares in `distance`, do not change along the ray. If
+        the ray passes an edge, this weighted mean is thus the distance where side and end are equally distant.
+        """
+        parts = self._signed(points)
+        return (torch.softmax(parts.detach() / self.edge, 0) * parts).sum(0)
+
+    def _signed(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, " 3 *points"]:
+        """Compute signed distances to the side, the lower end and the upper end."""
         offset = points - self.foot
         along = offset @ self.axis
         radius = (offset - along[..., None] * self.axis).square().sum(-1).clamp(min=1e-20).sqrt()
@@ -108,8 +121,7 @@ class Profile:
         first, second = self.radii[low], self.radii[low + 1]
         slope = ((second - first) / step).detach()
         side = (radius - torch.lerp(first, second, knot - low)) / (1 + slope.square()).sqrt()
-        # At rounded edges, the minimum along a ray depends on both adjacent surfaces, which gives useful gradients.
-        return self.edge * torch.logsumexp(torch.stack([side, -along, along - self.height]) / self.edge, 0)
+        return torch.stack([side, -along, along - self.height])
 
     def mesh(self) -> TriangleMesh:
         """Convert the body to a closed mesh with counter-clockwise faces seen from outside."""
@@ -164,7 +176,7 @@ def fit_revolution(
         return Profile(foot, axis, height, radii, settings.edge * float(size) / pixels)
 
     def misfits(numbers: Tensor) -> Tensor:
-        apart = body(numbers).distance(origins + lengths[:, None] * directions) / (width * lengths)
+        apart = body(numbers).least_distance(origins + lengths[:, None] * directions) / (width * lengths)
         return torch.where(side * apart > 0, 0.0, apart)
 
     numbers = torch.cat([torch.zeros(4), torch.tensor([-0.5, 0.5]), start.radii / size])
