@@ -60,6 +60,19 @@ def test_revolution_fit_recovers_a_glass_with_a_partly_hidden_foot() -> None:
     assert radius.max() == pytest.approx(0.45, abs=0.02)
 
 
+def test_sharp_edges_are_recovered_to_a_sixth_of_a_pixel() -> None:
+    elevation, height, pixel = 12 + 15 * (np.arange(VIEWS) % 3), 0.9, 4 / (2 * SIZE)
+    cameras = upright_cameras(VIEWS, SIZE, 2 * SIZE, elevation, world=TURN, near=0.1, far=9.0)
+    drum = _body([[0, 0], [0.35, 0], [0.42, height], [0, height]])
+    silhouettes = Silhouettes.of(cameras, _masks(drum, cameras))
+    found = fit_revolution(make_mesh(silhouettes, None, 48, 0, None, 0.0), silhouettes)
+    assert found is not None
+    points = found.vertices @ TURN - SHIFT
+    assert points[:, 2].min() == pytest.approx(0, abs=pixel / 6)
+    assert points[:, 2].max() == pytest.approx(height, abs=pixel / 6)
+    assert np.linalg.norm(points[:, :2], axis=1).max() == pytest.approx(0.42, abs=pixel / 6)
+
+
 @pytest.mark.parametrize(("slope", "is_cut"), [(2.3, True), (1.5, False)])
 def test_cameras_that_look_down_on_the_foot_do_not_see_a_cone_below(slope: float, is_cut: bool) -> None:
     # The lines of sight to the foot descend by 0.3, so that no camera sees a cone of more than slope 3.3. Those to the
