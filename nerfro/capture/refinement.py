@@ -6,7 +6,7 @@ paths (`samplers.paths.replay`). Partial reflections are followed if they explai
 make the descent converge:
 
 - The surroundings of inaccurate surfaces are blurred first, because the gradient of a photograph is informative only
-  over the width of its details. Accurate surfaces need small steps and sharp surroundings, and would become worse.
+  over the width of its details. Accurate surfaces need small steps and sharp surroundings; blur would make them worse.
 - The error is robust, because pixels that show opaque objects inside the body have large errors for every surface.
 - The contours of the surface stay in place, because the masks determine the contours. A surface that loses overlap
   with the masks is rejected.
@@ -84,15 +84,16 @@ class RefinementSettings(AlgorithmSettings):
         num_pixels: number of pixels in each step.
         levels: numbers of control points along each side of the splines that displace the surface.
         least_weight: smallest share of light that is followed separately at a surface that reflects partially.
-        min_known: smallest share of the light of a pixel from known surroundings.
-        min_light: smallest share of the light of a pixel on paths that have derivatives.
+        min_known: a pixel is used if at least this share of its light comes from known surroundings.
+        min_light: a path has derivatives if it carries at least this share of the light of its pixel.
         smoothings: standard deviations of the tested smoothings, as fractions of the object's size.
         max_overlap_loss: largest decrease of the mean overlap with the silhouettes, because smoothing decreases the
             error a little even where it cuts edges. Infinite for silhouettes that are no masks.
         max_validation_pixels: largest number of validation pixels.
         validate_every: number of steps between validations.
         max_increase: see `stages`, as a fraction of the smallest error.
-        min_gain: smallest decrease of the validation error of an accepted surface, as a fraction. A wrong surface also
+        min_gain: smallest decrease of the validation error by a blurred stage that is kept, and by all stages together
+            if the surface is accepted, as a fraction. A wrong surface also
             explains some of the reflections, the tint and the interior: errors decreased by 0.012 to 0.11 for better
             surfaces, and by up to 0.009 for worse ones.
         robust_scale: scale of the Geman-McClure loss, linear radiance: residual at which the loss is 1/2 of its maximum
@@ -135,7 +136,7 @@ class RefinementProblem:
 
     Attributes:
         mesh: the surface.
-        medium: the bodies with estimated indices; the mesh is the surface of the first one. Refraction is achromatic.
+        medium: the bodies with estimated indices; the mesh is the surface of the first one. Dispersion is ignored.
         silhouettes: silhouettes of the surface, whose outlines are kept.
         through: pixels inside the silhouette of the object.
         surroundings: known surroundings, near or distant.
@@ -156,7 +157,7 @@ class Refined:
         mesh: the refined surface; the given one without a significant improvement.
         medium: medium of the surface.
         steps: number of steps at each validation, which starts with 0, 0 for the given surface and for the smoothed
-            one. The last number is repeated for the surface of the smallest error after its final smoothing.
+            one. The last number is repeated for the best surface of the stages that are kept, after its smoothing.
         errors: mean robust error of the validation pixels at each validation: 0 for exact colours, 1 for outliers.
     """
 
@@ -183,16 +184,18 @@ def refine_surface(
     settings.use()
     descent = _Descent(problem, learn_index, settings)
     first, best = float(descent.initial_errors.mean()), _Candidate(descent.values(), descent.start_error)
-    history, is_rejected = [(0, first), (0, best.error)], False
+    history, skips_blurred = [(0, first), (0, best.error)], False
     with counting_bar("surface", sum(stage.steps for stage in settings.stages)) as advance:
         for number, stage in enumerate(settings.stages):
-            if is_rejected and stage.is_blurred:
+            if skips_blurred and stage.is_blurred:
                 advance(stage.steps)
                 continue
             descent.begin(best.values, seed=number)
-            found = _follow(descent, stage, best, history, advance)
-            is_rejected = stage.is_blurred and found.error > (1 - settings.min_gain) * best.error
-            best = best if is_rejected else found
+            candidate = _follow(descent, stage, best, history, advance)
+            if stage.is_blurred and candidate.error > (1 - settings.min_gain) * best.error:
+                skips_blurred = True
+            else:
+                best = candidate
         descent.begin(best.values)
         refined, error = descent.smoothed(descent.medium(), best.error)
     history.append((history[-1][0], error))
@@ -260,7 +263,7 @@ def refine(
     except NerfroError as reason:  # keep the results of the other steps
         warn(f"surface unchanged: {reason}")
         return mesh
-    before, after = refined.errors[0], min(refined.errors)
+    before, after = refined.errors[0], refined.errors[-1]
     change = f"the validation error changes from {before:.4f} to {after:.4f} (0: exact, 1: unrelated images)"
     if refined.mesh is start:
         print(f"surface unchanged: {change}, which is not significant")
@@ -319,7 +322,7 @@ class _Descent:
 
     def __init__(self, problem: RefinementProblem, learn_index: bool, settings: RefinementSettings) -> None:
         self.problem, self.settings = problem, settings
-        mesh, medium, silhouettes = problem.mesh, problem.medium, problem.silhouettes
+        mesh, medium, silhouettes = problem.mesh, problem.medium.achromatic(), problem.silhouettes
         self.iors = nn.Parameter(medium.iors.clone(), requires_grad=learn_index)
         # Paths with more events have no derivatives here, because small errors of the surface turn them far.
         self.max_events = 2 * len(medium.iors) + 1
@@ -376,7 +379,7 @@ class _Descent:
         medium, settings = self.medium(), self.settings
         pixels = self.training[torch.randint(len(self.training), (settings.num_pixels,), generator=self.generator)]
         path, known = self._traced(pixels.rays, medium)
-        radiance = path.sum_polylines(self.blurred(path.exits())).clamp(max=1)
+        radiance = path.sum_polylines(self.blurred(path.exits()).clamp(max=1))
         errors = geman_mcclure((radiance - pixels.radiance)[known], settings.robust_scale)
         photometric = errors.sum() / max(1, len(errors))
         rims = self.rims[torch.randint(len(self.rims), (settings.num_contour_points,), generator=self.generator)]
@@ -422,11 +425,10 @@ class _Descent:
     def _best_sampler(self, medium: Bodies) -> Snell:
         """Choose between paths without and with partial reflections by the validation pixels that both explain."""
         through, reflecting = Snell(), Snell(branches="all", least_weight=self.settings.least_weight)
-        (errors, is_valid), (others, are_valid) = (
-            self._validation_errors(medium, sampler) for sampler in (through, reflecting)
-        )
-        both = is_valid & are_valid
-        return reflecting if others[both].mean() < errors[both].mean() else through
+        errors, is_valid = self._validation_errors(medium, through)
+        reflecting_errors, reflecting_valid = self._validation_errors(medium, reflecting)
+        common = is_valid & reflecting_valid
+        return reflecting if reflecting_errors[common].mean() < errors[common].mean() else through
 
     def _validation_errors(self, medium: Bodies, sampler: Snell) -> tuple[Float[Tensor, "Q"], Bool[Tensor, "Q"]]:
         """Compute the robust errors of the validation pixels, and whether their surroundings are known."""

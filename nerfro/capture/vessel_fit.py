@@ -47,11 +47,11 @@ class VesselFitSettings(AlgorithmSettings):
         levels: levels of a liquid that are compared with an empty glass, as fractions of the height.
         max_level: highest level, as a fraction of the height; a level of four digits stays below the height.
         rounds: half width of the grid of candidates in each round: a factor for lengths, and a fraction of the height
-            for the level.
+            for the level, and for the foot above a stem.
         num_candidates: number of candidates of each length in each round.
         num_errors: a vessel contains a liquid if the liquid decreases the error by this number of standard errors.
-        max_standard_error: largest standard error of a known length, relative to the length; the last grid limits the
-            error to about 0.4.
+        max_standard_error: largest standard error of a known length, relative to the length. The last grid limits the
+            error to about 0.4, and for the level and the foot above a stem to few percent, so that these are known.
         errors: settings of the errors at pixels of the object.
     """
 
@@ -115,8 +115,8 @@ def find_vessel(
         return vessel(outer, lengths, Material(_GLASS), liquid, up, grid=grid)
 
     try:
-        width, stem = float(np.ptp(across, axis=0).max()), stem_height(mesh.vertices @ np.array(up), across)
-        fit = fit_vessel(build, width, height, observations, stem)
+        stem = stem_height(mesh, np.array(up) / np.linalg.norm(up))
+        fit = fit_vessel(build, float(np.ptp(across, axis=0).max()), height, observations, stem)
         rounded = {name: float(f"{length:.4g}") for name, length in fit.lengths.items()}
         fitted = build(VesselLengths(**rounded))
     except NerfroError as error:
@@ -134,25 +134,28 @@ def find_vessel(
 
 
 def stem_height(
-    heights: Float[np.ndarray, " vertices"],
-    across: Float[np.ndarray, "vertices 3"],
-    settings: VesselFitSettings = VesselFitSettings(),
+    mesh: TriangleMesh, up: Float[np.ndarray, "3"], settings: VesselFitSettings = VesselFitSettings()
 ) -> float:
     """Return the height of the upper end of a stem above the lowest point; 0 for a vessel without a stem.
 
     Args:
-        heights: coordinates of the vertices of the outer surface along the axis.
-        across: the vertices without this component.
+        mesh: closed outer surface.
+        up: unit direction from bottom to top.
         settings: number of slices, and the limit of their width.
     """
-    count, low, high = settings.num_slices, heights.min(), heights.max()
-    slice_of = ((heights - low) / (high - low) * count).astype(np.int64).clip(0, count - 1)
-    filled = np.unique(slice_of)
-    widths = [float(np.ptp(across[slice_of == number], axis=0).max()) for number in filled]
-    width = np.interp(np.arange(count), filled, widths)
-    below, above = np.maximum.accumulate(width), np.maximum.accumulate(width[::-1])[::-1]
-    stem = np.flatnonzero(width < settings.stem * np.minimum(below, above))
-    return float((stem[-1] + 1) / count * (high - low)) if len(stem) else 0.0
+    edges = np.unique(np.sort(mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)), axis=0)
+    heights = mesh.vertices @ up
+    low, slice_height = heights.min(), np.ptp(heights) / settings.num_slices
+    width = np.empty(settings.num_slices)
+    for number in range(settings.num_slices):
+        above = heights - (low + (number + 0.5) * slice_height)
+        first, second = edges[(above[edges[:, 0]] < 0) != (above[edges[:, 1]] < 0)].T
+        share = (above[first] / (above[first] - above[second]))[:, None]
+        section = (1 - share) * mesh.vertices[first] + share * mesh.vertices[second]
+        width[number] = np.ptp(section, axis=0).max()
+    below, beyond = np.maximum.accumulate(width), np.maximum.accumulate(width[::-1])[::-1]
+    stem = np.flatnonzero(width < settings.stem * np.minimum(below, beyond))
+    return float((stem[-1] + 1) * slice_height) if len(stem) else 0.0
 
 
 def fit_vessel(
@@ -169,7 +172,8 @@ def fit_vessel(
         build: makes the vessel from its lengths, with water if they have a level.
         width, height: size of the outer surface, world units.
         observations: observations of the object and its surroundings.
-        stem: height of the upper end of a stem. A stem is solid, so that the bottom of the cavity lies above it.
+        stem: height of the upper end of a stem, 0 without one. A stem is solid, so that the cavity does not begin below
+            this height.
         settings: typical lengths, candidates and limits.
     """
     settings.use()
@@ -197,7 +201,8 @@ def fit_vessel(
                 half_width = fraction * height if is_height else np.log(factor)
                 middle = lengths[name] if is_height else np.log(lengths[name])
                 grid = middle + half_width * offsets
-                values = grid.clip(stem, highest) if is_height else np.exp(grid)
+                grid += max(stem - grid[0], 0) if is_height else 0
+                values = grid.clip(max=highest) if is_height else np.exp(grid)
                 sums = np.stack([error_of(lengths | {name: value}) for value in values.tolist()])
                 # Robust errors have narrow minima, which a quadratic function through all candidates would miss.
                 minimum = parabola_minimum(grid, mean_errors(sums, search.counts))[0]

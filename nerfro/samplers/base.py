@@ -78,7 +78,14 @@ class PathSampler(nn.Module, ABC):
         return path
 
     def replay_rows(self, path: Path, rays: Rays, medium: Medium, rows: Int[Tensor, " rows"]) -> Path:
-        """Replay some polylines of a traced path; the others keep their values without gradients."""
+        """Replay some polylines of a traced path; the others keep their values without gradients.
+
+        Args:
+            path: traced path.
+            rays: traced rays.
+            medium: traced medium.
+            rows: the polylines, each at most once.
+        """
         if len(rows) == len(path.s):
             return self.replay(path, rays, medium)
         if not len(rows):

@@ -204,7 +204,7 @@ def fit_revolution(
 
 
 def _without_hidden_cone(body: Profile, centres: Float[Tensor, "cameras 3"], settings: RevolutionSettings) -> Profile:
-    """Cut the part below a sharp edge of the foot that hardly a camera sees as an outline, such as a flat cone.
+    """Cut the part below a sharp edge of the foot that hardly any camera sees as an outline, such as a flat cone.
 
     Args:
         body: fitted body.
@@ -214,10 +214,10 @@ def _without_hidden_cone(body: Profile, centres: Float[Tensor, "cameras 3"], set
     step = body.height / (len(body.radii) - 1)
     slopes = body.radii.diff()[: len(body.radii) // 3] / step
     heights = step * torch.arange(1, len(slopes))
-    sights = centres - (body.foot + heights[:, None] * body.axis)[:, None]
-    least_sine = (normalize(sights, dim=-1) @ body.axis).amin(1)
-    unseen = torch.where(least_sine > 0, (1 / least_sine.square() - 1).clamp(min=0).sqrt(), torch.inf)
-    hidden = slopes[:-1] > settings.hidden_slope * unseen
+    lines_of_sight = centres - (body.foot + heights[:, None] * body.axis)[:, None]
+    least_sine = (normalize(lines_of_sight, dim=-1) @ body.axis).amin(1)
+    least_unseen = torch.where(least_sine > 0, (1 / least_sine.square() - 1).clamp(min=0).sqrt(), torch.inf)
+    hidden = slopes[:-1] > settings.hidden_slope * least_unseen
     edges = (hidden & (slopes[1:] < settings.edge_ratio * slopes[:-1])).nonzero()
     first = int(edges.max()) + 1 if len(edges) else 0
     foot, height = body.foot + first * step * body.axis, body.height - first * step

@@ -12,10 +12,10 @@ from torch import Tensor
 from nerfro.backgrounds.base import Background
 from nerfro.capture.object_errors import unsupported_bodies
 from nerfro.capture.surroundings import Observations, Pixels, Surroundings
-from nerfro.capture.vessel_fit import fit_vessel, stem_height
+from nerfro.capture.vessel_fit import VesselFitSettings, fit_vessel, stem_height
 from nerfro.core.types import Exits
 from nerfro.data.base import Views
-from nerfro.geometry.mesh import load_mesh
+from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.media.bodies import Bodies, GridSettings
 from nerfro.media.body_settings import make_bodies
 from nerfro.media.material import Material
@@ -103,10 +103,24 @@ def test_pixels_support_the_body_that_refracts_their_rays(
         ([0.35, 0.35, 0.05, 0.05, 0.05, 0.4, 0.4, 0.35], 0.57),  # foot, stem and bowl
         ([0.3, 0.3, 0.3, 0.25, 0.06, 0.06, 0.06, 0.06], 0.0),  # a bottle with a narrow neck
         ([0.4, 0.35, 0.25, 0.2, 0.2, 0.25, 0.35, 0.4], 0.0),  # a waist
+        ([0.3, 0.4], 0.0),  # a tumbler of few triangles
     ],
 )
 def test_stem_is_a_narrow_part_between_two_wide_ones(radii: list[float], expected: float) -> None:
-    heights, angles = np.linspace(0, 1, 200), np.linspace(0, 2 * np.pi, 40)
-    radius = np.interp(heights, np.linspace(0, 1, len(radii)), radii)[:, None]
-    across = np.stack([radius * np.cos(angles), radius * np.sin(angles), np.zeros((200, 40))], -1).reshape(-1, 3)
-    assert stem_height(heights.repeat(40), across) == pytest.approx(expected, abs=0.06)
+    outline = np.column_stack([radii, np.linspace(0, 1, len(radii))])
+    shape = trimesh.creation.revolve(np.vstack([[0, 0], outline, [0, 1]]))
+    mesh = TriangleMesh(np.asarray(shape.vertices), np.asarray(shape.faces))
+    assert stem_height(mesh, np.array([0.0, 0.0, 1.0])) == pytest.approx(expected, abs=0.06)
+
+
+def test_cavity_does_not_continue_into_a_stem(cylinder: Path) -> None:
+    """The best foot would be lower than the stem, and then the foot ends with the stem."""
+    outer, grid = MeshSurface(str(cylinder)), GridSettings(**BOX)
+
+    def build(lengths: VesselLengths) -> Bodies:
+        return vessel(outer, lengths, Material(1.52), None, grid=grid)
+
+    observations = observed(cylinder, build(VesselLengths(wall=0.025, foot=0.2, fillet=0.12)))
+    settings = VesselFitSettings(levels=(), rounds=((2.0, 0.1),), num_candidates=3)
+    found = fit_vessel(build, 2 * RADIUS, HEIGHT, observations, stem=0.4, settings=settings)
+    assert found.lengths["foot"] == pytest.approx(0.4)

@@ -186,8 +186,8 @@ def intersect_triangles(triangles: Triangles, triangle: Int[Tensor, "P S"]) -> I
         x, d = x.cpu().double(), d.cpu().double()
         length = triangles.distance(x, d, face)
         smooth = triangles.normal(x + length[:, None] * d, face)
-        own = functional.normalize(triangles.areas(face), dim=-1)
-        normal = torch.where(_stays_on_its_side(d, smooth, own, ratio.to(d))[:, None], smooth, own)
+        flat = functional.normalize(triangles.areas(face), dim=-1)
+        normal = torch.where(_stays_on_its_side(d, smooth, flat, ratio.to(d))[:, None], smooth, flat)
         return length.to(like), normal.to(like)
 
     return intersect
@@ -195,13 +195,20 @@ def intersect_triangles(triangles: Triangles, triangle: Int[Tensor, "P S"]) -> I
 
 @torch.no_grad()
 def _stays_on_its_side(
-    d: Float[Tensor, "R 3"], normals: Float[Tensor, "R 3"], own: Float[Tensor, "R 3"], ratio: Float[Tensor, "R"]
+    d: Float[Tensor, "R 3"], smooth: Float[Tensor, "R 3"], flat: Float[Tensor, "R 3"], ratio: Float[Tensor, "R"]
 ) -> Bool[Tensor, "R"]:
-    """Test that reflected light leaves before a triangle with the normal `own`, and refracted light behind it."""
-    n_behind, every = torch.ones_like(ratio), torch.ones_like(ratio, dtype=torch.bool)
-    mirrored, _ = refract(d, normals, ratio, n_behind, every)
-    bent, is_total = refract(d, normals, ratio, n_behind)
-    height, mirrored_height, bent_height = ((directions * own).sum(-1) for directions in (d, mirrored, bent))
+    """Test that smooth normals send reflected light before a triangle and refracted light behind it.
+
+    Args:
+        d: unit directions of arriving rays.
+        smooth: interpolated unit normals.
+        flat: unit normals of the planes of the triangles.
+        ratio: ratio of the index before the triangle to the index behind it.
+    """
+    n_behind, all_reflect = torch.ones_like(ratio), torch.ones_like(ratio, dtype=torch.bool)
+    mirrored, _ = refract(d, smooth, ratio, n_behind, all_reflect)
+    bent, is_total = refract(d, smooth, ratio, n_behind)
+    height, mirrored_height, bent_height = ((directions * flat).sum(-1) for directions in (d, mirrored, bent))
     return (mirrored_height * height < 0) & (is_total | (bent_height * height > 0))
 
 
