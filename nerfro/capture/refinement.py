@@ -93,9 +93,8 @@ class RefinementSettings(AlgorithmSettings):
         validate_every: number of steps between validations.
         max_increase: see `stages`, as a fraction of the smallest error.
         min_gain: smallest decrease of the validation error by a blurred stage that is kept, and by all stages together
-            if the surface is accepted, as a fraction. A wrong surface also
-            explains some of the reflections, the tint and the interior: errors decreased by 0.012 to 0.11 for better
-            surfaces, and by up to 0.009 for worse ones.
+            if the surface is accepted, as a fraction. A wrong surface also explains some of the reflections, the tint
+            and the interior: errors decreased by 0.012 to 0.11 for better surfaces, and by up to 0.009 for worse ones.
         robust_scale: scale of the Geman-McClure loss, linear radiance: residual at which the loss is 1/2 of its maximum
             and the weight 1/4.
         contour_deviation: standard deviation of contours, in pixels.

@@ -51,7 +51,7 @@ class VesselFitSettings(AlgorithmSettings):
         num_candidates: number of candidates of each length in each round.
         num_errors: a vessel contains a liquid if the liquid decreases the error by this number of standard errors.
         max_standard_error: largest standard error of a known length, relative to the length. The last grid limits the
-            error to about 0.4, and for the level and the foot above a stem to few percent, so that these are known.
+            error to about 0.4, and for the level and the foot above a stem to a few percent, so that these are known.
         errors: settings of the errors at pixels of the object.
     """
 
@@ -107,7 +107,8 @@ def find_vessel(
     low, high = (first.box.double().numpy() + medium.origin).tolist()
     grid, outer = GridSettings(len(first.distances), low, high), MeshSurface(location)
 
-    lowest, highest = extent(outer, direction("up", up))
+    upwards = direction("up", up)
+    lowest, highest = extent(outer, upwards)
     height = highest - lowest
 
     def build(lengths: VesselLengths) -> Bodies:
@@ -115,7 +116,7 @@ def find_vessel(
         return vessel(outer, lengths, Material(_GLASS), liquid, up, grid=grid)
 
     try:
-        stem = stem_height(mesh, np.array(up) / np.linalg.norm(up))
+        stem = stem_height(mesh, upwards)
         fit = fit_vessel(build, float(np.ptp(across, axis=0).max()), height, observations, stem)
         rounded = {name: float(f"{length:.4g}") for name, length in fit.lengths.items()}
         fitted = build(VesselLengths(**rounded))

@@ -92,10 +92,10 @@ def face_normal(tree, face, line, ratio):
     gx, gy, gz = _geometric_normal(tree.corners[face])
     cosine = line.dx * nx + line.dy * ny + line.dz * nz
     height, tilt = line.dx * gx + line.dy * gy + line.dz * gz, nx * gx + ny * gy + nz * gz
-    reflected = height - 2.0 * cosine * tilt
+    mirrored_height = height - 2.0 * cosine * tilt
     root = math.sqrt(max(1.0 - ratio * ratio * (1.0 - cosine * cosine), 0.0))
-    refracted = ratio * height + (math.copysign(root, cosine) - ratio * cosine) * tilt
-    if reflected * height < 0.0 and (root == 0.0 or refracted * height > 0.0):
+    bent_height = ratio * height + (math.copysign(root, cosine) - ratio * cosine) * tilt
+    if mirrored_height * height < 0.0 and (root == 0.0 or bent_height * height > 0.0):
         return nx, ny, nz
     return gx, gy, gz
 
