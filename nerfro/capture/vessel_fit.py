@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
+import trimesh
 from jaxtyping import Float
 
 from nerfro.capture.object_errors import (
@@ -144,16 +145,12 @@ def stem_height(
         up: unit direction from bottom to top.
         settings: number of slices, and the limit of their width.
     """
-    edges = np.unique(np.sort(mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)), axis=0)
     heights = mesh.vertices @ up
-    low, slice_height = heights.min(), np.ptp(heights) / settings.num_slices
-    width = np.empty(settings.num_slices)
-    for number in range(settings.num_slices):
-        above = heights - (low + (number + 0.5) * slice_height)
-        first, second = edges[(above[edges[:, 0]] < 0) != (above[edges[:, 1]] < 0)].T
-        share = (above[first] / (above[first] - above[second]))[:, None]
-        section = (1 - share) * mesh.vertices[first] + share * mesh.vertices[second]
-        width[number] = np.ptp(section, axis=0).max()
+    slice_height = np.ptp(heights) / settings.num_slices
+    middles = heights.min() + (np.arange(settings.num_slices) + 0.5) * slice_height
+    solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    sections, _, _ = trimesh.intersections.mesh_multiplane(solid, np.zeros(3), up, middles)
+    width = np.array([np.ptp(section.reshape(-1, 2), axis=0).max() for section in sections])
     below, beyond = np.maximum.accumulate(width), np.maximum.accumulate(width[::-1])[::-1]
     stem = np.flatnonzero(width < settings.stem * np.minimum(below, beyond))
     return float((stem[-1] + 1) * slice_height) if len(stem) else 0.0
