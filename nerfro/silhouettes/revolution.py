@@ -16,7 +16,7 @@ from torch.nn.functional import normalize
 
 from nerfro.core.progress import track
 from nerfro.core.provenance import AlgorithmSettings
-from nerfro.core.robust import geman_mcclure_weight
+from nerfro.core.robust import geman_mcclure, geman_mcclure_weight
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.media.surfaces import revolve
 from nerfro.silhouettes.upright import body_axis
@@ -43,14 +43,12 @@ class RevolutionSettings(AlgorithmSettings):
         end_bending: factor of bending at the ends, where the masks show only thin slices.
         corner: bending at which its weight is one quarter, as a fraction of the height: objects have few, sharp
             corners.
-        flatness: weight of the height relative to the observations: no camera sees a low roof on the top or a cone
-            below the foot.
         max_step: longest step, as a fraction of the height.
         min_radius: smallest radius, as a fraction of the height.
         edge: radius of the rounded edges, in pixels.
-        hidden_slope: a cone below the foot is cut if its slope exceeds this fraction of the slope that no camera sees
-            as an outline.
-        edge_ratio: smallest factor by which the slope then decreases at the edge of the foot.
+        cut_knots, max_cut: distance of the tested cuts of an end, and largest cut, in knots.
+        cut_iterations: number of steps after each cut, and of final steps.
+        max_rise: no larger cuts are tested if one multiplies the smallest error by this factor.
         ray_samples, closer_samples: number of samples along a ray, and of samples in each of two refinements.
         border: width of the ignored image border, in pixels.
     """
@@ -68,12 +66,13 @@ class RevolutionSettings(AlgorithmSettings):
     bending: float = 2.0
     end_bending: float = 10.0
     corner: float = 0.002
-    flatness: float = 0.003
     max_step: float = 0.03
     min_radius: float = 1e-3
     edge: float = 0.5
-    hidden_slope: float = 0.6
-    edge_ratio: float = 0.6
+    cut_knots: int = 2
+    max_cut: int = 24
+    cut_iterations: int = 4
+    max_rise: float = 1.05
     ray_samples: int = 48
     closer_samples: int = 12
     border: int = 2
@@ -161,67 +160,124 @@ def fit_revolution(
         start = _profile_around(mesh, *axis, settings.inner_quantile, settings)[1]
     if start is None:
         return None
-    origins, directions, width, side = _rays(silhouettes, settings)
-    middle, size = start.foot + 0.5 * start.height * start.axis, start.height
-    if ((origins - middle) @ start.axis).mean() < 0:  # the axis points towards the cameras
-        start = Profile(start.foot + size * start.axis, -start.axis, size, start.radii.flip(0))
-    across = torch.linalg.svd(start.axis[None])[2][1:]
-    pixels = float(size / (width * (origins - middle).norm(dim=-1)).median())  # in the height
-
-    # Parameters in units of the height: two translations and two rotations of the axis, both ends, and the radii.
-    def body(numbers: Tensor) -> Profile:
-        axis = normalize(start.axis + numbers[2:4] @ across, dim=0)
-        foot = middle + size * (numbers[:2] @ across + numbers[4] * axis)
-        height, radii = size * (numbers[5] - numbers[4]), size * numbers[6:].clamp(min=settings.min_radius)
-        return Profile(foot, axis, height, radii, settings.edge * float(size) / pixels)
-
-    def misfits(numbers: Tensor) -> Tensor:
-        apart = body(numbers).least_distance(origins + lengths[:, None] * directions) / (width * lengths)
-        return torch.where(side * apart > 0, 0.0, apart)
-
-    numbers = torch.cat([torch.zeros(4), torch.tensor([-0.5, 0.5]), start.radii / size])
-    knots, end = settings.knots, settings.end_knots
-    bends = functional.pad(torch.eye(knots).diff(n=2, dim=0), (6, 0))
-    bends[:end] *= settings.end_bending
-    bends[-end:] *= settings.end_bending
-    first_scale, last_scale = settings.robust_scale
+    fit, (first_scale, last_scale) = _Fit(start, silhouettes, settings), settings.robust_scale
+    numbers = fit.start
     for iteration in track("finding the axis", range(settings.iterations)):
         done = min(1.0, iteration / (settings.iterations - 6))
-        scale = first_scale * (last_scale / first_scale) ** done
-        lengths = _nearest_lengths(body(numbers), origins, directions, settings)
-        misfit, slopes = misfits(numbers).double(), jacfwd(misfits)(numbers).double()
-        weight = geman_mcclure_weight(misfit[:, None], scale)
-        smooth = 1 / (1 + (bends @ numbers / settings.corner).square()).square()  # corners have little weight
-        smooth[-end:] = 1  # the upper end would flare
-        stiff = (settings.bending * pixels) ** 2 * len(misfit) / knots * (bends.T @ (smooth[:, None] * bends)).double()
-        system = slopes.T @ (weight[:, None] * slopes) + stiff
-        right = slopes.T @ (weight * misfit) + stiff @ numbers.double()
-        right[4:6] += settings.flatness * len(misfit) * pixels * torch.tensor([-1.0, 1.0])
-        damping = 1e-3 * system.diagonal().mean() * torch.eye(len(numbers)).double()
-        step = torch.linalg.solve(system + damping, right)
-        numbers = numbers - (step * (settings.max_step / step.abs().max()).clamp(max=1)).float()
-    return _without_hidden_cone(body(numbers), origins.unique(dim=0), settings).mesh()
+        numbers = fit.step(numbers, first_scale * (last_scale / first_scale) ** done)
+    for end in ("upper", "lower"):  # covers above the object distort the upper end most
+        numbers = fit.with_cut_end(numbers, end)
+    return fit.body(numbers).mesh()
 
 
-def _without_hidden_cone(body: Profile, centres: Float[Tensor, "cameras 3"], settings: RevolutionSettings) -> Profile:
-    """Cut the part below a sharp edge of the foot that hardly any camera sees as an outline, such as a flat cone.
+class _Fit:
+    """Gauss-Newton steps from an initial body, whose axis points towards the cameras.
+
+    The numbers of a body are in units of the initial height: two translations and two rotations of the axis, both ends,
+    and the radii.
 
     Args:
-        body: fitted body.
-        centres: centres of the cameras. They see the foot at larger angles to its plane than the rest of the body.
-        settings: limits of the slopes.
+        start: initial body.
+        silhouettes: silhouettes of the object.
+        settings: samples, weights and limits.
+
+    Attributes:
+        start: numbers of the initial body.
     """
-    step = body.height / (len(body.radii) - 1)
-    slopes = body.radii.diff()[: len(body.radii) // 3] / step
-    heights = step * torch.arange(1, len(slopes))
-    lines_of_sight = centres - (body.foot + heights[:, None] * body.axis)[:, None]
-    least_sine = (normalize(lines_of_sight, dim=-1) @ body.axis).amin(1)
-    least_unseen = torch.where(least_sine > 0, (1 / least_sine.square() - 1).clamp(min=0).sqrt(), torch.inf)
-    hidden = slopes[:-1] > settings.hidden_slope * least_unseen
-    edges = (hidden & (slopes[1:] < settings.edge_ratio * slopes[:-1])).nonzero()
-    first = int(edges.max()) + 1 if len(edges) else 0
-    foot, height = body.foot + first * step * body.axis, body.height - first * step
-    return Profile(foot, body.axis, height, body.radii[first:], body.edge)
+
+    def __init__(self, start: Profile, silhouettes: Silhouettes, settings: RevolutionSettings) -> None:
+        self._settings = settings
+        self._origins, self._directions, self._width, self._side = _rays(silhouettes, settings)
+        self._middle, self._size = start.foot + 0.5 * start.height * start.axis, start.height
+        apart = self._origins - self._middle
+        is_upright = bool((apart @ start.axis).mean() >= 0)
+        self._axis = start.axis if is_upright else -start.axis
+        self._across = torch.linalg.svd(start.axis[None])[2][1:]
+        self._pixels = float(self._size / (self._width * apart.norm(dim=-1)).median())  # in the height
+        radii = start.radii if is_upright else start.radii.flip(0)
+        self.start = torch.cat([torch.zeros(4), torch.tensor([-0.5, 0.5]), radii / self._size])
+        knots, end = settings.knots, settings.end_knots
+        self._bends = functional.pad(torch.eye(knots).diff(n=2, dim=0), (6, 0))
+        self._bends[:end] *= settings.end_bending
+        self._bends[-end:] *= settings.end_bending
+
+    def body(self, numbers: Float[Tensor, " numbers"]) -> Profile:
+        """Return the body with these numbers."""
+        axis = normalize(self._axis + numbers[2:4] @ self._across, dim=0)
+        foot = self._middle + self._size * (numbers[:2] @ self._across + numbers[4] * axis)
+        radii = self._size * numbers[6:].clamp(min=self._settings.min_radius)
+        edge = self._settings.edge * float(self._size) / self._pixels
+        return Profile(foot, axis, self._size * (numbers[5] - numbers[4]), radii, edge)
+
+    def step(self, numbers: Float[Tensor, " numbers"], scale: float) -> Float[Tensor, " numbers"]:
+        """Make a step; `scale` is the scale of the Geman-McClure loss, in pixels."""
+        settings, lengths = self._settings, self._nearest_lengths(numbers)
+        misfit = self._misfits(numbers, lengths).double()
+        slopes = jacfwd(self._misfits)(numbers, lengths).double()
+        weight = geman_mcclure_weight(misfit[:, None], scale)
+        smooth = 1 / (1 + (self._bends @ numbers / settings.corner).square()).square()  # corners have little weight
+        smooth[-settings.end_knots :] = 1  # the upper end would flare
+        stiffness = (settings.bending * self._pixels) ** 2 * len(misfit) / settings.knots
+        stiff = stiffness * (self._bends.T @ (smooth[:, None] * self._bends)).double()
+        system = slopes.T @ (weight[:, None] * slopes) + stiff
+        right = slopes.T @ (weight * misfit) + stiff @ numbers.double()
+        damping = 1e-3 * system.diagonal().mean() * torch.eye(len(numbers)).double()
+        step = torch.linalg.solve(system + damping, right)
+        return numbers - (step * (settings.max_step / step.abs().max()).clamp(max=1)).float()
+
+    def with_cut_end(
+        self, numbers: Float[Tensor, " numbers"], end: Literal["lower", "upper"]
+    ) -> Float[Tensor, " numbers"]:
+        """Cut an end at the height with the smallest error, because steps do not find the shortest body.
+
+        Few outlines contradict a cone below the foot or a low roof on the top, which bending connects with the side.
+
+        Returns:
+            Numbers of the body, after more steps.
+        """
+        settings = self._settings
+        best = self._after_steps(numbers)
+        whole, least = best, self._error(best)
+        for cut in range(settings.cut_knots, settings.max_cut + 1, settings.cut_knots):
+            candidate = self._after_steps(_cut(whole, cut, end))
+            error = self._error(candidate)
+            if error > settings.max_rise * least:
+                break
+            if error < least:
+                best, least = candidate, error
+        return best
+
+    def _after_steps(self, numbers: Float[Tensor, " numbers"]) -> Float[Tensor, " numbers"]:
+        for _ in range(self._settings.cut_iterations):
+            numbers = self.step(numbers, self._settings.robust_scale[1])
+        return numbers
+
+    def _error(self, numbers: Float[Tensor, " numbers"]) -> float:
+        """Compute the mean robust misfit."""
+        misfits = self._misfits(numbers, self._nearest_lengths(numbers))
+        return float(geman_mcclure(misfits[:, None], self._settings.robust_scale[1]).mean())
+
+    def _misfits(
+        self, numbers: Float[Tensor, " numbers"], lengths: Float[Tensor, " points"]
+    ) -> Float[Tensor, " points"]:
+        """Compute distances of rays to the body in pixels; 0 for rays on their side of the outline."""
+        points = self._origins + lengths[:, None] * self._directions
+        apart = self.body(numbers).least_distance(points) / (self._width * lengths)
+        return torch.where(self._side * apart > 0, 0.0, apart)
+
+    def _nearest_lengths(self, numbers: Float[Tensor, " numbers"]) -> Float[Tensor, " points"]:
+        return _nearest_lengths(self.body(numbers), self._origins, self._directions, self._settings)
+
+
+def _cut(numbers: Float[Tensor, " numbers"], count: int, end: Literal["lower", "upper"]) -> Float[Tensor, " numbers"]:
+    """Cut a body by `count` knots at an end; the number of radii stays."""
+    radii, (low, high) = numbers[6:], numbers[4:6].tolist()
+    last = len(radii) - 1
+    first, last_kept = (count, last) if end == "lower" else (0, last - count)
+    at = np.linspace(first, last_kept, len(radii))
+    kept = torch.from_numpy(np.interp(at, np.arange(len(radii)), radii.numpy())).to(radii)
+    ends = numbers.new_tensor([low + first / last * (high - low), low + last_kept / last * (high - low)])
+    return torch.cat([numbers[:4], ends, kept])
 
 
 def _initial_profile(mesh: TriangleMesh, settings: RevolutionSettings) -> Profile | None:

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy.ndimage import gaussian_filter
 
 from nerfro.core.cameras import Cameras
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.silhouettes import surface
-from nerfro.silhouettes.revolution import Profile, RevolutionSettings, _without_hidden_cone, fit_revolution
+from nerfro.silhouettes.revolution import fit_revolution
 from nerfro.silhouettes.silhouettes import mesh_silhouettes
 from nerfro.silhouettes.surface import make_mesh
 from nerfro.silhouettes.visual_hull import Silhouettes
@@ -54,7 +55,7 @@ def test_revolution_fit_recovers_a_glass_with_a_partly_hidden_foot() -> None:
     # As wide as it is, at the brim and around the foot, and as high.
     points = found.vertices @ TURN - SHIFT
     radius = np.linalg.norm(points[:, :2], axis=1)
-    assert points[:, 2].min() == pytest.approx(0, abs=0.03)  # no camera sees a low cone below the foot
+    assert points[:, 2].min() == pytest.approx(0, abs=0.035)  # hardly any camera sees a low cone below the foot
     assert points[:, 2].max() == pytest.approx(1.2, abs=0.04)
     assert radius[np.abs(points[:, 2] - 0.7) < 0.03].max() == pytest.approx(0.322, abs=0.015)
     assert radius.max() == pytest.approx(0.45, abs=0.02)
@@ -73,18 +74,25 @@ def test_sharp_edges_are_recovered_to_a_sixth_of_a_pixel() -> None:
     assert np.linalg.norm(points[:, :2], axis=1).max() == pytest.approx(0.42, abs=pixel / 6)
 
 
-@pytest.mark.parametrize(("slope", "is_cut"), [(2.3, True), (1.5, False)])
-def test_cameras_that_look_down_on_the_foot_do_not_see_a_cone_below(slope: float, is_cut: bool) -> None:
-    # The lines of sight to the foot descend by 0.3, so that no camera sees a cone of more than slope 3.3. Those to the
-    # middle of the body descend by 0.15, and the limit would be 6.7.
-    angle = torch.arange(12) * 2 * np.pi / 12
-    centres = torch.stack([3 * angle.cos(), 3 * angle.sin(), torch.full_like(angle, 0.9)], -1)
-    heights = torch.linspace(-0.1, 1, 56)
-    radii = 0.4 + slope * heights.clamp(max=0)
-    body = Profile(torch.tensor([0.0, 0.0, -0.1]), torch.tensor([0.0, 0.0, 1.0]), torch.tensor(1.1), radii)
-    rest = _without_hidden_cone(body, centres, RevolutionSettings())
-    assert float(rest.foot[2]) == pytest.approx(0 if is_cut else -0.1, abs=1e-6)
-    assert float(rest.foot[2] + rest.height) == pytest.approx(1, abs=1e-6)
+@pytest.mark.parametrize(
+    "outline",
+    [
+        pytest.param([[0, 0], [0.35, 0], [0.42, 0.9], [0, 0.9]], id="flat foot"),
+        pytest.param([[0, 0], [0.1, 0], [0.4, 0.25], [0.42, 0.9], [0, 0.9]], id="conical foot"),
+    ],
+)
+def test_ends_are_found_in_noisy_masks(outline: list[list[float]]) -> None:
+    elevation, pixel, random = 12 + 15 * (np.arange(VIEWS) % 3), 4 / (2 * SIZE), np.random.default_rng(0)
+    cameras = upright_cameras(VIEWS, SIZE, 2 * SIZE, elevation, world=TURN, near=0.1, far=9.0)
+    distances = Silhouettes.of(cameras, _masks(_body(outline), cameras)).distances.numpy()
+    noise = np.stack([gaussian_filter(random.normal(size=(SIZE, SIZE)), 4) for _ in range(VIEWS)])
+    masks = torch.from_numpy(distances + noise / noise.std() > 0).float()  # one pixel
+    silhouettes = Silhouettes.of(cameras, masks)
+    found = fit_revolution(make_mesh(silhouettes, None, 48, 0, None, 0.0), silhouettes)
+    assert found is not None
+    heights = found.vertices @ TURN[:, 2] - SHIFT[2]
+    assert heights.min() == pytest.approx(0, abs=2.5 * pixel)
+    assert heights.max() == pytest.approx(0.9, abs=2.5 * pixel)
 
 
 def test_box_is_no_body_of_revolution(capsys: pytest.CaptureFixture[str]) -> None:
