@@ -46,9 +46,12 @@ class RevolutionSettings(AlgorithmSettings):
         max_step: longest step, as a fraction of the height.
         min_radius: smallest radius, as a fraction of the height.
         edge: radius of the rounded edges, in pixels.
-        cut_knots, max_cut: distance of the tested cuts of an end, and largest cut, in knots.
-        cut_iterations: number of steps after each cut, and of final steps.
-        max_rise: no larger cuts are tested if one multiplies the smallest error by this factor.
+        cut_knots, max_cut: distance of the tested cuts of an end, and largest cut, in knots. The neighbours of the best
+            one are tested, too.
+        cut_iterations: number of steps before and after each cut.
+        cut_scale: scale of the Geman-McClure loss that compares cuts, in pixels. With a scale of one pixel, views that
+            contradict a cut would be outliers.
+        max_rise: no larger cuts are tested if one exceeds the smallest mean robust error by more than this.
         ray_samples, closer_samples: number of samples along a ray, and of samples in each of two refinements.
         border: width of the ignored image border, in pixels.
     """
@@ -69,10 +72,11 @@ class RevolutionSettings(AlgorithmSettings):
     max_step: float = 0.03
     min_radius: float = 1e-3
     edge: float = 0.5
-    cut_knots: int = 2
+    cut_knots: int = 3
     max_cut: int = 24
     cut_iterations: int = 4
-    max_rise: float = 1.05
+    cut_scale: float = 4.0
+    max_rise: float = 0.02
     ray_samples: int = 48
     closer_samples: int = 12
     border: int = 2
@@ -235,17 +239,21 @@ class _Fit:
         Returns:
             Numbers of the body, after more steps.
         """
-        settings = self._settings
-        best = self._after_steps(numbers)
-        whole, least = best, self._error(best)
+        settings, whole = self._settings, self._after_steps(numbers)
+        bodies, errors = {0: whole}, {0: self._error(whole)}
+
+        def attempt(cut: int) -> None:
+            bodies[cut] = self._after_steps(_cut(whole, cut, end))
+            errors[cut] = self._error(bodies[cut])
+
         for cut in range(settings.cut_knots, settings.max_cut + 1, settings.cut_knots):
-            candidate = self._after_steps(_cut(whole, cut, end))
-            error = self._error(candidate)
-            if error > settings.max_rise * least:
+            attempt(cut)
+            if errors[cut] > min(errors.values()) + settings.max_rise:
                 break
-            if error < least:
-                best, least = candidate, error
-        return best
+        best = min(errors, key=errors.__getitem__)
+        for cut in (max(0, best - 1), best + 1):
+            attempt(cut)
+        return bodies[min(errors, key=errors.__getitem__)]
 
     def _after_steps(self, numbers: Float[Tensor, " numbers"]) -> Float[Tensor, " numbers"]:
         for _ in range(self._settings.cut_iterations):
@@ -255,7 +263,7 @@ class _Fit:
     def _error(self, numbers: Float[Tensor, " numbers"]) -> float:
         """Compute the mean robust misfit."""
         misfits = self._misfits(numbers, self._nearest_lengths(numbers))
-        return float(geman_mcclure(misfits[:, None], self._settings.robust_scale[1]).mean())
+        return float(geman_mcclure(misfits[:, None], self._settings.cut_scale).mean())
 
     def _misfits(
         self, numbers: Float[Tensor, " numbers"], lengths: Float[Tensor, " points"]
