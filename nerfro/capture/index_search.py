@@ -312,7 +312,8 @@ class _Search:
         values = values.clip(self.settings.lowest, self.settings.highest)
         medium = self._achromatic.with_indices(torch.from_numpy(values))
         trace = self._sampler.trace(pixels.rays, medium)
-        radiance, known = self._surroundings.radiance(trace.path.in_room_of(pixels.rays).exits())
+        exits = trace.path.in_room_of(pixels.rays).exits()
+        radiance, known = self._surroundings.radiance(exits).clamp(max=1), self._surroundings.known(exits)
         return radiance - pixels.radiance, known & ~trace.exceeded
 
     def errors(

@@ -6,7 +6,6 @@ The errors of each candidate are summed by view, so that random samples of the v
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
@@ -16,7 +15,7 @@ import torch
 from jaxtyping import Float, Num
 from torch import Tensor
 
-from nerfro.capture.surroundings import Observations, robust_scale
+from nerfro.capture.surroundings import Observations, recorded_and_clipped, robust_scale
 from nerfro.core.provenance import AlgorithmSettings
 from nerfro.core.robust import geman_mcclure
 from nerfro.core.types import Path
@@ -126,7 +125,8 @@ class ObjectErrorSettings(AlgorithmSettings):
         num_errors: a supported body decreases the error of straight rays, and a reflection or absorption that of the
             body, by at least this number of standard errors.
         min_gain: smallest decrease of a supported body, as a fraction of the decrease of the best body.
-        num_shares: number of shares of absorbed light, from 0 to 0.95, that are compared.
+        initial_light: initial optical depth of the mean path, and initial excess of clipped radiance over 1.
+        light_steps, light_rate: number of steps of Adam that fit both, and initial rate of their logarithms.
         min_share: smallest share of absorbed light that is reported.
     """
 
@@ -134,8 +134,32 @@ class ObjectErrorSettings(AlgorithmSettings):
     min_weight: float = 0.02
     num_errors: float = 3.0
     min_gain: float = 0.75
-    num_shares: int = 20
+    initial_light: tuple[float, float] = (0.3, 0.3)
+    light_steps: int = 150
+    light_rate: float = 0.1
     min_share: float = 0.05
+
+
+@dataclass(frozen=True)
+class ObservedLight:
+    """Light of the surroundings that reaches the camera through an object.
+
+    Attributes:
+        absorption: absorption coefficients of all bodies for red, green and blue, per world unit.
+        length: mean length within the bodies of rays that cross them, world units.
+        clipped: linear radiance of the surroundings where photographs are clipped, see `Surroundings`.
+        reflects: whether partial reflection explains the pixels better than none.
+    """
+
+    absorption: Float[Tensor, "3"]
+    length: float
+    clipped: Float[Tensor, "3"]
+    reflects: bool = False
+
+    @property
+    def absorbed(self) -> list[float]:
+        """Shares of red, green and blue light that are absorbed along the mean path."""
+        return [round(share, 2) for share in (-torch.expm1(-self.absorption * self.length)).tolist()]
 
 
 class ObjectErrors:
@@ -156,7 +180,7 @@ class ObjectErrors:
         branches: Literal["none", "all"] = "all",
     ) -> None:
         settings.use()
-        self._surroundings = observations.surroundings
+        self._settings, self._surroundings = settings, observations.surroundings
         self._pixels = observations.through.some(settings.num_pixels)
         self._scale = robust_scale(self._surroundings)
         self._sampler = Snell(branches=branches, least_weight=settings.min_weight)
@@ -166,35 +190,47 @@ class ObjectErrors:
 
     def of(self, body: Medium) -> Float[np.ndarray, "V"]:
         """Sum the robust errors over the pixels of each view."""
-        light, path = self._light(body)
+        path = self._path(body)
+        light = self._surroundings.radiance(path.exits())
+        light = light * path.transmitted(path.far[:, None])[:, 0] if path.absorbs else light
         self._advance()
         return self._sums(path.sum_polylines(light).clamp(max=1) - self._pixels.radiance)
 
-    def of_absorption(
-        self, body: Bodies, shares: Float[np.ndarray, " candidates"]
-    ) -> tuple[Float[np.ndarray, "3 candidates V"], float]:
-        """Sum the robust errors of red, green and blue for shares of the light that are absorbed along the mean path.
+    def fit_light(self, body: Bodies, absorbs: bool) -> tuple[ObservedLight, Float[np.ndarray, "3 V"]]:
+        """Fit absorption coefficients and the radiance of clipped directions by gradient descent, with fixed paths.
+
+        Args:
+            body: the bodies.
+            absorbs: whether the bodies absorb light.
 
         Returns:
-            Sums of the errors, and the mean length within the body of rays that cross it, world units.
+            The light, and the robust errors of red, green and blue, summed by view.
         """
-        light, path = self._light(body)  # the paths do not depend on the absorption
+        settings, path = self._settings, self._path(body)
         size = float((body.box[1] - body.box[0]).max())
         unit = body.with_absorption_coefficients(torch.full((len(body.iors), 3), 1 / size))
         lengths = -size * unit.with_absorption(path).transmitted(path.far[:, None])[:, 0].log()
         main = path.main_polyline(lengths)
-        mean, errors = float(main[main > 0].mean()), []
-        for share in shares.tolist():
-            radiance = path.sum_polylines(light * torch.exp(math.log1p(-share) / mean * lengths)).clamp(max=1)
-            residuals = radiance - self._pixels.radiance
-            errors.append([self._sums(residuals[:, channel : channel + 1]) for channel in range(3)])
-        return np.array(errors).transpose(1, 0, 2), mean
+        length = float(main[main > 0].mean())
+        recorded, share = recorded_and_clipped(self._surroundings.background(path.exits()))
+        # Logarithms of the optical depth of the mean path, and of the excess of clipped radiance over 1.
+        logarithms = torch.tensor(settings.initial_light).log()[:, None].repeat(1, 3).requires_grad_()
+        optimizer = torch.optim.Adam([logarithms])
+        with torch.enable_grad():
+            for step in range(settings.light_steps + 1):
+                depth, excess = logarithms.exp()
+                transmitted = torch.exp(-depth * lengths / length) if absorbs else 1.0
+                radiance = path.sum_polylines((recorded + share * excess) * transmitted).clamp(max=1)
+                residuals = radiance - self._pixels.radiance
+                optimizer.param_groups[0]["lr"] = settings.light_rate * (1 - step / settings.light_steps)
+                optimizer.zero_grad()
+                geman_mcclure(residuals[..., None], self._scale).mean().backward()
+                optimizer.step()  # the rate of the last step is 0
+        errors = np.array([self._sums(residuals[:, channel : channel + 1].detach()) for channel in range(3)])
+        return ObservedLight(absorbs * depth.detach() / length, length, 1 + excess.detach()), errors
 
-    def _light(self, body: Medium) -> tuple[Float[Tensor, "P 3"], Path]:
-        """Trace the pixels; returns the light of the surroundings along each polyline, and the path."""
-        path = body.with_absorption(self._sampler(self._pixels.rays, body).in_room_of(self._pixels.rays))
-        light = self._surroundings.background(path.exits())
-        return light * path.transmitted(path.far[:, None])[:, 0] if path.absorbs else light, path
+    def _path(self, body: Medium) -> Path:
+        return body.with_absorption(self._sampler(self._pixels.rays, body).in_room_of(self._pixels.rays))
 
     def _sums(self, residuals: Float[Tensor, "Q C"]) -> Float[np.ndarray, "V"]:
         """Sum the robust errors of residuals by view."""
@@ -248,31 +284,35 @@ def unsupported_bodies(
     return sorted((name for name in bodies if name not in supported), key=gains.__getitem__, reverse=True)
 
 
-def absorption_and_reflection(
+def observed_light(
     observations: Observations, body: Bodies, settings: ObjectErrorSettings = ObjectErrorSettings()
-) -> tuple[list[float], bool]:
+) -> ObservedLight:
     """Measure absorption and reflection of a body by the colours of its pixels against the surroundings.
+
+    Absorption and reflection count if they decrease the error significantly.
 
     Args:
         observations: observations of the object and its surroundings.
         body: bodies with known indices.
-        settings: number of pixels, candidates and limits.
-
-    Returns:
-        Share of red, green and blue light that is absorbed along the mean path, 0 if none is significant; and whether
-        partial reflection explains the pixels better than none.
+        settings: number of pixels, steps and limits.
     """
     through, both = (ObjectErrors(observations, settings=settings, branches=branches) for branches in ("none", "all"))
-    shares, absorbed = np.linspace(0, 0.95, settings.num_shares), list[float]()
-    by_colour, length = both.of_absorption(body, shares)
-    for errors in by_colour:
-        share = float(parabola_minimum(shares, mean_errors(errors, both.counts))[0])
-        best = errors[np.abs(shares - share).argmin()]
-        is_significant = share >= settings.min_share and both.decreases(errors[0], best, settings.num_errors)
-        absorbed.append(round(share, 2) if is_significant else 0.0)
-    coefficients = -torch.log1p(-torch.tensor(absorbed)) / length
-    body = body.with_absorption_coefficients(coefficients.expand(len(body.iors), 3))
-    return absorbed, both.decreases(through.of(body), both.of(body), settings.num_errors)
+    light, errors = both.fit_light(body, absorbs=True)
+    clear, clear_errors = both.fit_light(body, absorbs=False)
+    absorbs = torch.tensor(
+        [
+            share >= settings.min_share and both.decreases(before, after, settings.num_errors)
+            for share, before, after in zip(light.absorbed, clear_errors, errors, strict=True)
+        ]
+    )
+    best = errors.sum(0) if absorbs.any() else clear_errors.sum(0)
+    without = through.fit_light(body, absorbs=bool(absorbs.any()))[1].sum(0)
+    return ObservedLight(
+        torch.where(absorbs, light.absorption, 0.0),
+        light.length,
+        torch.where(absorbs, light.clipped, clear.clipped),
+        both.decreases(without / 3, best / 3, settings.num_errors),
+    )
 
 
 def _with_index(solid: Bodies, ior: float) -> Bodies:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 
 from nerfro.capture.index_search import FoundMedium, find_medium, initial_medium
-from nerfro.capture.object_errors import absorption_and_reflection, unsupported_bodies
+from nerfro.capture.object_errors import observed_light, unsupported_bodies
 from nerfro.capture.preprocess_options import MESH, PreprocessConfig, Request, surface_settings, write_scene
 from nerfro.capture.refinement import refine
 from nerfro.capture.surroundings import Observations
@@ -102,10 +102,10 @@ def _with_absorption_and_reflection(request: Request, observations: Observations
     bodies, origin = indexed.medium.bodies, indexed.provenance
     if bodies is None or not request.searches_index or origin.doubts:
         return origin
-    absorbed, reflects = absorption_and_reflection(observations, bodies)
-    shares = ", ".join(f"{share:.0%} of {name}" for share, name in zip(absorbed, COLOURS, strict=True))
-    print(f"absorbed along the mean path: {shares} light; partial reflection is {'' if reflects else 'not '}seen")
-    return replace(origin, absorbed=absorbed, reflects=reflects)
+    light = observed_light(observations, bodies)
+    shares = ", ".join(f"{share:.0%} of {name}" for share, name in zip(light.absorbed, COLOURS, strict=True))
+    print(f"absorbed along the mean path: {shares} light; partial reflection is {'' if light.reflects else 'not '}seen")
+    return replace(origin, absorbed=light.absorbed, reflects=light.reflects)
 
 
 def _fit_surface(request: Request, views: Views, mesh: TriangleMesh | None) -> tuple[TriangleMesh, Views, Silhouettes]:

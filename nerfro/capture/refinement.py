@@ -2,8 +2,8 @@
 
 Pixels inside the silhouette of a clear body show the surroundings in the exit directions of their rays. The surface is
 displaced until the surroundings in the exit directions have the colours of the pixels, with derivatives of the exact
-paths (`samplers.paths.replay`). Partial reflections are followed if they explain the photographs better. Three measures
-make the descent converge:
+paths (`samplers.paths.replay`). Absorption is measured first, and partial reflections are followed if they explain the
+photographs better. Three measures make the descent converge:
 
 - The surroundings of inaccurate surfaces are blurred first, because the gradient of a photograph is informative only
   over the width of its details. Accurate surfaces need small steps and sharp surroundings; blur would make them worse.
@@ -28,9 +28,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from nerfro.backgrounds.base import Background
 from nerfro.backgrounds.cube_map import texel_directions
 from nerfro.backgrounds.envmap import EnvironmentMap
+from nerfro.capture.object_errors import observed_light
 from nerfro.capture.preprocess_options import FIGURES
 from nerfro.capture.surroundings import Observations, Pixels, Room, RoomPanorama, Surroundings, panorama_of
 from nerfro.core.errors import NerfroError, warn
@@ -95,8 +95,8 @@ class RefinementSettings(AlgorithmSettings):
         min_gain: smallest decrease of the validation error by a blurred stage that is kept, and by all stages together
             if the surface is accepted, as a fraction. A wrong surface also explains some of the reflections, the tint
             and the interior: errors decreased by 0.012 to 0.11 for better surfaces, and by up to 0.009 for worse ones.
-        robust_scale: scale of the Geman-McClure loss, linear radiance: residual at which the loss is 1/2 of its maximum
-            and the weight 1/4.
+        robust_scale: scale of the Geman-McClure loss relative to the mean transmittance, linear radiance: residual at
+            which the loss is 1/2 of its maximum and the weight 1/4.
         contour_deviation: standard deviation of contours, in pixels.
         contour_weight, roughness_weight: weights of contours and of roughness, relative to the photometric error.
         num_contour_points: number of contour points in each step.
@@ -118,7 +118,7 @@ class RefinementSettings(AlgorithmSettings):
     max_overlap_loss: float = 0.003
     max_validation_pixels: int = 20_000
     validate_every: int = 25
-    max_increase: float = 0.03
+    max_increase: float = 0.3
     min_gain: float = 0.01
     robust_scale: float = 0.1
     contour_deviation: float = 0.25
@@ -135,7 +135,8 @@ class RefinementProblem:
 
     Attributes:
         mesh: the surface.
-        medium: the bodies with estimated indices; the mesh is the surface of the first one. Dispersion is ignored.
+        medium: the bodies with estimated indices and absorption; the mesh is the surface of the first one. Dispersion
+            is ignored.
         silhouettes: silhouettes of the surface, whose outlines are kept.
         through: pixels inside the silhouette of the object.
         surroundings: known surroundings, near or distant.
@@ -247,9 +248,12 @@ def refine(
     Returns:
         The refined surface; the given one without a significant improvement, or if the refinement is impossible.
     """
-    through, surroundings, cameras = observations.through, observations.surroundings, observations.views.cameras
-    bodies = medium.bodies
+    through, cameras, bodies = observations.through, observations.views.cameras, medium.bodies
     assert bodies is not None  # see Request.check
+    light = observed_light(observations, bodies)
+    surroundings = replace(observations.surroundings, clipped=light.clipped)
+    if bodies.absorption is None:
+        bodies = bodies.with_absorption_coefficients(light.absorption.expand(len(bodies.iors), 3))
     start, settings = mesh.relative_to(observations.shift), RefinementSettings()
     if silhouettes is None:
         settings = replace(settings, max_overlap_loss=math.inf)
@@ -330,6 +334,7 @@ class _Descent:
         self.learned = [*self.offsets.levels, self.iors]
         self.training, validation = problem.through.split()
         self.validation = validation.some(settings.max_validation_pixels)
+        self.robust_scale = settings.robust_scale * self._transmittance(medium)
         self.sampler = self._best_sampler(medium)
         errors, is_valid = self._validation_errors(medium, self.sampler)
         if not is_valid.any():
@@ -367,7 +372,8 @@ class _Descent:
         done = step / stage.steps
         if step % self.settings.validate_every == 0:
             degrees = stage.blur[0] + (stage.blur[1] - stage.blur[0]) * done
-            self.blurred = _blurred(self.panorama, degrees, self.settings)
+            surroundings = replace(self.problem.surroundings, background=self.panorama)
+            self.blurred = _blurred(surroundings, degrees, self.settings)
         self.optimizer.param_groups[0]["lr"] = stage.rate * 0.5 * (1 + math.cos(math.pi * done))
         self.optimizer.zero_grad()
         with torch.enable_grad():
@@ -378,8 +384,8 @@ class _Descent:
         medium, settings = self.medium(), self.settings
         pixels = self.training[torch.randint(len(self.training), (settings.num_pixels,), generator=self.generator)]
         path, known = self._traced(pixels.rays, medium)
-        radiance = path.sum_polylines(self.blurred(path.exits()).clamp(max=1))
-        errors = geman_mcclure((radiance - pixels.radiance)[known], settings.robust_scale)
+        radiance = self._recorded(path, medium, self.blurred)
+        errors = geman_mcclure((radiance - pixels.radiance)[known], self.robust_scale)
         photometric = errors.sum() / max(1, len(errors))
         rims = self.rims[torch.randint(len(self.rims), (settings.num_contour_points,), generator=self.generator)]
         current, initial = (solid.grids[0](rims)[0] for solid in (medium, self.problem.medium))
@@ -433,9 +439,21 @@ class _Descent:
         """Compute the robust errors of the validation pixels, and whether their surroundings are known."""
         trace = sampler.trace(self.validation.rays, medium)
         path = trace.path.in_room_of(self.validation.rays)
-        light, _ = self.problem.surroundings.radiance(path.exits())
-        errors = geman_mcclure(path.sum_polylines(light) - self.validation.radiance, self.settings.robust_scale)
+        radiance = self._recorded(path, medium, self.problem.surroundings.radiance)
+        errors = geman_mcclure(radiance - self.validation.radiance, self.robust_scale)
         return errors, self._shows_known(trace, path)
+
+    def _transmittance(self, medium: Bodies) -> float:
+        """Return the mean transmittance along the rays of the validation pixels."""
+        path = medium.with_absorption(Snell()(self.validation.rays, medium))
+        return float(path.transmitted(path.far[:, None]).mean()) if path.absorbs else 1.0
+
+    @staticmethod
+    def _recorded(path: Path, medium: Bodies, radiance: Callable[[Exits], Tensor]) -> Float[Tensor, "R 3"]:
+        """Compute the radiance that a photograph records of given surroundings."""
+        path, light = medium.with_absorption(path), radiance(path.exits())
+        light = light * path.transmitted(path.far[:, None])[:, 0] if path.absorbs else light
+        return path.sum_polylines(light).clamp(max=1)
 
     def _shows_known(self, trace: SnellTrace, path: Path) -> Bool[Tensor, "R"]:
         """Test which rays meet the object and show known surroundings."""
@@ -454,18 +472,19 @@ class _Descent:
         return self.sampler.replay_rows(path, rays, medium, rows), known
 
 
-def _blurred(panorama: EnvironmentMap | RoomPanorama, degrees: float, settings: RefinementSettings) -> Background:
-    """Convolve surroundings with a Gaussian of the given standard deviation."""
+def _blurred(surroundings: Surroundings, degrees: float, settings: RefinementSettings) -> Callable[[Exits], Tensor]:
+    """Convolve the radiance of surroundings with a Gaussian of the given standard deviation."""
     if degrees == 0:
-        return panorama
-    sky = panorama.colours if isinstance(panorama, RoomPanorama) else panorama
+        return surroundings.radiance
+    panorama = surroundings.background
+    sky = replace(surroundings, background=panorama.colours) if isinstance(panorama, RoomPanorama) else surroundings
     generator = torch.Generator().manual_seed(0)
     side = round(settings.texels_per_deviation * 90 / degrees)  # a face of the cube spans 90 degrees
     directions = texel_directions(max(16, side))
     total = torch.zeros_like(directions)
     for _ in range(settings.blur_samples):
         turned = directions + math.radians(degrees) * torch.randn(3, generator=generator)
-        total += sky(Exits(turned / turned.norm(dim=-1, keepdim=True))).clamp(max=1)
+        total += sky.radiance(Exits(turned / turned.norm(dim=-1, keepdim=True)))
     blurred = EnvironmentMap.of_texels(total / settings.blur_samples)
     return RoomPanorama(panorama.middle, blurred, panorama.distances) if isinstance(panorama, RoomPanorama) else blurred
 

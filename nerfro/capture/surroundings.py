@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 
@@ -35,6 +35,8 @@ from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.samplers.subdivision import pixel_rays
 from nerfro.silhouettes.silhouettes import VALIDATION_EVERY, PixelBlocks, mesh_silhouettes
+
+CLIPPED = 1.3  # least learned radiance of pixels that are clipped at 1, which tells them from others
 
 
 @dataclass(frozen=True)
@@ -159,26 +161,34 @@ class Surroundings:
     """Reconstructed surroundings.
 
     Attributes:
-        background: background model that returns the background radiance.
+        background: background model. Its radiance is `CLIPPED` or more where photographs are clipped.
         seen: observed directions, by face, row and column of a cube map; None if all directions are known.
         unexplained: fraction of the variance of the validation pixels that is not explained.
         colours: a sample of observed radiances.
+        clipped: linear radiance of red, green and blue where photographs are clipped, at least 1.
     """
 
-    background: EnvironmentMap | Room
+    background: EnvironmentMap | Room | RoomPanorama
     seen: Bool[Tensor, "6 n n"] | None
     unexplained: float
     colours: Float[Tensor, "Q 3"]
+    clipped: Float[Tensor, "3"] = field(default_factory=lambda: torch.ones(3))
 
-    def radiance(self, exits: Exits) -> tuple[Float[Tensor, "P 3"], Bool[Tensor, "P"]]:
-        """Return the radiance that a photograph records along exit rays, and whether the radiance is known."""
-        return self.background(exits).clamp(max=1), self.known(exits)
+    def radiance(self, exits: Exits) -> Float[Tensor, "P 3"]:
+        """Return the linear radiance along exit rays, which a photograph clips at 1."""
+        recorded, share = recorded_and_clipped(self.background(exits))
+        return recorded + share * (self.clipped - 1)
 
     def known(self, exits: Exits) -> Bool[Tensor, "P"]:
         """Test whether the radiance in the exit directions is known."""
         if self.seen is None:
             return torch.ones(len(exits.directions), dtype=torch.bool)
         return self.seen.flatten()[cube_map.nearest_texel(exits.directions, self.seen.shape[-1])]
+
+
+def recorded_and_clipped(learned: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]:
+    """Split the radiance of a background into the radiance that a photograph records, and the share that it clips."""
+    return learned.clamp(max=1), ((learned - 1) / (CLIPPED - 1)).clamp(0, 1)
 
 
 def learn_surroundings(
@@ -331,9 +341,10 @@ def _learned(
             draws = (Draws(0, step, torch.arange(batch)),) if isinstance(background, Room) else ()
             predicted = background(exits, *draws)
             # A photograph clips radiance at 1, so brighter predictions of clipped pixels are no error.
-            clipped = torch.where(drawn.radiance >= 1, predicted.clamp(max=1), predicted)
+            is_clipped = drawn.radiance >= 1
+            recorded = torch.where(is_clipped, predicted.clamp(max=CLIPPED), predicted)
             optimizer.zero_grad()
-            functional.mse_loss(clipped, drawn.radiance).backward()
+            functional.mse_loss(recorded, drawn.radiance.masked_fill(is_clipped, CLIPPED)).backward()
             optimizer.step()
             if isinstance(background, Room):
                 background.sampler.update([background.field], Draws(0, step + 1, torch.arange(batch)))

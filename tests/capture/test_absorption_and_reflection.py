@@ -4,9 +4,11 @@ import math
 
 import pytest
 import torch
+from torch import Tensor
 
-from nerfro.capture.object_errors import absorption_and_reflection
-from nerfro.capture.surroundings import Observations, Surroundings
+from nerfro.capture.object_errors import observed_light
+from nerfro.capture.surroundings import CLIPPED, Observations, Surroundings, recorded_and_clipped
+from nerfro.core.types import Exits
 from nerfro.rendering.scene_file import Provenance, SceneFile
 from nerfro.samplers.paths.snell import Snell
 from tests.ball_photographs import RADIUS, mesh, photographs_of, sky, solid
@@ -21,12 +23,34 @@ def test_absorbed_light_and_reflection_are_measured(absorption: tuple[float, ...
     observations = Observations(views, mesh(), False)
     colours = sky(observations.through.rays.directions)
     observations.surroundings = Surroundings(lambda exits: sky(exits.directions), None, 0.0, colours)
-    absorbed, reflects = absorption_and_reflection(observations, body)
-    assert reflects == (branches == "all")
+    light = observed_light(observations, body)
+    assert light.reflects == (branches == "all")
     # A parallel beam crosses 2 R sqrt(1 - (b / n)^2), with a mean of 2 R (1 - (1 - 1 / n^2)^1.5) n^2 2 / 3.
     length = 2 * RADIUS * (1 - (1 - 1 / 1.5**2) ** 1.5) * 1.5**2 * 2 / 3
-    for share, coefficient in zip(absorbed, absorption, strict=True):
+    for share, coefficient in zip(light.absorbed, absorption, strict=True):
         assert share == pytest.approx(1 - math.exp(-coefficient * length), abs=0.04)
+
+
+def test_radiance_that_photographs_clip_is_measured_through_an_absorbing_body() -> None:
+    """A sky that is 2.5 wherever it would exceed 0.6, of which photographs record 1."""
+
+    def bright(exits: Exits) -> Tensor:
+        return sky(exits.directions).where(sky(exits.directions) < 0.6, 2.5)
+
+    body, coefficients = solid([1.5]), torch.tensor([[0.4, 0.8, 1.6]])
+    absorbing = body.with_absorption_coefficients(coefficients)
+    views = photographs_of(absorbing, around=bright, sampler=Snell(branches="all"))
+    observations = Observations(views, mesh(), False)
+    exits = Exits.unbent(observations.views.cameras.image_rays(0))
+    is_bright = bright(exits) > 1
+    share = recorded_and_clipped(observations.surroundings.background(exits))[1]
+    assert share[is_bright].mean() > 0.9
+    assert share[~is_bright].mean() < 0.1
+    colours = observations.surroundings.colours
+    observations.surroundings = Surroundings(lambda exits: bright(exits).clamp(max=CLIPPED), None, 0.0, colours)
+    light = observed_light(observations, body)
+    assert light.absorption == pytest.approx(coefficients[0], rel=0.03)
+    assert light.clipped == pytest.approx(torch.full((3,), 2.5), rel=0.03)
 
 
 @pytest.mark.parametrize(

@@ -43,13 +43,17 @@ def dented() -> Bodies:
 SHORT = RefinementSettings((DescentStage(150, 5e-4, (3.0, 1.0)), DescentStage(50, 1e-4, (0.0, 0.0))), 2000, (8, 16))
 
 
+ABSORPTION = torch.tensor([[0.2, 0.6, 1.4]])
+
+
 @functools.cache
-def shown(reflects: bool = False) -> tuple[Silhouettes, Pixels, Surroundings]:
+def shown(reflects: bool = False, absorbs: bool = False) -> tuple[Silhouettes, Pixels, Surroundings]:
     """Outlines of the dented ball, pixels that it fills, and what is around it."""
     outlines = mesh_silhouettes(refinement._project_onto(mesh(), dented()), cameras(), 1)
     silhouettes = Silhouettes.of(cameras(), outlines.float())
     sampler = Snell(branches="all", least_weight=0.02) if reflects else Snell()
-    beside, through = divide_pixels(photographs_of(dented(), sampler=sampler), mesh())
+    body = dented().with_absorption_coefficients(ABSORPTION) if absorbs else dented()
+    beside, through = divide_pixels(photographs_of(body, sampler=sampler), mesh())
     return silhouettes, through, learn_surroundings(beside, mesh(), False)
 
 
@@ -94,6 +98,15 @@ def test_refinement_of_a_reflecting_body_recovers_a_dent() -> None:
     found = refined(before, reflects=True)
     assert degrees_off(found.medium) < 0.4 * degrees_off(before)
     assert found.errors[-1] < 0.6 * found.errors[0]
+
+
+@pytest.mark.slow
+def test_refinement_of_an_absorbing_body_recovers_a_dent() -> None:
+    silhouettes, through, surroundings = shown(absorbs=True)
+    before = solid([1.5]).with_absorption_coefficients(ABSORPTION)
+    found = refine_surface(RefinementProblem(mesh(), before, silhouettes, through, surroundings), settings=SHORT)
+    assert degrees_off(found.medium) < 0.4 * degrees_off(before)
+    assert found.medium.absorption == pytest.approx(ABSORPTION)
 
 
 @pytest.mark.parametrize("reflects", [False, True])
