@@ -449,6 +449,8 @@ def test_decision_weighs_psnr_and_lpips(
     printed = capsys.readouterr().out
     assert f"training continues with: {best}\n" in printed
     assert ("PSNR and LPIPS disagree" in printed) == (other is not None)
+    is_by_lpips = best == "vessel" and psnr["glass"] < psnr["straight"] + 0.25
+    assert ("LPIPS decides" in printed) == is_by_lpips
     if other is not None:
         line, command = printed.splitlines()[-2:]
         for name in (best, other):
@@ -595,6 +597,7 @@ def test_scene_file_selects_the_experiment(run_here: Runner, pretended: Pretende
         (("images=PHOTOS", "train=--help"), "train='--help': --help is a flag; give options of the form key=value"),
         (("images=PHOTOS/film",), "film holds no image, but .mp4 files; allowed are"),
         (("images=PHOTOS/two",), "2 photographs do not determine poses and shape"),
+        (("images=PHOTOS", "outlines=none.json"), "none.json does not exist"),
     ],
 )
 def test_contradictory_options_are_refused(

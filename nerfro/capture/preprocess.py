@@ -15,7 +15,6 @@ from nerfro.capture.surroundings import Observations
 from nerfro.capture.vessel_fit import find_vessel
 from nerfro.cli.calls import composed
 from nerfro.cli.overrides import as_overrides
-from nerfro.core.errors import warn
 from nerfro.core.provenance import AlgorithmSettings
 from nerfro.data.base import Views
 from nerfro.data.capture import Capture
@@ -73,7 +72,7 @@ def _preprocess(request: Request) -> SceneFile:
     if config.refine:
         carved, location = mesh, str(request.out / MESH)
         if indexed.provenance.doubts:
-            warn("surface unchanged: refine=true needs the index, and the photographs do not determine the index")
+            print("surface not refined, because the photographs do not determine the index")
         else:
             mesh = refine(observations, mesh, indexed.medium, silhouettes, request.searches_index, request.out)
         mesh.relative_to(-source.origin).save(request.out / MESH)

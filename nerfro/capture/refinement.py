@@ -78,9 +78,8 @@ class RefinementSettings(AlgorithmSettings):
     """Settings of the refinement. docs/lab/surface_refinement.md describes how the defaults were chosen.
 
     Attributes:
-        stages: stages of the descent. Each stage starts with the best surface so far, and ends early if the validation
-            error exceeds the smallest one by more than `max_increase`. A stage with blurred surroundings that gains
-            less than `min_gain` is undone, and others are left out: the surface is too accurate for them.
+        stages: stages of the descent. Each stage starts with the best surface so far. A stage with blurred surroundings
+            that gains less than `min_gain` is undone, and others are left out: the surface is too accurate for them.
         num_pixels: number of pixels in each step.
         levels: numbers of control points along each side of the splines that displace the surface.
         least_weight: smallest share of light that is followed separately at a surface that reflects partially.
@@ -91,7 +90,6 @@ class RefinementSettings(AlgorithmSettings):
             error a little even where it cuts edges. Infinite for silhouettes that are no masks.
         max_validation_pixels: largest number of validation pixels.
         validate_every: number of steps between validations.
-        max_increase: see `stages`, as a fraction of the smallest error.
         min_gain: smallest decrease of the validation error by a blurred stage that is kept, and by all stages together
             if the surface is accepted, as a fraction. A wrong surface also explains some of the reflections, the tint
             and the interior: errors decreased by 0.012 to 0.11 for better surfaces, and by up to 0.009 for worse ones.
@@ -118,7 +116,6 @@ class RefinementSettings(AlgorithmSettings):
     max_overlap_loss: float = 0.003
     max_validation_pixels: int = 20_000
     validate_every: int = 25
-    max_increase: float = 0.3
     min_gain: float = 0.01
     robust_scale: float = 0.1
     contour_deviation: float = 0.25
@@ -222,9 +219,6 @@ def _follow(
             history.append((history[-1][0] + settings.validate_every, error))
             if error < best.error:
                 best = _Candidate(descent.values(), error)
-            elif error > (1 + settings.max_increase) * best.error:
-                advance(stage.steps - step - 1)
-                break
     return best
 
 

@@ -50,9 +50,10 @@ class VesselFitSettings(AlgorithmSettings):
         rounds: half width of the grid of candidates in each round: a factor for lengths, and a fraction of the height
             for the level, and for the foot above a stem.
         num_candidates: number of candidates of each length in each round.
-        num_errors: a vessel contains a liquid if the liquid decreases the error by this number of standard errors.
-        max_standard_error: largest standard error of a known length, relative to the length. The last grid limits the
-            error to about 0.4, and for the level and the foot above a stem to a few percent, so that these are known.
+        num_errors: a vessel contains a liquid if the liquid decreases the error by this number of standard errors. An
+            uncertain length is kept if it decreases the error of the typical length by this number.
+        max_standard_error: largest standard error of a certain length, relative to the length. The last grid limits the
+            error to about 0.4, and for the level and the foot above a stem to a few percent, so that these are certain.
         errors: settings of the errors at pixels of the object.
     """
 
@@ -131,7 +132,8 @@ def find_vessel(
     liquid_ior = _WATER if "level" in rounded else 1.0
     print(f"vessel, {'with a liquid' if liquid_ior > 1 else 'empty'}: {', '.join(values)}, height {height:.3g}")
     if fit.unknown:
-        warn(f"typical values of {' and '.join(fit.unknown)} are kept, because the photographs do not determine them")
+        kept = " and ".join(f"{name} {fit.lengths[name]:.3g}" for name in fit.unknown)
+        warn(f"typical values are kept, because the photographs do not determine them: {kept}")
     return {"up": up, "ior": _GLASS, "liquid_ior": liquid_ior} | rounded, fitted
 
 
@@ -179,7 +181,7 @@ def fit_vessel(
     typical["foot"] = max(typical["foot"], stem + typical["wall"]) if stem else typical["foot"]
     widest = typical | {"fillet": settings.max_fillet * width}  # distances are exact up to this depth
     empty, filled = build(VesselLengths(**widest)), build(VesselLengths(**widest, level=0.5 * height))
-    work = 1 + len(settings.levels) + len(settings.rounds) * (len(typical) + 1) * settings.num_candidates
+    work = 2 + len(settings.levels) + len(settings.rounds) * (len(typical) + 1) * settings.num_candidates
     levels: list[dict[str, float]] = [{}, *({"level": level * height} for level in settings.levels)]
 
     def error_of(lengths: dict[str, float]) -> Float[np.ndarray, "V"]:
@@ -208,5 +210,11 @@ def fit_vessel(
                 spread = float(standard_error(minima, search.counts))
                 lengths[name] = float(np.clip(minimum, stem, highest) if is_height else np.exp(minimum))
                 standard_errors[name] = spread if is_height else spread * lengths[name]
-    unknown = [name for name in typical if standard_errors[name] > settings.max_standard_error * lengths[name]]
+        fitted, unknown = error_of(lengths), list[str]()
+        for name in typical:
+            is_uncertain = standard_errors[name] > settings.max_standard_error * lengths[name]
+            if is_uncertain and not search.decreases(
+                error_of(lengths | {name: typical[name]}), fitted, settings.num_errors
+            ):
+                unknown.append(name)
     return VesselFit(lengths | {name: typical[name] for name in unknown}, standard_errors, unknown)

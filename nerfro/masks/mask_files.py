@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Float, UInt8
 from omegaconf import DictConfig, OmegaConf
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
@@ -58,8 +58,24 @@ def read_outlines(source: object) -> dict[str, list]:
                 f"the outline of {name} is {outline}; give a box [left,top,right,bottom] or a polygon of at least "
                 "three vertices [column,row]"
             )
+        if polygon and _crosses_itself(numbers):
+            raise NerfroError(f"the outline of {name} crosses itself; give its vertices in the order along the outline")
         outlines[str(name)] = numbers.tolist()
     return outlines
+
+
+def _crosses_itself(polygon: Float[np.ndarray, "vertices 2"]) -> bool:
+    """Test whether two sides of a polygon cross between their ends."""
+    starts, ends = polygon, np.roll(polygon, -1, axis=0)
+    sides = (ends - starts)[:, None]
+
+    def turns(points: Float[np.ndarray, "vertices 2"]) -> Float[np.ndarray, "vertices vertices"]:
+        """Return on which side of each side, by rows, each point lies."""
+        offsets = points[None] - starts[:, None]
+        return np.sign(sides[..., 0] * offsets[..., 1] - sides[..., 1] * offsets[..., 0])
+
+    separates = turns(starts) * turns(ends) < 0
+    return bool((separates & separates.T).any())
 
 
 def load_all(source: DataSource) -> tuple[Cameras, list[UInt8[np.ndarray, "H W 3"]], list[Frame]]:

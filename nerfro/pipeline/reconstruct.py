@@ -24,6 +24,7 @@ from nerfro.data.lazy_images import decoded_once
 from nerfro.evaluation.results import read_metrics_json
 from nerfro.files.atomic import lock_folder, write_atomically
 from nerfro.files.images import save_image
+from nerfro.masks.mask_files import read_outlines
 from nerfro.masks.segment import segment
 from nerfro.pipeline.export import export
 from nerfro.pipeline.hypotheses import Hypothesis, hypotheses, worth_a_trial
@@ -67,6 +68,7 @@ def reconstruct_composed(composition: Composition) -> Run:
     """Run all stages that are not done, for composed options."""
     config, posed = composition.config, have_poses(composition.config, composition.overrides)
     out = user_path(config.out)
+    read_outlines(config.outlines)  # refuses wrong outlines before the poses are estimated
     with lock_folder(out, "out"), decoded_once():
         capture = Capture.of(composition)
         if not posed:

@@ -169,6 +169,11 @@ def decide(trials: Sequence[Trial], overrides: Sequence[str]) -> Trial:
         print(f"PSNR alone decides, because LPIPS of the crop is not available: {reason}")
     if best is trials[0]:
         print(_why_straight(trials, settings))
+    gain = best.mean - trials[0].mean
+    if best is not trials[0] and gain < settings.min_gain:
+        print(
+            f"LPIPS decides, because the mean PSNR of bent rays is not higher by {settings.min_gain} dB: {gain:+.2f} dB"
+        )
     if other is not None:
         print(f"PSNR and LPIPS disagree: {best.figures}; {other.figures}; to continue with {other.hypothesis.name}:")
         choice = [f"hypothesis={other.hypothesis.choice}"]

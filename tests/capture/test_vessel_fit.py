@@ -124,3 +124,21 @@ def test_cavity_does_not_continue_into_a_stem(cylinder: Path) -> None:
     settings = VesselFitSettings(levels=(), rounds=((2.0, 0.1),), num_candidates=3)
     found = fit_vessel(build, 2 * RADIUS, HEIGHT, observations, stem=0.4, settings=settings)
     assert found.lengths["foot"] == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize(("factor", "unknown"), [(1.0, ["wall", "foot", "fillet"]), (2.0, [])])
+def test_uncertain_lengths_are_kept_if_they_explain_the_pixels_better(
+    cylinder: Path, factor: float, unknown: list[str]
+) -> None:
+    outer, grid = MeshSurface(str(cylinder)), GridSettings(**BOX)
+
+    def build(lengths: VesselLengths) -> Bodies:
+        return vessel(outer, lengths, Material(1.52), None, grid=grid)
+
+    settings = VesselFitSettings(levels=(), rounds=((2.0, 0.1),), num_candidates=3, max_standard_error=0.0)
+    typical = {name: 2 * RADIUS * getattr(settings, name) for name in ("wall", "foot", "fillet")}
+    lengths = {name: factor * length for name, length in typical.items()}
+    observations = observed(cylinder, build(VesselLengths(**lengths)))
+    found = fit_vessel(build, 2 * RADIUS, HEIGHT, observations, settings=settings)
+    assert found.unknown == unknown
+    assert found.lengths == pytest.approx(lengths, rel=1e-6 if factor == 1 else 0.3)

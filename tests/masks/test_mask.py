@@ -243,6 +243,7 @@ def test_mistakes_are_reported_in_one_line(capture: Path, mask: Callable[..., st
     assert torch.is_grad_enabled()
     assert "q_1 is not an image of the data set; names" in mask("outlines={q_1:[1,1,9,9]}")
     assert "give a box [left,top,right,bottom]" in mask("outlines={p_1:[9,9,1,1]}")
+    assert "p_1 crosses itself" in mask("outlines={p_1:[[1,1],[9,9],[9,1],[1,9]]}")
     assert "nothing.json does not exist" in mask("outlines=nothing.json")
     assert "is part of nerfro" in mask("data=blender", "data.root=embedded:torus")
     assert not list((capture / "photos").glob("mask_*"))
