@@ -113,7 +113,7 @@ def picture(sampler: Snell, medium: Bodies, side: int, parts: int = 3) -> np.nda
         path = medium.with_absorption(sampler(part_rays(cameras, pixels, parts), medium))
         light = lat_long.sample(radiance_of_sky, path.exit_directions, width=4096)
         if path.absorbs:
-            light = light * path.transmitted(path.far[:, None])[:, 0]
+            light = light * path.whole_transmittance()
         radiance.append(path.sum_polylines(light).view(-1, parts**2, 3).mean(1))
     return to_srgb(torch.cat(radiance)).clamp(0, 1).view(cameras.height, cameras.width, 3).numpy()
 

@@ -93,9 +93,7 @@ def photographs_of(
     for view in range(NUM_VIEWS):
         rays = taken.image_rays(view)
         path = medium.with_absorption(sampler(rays, medium))
-        radiance = around(path.exits())
-        radiance = radiance * path.transmitted(path.far[:, None])[:, 0] if path.absorbs else radiance
-        radiance = path.sum_polylines(radiance)
+        radiance = path.sum_polylines(around(path.exits()) * path.whole_transmittance())
         if opaque:  # painted, in every colour of the sky
             radiance = torch.where(path.refracted[:, None], sky(normalize(path.positions[:, 1], dim=-1)), radiance)
         images.append(to_srgb(radiance).view(SIZE, SIZE, 3))

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float, Num
 from torch import Tensor
 
-from nerfro.capture.surroundings import Observations, recorded_and_clipped, robust_scale
+from nerfro.capture.surroundings import Observations, recorded_and_clipped, recorded_radiance, robust_scale
 from nerfro.core.provenance import AlgorithmSettings
 from nerfro.core.robust import geman_mcclure
 from nerfro.core.types import Path
@@ -123,9 +123,10 @@ class ObjectErrorSettings(AlgorithmSettings):
         num_pixels: number of pixels.
         min_weight: smallest weight of a reflected or refracted path.
         num_errors: a supported body decreases the error of straight rays, and a reflection or absorption that of the
-            body, by at least this number of standard errors.
+            body without it, by at least this number of standard errors.
         min_gain: smallest decrease of a supported body, as a fraction of the decrease of the best body.
-        initial_light: initial optical depth of the mean path, and initial excess of clipped radiance over 1.
+        initial_depth, max_depth: initial and largest optical depth of the mean path.
+        initial_excess: initial excess of the radiance of clipped surroundings over 1, linear radiance.
         light_steps, light_rate: number of steps of Adam that fit both, and initial rate of their logarithms.
         min_share: smallest share of absorbed light that is reported.
     """
@@ -134,7 +135,9 @@ class ObjectErrorSettings(AlgorithmSettings):
     min_weight: float = 0.02
     num_errors: float = 3.0
     min_gain: float = 0.75
-    initial_light: tuple[float, float] = (0.3, 0.3)
+    initial_depth: float = 0.3
+    max_depth: float = 3.0
+    initial_excess: float = 0.3
     light_steps: int = 150
     light_rate: float = 0.1
     min_share: float = 0.05
@@ -145,21 +148,21 @@ class ObservedLight:
     """Light of the surroundings that reaches the camera through an object.
 
     Attributes:
-        absorption: absorption coefficients of all bodies for red, green and blue, per world unit.
-        length: mean length within the bodies of rays that cross them, world units.
-        clipped: linear radiance of the surroundings where photographs are clipped, see `Surroundings`.
+        absorption: absorption coefficients of the bodies for red, green and blue, per world unit; 0 for air.
+        length: mean length within absorbing bodies of rays that cross them, world units.
+        clipped_radiance: linear radiance of the surroundings where photographs are clipped, see `Surroundings`.
         reflects: whether partial reflection explains the pixels better than none.
     """
 
-    absorption: Float[Tensor, "3"]
+    absorption: Float[Tensor, "K 3"]
     length: float
-    clipped: Float[Tensor, "3"]
+    clipped_radiance: Float[Tensor, "3"]
     reflects: bool = False
 
     @property
     def absorbed(self) -> list[float]:
         """Shares of red, green and blue light that are absorbed along the mean path."""
-        return [round(share, 2) for share in (-torch.expm1(-self.absorption * self.length)).tolist()]
+        return [round(share, 2) for share in (-torch.expm1(-self.absorption.amax(0) * self.length)).tolist()]
 
 
 class ObjectErrors:
@@ -190,35 +193,35 @@ class ObjectErrors:
 
     def of(self, body: Medium) -> Float[np.ndarray, "V"]:
         """Sum the robust errors over the pixels of each view."""
-        path = self._path(body)
-        light = self._surroundings.radiance(path.exits())
-        light = light * path.transmitted(path.far[:, None])[:, 0] if path.absorbs else light
+        radiance = recorded_radiance(self._path(body), self._surroundings.radiance)
         self._advance()
-        return self._sums(path.sum_polylines(light).clamp(max=1) - self._pixels.radiance)
+        return self._sums(radiance - self._pixels.radiance)
 
     def fit_light(self, body: Bodies, absorbs: bool) -> tuple[ObservedLight, Float[np.ndarray, "3 V"]]:
-        """Fit absorption coefficients and the radiance of clipped directions by gradient descent, with fixed paths.
+        """Fit absorption coefficients and the radiance of clipped surroundings by gradient descent, with fixed paths.
 
         Args:
-            body: the bodies.
-            absorbs: whether the bodies absorb light.
+            body: the bodies. Those of index 1 are air.
+            absorbs: whether the others absorb light, all alike.
 
         Returns:
             The light, and the robust errors of red, green and blue, summed by view.
         """
-        settings, path = self._settings, self._path(body)
-        size = float((body.box[1] - body.box[0]).max())
-        unit = body.with_absorption_coefficients(torch.full((len(body.iors), 3), 1 / size))
-        lengths = -size * unit.with_absorption(path).transmitted(path.far[:, None])[:, 0].log()
+        settings = self._settings
+        size, is_dense = float((body.box[1] - body.box[0]).max()), (body.iors != 1)[:, None]
+        path = self._path(body.with_absorption_coefficients(is_dense.expand(-1, 3) / size))
+        lengths = -size * path.whole_transmittance().log()
         main = path.main_polyline(lengths)
         length = float(main[main > 0].mean())
         recorded, share = recorded_and_clipped(self._surroundings.background(path.exits()))
         # Logarithms of the optical depth of the mean path, and of the excess of clipped radiance over 1.
-        logarithms = torch.tensor(settings.initial_light).log()[:, None].repeat(1, 3).requires_grad_()
+        start = torch.tensor([[settings.initial_depth], [settings.initial_excess]])
+        logarithms = start.log().repeat(1, 3).requires_grad_()
         optimizer = torch.optim.Adam([logarithms])
         with torch.enable_grad():
             for step in range(settings.light_steps + 1):
                 depth, excess = logarithms.exp()
+                depth = depth.clamp(max=settings.max_depth)
                 transmitted = torch.exp(-depth * lengths / length) if absorbs else 1.0
                 radiance = path.sum_polylines((recorded + share * excess) * transmitted).clamp(max=1)
                 residuals = radiance - self._pixels.radiance
@@ -227,9 +230,11 @@ class ObjectErrors:
                 geman_mcclure(residuals[..., None], self._scale).mean().backward()
                 optimizer.step()  # the rate of the last step is 0
         errors = np.array([self._sums(residuals[:, channel : channel + 1].detach()) for channel in range(3)])
-        return ObservedLight(absorbs * depth.detach() / length, length, 1 + excess.detach()), errors
+        absorption = is_dense * (absorbs * depth.detach() / length)
+        return ObservedLight(absorption, length, 1 + share.any(0) * excess.detach()), errors
 
     def _path(self, body: Medium) -> Path:
+        """Trace the pixels."""
         return body.with_absorption(self._sampler(self._pixels.rays, body).in_room_of(self._pixels.rays))
 
     def _sums(self, residuals: Float[Tensor, "Q C"]) -> Float[np.ndarray, "V"]:
@@ -310,8 +315,8 @@ def observed_light(
     return ObservedLight(
         torch.where(absorbs, light.absorption, 0.0),
         light.length,
-        torch.where(absorbs, light.clipped, clear.clipped),
-        both.decreases(without / 3, best / 3, settings.num_errors),
+        torch.where(absorbs, light.clipped_radiance, clear.clipped_radiance),
+        both.decreases(without, best, settings.num_errors),
     )
 
 

@@ -1,8 +1,8 @@
 """Refinement of a surface by gradient descent on the error of photographs.
 
-Pixels inside the silhouette of a clear body show the surroundings in the exit directions of their rays. The surface is
-displaced until the surroundings in the exit directions have the colours of the pixels, with derivatives of the exact
-paths (`samplers.paths.replay`). Absorption is measured first, and partial reflections are followed if they explain the
+Pixels inside the silhouette of a transparent body show the surroundings in the exit directions of their rays. The
+surface is displaced until the surroundings in the exit directions have the colours of the pixels, with derivatives of
+the exact paths (`samplers.paths.replay`). Measured absorption and partial reflections are included if they explain the
 photographs better. Three measures make the descent converge:
 
 - The surroundings of inaccurate surfaces are blurred first, because the gradient of a photograph is informative only
@@ -30,9 +30,17 @@ from torch import Tensor, nn
 
 from nerfro.backgrounds.cube_map import texel_directions
 from nerfro.backgrounds.envmap import EnvironmentMap
-from nerfro.capture.object_errors import observed_light
+from nerfro.capture.object_errors import ObservedLight, observed_light
 from nerfro.capture.preprocess_options import FIGURES
-from nerfro.capture.surroundings import Observations, Pixels, Room, RoomPanorama, Surroundings, panorama_of
+from nerfro.capture.surroundings import (
+    Observations,
+    Pixels,
+    Room,
+    RoomPanorama,
+    Surroundings,
+    panorama_of,
+    recorded_radiance,
+)
 from nerfro.core.errors import NerfroError, warn
 from nerfro.core.progress import counting_bar
 from nerfro.core.provenance import AlgorithmSettings
@@ -91,10 +99,10 @@ class RefinementSettings(AlgorithmSettings):
         max_validation_pixels: largest number of validation pixels.
         validate_every: number of steps between validations.
         min_gain: smallest decrease of the validation error by a blurred stage that is kept, and by all stages together
-            if the surface is accepted, as a fraction. A wrong surface also explains some of the reflections, the tint
-            and the interior: errors decreased by 0.012 to 0.11 for better surfaces, and by up to 0.009 for worse ones.
-        robust_scale: scale of the Geman-McClure loss relative to the mean transmittance, linear radiance: residual at
-            which the loss is 1/2 of its maximum and the weight 1/4.
+            if the surface is accepted, as a fraction. A wrong surface also explains some of the interior: errors
+            decreased by 0.012 to 0.11 for better surfaces, and by up to 0.009 for worse ones.
+        robust_scale: scale of the Geman-McClure loss relative to the mean transmittance of the object, linear radiance:
+            residual at which the loss is 1/2 of its maximum and the weight 1/4.
         contour_deviation: standard deviation of contours, in pixels.
         contour_weight, roughness_weight: weights of contours and of roughness, relative to the photometric error.
         num_contour_points: number of contour points in each step.
@@ -132,11 +140,13 @@ class RefinementProblem:
 
     Attributes:
         mesh: the surface.
-        medium: the bodies with estimated indices and absorption; the mesh is the surface of the first one. Dispersion
-            is ignored.
+        medium: the bodies with estimated indices, and absorption if it is given; dispersion is ignored. The mesh is the
+            surface of the first one.
         silhouettes: silhouettes of the surface, whose outlines are kept.
         through: pixels inside the silhouette of the object.
         surroundings: known surroundings, near or distant.
+        light: measured absorption and radiance of clipped surroundings, which are used if they decrease the error of
+            the validation pixels.
     """
 
     mesh: TriangleMesh
@@ -144,6 +154,7 @@ class RefinementProblem:
     silhouettes: Silhouettes
     through: Pixels
     surroundings: Surroundings
+    light: ObservedLight | None = None
 
 
 @dataclass(frozen=True)
@@ -244,17 +255,15 @@ def refine(
     """
     through, cameras, bodies = observations.through, observations.views.cameras, medium.bodies
     assert bodies is not None  # see Request.check
-    light = observed_light(observations, bodies)
-    surroundings = replace(observations.surroundings, clipped=light.clipped)
-    if bodies.absorption is None:
-        bodies = bodies.with_absorption_coefficients(light.absorption.expand(len(bodies.iors), 3))
+    is_given = any(material.absorbs and "absorption" not in material.learned() for material in bodies.materials)
+    light = None if is_given else observed_light(observations, bodies)
     start, settings = mesh.relative_to(observations.shift), RefinementSettings()
     if silhouettes is None:
         settings = replace(settings, max_overlap_loss=math.inf)
         silhouettes = Silhouettes.of(cameras, mesh_silhouettes(start, cameras, 1).float())
     else:
         silhouettes = replace(silhouettes, cameras=silhouettes.cameras.relative_to(observations.shift))
-    problem = RefinementProblem(start, bodies, silhouettes, through, surroundings)
+    problem = RefinementProblem(start, bodies, silhouettes, through, observations.surroundings, light)
     try:
         refined = refine_surface(problem, learn_index, settings)
     except NerfroError as reason:  # keep the results of the other steps
@@ -319,18 +328,18 @@ class _Descent:
 
     def __init__(self, problem: RefinementProblem, learn_index: bool, settings: RefinementSettings) -> None:
         self.problem, self.settings = problem, settings
-        mesh, medium, silhouettes = problem.mesh, problem.medium.achromatic(), problem.silhouettes
+        mesh, silhouettes = problem.mesh, problem.silhouettes
+        self.training, validation = problem.through.split()
+        self.validation = validation.some(settings.max_validation_pixels)
+        medium, self.surroundings, self.sampler = self._best_model()
+        self.robust_scale = settings.robust_scale * self._transmittance(medium)
         self.iors = nn.Parameter(medium.iors.clone(), requires_grad=learn_index)
         # Paths with more events have no derivatives here, because small errors of the surface turn them far.
         self.max_events = 2 * len(medium.iors) + 1
         self.size = float(np.ptp(mesh.bounds, axis=0).max())
         self.offsets = Displacement(tuple(medium.grids[0].distances.shape), self.size, settings.levels)
         self.learned = [*self.offsets.levels, self.iors]
-        self.training, validation = problem.through.split()
-        self.validation = validation.some(settings.max_validation_pixels)
-        self.robust_scale = settings.robust_scale * self._transmittance(medium)
-        self.sampler = self._best_sampler(medium)
-        errors, is_valid = self._validation_errors(medium, self.sampler)
+        errors, is_valid = self._validation_errors(medium)
         if not is_valid.any():
             raise NerfroError("no pixel shows known surroundings through the object; remove refine=true")
         self.validation, self.initial_errors = self.validation[is_valid], errors[is_valid]
@@ -341,7 +350,7 @@ class _Descent:
         middle = torch.from_numpy(mesh.bounds.mean(0)).float()
         distance = (cameras.camera_to_world[:, :, 3] - middle).norm(dim=-1)
         self.contour_deviation = settings.contour_deviation * float((distance / cameras.fx).mean())
-        background = problem.surroundings.background
+        background = self.surroundings.background
         self.panorama = panorama_of(background, medium, middle) if isinstance(background, Room) else background
         # The displacements count from the smoothed surface.
         self.start, self.start_error = self.smoothed(medium, float(self.initial_errors.mean()))
@@ -366,7 +375,7 @@ class _Descent:
         done = step / stage.steps
         if step % self.settings.validate_every == 0:
             degrees = stage.blur[0] + (stage.blur[1] - stage.blur[0]) * done
-            surroundings = replace(self.problem.surroundings, background=self.panorama)
+            surroundings = replace(self.surroundings, background=self.panorama)
             self.blurred = _blurred(surroundings, degrees, self.settings)
         self.optimizer.param_groups[0]["lr"] = stage.rate * 0.5 * (1 + math.cos(math.pi * done))
         self.optimizer.zero_grad()
@@ -378,7 +387,7 @@ class _Descent:
         medium, settings = self.medium(), self.settings
         pixels = self.training[torch.randint(len(self.training), (settings.num_pixels,), generator=self.generator)]
         path, known = self._traced(pixels.rays, medium)
-        radiance = self._recorded(path, medium, self.blurred)
+        radiance = recorded_radiance(medium.with_absorption(path), self.blurred)
         errors = geman_mcclure((radiance - pixels.radiance)[known], self.robust_scale)
         photometric = errors.sum() / max(1, len(errors))
         rims = self.rims[torch.randint(len(self.rims), (settings.num_contour_points,), generator=self.generator)]
@@ -418,40 +427,43 @@ class _Descent:
         Pixels with unknown surroundings for the new surface keep their initial error, so that a surface cannot
         lower its error by hiding pixels.
         """
-        errors, is_valid = self._validation_errors(medium, self.sampler)
+        errors, is_valid = self._validation_errors(medium)
         return float(torch.where(is_valid, errors, self.initial_errors).mean())
 
-    def _best_sampler(self, medium: Bodies) -> Snell:
-        """Choose between paths without and with partial reflections by the validation pixels that both explain."""
-        through, reflecting = Snell(), Snell(branches="all", least_weight=self.settings.least_weight)
-        errors, is_valid = self._validation_errors(medium, through)
-        reflecting_errors, reflecting_valid = self._validation_errors(medium, reflecting)
-        common = is_valid & reflecting_valid
-        return reflecting if reflecting_errors[common].mean() < errors[common].mean() else through
+    def _best_model(self) -> tuple[Bodies, Surroundings, Snell]:
+        """Choose absorption and partial reflections by the validation pixels that all choices explain."""
+        problem, medium = self.problem, self.problem.medium.achromatic()
+        light = [(medium, problem.surroundings)]
+        if problem.light is not None:
+            absorbing = medium.with_absorption_coefficients(problem.light.absorption)
+            brighter = replace(problem.surroundings, clipped_radiance=problem.light.clipped_radiance)
+            light.append((absorbing, brighter))
+        samplers = Snell(), Snell(branches="all", least_weight=self.settings.least_weight)
+        models = [(*seen, sampler) for seen in light for sampler in samplers]
+        self.robust_scale, errors, common = self.settings.robust_scale, list[Tensor](), torch.tensor(True)
+        for model in models:
+            medium, self.surroundings, self.sampler = model
+            error, is_valid = self._validation_errors(medium)
+            errors.append(error)
+            common = common & is_valid
+        return models[int(torch.stack(errors)[:, common].mean(1).nan_to_num(torch.inf).argmin())]
 
-    def _validation_errors(self, medium: Bodies, sampler: Snell) -> tuple[Float[Tensor, "Q"], Bool[Tensor, "Q"]]:
+    def _validation_errors(self, medium: Bodies) -> tuple[Float[Tensor, "Q"], Bool[Tensor, "Q"]]:
         """Compute the robust errors of the validation pixels, and whether their surroundings are known."""
-        trace = sampler.trace(self.validation.rays, medium)
+        trace = self.sampler.trace(self.validation.rays, medium)
         path = trace.path.in_room_of(self.validation.rays)
-        radiance = self._recorded(path, medium, self.problem.surroundings.radiance)
+        radiance = recorded_radiance(medium.with_absorption(path), self.surroundings.radiance)
         errors = geman_mcclure(radiance - self.validation.radiance, self.robust_scale)
         return errors, self._shows_known(trace, path)
 
     def _transmittance(self, medium: Bodies) -> float:
-        """Return the mean transmittance along the rays of the validation pixels."""
-        path = medium.with_absorption(Snell()(self.validation.rays, medium))
-        return float(path.transmitted(path.far[:, None]).mean()) if path.absorbs else 1.0
-
-    @staticmethod
-    def _recorded(path: Path, medium: Bodies, radiance: Callable[[Exits], Tensor]) -> Float[Tensor, "R 3"]:
-        """Compute the radiance that a photograph records of given surroundings."""
-        path, light = medium.with_absorption(path), radiance(path.exits())
-        light = light * path.transmitted(path.far[:, None])[:, 0] if path.absorbs else light
-        return path.sum_polylines(light).clamp(max=1)
+        """Return the mean transmittance of all colours along the rays of the validation pixels, without reflections."""
+        path = Snell()(self.validation.rays, medium)
+        return float(medium.with_absorption(path).whole_transmittance().mean())
 
     def _shows_known(self, trace: SnellTrace, path: Path) -> Bool[Tensor, "R"]:
         """Test which rays meet the object and show known surroundings."""
-        known = self.problem.surroundings.known(path.exits()) & ~trace.exceeded
+        known = self.surroundings.known(path.exits()) & ~trace.exceeded
         return (path.sum_polylines(known.float()) >= self.settings.min_known) & path.main_polyline(path.refracted)
 
     def _traced(self, rays: Rays, medium: Bodies) -> tuple[Path, Bool[Tensor, "R"]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
@@ -23,7 +24,7 @@ from nerfro.core.light import to_linear
 from nerfro.core.progress import track
 from nerfro.core.provenance import AlgorithmSettings
 from nerfro.core.rays import Rays
-from nerfro.core.types import WORLD_ORIGIN, Exits
+from nerfro.core.types import WORLD_ORIGIN, Exits, Path
 from nerfro.data.base import Views
 from nerfro.fields.hash_grid import HashGridField
 from nerfro.geometry.mesh import TriangleMesh
@@ -36,7 +37,8 @@ from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.samplers.subdivision import pixel_rays
 from nerfro.silhouettes.silhouettes import VALIDATION_EVERY, PixelBlocks, mesh_silhouettes
 
-CLIPPED = 1.3  # least learned radiance of pixels that are clipped at 1, which tells them from others
+# Least learned radiance of pixels that photographs clip at 1; the margin distinguishes them from other bright pixels.
+CLIPPED_RADIANCE = 1.1
 
 
 @dataclass(frozen=True)
@@ -161,23 +163,23 @@ class Surroundings:
     """Reconstructed surroundings.
 
     Attributes:
-        background: background model. Its radiance is `CLIPPED` or more where photographs are clipped.
+        background: background model. Its radiance is `CLIPPED_RADIANCE` or more where photographs are clipped.
         seen: observed directions, by face, row and column of a cube map; None if all directions are known.
         unexplained: fraction of the variance of the validation pixels that is not explained.
         colours: a sample of observed radiances.
-        clipped: linear radiance of red, green and blue where photographs are clipped, at least 1.
+        clipped_radiance: linear radiance of red, green and blue where photographs are clipped, at least 1.
     """
 
     background: EnvironmentMap | Room | RoomPanorama
     seen: Bool[Tensor, "6 n n"] | None
     unexplained: float
     colours: Float[Tensor, "Q 3"]
-    clipped: Float[Tensor, "3"] = field(default_factory=lambda: torch.ones(3))
+    clipped_radiance: Float[Tensor, "3"] = field(default_factory=lambda: torch.ones(3))
 
     def radiance(self, exits: Exits) -> Float[Tensor, "P 3"]:
         """Return the linear radiance along exit rays, which a photograph clips at 1."""
         recorded, share = recorded_and_clipped(self.background(exits))
-        return recorded + share * (self.clipped - 1)
+        return recorded + share * (self.clipped_radiance - 1)
 
     def known(self, exits: Exits) -> Bool[Tensor, "P"]:
         """Test whether the radiance in the exit directions is known."""
@@ -186,9 +188,19 @@ class Surroundings:
         return self.seen.flatten()[cube_map.nearest_texel(exits.directions, self.seen.shape[-1])]
 
 
+def recorded_radiance(path: Path, radiance: Callable[[Exits], Tensor]) -> Float[Tensor, "R 3"]:
+    """Compute the linear radiance of rays that a photograph records, clipped at 1.
+
+    Args:
+        path: the paths, which may cross absorbing bodies.
+        radiance: radiance of the surroundings along exit rays, linear.
+    """
+    return path.sum_polylines(radiance(path.exits()) * path.whole_transmittance()).clamp(max=1)
+
+
 def recorded_and_clipped(learned: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]:
     """Split the radiance of a background into the radiance that a photograph records, and the share that it clips."""
-    return learned.clamp(max=1), ((learned - 1) / (CLIPPED - 1)).clamp(0, 1)
+    return learned.clamp(max=1), ((learned - 1) / (CLIPPED_RADIANCE - 1)).clamp(0, 1)
 
 
 def learn_surroundings(
@@ -342,9 +354,9 @@ def _learned(
             predicted = background(exits, *draws)
             # A photograph clips radiance at 1, so brighter predictions of clipped pixels are no error.
             is_clipped = drawn.radiance >= 1
-            recorded = torch.where(is_clipped, predicted.clamp(max=CLIPPED), predicted)
+            recorded = torch.where(is_clipped, predicted.clamp(max=CLIPPED_RADIANCE), predicted)
             optimizer.zero_grad()
-            functional.mse_loss(recorded, drawn.radiance.masked_fill(is_clipped, CLIPPED)).backward()
+            functional.mse_loss(recorded, drawn.radiance.masked_fill(is_clipped, CLIPPED_RADIANCE)).backward()
             optimizer.step()
             if isinstance(background, Room):
                 background.sampler.update([background.field], Draws(0, step + 1, torch.arange(batch)))

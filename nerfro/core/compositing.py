@@ -51,6 +51,6 @@ def composite(
     background_radiance = background_radiance.float()
     if path.absorbs:
         radiance = radiance * path.transmitted(samples.s)
-        background_radiance = background_radiance * path.transmitted(path.far[:, None])[:, 0]
+        background_radiance = background_radiance * path.whole_transmittance()
     radiance = (weights[..., None] * radiance).sum(-2) + transmittance[:, None] * background_radiance
     return Rendering(path.sum_polylines(radiance), weights, transmittance, background_radiance, samples, path)

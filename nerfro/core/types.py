@@ -205,6 +205,10 @@ class Path:
             depth = depth + length[..., None] * absorption[number]
         return torch.exp(-depth)
 
+    def whole_transmittance(self) -> Float[Tensor, "P 3"]:
+        """Compute the transmittance of absorbing bodies along each whole polyline; 1 if all bodies are clear."""
+        return self.transmitted(self.far[:, None])[:, 0] if self.absorbs else torch.ones_like(self.throughput)
+
     def exits(self, directions: Float[Tensor, "P 3"] | None = None) -> Exits:
         """Return the last segment of each polyline, along which background radiance arrives, in axes of the room."""
         turns = (self.directions[:, 1:] != self.directions[:, :-1]).any(-1)
@@ -397,7 +401,7 @@ class Rendering:
     def background_fraction(self) -> Float[Tensor, "P 3"]:
         """Fraction of the background radiance that reaches the camera along each polyline."""
         fraction = self.transmittance[:, None] * self.path.throughput
-        return fraction * self.path.transmitted(self.path.far[:, None])[:, 0] if self.path.absorbs else fraction
+        return fraction * self.path.whole_transmittance() if self.path.absorbs else fraction
 
     @property
     def opacity(self) -> Float[Tensor, "R"]:

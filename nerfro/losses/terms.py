@@ -85,7 +85,7 @@ class BackgroundRegularizer(Loss):
         if path.record is not None and path.record.absorption.requires_grad:
             fixed = replace(path, s=path.s.detach())
             # The quotient of zeros would not be a number.
-            absorbed = fixed.transmitted(fixed.far[:, None])[:, 0].clamp(min=1e-30)
+            absorbed = fixed.whole_transmittance().clamp(min=1e-30)
             error = error + self._error(path.sum_polylines(light * (absorbed / absorbed.detach())), batch, scene)
         # Gradients are averaged over processes, so each process multiplies its sum by the number of processes.
         return (error * counted).sum() * rank_and_size()[1] / (sum_over_processes(counted.sum()) + 1)

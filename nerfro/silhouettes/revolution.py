@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -14,7 +15,7 @@ from torch.func import jacfwd
 from torch.nn import functional
 from torch.nn.functional import normalize
 
-from nerfro.core.progress import track
+from nerfro.core.progress import counting_bar
 from nerfro.core.provenance import AlgorithmSettings
 from nerfro.core.robust import geman_mcclure, geman_mcclure_weight
 from nerfro.geometry.mesh import TriangleMesh
@@ -46,8 +47,8 @@ class RevolutionSettings(AlgorithmSettings):
         max_step: longest step, as a fraction of the height.
         min_radius: smallest radius, as a fraction of the height.
         edge: radius of the rounded edges, in pixels.
-        cut_knots, max_cut: distance of the tested cuts of an end, and largest cut, in knots. The neighbours of the best
-            one are tested, too.
+        cut_knots, max_cut: distance of the tested cuts of an end, and largest cut, in knots, less than `knots` - 1. The
+            neighbours of the best one are tested, too.
         cut_iterations: number of steps before and after each cut.
         cut_scale: scale of the Geman-McClure loss that compares cuts, in pixels. With a scale of one pixel, views that
             contradict a cut would be outliers.
@@ -164,33 +165,39 @@ def fit_revolution(
         start = _profile_around(mesh, *axis, settings.inner_quantile, settings)[1]
     if start is None:
         return None
-    fit, (first_scale, last_scale) = _Fit(start, silhouettes, settings), settings.robust_scale
-    numbers = fit.start
-    for iteration in track("finding the axis", range(settings.iterations)):
-        done = min(1.0, iteration / (settings.iterations - 6))
-        numbers = fit.step(numbers, first_scale * (last_scale / first_scale) ** done)
-    for end in ("upper", "lower"):  # covers above the object distort the upper end most
-        numbers = fit.with_cut_end(numbers, end)
-    return fit.body(numbers).mesh()
+    first_scale, last_scale = settings.robust_scale
+    # Two ends, and about five cuts of each.
+    with counting_bar("finding the axis", settings.iterations + 2 * 5 * settings.cut_iterations) as advance:
+        fit = _Fit(start, silhouettes, settings, advance)
+        parameters = fit.start
+        for iteration in range(settings.iterations):
+            done = min(1.0, iteration / (settings.iterations - 6))
+            parameters = fit.step(parameters, first_scale * (last_scale / first_scale) ** done)
+        for end in ("upper", "lower"):  # objects in front of the foot give the body a roof, too
+            parameters = fit.with_cut_end(parameters, end)
+    return fit.body(parameters).mesh()
 
 
 class _Fit:
     """Gauss-Newton steps from an initial body, whose axis points towards the cameras.
 
-    The numbers of a body are in units of the initial height: two translations and two rotations of the axis, both ends,
-    and the radii.
+    The parameters of a body are two translations and two rotations of the axis, both ends, and the radii; lengths are
+    in units of the initial height.
 
     Args:
         start: initial body.
         silhouettes: silhouettes of the object.
         settings: samples, weights and limits.
+        advance: called once for each step.
 
     Attributes:
-        start: numbers of the initial body.
+        start: parameters of the initial body.
     """
 
-    def __init__(self, start: Profile, silhouettes: Silhouettes, settings: RevolutionSettings) -> None:
-        self._settings = settings
+    def __init__(
+        self, start: Profile, silhouettes: Silhouettes, settings: RevolutionSettings, advance: Callable[[], None]
+    ) -> None:
+        self._settings, self._advance = settings, advance
         self._origins, self._directions, self._width, self._side = _rays(silhouettes, settings)
         self._middle, self._size = start.foot + 0.5 * start.height * start.axis, start.height
         apart = self._origins - self._middle
@@ -205,33 +212,34 @@ class _Fit:
         self._bends[:end] *= settings.end_bending
         self._bends[-end:] *= settings.end_bending
 
-    def body(self, numbers: Float[Tensor, " numbers"]) -> Profile:
-        """Return the body with these numbers."""
-        axis = normalize(self._axis + numbers[2:4] @ self._across, dim=0)
-        foot = self._middle + self._size * (numbers[:2] @ self._across + numbers[4] * axis)
-        radii = self._size * numbers[6:].clamp(min=self._settings.min_radius)
+    def body(self, parameters: Float[Tensor, " parameters"]) -> Profile:
+        """Return the body with these parameters."""
+        axis = normalize(self._axis + parameters[2:4] @ self._across, dim=0)
+        foot = self._middle + self._size * (parameters[:2] @ self._across + parameters[4] * axis)
+        radii = self._size * parameters[6:].clamp(min=self._settings.min_radius)
         edge = self._settings.edge * float(self._size) / self._pixels
-        return Profile(foot, axis, self._size * (numbers[5] - numbers[4]), radii, edge)
+        return Profile(foot, axis, self._size * (parameters[5] - parameters[4]), radii, edge)
 
-    def step(self, numbers: Float[Tensor, " numbers"], scale: float) -> Float[Tensor, " numbers"]:
+    def step(self, parameters: Float[Tensor, " parameters"], scale: float) -> Float[Tensor, " parameters"]:
         """Make a step; `scale` is the scale of the Geman-McClure loss, in pixels."""
-        settings, lengths = self._settings, self._nearest_lengths(numbers)
-        misfit = self._misfits(numbers, lengths).double()
-        slopes = jacfwd(self._misfits)(numbers, lengths).double()
+        settings, lengths = self._settings, self._nearest_lengths(parameters)
+        misfit = self._misfits(parameters, lengths).double()
+        slopes = jacfwd(self._misfits)(parameters, lengths).double()
         weight = geman_mcclure_weight(misfit[:, None], scale)
-        smooth = 1 / (1 + (self._bends @ numbers / settings.corner).square()).square()  # corners have little weight
+        smooth = 1 / (1 + (self._bends @ parameters / settings.corner).square()).square()  # corners have little weight
         smooth[-settings.end_knots :] = 1  # the upper end would flare
         stiffness = (settings.bending * self._pixels) ** 2 * len(misfit) / settings.knots
         stiff = stiffness * (self._bends.T @ (smooth[:, None] * self._bends)).double()
         system = slopes.T @ (weight[:, None] * slopes) + stiff
-        right = slopes.T @ (weight * misfit) + stiff @ numbers.double()
-        damping = 1e-3 * system.diagonal().mean() * torch.eye(len(numbers)).double()
+        right = slopes.T @ (weight * misfit) + stiff @ parameters.double()
+        self._advance()
+        damping = 1e-3 * system.diagonal().mean() * torch.eye(len(parameters)).double()
         step = torch.linalg.solve(system + damping, right)
-        return numbers - (step * (settings.max_step / step.abs().max()).clamp(max=1)).float()
+        return parameters - (step * (settings.max_step / step.abs().max()).clamp(max=1)).float()
 
     def with_cut_end(
-        self, numbers: Float[Tensor, " numbers"], end: Literal["lower", "upper"]
-    ) -> Float[Tensor, " numbers"]:
+        self, parameters: Float[Tensor, " parameters"], end: Literal["lower", "upper"]
+    ) -> Float[Tensor, " parameters"]:
         """Cut an end at the height with the smallest error, because steps do not find the shortest body.
 
         Few outlines contradict a cone below the foot or a low roof on the top, which bending connects with the side.
@@ -239,7 +247,7 @@ class _Fit:
         Returns:
             Numbers of the body, after more steps.
         """
-        settings, whole = self._settings, self._after_steps(numbers)
+        settings, whole = self._settings, self._after_steps(parameters)
         bodies, errors = {0: whole}, {0: self._error(whole)}
 
         def attempt(cut: int) -> None:
@@ -251,41 +259,43 @@ class _Fit:
             if errors[cut] > min(errors.values()) + settings.max_rise:
                 break
         best = min(errors, key=errors.__getitem__)
-        for cut in (max(0, best - 1), best + 1):
+        for cut in {best - 1, best + 1}.intersection(range(1, settings.max_cut + 1)):
             attempt(cut)
         return bodies[min(errors, key=errors.__getitem__)]
 
-    def _after_steps(self, numbers: Float[Tensor, " numbers"]) -> Float[Tensor, " numbers"]:
+    def _after_steps(self, parameters: Float[Tensor, " parameters"]) -> Float[Tensor, " parameters"]:
+        """Make the steps before or after a cut."""
         for _ in range(self._settings.cut_iterations):
-            numbers = self.step(numbers, self._settings.robust_scale[1])
-        return numbers
+            parameters = self.step(parameters, self._settings.robust_scale[1])
+        return parameters
 
-    def _error(self, numbers: Float[Tensor, " numbers"]) -> float:
+    def _error(self, parameters: Float[Tensor, " parameters"]) -> float:
         """Compute the mean robust misfit."""
-        misfits = self._misfits(numbers, self._nearest_lengths(numbers))
+        misfits = self._misfits(parameters, self._nearest_lengths(parameters))
         return float(geman_mcclure(misfits[:, None], self._settings.cut_scale).mean())
 
     def _misfits(
-        self, numbers: Float[Tensor, " numbers"], lengths: Float[Tensor, " points"]
+        self, parameters: Float[Tensor, " parameters"], lengths: Float[Tensor, " points"]
     ) -> Float[Tensor, " points"]:
         """Compute distances of rays to the body in pixels; 0 for rays on their side of the outline."""
         points = self._origins + lengths[:, None] * self._directions
-        apart = self.body(numbers).least_distance(points) / (self._width * lengths)
+        apart = self.body(parameters).least_distance(points) / (self._width * lengths)
         return torch.where(self._side * apart > 0, 0.0, apart)
 
-    def _nearest_lengths(self, numbers: Float[Tensor, " numbers"]) -> Float[Tensor, " points"]:
-        return _nearest_lengths(self.body(numbers), self._origins, self._directions, self._settings)
+    def _nearest_lengths(self, parameters: Float[Tensor, " parameters"]) -> Float[Tensor, " points"]:
+        return _nearest_lengths(self.body(parameters), self._origins, self._directions, self._settings)
 
 
-def _cut(numbers: Float[Tensor, " numbers"], count: int, end: Literal["lower", "upper"]) -> Float[Tensor, " numbers"]:
+def _cut(
+    parameters: Float[Tensor, " parameters"], count: int, end: Literal["lower", "upper"]
+) -> Float[Tensor, " parameters"]:
     """Cut a body by `count` knots at an end; the number of radii stays."""
-    radii, (low, high) = numbers[6:], numbers[4:6].tolist()
-    last = len(radii) - 1
-    first, last_kept = (count, last) if end == "lower" else (0, last - count)
-    at = np.linspace(first, last_kept, len(radii))
-    kept = torch.from_numpy(np.interp(at, np.arange(len(radii)), radii.numpy())).to(radii)
-    ends = numbers.new_tensor([low + first / last * (high - low), low + last_kept / last * (high - low)])
-    return torch.cat([numbers[:4], ends, kept])
+    radii, low, high = parameters[6:], parameters[4], parameters[5]
+    kept = radii[count:] if end == "lower" else radii[: len(radii) - count]
+    removed = count / (len(radii) - 1) * (high - low)
+    ends = [low + removed, high] if end == "lower" else [low, high - removed]
+    resampled = functional.interpolate(kept[None, None], len(radii), mode="linear", align_corners=True)[0, 0]
+    return torch.cat([parameters[:4], torch.stack(ends), resampled])
 
 
 def _initial_profile(mesh: TriangleMesh, settings: RevolutionSettings) -> Profile | None:

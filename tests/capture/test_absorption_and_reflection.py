@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from nerfro.capture.object_errors import observed_light
-from nerfro.capture.surroundings import CLIPPED, Observations, Surroundings, recorded_and_clipped
+from nerfro.capture.surroundings import CLIPPED_RADIANCE, Observations, Surroundings, recorded_and_clipped
 from nerfro.core.types import Exits
 from nerfro.rendering.scene_file import Provenance, SceneFile
 from nerfro.samplers.paths.snell import Snell
@@ -31,6 +31,17 @@ def test_absorbed_light_and_reflection_are_measured(absorption: tuple[float, ...
         assert share == pytest.approx(1 - math.exp(-coefficient * length), abs=0.04)
 
 
+def test_air_in_a_body_does_not_absorb() -> None:
+    """A hollow ball of glass, whose air would absorb as much as its wall."""
+    body = solid([1.5, 1.0])
+    wall = torch.tensor([[0.4, 0.8, 1.6], [0.0, 0.0, 0.0]])
+    views = photographs_of(body.with_absorption_coefficients(wall), sampler=Snell(branches="all"))
+    observations = Observations(views, mesh(), False)
+    colours = sky(observations.through.rays.directions)
+    observations.surroundings = Surroundings(lambda exits: sky(exits.directions), None, 0.0, colours)
+    assert observed_light(observations, body).absorption == pytest.approx(wall, rel=0.03)
+
+
 def test_radiance_that_photographs_clip_is_measured_through_an_absorbing_body() -> None:
     """A sky that is 2.5 wherever it would exceed 0.6, of which photographs record 1."""
 
@@ -47,10 +58,12 @@ def test_radiance_that_photographs_clip_is_measured_through_an_absorbing_body() 
     assert share[is_bright].mean() > 0.9
     assert share[~is_bright].mean() < 0.1
     colours = observations.surroundings.colours
-    observations.surroundings = Surroundings(lambda exits: bright(exits).clamp(max=CLIPPED), None, 0.0, colours)
+    observations.surroundings = Surroundings(
+        lambda exits: bright(exits).clamp(max=CLIPPED_RADIANCE), None, 0.0, colours
+    )
     light = observed_light(observations, body)
-    assert light.absorption == pytest.approx(coefficients[0], rel=0.03)
-    assert light.clipped == pytest.approx(torch.full((3,), 2.5), rel=0.03)
+    assert light.absorption == pytest.approx(coefficients, rel=0.03)
+    assert light.clipped_radiance == pytest.approx(torch.full((3,), 2.5), rel=0.03)
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from nerfro.backgrounds.base import Background
 from nerfro.capture import refinement
+from nerfro.capture.object_errors import ObservedLight
 from nerfro.capture.refinement import DescentStage, Refined, RefinementProblem, RefinementSettings, refine_surface
 from nerfro.capture.surroundings import Pixels, Room, Surroundings, divide_pixels, learn_surroundings, panorama_of
 from nerfro.core.draws import Draws
@@ -114,6 +115,16 @@ def test_partial_reflections_are_followed_if_photographs_have_them(reflects: boo
     descent = refinement._Descent(problem(dented(), reflects), False, SHORT)
     assert (descent.sampler.branching.max_split_events > 0) == reflects
     assert descent.initial_errors.mean() < 0.01, "the body is the true one"
+
+
+@pytest.mark.parametrize(("absorbs", "measured"), [(True, ABSORPTION), (False, 0 * ABSORPTION + 0.3)])
+def test_measured_absorption_is_used_if_it_explains_validation_pixels(absorbs: bool, measured: Tensor) -> None:
+    light = ObservedLight(measured, 1.0, torch.full((3,), 2.0))
+    given = RefinementProblem(mesh(), dented(), *shown(absorbs=absorbs), light)
+    descent = refinement._Descent(given, False, SHORT)
+    assert (descent.medium().absorption is not None) == absorbs
+    assert descent.surroundings.clipped_radiance.tolist() == [2.0 if absorbs else 1.0] * 3
+    assert descent.initial_errors.mean() < 0.01, "the surface is the true one"
 
 
 @torch.no_grad()

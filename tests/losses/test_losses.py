@@ -194,7 +194,7 @@ def test_absorption_replaces_dark_fog_that_explains_the_photograph() -> None:
     path = example_path(8)
     path = replace(path, record=replace(path.record, absorption=absorption))
     passed = torch.full((8,), 0.8, requires_grad=True)
-    light = torch.full((8, 3), 0.5) * path.transmitted(path.far[:, None])[:, 0]
+    light = torch.full((8, 3), 0.5) * path.whole_transmittance()
     fog = replace(rendering(torch.rand(8, 3), light, passed), transmittance=passed, path=path)
     fog = replace(fog, radiance=passed[:, None] * light)
     given = replace(example_batch(8), maps={}, rgb=to_srgb(fog.radiance.detach()))
@@ -208,7 +208,7 @@ def test_gradient_of_a_body_that_absorbs_all_light_is_finite() -> None:
     absorption = torch.tensor([[0.0] * 3, [1e4] * 3], requires_grad=True)
     path = example_path(8)
     path = replace(path, record=replace(path.record, absorption=absorption))
-    dark = path.transmitted(path.far[:, None])[:, 0]
+    dark = path.whole_transmittance()
     assert (dark == 0).any()
     black = replace(rendering(torch.zeros(8, 3), dark, torch.ones(8)), transmittance=torch.ones(8), path=path)
     given = replace(example_batch(8), maps={}, rgb=torch.rand(8, 3))

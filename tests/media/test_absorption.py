@@ -31,7 +31,7 @@ def test_background_behind_a_ball_is_attenuated_by_its_chord() -> None:
     path = _path(heights.tolist())
     chord = torch.where(heights < 0.8, 1.6 * (1 - (heights / 1.2).square()).sqrt(), 0.0)
     expected = torch.exp(-chord[:, None] * torch.tensor(SIGMA, dtype=torch.float64))
-    torch.testing.assert_close(path.transmitted(path.far[:, None])[:, 0], expected)
+    torch.testing.assert_close(path.whole_transmittance(), expected)
     assert (expected[-1] == 1).all()
 
 
@@ -53,7 +53,7 @@ def test_content_inside_is_attenuated_by_the_glass_before_it() -> None:
 def test_reflection_at_the_outside_of_a_ball_is_not_tinted() -> None:
     medium = Ball(0.8, 1.5, absorption=SIGMA).double()
     path = medium.with_absorption(Snell(branches="first")(beam(torch.tensor([0.5]).double()), medium))
-    through, reflected = path.transmitted(path.far[:, None])[:, 0]
+    through, reflected = path.whole_transmittance()
     assert (through < 0.9).all()
     assert (reflected == 1).all()
 
@@ -68,7 +68,7 @@ def test_absorption_does_not_depend_on_a_change_of_the_index(tracer: str, tmp_pa
 
     def left(*iors: float) -> Tensor:
         path = medium.with_absorption(sampler(rays, medium.with_indices(torch.tensor(iors))))
-        return path.transmitted(path.far[:, None])[:, 0]
+        return path.whole_transmittance()
 
     for outer, inner in ((1.0, 1.0), (1.5, 1.5), (1.0, 1.5)):
         torch.testing.assert_close(left(outer, inner), left(outer + 1e-6, inner + 2e-6), atol=1e-4, rtol=0)

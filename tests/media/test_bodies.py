@@ -152,7 +152,7 @@ def test_index_and_absorption_of_two_bodies_are_learned_together(tmp_path: Path)
     for _ in range(120):
         path = refined(tinted)
         chords = (path.s[:, 2] - path.s[:, 1]).detach()[:, None]
-        seen = path.transmitted(path.far[:, None])[:, 0]
+        seen = path.whole_transmittance()
         loss = (seen - torch.exp(-sigma * chords)).square().mean()
         loss = loss + (refined(clear).exit_directions - expected).square().mean()
         optimizer.zero_grad()

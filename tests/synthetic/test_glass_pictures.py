@@ -129,7 +129,7 @@ def test_absorption_matches_the_path_tracer_and_is_learned_from_an_image(what: s
     given, learner = on_grid(what, absorption=list(COLOURED)), on_grid(what, learn=["absorption"])
 
     def picture(medium: Bodies, path: Path) -> Tensor:
-        return seen(path, medium.with_absorption(path).transmitted(path.far[:, None])[:, 0])
+        return seen(path, medium.with_absorption(path).whole_transmittance())
 
     assert agreement(picture(given, BRANCHES(rays_of_picture(), given)), expected) > 35
     few = BRANCHES(rays_of_picture(8), given)
