@@ -101,6 +101,8 @@ class RefinementSettings(AlgorithmSettings):
         min_gain: smallest decrease of the validation error by a blurred stage that is kept, and by all stages together
             if the surface is accepted, as a fraction. A wrong surface also explains some of the interior: errors
             decreased by 0.012 to 0.11 for better surfaces, and by up to 0.009 for worse ones.
+        min_absorption_gain: smallest decrease of the validation error by measured absorption that is used, as a
+            fraction. Content has an effect on colours that resembles weak absorption.
         robust_scale: scale of the Geman-McClure loss relative to the mean transmittance of the object, linear radiance:
             residual at which the loss is 1/2 of its maximum and the weight 1/4.
         contour_deviation: standard deviation of contours, in pixels.
@@ -125,6 +127,7 @@ class RefinementSettings(AlgorithmSettings):
     max_validation_pixels: int = 20_000
     validate_every: int = 25
     min_gain: float = 0.01
+    min_absorption_gain: float = 0.1
     robust_scale: float = 0.1
     contour_deviation: float = 0.25
     contour_weight: float = 0.1
@@ -446,7 +449,9 @@ class _Descent:
             error, is_valid = self._validation_errors(medium)
             errors.append(error)
             common = common & is_valid
-        return models[int(torch.stack(errors)[:, common].mean(1).nan_to_num(torch.inf).argmin())]
+        means = torch.stack(errors)[:, common].mean(1).nan_to_num(torch.inf)
+        means[len(samplers) :] /= 1 - self.settings.min_absorption_gain
+        return models[int(means.argmin())]
 
     def _validation_errors(self, medium: Bodies) -> tuple[Float[Tensor, "Q"], Bool[Tensor, "Q"]]:
         """Compute the robust errors of the validation pixels, and whether their surroundings are known."""
