@@ -173,7 +173,7 @@ def fit_revolution(
         for iteration in range(settings.iterations):
             done = min(1.0, iteration / (settings.iterations - 6))
             parameters = fit.step(parameters, first_scale * (last_scale / first_scale) ** done)
-        for end in ("upper", "lower"):  # objects in front of the foot give the body a roof, too
+        for end in ("upper", "lower"):  # a roof on the top would hide the best cut of the foot
             parameters = fit.with_cut_end(parameters, end)
     return fit.body(parameters).mesh()
 
@@ -232,9 +232,9 @@ class _Fit:
         stiff = stiffness * (self._bends.T @ (smooth[:, None] * self._bends)).double()
         system = slopes.T @ (weight[:, None] * slopes) + stiff
         right = slopes.T @ (weight * misfit) + stiff @ parameters.double()
-        self._advance()
         damping = 1e-3 * system.diagonal().mean() * torch.eye(len(parameters)).double()
         step = torch.linalg.solve(system + damping, right)
+        self._advance()
         return parameters - (step * (settings.max_step / step.abs().max()).clamp(max=1)).float()
 
     def with_cut_end(
@@ -245,7 +245,7 @@ class _Fit:
         Few outlines contradict a cone below the foot or a low roof on the top, which bending connects with the side.
 
         Returns:
-            Numbers of the body, after more steps.
+            Parameters of the body, after more steps.
         """
         settings, whole = self._settings, self._after_steps(parameters)
         bodies, errors = {0: whole}, {0: self._error(whole)}
