@@ -111,9 +111,7 @@ def picture(sampler: Snell, medium: Bodies, side: int, parts: int = 3) -> np.nda
     radiance = []
     for pixels in torch.arange(cameras.width * cameras.height).split(8192):
         path = medium.with_absorption(sampler(part_rays(cameras, pixels, parts), medium))
-        light = lat_long.sample(radiance_of_sky, path.exit_directions, width=4096)
-        if path.absorbs:
-            light = light * path.whole_transmittance()
+        light = lat_long.sample(radiance_of_sky, path.exit_directions, width=4096) * path.whole_transmittance()
         radiance.append(path.sum_polylines(light).view(-1, parts**2, 3).mean(1))
     return to_srgb(torch.cat(radiance)).clamp(0, 1).view(cameras.height, cameras.width, 3).numpy()
 

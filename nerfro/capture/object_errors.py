@@ -6,8 +6,8 @@ The errors of each candidate are summed by view, so that random samples of the v
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -197,15 +197,15 @@ class ObjectErrors:
         self._advance()
         return self._sums(radiance - self._pixels.radiance)
 
-    def fit_light(self, body: Bodies, absorbs: bool) -> tuple[ObservedLight, Float[np.ndarray, "3 V"]]:
+    def fit_light(self, body: Bodies, absorbs: Sequence[bool]) -> list[tuple[ObservedLight, Float[np.ndarray, "3 V"]]]:
         """Fit absorption coefficients and the radiance of clipped surroundings by gradient descent, with fixed paths.
 
         Args:
             body: the bodies. Those of index 1 are air.
-            absorbs: whether the others absorb light, all alike.
+            absorbs: for each fit, whether the others absorb light, all alike.
 
         Returns:
-            The light, and the robust errors of red, green and blue, summed by view.
+            For each fit, the light, and the robust errors of red, green and blue, summed by view.
         """
         settings = self._settings
         size, is_dense = float((body.box[1] - body.box[0]).max()), (body.iors != 1)[:, None]
@@ -214,24 +214,28 @@ class ObjectErrors:
         main = path.main_polyline(lengths)
         length = float(main[main > 0].mean())
         recorded, share = recorded_and_clipped(self._surroundings.background(path.exits()))
-        # Logarithms of the optical depth of the mean path, and of the excess of clipped radiance over 1.
-        start = torch.tensor([[settings.initial_depth], [settings.initial_excess]])
-        logarithms = start.log().repeat(1, 3).requires_grad_()
-        optimizer = torch.optim.Adam([logarithms])
-        with torch.enable_grad():
-            for step in range(settings.light_steps + 1):
-                depth, excess = logarithms.exp()
-                depth = depth.clamp(max=settings.max_depth)
-                transmitted = torch.exp(-depth * lengths / length) if absorbs else 1.0
-                radiance = path.sum_polylines((recorded + share * excess) * transmitted).clamp(max=1)
-                residuals = radiance - self._pixels.radiance
-                optimizer.param_groups[0]["lr"] = settings.light_rate * (1 - step / settings.light_steps)
-                optimizer.zero_grad()
-                geman_mcclure(residuals[..., None], self._scale).mean().backward()
-                optimizer.step()  # the rate of the last step is 0
-        errors = np.array([self._sums(residuals[:, channel : channel + 1].detach()) for channel in range(3)])
-        absorption = is_dense * (absorbs * depth.detach() / length)
-        return ObservedLight(absorption, length, 1 + share.any(0) * excess.detach()), errors
+
+        def fit(absorbs: bool) -> tuple[ObservedLight, Float[np.ndarray, "3 V"]]:
+            # Logarithms of the optical depth of the mean path, and of the excess of clipped radiance over 1.
+            start = torch.tensor([[settings.initial_depth], [settings.initial_excess]])
+            logarithms = start.log().repeat(1, 3).requires_grad_()
+            optimizer = torch.optim.Adam([logarithms])
+            with torch.enable_grad():
+                for step in range(settings.light_steps + 1):
+                    depth, excess = logarithms.exp()
+                    depth = depth.clamp(max=settings.max_depth)
+                    transmitted = torch.exp(-depth * lengths / length) if absorbs else 1.0
+                    radiance = path.sum_polylines((recorded + share * excess) * transmitted).clamp(max=1)
+                    residuals = radiance - self._pixels.radiance
+                    optimizer.param_groups[0]["lr"] = settings.light_rate * (1 - step / settings.light_steps)
+                    optimizer.zero_grad()
+                    geman_mcclure(residuals[..., None], self._scale).mean().backward()
+                    optimizer.step()  # the rate of the last step is 0
+            errors = np.array([self._sums(residuals[:, channel : channel + 1].detach()) for channel in range(3)])
+            absorption = is_dense * (absorbs * depth.detach() / length)
+            return ObservedLight(absorption, length, 1 + share.any(0) * excess.detach()), errors
+
+        return [fit(value) for value in absorbs]
 
     def _path(self, body: Medium) -> Path:
         """Trace the pixels."""
@@ -302,8 +306,7 @@ def observed_light(
         settings: number of pixels, steps and limits.
     """
     through, both = (ObjectErrors(observations, settings=settings, branches=branches) for branches in ("none", "all"))
-    light, errors = both.fit_light(body, absorbs=True)
-    clear, clear_errors = both.fit_light(body, absorbs=False)
+    (light, errors), (clear, clear_errors) = both.fit_light(body, absorbs=(True, False))
     absorbs = torch.tensor(
         [
             share >= settings.min_share and both.decreases(before, after, settings.num_errors)
@@ -311,12 +314,12 @@ def observed_light(
         ]
     )
     best = errors.sum(0) if absorbs.any() else clear_errors.sum(0)
-    without = through.fit_light(body, absorbs=bool(absorbs.any()))[1].sum(0)
-    return ObservedLight(
-        torch.where(absorbs, light.absorption, 0.0),
-        light.length,
-        torch.where(absorbs, light.clipped_radiance, clear.clipped_radiance),
-        both.decreases(without, best, settings.num_errors),
+    [(_, without)] = through.fit_light(body, absorbs=(bool(absorbs.any()),))
+    return replace(
+        light,
+        absorption=torch.where(absorbs, light.absorption, 0.0),
+        clipped_radiance=torch.where(absorbs, light.clipped_radiance, clear.clipped_radiance),
+        reflects=both.decreases(without.sum(0), best, settings.num_errors),
     )
 
 

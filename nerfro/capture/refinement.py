@@ -334,8 +334,9 @@ class _Descent:
         mesh, silhouettes = problem.mesh, problem.silhouettes
         self.training, validation = problem.through.split()
         self.validation = validation.some(settings.max_validation_pixels)
+        self.robust_scale = settings.robust_scale
         medium, self.surroundings, self.sampler = self._best_model()
-        self.robust_scale = settings.robust_scale * self._transmittance(medium)
+        self.robust_scale *= self._transmittance(medium)
         self.iors = nn.Parameter(medium.iors.clone(), requires_grad=learn_index)
         # Paths with more events have no derivatives here, because small errors of the surface turn them far.
         self.max_events = 2 * len(medium.iors) + 1
@@ -443,7 +444,7 @@ class _Descent:
             light.append((absorbing, brighter))
         samplers = Snell(), Snell(branches="all", least_weight=self.settings.least_weight)
         models = [(*seen, sampler) for seen in light for sampler in samplers]
-        self.robust_scale, errors, common = self.settings.robust_scale, list[Tensor](), torch.tensor(True)
+        errors, common = list[Tensor](), torch.tensor(True)
         for model in models:
             medium, self.surroundings, self.sampler = model
             error, is_valid = self._validation_errors(medium)

@@ -210,11 +210,8 @@ def fit_vessel(
                 spread = float(standard_error(minima, search.counts))
                 lengths[name] = float(np.clip(minimum, stem, highest) if is_height else np.exp(minimum))
                 standard_errors[name] = spread if is_height else spread * lengths[name]
-        fitted, unknown = error_of(lengths), list[str]()
-        for name in typical:
-            is_uncertain = standard_errors[name] > settings.max_standard_error * lengths[name]
-            if is_uncertain and not search.decreases(
-                error_of(lengths | {name: typical[name]}), fitted, settings.num_errors
-            ):
-                unknown.append(name)
+        uncertain = [name for name in typical if standard_errors[name] > settings.max_standard_error * lengths[name]]
+        fitted = error_of(lengths) if uncertain else np.empty(0)
+        without = {name: error_of(lengths | {name: typical[name]}) for name in uncertain}
+        unknown = [name for name in uncertain if not search.decreases(without[name], fitted, settings.num_errors)]
     return VesselFit(lengths | {name: typical[name] for name in unknown}, standard_errors, unknown)

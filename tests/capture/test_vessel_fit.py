@@ -1,5 +1,6 @@
 """The lengths of a glass, and the support for bodies, from pixels under a sky in closed form."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,17 @@ def cylinder(tmp_path: Path) -> Path:
     return tmp_path / "glass.ply"
 
 
+def vessels_in(cylinder: Path) -> Callable[[VesselLengths], Bodies]:
+    """Return a function that builds vessels of lengths within the cylinder, with water if they have a level."""
+    outer, grid = MeshSurface(str(cylinder)), GridSettings(**BOX)
+
+    def build(lengths: VesselLengths) -> Bodies:
+        liquid = None if lengths.level is None else Material(1.333)
+        return vessel(outer, lengths, Material(1.52), liquid, grid=grid)
+
+    return build
+
+
 def observed(cylinder: Path, glass: Bodies) -> Observations:
     """Observe a body through pixels of its silhouette, with all reflections."""
     taken, random = cameras(), torch.Generator().manual_seed(0)
@@ -66,12 +78,7 @@ def observed(cylinder: Path, glass: Bodies) -> Observations:
     ids=["empty", "partly filled"],
 )
 def test_vessel_fit_recovers_lengths_from_default_values(cylinder: Path, lengths: dict[str, float]) -> None:
-    outer, grid = MeshSurface(str(cylinder)), GridSettings(**BOX)
-
-    def build(lengths: VesselLengths) -> Bodies:
-        liquid = None if lengths.level is None else Material(1.333)
-        return vessel(outer, lengths, Material(1.52), liquid, grid=grid)
-
+    build = vessels_in(cylinder)
     glass = build(VesselLengths(**lengths))
     found = fit_vessel(build, 2 * RADIUS, HEIGHT, observed(cylinder, glass))
     assert found.lengths.keys() == lengths.keys()
@@ -115,11 +122,7 @@ def test_stem_is_a_narrow_part_between_two_wide_ones(radii: list[float], expecte
 
 def test_cavity_does_not_continue_into_a_stem(cylinder: Path) -> None:
     """The best foot would be lower than the stem, and then the foot ends with the stem."""
-    outer, grid = MeshSurface(str(cylinder)), GridSettings(**BOX)
-
-    def build(lengths: VesselLengths) -> Bodies:
-        return vessel(outer, lengths, Material(1.52), None, grid=grid)
-
+    build = vessels_in(cylinder)
     observations = observed(cylinder, build(VesselLengths(wall=0.025, foot=0.2, fillet=0.12)))
     settings = VesselFitSettings(levels=(), rounds=((2.0, 0.1),), num_candidates=3)
     found = fit_vessel(build, 2 * RADIUS, HEIGHT, observations, stem=0.4, settings=settings)
@@ -130,11 +133,7 @@ def test_cavity_does_not_continue_into_a_stem(cylinder: Path) -> None:
 def test_uncertain_lengths_are_kept_if_they_explain_the_pixels_better(
     cylinder: Path, factor: float, unknown: list[str]
 ) -> None:
-    outer, grid = MeshSurface(str(cylinder)), GridSettings(**BOX)
-
-    def build(lengths: VesselLengths) -> Bodies:
-        return vessel(outer, lengths, Material(1.52), None, grid=grid)
-
+    build = vessels_in(cylinder)
     settings = VesselFitSettings(levels=(), rounds=((2.0, 0.1),), num_candidates=3, max_standard_error=0.0)
     typical = {name: 2 * RADIUS * getattr(settings, name) for name in ("wall", "foot", "fillet")}
     lengths = {name: factor * length for name, length in typical.items()}
