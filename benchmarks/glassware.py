@@ -397,6 +397,9 @@ def main() -> None:
     parser.add_argument("--reconstruction", type=Path, help="output folder of nerfro.reconstruct")
     given = parser.parse_args()
     if given.reconstruction is not None:
+        for file in (given.capture / "outlines.json", given.reconstruction / "run" / "metrics.json"):
+            if not file.is_file():
+                parser.error(f"{file} is missing; give a capture of this program and a finished reconstruction of it")
         print(
             "| capture | poses | rotation, median error | overlap of masks, mean and least | image, dB | object, dB |"
         )
