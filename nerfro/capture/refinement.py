@@ -49,7 +49,7 @@ from nerfro.core.robust import geman_mcclure
 from nerfro.core.types import Exits, Path
 from nerfro.files.atomic import write_json
 from nerfro.geometry.interpolation import bspline_basis, smooth
-from nerfro.geometry.mesh import TriangleMesh
+from nerfro.geometry.mesh import TriangleMesh, subdivided
 from nerfro.media.base import Medium
 from nerfro.media.bodies import Bodies
 from nerfro.samplers.paths.polylines import SnellTrace
@@ -88,6 +88,8 @@ class RefinementSettings(AlgorithmSettings):
     Attributes:
         stages: stages of the descent. Each stage starts with the best surface so far. A stage with blurred surroundings
             that gains less than `min_gain` is undone, and others are left out: the surface is too accurate for them.
+        edge_voxels: longest edge of the mesh whose vertices move, in voxels of the medium; longer ones are bisected, or
+            triangles would hide the displacement between their vertices.
         num_pixels: number of pixels in each step.
         levels: numbers of control points along each side of the splines that displace the surface.
         least_weight: smallest share of light that is followed separately at a surface that reflects partially.
@@ -133,6 +135,7 @@ class RefinementSettings(AlgorithmSettings):
     contour_weight: float = 0.1
     roughness_weight: float = 0.1
     num_contour_points: int = 4000
+    edge_voxels: float = 2.0
     blur_samples: int = 32
     texels_per_deviation: float = 1.5
 
@@ -260,7 +263,9 @@ def refine(
     assert bodies is not None  # see Request.check
     is_given = any(material.absorbs and "absorption" not in material.learned() for material in bodies.materials)
     light = None if is_given else observed_light(observations, bodies)
-    start, settings = mesh.relative_to(observations.shift), RefinementSettings()
+    settings = RefinementSettings()
+    max_edge = settings.edge_voxels * float(bodies.grids[0].spacing.min())
+    start = subdivided(mesh.relative_to(observations.shift), max_edge)
     if silhouettes is None:
         settings = replace(settings, max_overlap_loss=math.inf)
         silhouettes = Silhouettes.of(cameras, mesh_silhouettes(start, cameras, 1).float())

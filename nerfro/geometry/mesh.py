@@ -244,6 +244,32 @@ def merge_vertices(
     return TriangleMesh(unique, merged[kept], None if normals is None else normals[kept])
 
 
+def subdivided(mesh: TriangleMesh, max_edge: float) -> TriangleMesh:
+    """Bisect edges until none is longer than `max_edge`; the shape stays, and a closed mesh stays closed.
+
+    Args:
+        mesh: the mesh.
+        max_edge: largest length of an edge, world units.
+
+    Returns:
+        A mesh without normals and facets; the given one if it has no longer edges.
+    """
+    while np.linalg.norm(mesh.triangles - np.roll(mesh.triangles, -1, 1), axis=-1).max() > max_edge:
+        vertices, faces = mesh.vertices, mesh.faces
+        sides = np.sort(np.stack([faces, np.roll(faces, -1, 1)], -1), -1).reshape(-1, 2)
+        edges, side = np.unique(sides, axis=0, return_inverse=True)
+        is_long = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1) > max_edge
+        middle, side = len(vertices) + np.cumsum(is_long) - 1, side.reshape(faces.shape)
+        # A short side has its start in place of its middle, and triangles without area are left out.
+        (a, b, c), (ab, bc, ca) = faces.T, np.where(is_long[side], middle[side], faces).T
+        parts = np.concatenate(
+            [np.stack(corners, 1) for corners in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
+        )
+        has_area = (parts != np.roll(parts, 1, 1)).all(1)
+        mesh = TriangleMesh(np.concatenate([vertices, vertices[edges[is_long]].mean(1)]), parts[has_area])
+    return mesh
+
+
 def require_inside(any_inside: bool) -> None:
     """Raise an error if no vertex of a grid lies inside a mesh, because there would be no object."""
     if not any_inside:

@@ -10,17 +10,33 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
 from torch import Tensor
 
 from nerfro.backgrounds.base import Background
 from nerfro.capture import refinement
 from nerfro.capture.object_errors import ObservedLight
-from nerfro.capture.refinement import DescentStage, Refined, RefinementProblem, RefinementSettings, refine_surface
-from nerfro.capture.surroundings import Pixels, Room, Surroundings, divide_pixels, learn_surroundings, panorama_of
+from nerfro.capture.refinement import (
+    DescentStage,
+    Refined,
+    RefinementProblem,
+    RefinementSettings,
+    refine,
+    refine_surface,
+)
+from nerfro.capture.surroundings import (
+    Observations,
+    Pixels,
+    Room,
+    Surroundings,
+    divide_pixels,
+    learn_surroundings,
+    panorama_of,
+)
 from nerfro.core.draws import Draws
 from nerfro.core.errors import NerfroError
 from nerfro.core.types import Exits
-from nerfro.geometry.mesh import load_mesh
+from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.media.bodies import Bodies
 from nerfro.samplers.paths.snell import Snell
 from nerfro.silhouettes.silhouettes import mesh_silhouettes
@@ -179,6 +195,37 @@ def test_surface_that_loses_overlap_with_the_masks_is_rejected(monkeypatch: pyte
     before, shrinking = dented(), RefinementSettings(stages=(), smoothings=(0.3,))
     assert refined(before, shrinking).medium is before
     assert refined(before, replace(shrinking, max_overlap_loss=math.inf)).medium is not before
+
+
+def test_triangles_longer_than_voxels_are_displaced_between_their_vertices(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """All vertices of a cube are corners, and the dent is in the middle of a side."""
+    corners = trimesh.creation.box((1.0, 1.0, 1.0))
+    cube = TriangleMesh(np.asarray(corners.vertices), np.asarray(corners.faces))
+    points = grid_points(0.9, 33)
+    distances = (points.abs() - 0.5).amax(-1)
+    solid_cube = sampled([distances], BOX, [1.5], 0.01)
+    middle = torch.tensor([0.0, 0.0, 0.5])
+    hollow = solid_cube.grown(-DEPTH * torch.exp(-(points - middle).square().sum(-1) / (2 * 0.15**2)))
+    _, through, surroundings = shown()
+    observations = Observations(photographs_of(solid([1.5])), cube, False)
+    observations.__dict__.update(through=through, surroundings=surroundings)
+    monkeypatch.setattr(refinement, "observed_light", lambda *_: None)
+
+    def refined_to(medium: Bodies) -> TriangleMesh:
+        def found(problem: RefinementProblem, *_: object) -> Refined:
+            moved = problem.mesh if medium is solid_cube else refinement._project_onto(problem.mesh, medium)
+            return Refined(moved, medium, [0, 1], [1.0, 0.5])
+
+        monkeypatch.setattr(refinement, "refine_surface", found)
+        return refine(observations, cube, solid_cube, None, False, tmp_path)
+
+    dented_cube = refined_to(hollow)
+    nearest = np.linalg.norm(dented_cube.vertices - [0, 0, 0.5 - DEPTH], axis=1).min()
+    assert nearest < 0.01
+    assert dented_cube.is_closed
+    assert refined_to(solid_cube) is cube, "the given mesh, if it is not improved"
 
 
 def test_reconstructed_room_is_independent_of_earlier_random_numbers() -> None:

@@ -14,7 +14,7 @@ import trimesh
 from trimesh.exchange.gltf import export_glb
 
 from nerfro.core.errors import NerfroError
-from nerfro.geometry.mesh import load_mesh, load_points
+from nerfro.geometry.mesh import TriangleMesh, load_mesh, load_points, subdivided
 from tests.conftest import refused
 
 
@@ -152,3 +152,14 @@ def test_triangles_with_missing_vertices_are_refused(index: int, tmp_path: Path)
     (tmp_path / "bad.ply").write_text("\n".join([*header, *lines]) + "\n")
     with pytest.raises(NerfroError, match=r"bad\.ply (has triangles with indices of missing vertices|cannot be read)"):
         load_mesh(tmp_path / "bad.ply", accept_open_mesh=True)
+
+
+@pytest.mark.parametrize("shape", [trimesh.creation.box((1.2, 0.4, 0.1)), trimesh.creation.cylinder(0.3, 2.0)])
+def test_long_edges_are_bisected_without_gaps(shape: trimesh.Trimesh) -> None:
+    mesh = TriangleMesh(np.asarray(shape.vertices), np.asarray(shape.faces))
+    fine = subdivided(mesh, 0.11)
+    result = trimesh.Trimesh(fine.vertices, fine.faces, process=False)
+    assert result.edges_unique_length.max() <= 0.11
+    assert result.is_watertight
+    assert (result.volume, result.area) == pytest.approx((shape.volume, shape.area))
+    assert subdivided(fine, 0.11) is fine
