@@ -25,6 +25,7 @@ from nerfro.silhouettes.visual_hull import (
     find_box,
     reaches_border,
     remove_strays,
+    require_hull,
 )
 
 _MIN_VIEWS, _FEW_VIEWS = 3, 12
@@ -133,9 +134,12 @@ def make_mesh(
         is_revolution: whether silhouettes are projections of a body of revolution, so that a free surface is only
             fitted if the hull has no axis.
         settings: settings of hull and fits.
+
+    Raises:
+        NerfroError: the hull is empty, no view sees the surface, or the hull has no axis for `symmetry=axis`.
     """
     settings.use()
-    box = _object_box(silhouettes, wrong_masks, settings) if corners is None else corners
+    box = _object_box(silhouettes, wrong_masks, keep, settings) if corners is None else corners
     with fraction_bar("carving") as progress:
         distances, corner, spacing = carve_grid(silhouettes, box, resolution, wrong_masks, progress, settings.hull)
     num_parts, num_kept = remove_strays(distances, keep)
@@ -182,7 +186,9 @@ def _choose_symmetry(
     return revolution if symmetric >= unconstrained - max_loss else free
 
 
-def _object_box(silhouettes: Silhouettes, wrong_masks: int, settings: SurfaceSettings) -> Float[np.ndarray, "2 3"]:
+def _object_box(
+    silhouettes: Silhouettes, wrong_masks: int, keep: int | None, settings: SurfaceSettings
+) -> Float[np.ndarray, "2 3"]:
     """Estimate the bounding box of the object, with a margin, from a coarse visual hull.
 
     A box that cuts the hull is enlarged; if no enlargement contains the hull, the initial box is used.
@@ -193,9 +199,10 @@ def _object_box(silhouettes: Silhouettes, wrong_masks: int, settings: SurfaceSet
         distances, corner, spacing = carve_grid(
             silhouettes, box, settings.coarse_voxels, wrong_masks, settings=settings.hull
         )
-        remove_strays(distances)
+        remove_strays(distances, keep)
         if not reaches_border(distances):
             break
+    require_hull(distances)
     inside = np.argwhere(distances < 0)
     low, high = inside.min(0) - settings.margin_voxels, inside.max(0) + settings.margin_voxels
     return np.stack([corner + spacing * low, corner + spacing * high]).clip(*box)

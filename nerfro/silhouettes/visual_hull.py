@@ -234,6 +234,12 @@ def remove_strays(
     return num_parts, num_kept
 
 
+def require_hull(distances: Float[np.ndarray, "X Y Z"]) -> None:
+    """Refuse an empty visual hull."""
+    if not (distances < 0).any():
+        raise NerfroError("the visual hull is empty: no point is inside all masks; check masks and poses")
+
+
 def extract_surface(
     distances: Float[np.ndarray, "X Y Z"], corner: Float[np.ndarray, "3"], spacing: float | Float[np.ndarray, "3"]
 ) -> TriangleMesh:
@@ -242,8 +248,7 @@ def extract_surface(
     Raises:
         NerfroError: no voxel is inside.
     """
-    if not (distances < 0).any():
-        raise NerfroError("the visual hull is empty: no point is inside all masks; check masks and poses")
+    require_hull(distances)
     padded = np.pad(distances, 1, constant_values=0.5 * np.max(spacing))
     sides = tuple(np.broadcast_to(spacing, 3))
     vertices, faces, _, _ = measure.marching_cubes(padded, 0.0, spacing=sides, gradient_direction="descent")

@@ -31,6 +31,7 @@ from nerfro.silhouettes.visual_hull import (
     reaches_border,
     remove_strays,
 )
+from tests.conftest import refused
 from tests.exact_silhouettes import cameras_around, hull, odd_shape, photographed, photographed_softly, volume
 
 
@@ -120,6 +121,25 @@ def test_too_small_box_grows(odd_shape: trimesh.Trimesh, monkeypatch: pytest.Mon
     small = whole.bounds.mean(0) + 0.4 * np.ptp(whole.bounds, axis=0).max() * np.array([[-1.0], [1.0]])
     monkeypatch.setattr(surface, "find_box", lambda *given: small)
     assert make_mesh(silhouettes, None, 32, 0, None, 0.0).bounds == pytest.approx(whole.bounds, abs=0.05)
+
+
+def test_small_components_are_kept_on_request() -> None:
+    """The small ball has 1 % of the volume, and the box is that of all components."""
+    balls = [trimesh.creation.icosphere(2, 0.45).apply_translation((-0.2, 0, 0)), trimesh.creation.icosphere(2, 0.11)]
+    balls[1].apply_translation((0.75, 0, 0))
+    silhouettes = photographed(trimesh.util.concatenate(balls), cameras_around(12, 64))
+    assert make_mesh(silhouettes, None, 48, 0, 2, 0.0).bounds[1, 0] == pytest.approx(0.86, abs=0.05)
+    assert make_mesh(silhouettes, None, 48, 0, None, 0.0).bounds[1, 0] == pytest.approx(0.25, abs=0.05)
+
+
+def test_empty_hull_is_named() -> None:
+    cameras = cameras_around(4, 16)
+    parts = [
+        photographed(trimesh.creation.icosphere(2, 0.3).apply_translation((x, 0, 0)), cameras) for x in (-0.8, 0.8)
+    ]
+    masks = parts[0].masks.clone()
+    masks[::2] = parts[1].masks[::2]
+    refused("the visual hull is empty", make_mesh, Silhouettes.of(cameras, masks), None, 16, 0, None, 0.0)
 
 
 def test_stray_voxels_are_removed_and_voids_are_filled() -> None:
