@@ -146,12 +146,17 @@ def stem_height(
         mesh: closed outer surface.
         up: unit direction from bottom to top.
         settings: number of slices, and the limit of their width.
+
+    Raises:
+        NerfroError: a slice between bottom and top is empty.
     """
     heights = mesh.vertices @ up
     slice_height = np.ptp(heights) / settings.num_slices
     middles = heights.min() + (np.arange(settings.num_slices) + 0.5) * slice_height
     solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     sections, _, _ = trimesh.intersections.mesh_multiplane(solid, np.zeros(3), up, middles)
+    if not all(map(len, sections)):
+        raise NerfroError("the surface has separate parts above each other; keep the largest with keep=1")
     width = np.array([np.ptp(section.reshape(-1, 2), axis=0).max() for section in sections])
     below, beyond = np.maximum.accumulate(width), np.maximum.accumulate(width[::-1])[::-1]
     stem = np.flatnonzero(width < settings.stem * np.minimum(below, beyond))

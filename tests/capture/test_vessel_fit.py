@@ -25,6 +25,7 @@ from nerfro.media.vessel import VesselLengths, make_vessel, vessel
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.subdivision import pixel_rays
 from tests.ball_photographs import NUM_VIEWS, SIZE, cameras, sky
+from tests.conftest import refused
 
 RADIUS, HEIGHT, NUM_PIXELS = 0.45, 1.0, 1000
 # A larger fillet and a thicker foot have similar effects.
@@ -118,6 +119,13 @@ def test_stem_is_a_narrow_part_between_two_wide_ones(radii: list[float], expecte
     shape = trimesh.creation.revolve(np.vstack([[0, 0], outline, [0, 1]]))
     mesh = TriangleMesh(np.asarray(shape.vertices), np.asarray(shape.faces))
     assert stem_height(mesh, np.array([0.0, 0.0, 1.0])) == pytest.approx(expected, abs=0.06)
+
+
+def test_parts_above_each_other_are_no_vessel() -> None:
+    balls = [trimesh.creation.icosphere(2, 0.3), trimesh.creation.icosphere(2, 0.2).apply_translation((0, 0, 0.9))]
+    shape = trimesh.util.concatenate(balls)
+    mesh = TriangleMesh(np.asarray(shape.vertices), np.asarray(shape.faces))
+    refused("separate parts above each other", stem_height, mesh, np.array([0.0, 0.0, 1.0]))
 
 
 def test_cavity_does_not_continue_into_a_stem(cylinder: Path) -> None:
