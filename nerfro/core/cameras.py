@@ -19,6 +19,8 @@ from nerfro.core.rays import Rays, in_room
 
 # The up direction is an axis of the world if the mean up direction of the photographs is closer than this to the axis.
 _MIN_AXIS_COSINE = math.cos(math.radians(15))
+# Cameras have a common up direction if the mean of their unit up directions is at least this long.
+MIN_MEAN_UP = 0.1
 
 
 class Window(NamedTuple):
@@ -42,7 +44,7 @@ def up_direction(upward: Float[Tensor, "V 3"]) -> Float[Tensor, "3"]:
         upward: direction from the centre of each image to its upper edge, in world space.
     """
     mean = upward.mean(0).cpu()
-    if float(mean.norm()) < 0.1:  # the cameras have no common up direction
+    if float(mean.norm()) < MIN_MEAN_UP:
         return torch.tensor([0.0, 0.0, 1.0])
     up = torch.nn.functional.normalize(mean, dim=0)
     axis = torch.eye(3).to(up)[up.abs().argmax()] * up[up.abs().argmax()].sign()

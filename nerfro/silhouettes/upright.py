@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from nerfro.core.cameras import Cameras
+from nerfro.core.cameras import MIN_MEAN_UP, Cameras
 from nerfro.core.provenance import AlgorithmSettings
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.geometry.orientation import area_vectors
@@ -66,13 +66,18 @@ def find_up(
 
 
 def camera_up(cameras: Cameras, settings: UprightSettings = UprightSettings()) -> Float[np.ndarray, "3"] | None:
-    """Estimate the direction perpendicular to the cameras' x axes, towards their y axes; None if it is ambiguous."""
+    """Estimate the direction perpendicular to the cameras' x axes, towards their y axes.
+
+    Returns:
+        The unit vector; None if it is ambiguous, or the cameras look along it, so that noise decides its sign.
+    """
     right, upwards = (cameras.camera_to_world[:, :, axis].double().numpy() for axis in (0, 1))
     spread, directions = np.linalg.eigh(right.T @ right / len(right))
     up = directions[:, 0]
-    if spread[0] > settings.max_tilt**2 or spread[1] < settings.min_spread**2:
+    upward = up @ upwards.mean(0)
+    if spread[0] > settings.max_tilt**2 or spread[1] < settings.min_spread**2 or abs(upward) < MIN_MEAN_UP:
         return None
-    return up * np.sign(up @ upwards.mean(0))
+    return up * np.sign(upward)
 
 
 def body_axis(

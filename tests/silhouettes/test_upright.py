@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from nerfro.core.cameras import Cameras
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.silhouettes.upright import body_axis, camera_up, find_up
-from tests.cameras_at import upright_cameras
+from tests.cameras_at import cameras_at, upright_cameras
 
 TURN = trimesh.transformations.rotation_matrix(1.1, [0.3, -0.9, 0.4])[:3, :3]  # of the world
 UP = TURN[:, 2]
@@ -41,6 +42,15 @@ def test_level_cameras_determine_up() -> None:
 def test_tumbled_or_coincident_cameras_do_not_determine_up() -> None:
     assert camera_up(_cameras(level=False)) is None
     assert camera_up(_cameras().select([0] * 8)) is None
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.03])
+def test_cameras_that_look_straight_down_do_not_determine_up(tilt: float) -> None:
+    """Their x axes are perpendicular to the vertical line, but nothing says which end of it is up."""
+    turns = Rotation.from_euler("z", np.linspace(0, 6, 24)[:, None])
+    wobble = Rotation.from_rotvec(np.random.default_rng(0).normal(0, tilt, (24, 3)))
+    back = (wobble * turns).as_matrix()
+    assert camera_up(cameras_at(np.concatenate([back, 3 * back[:, :, 2:]], -1), 40, 40, 50.0)) is None
 
 
 @pytest.mark.parametrize("tilt", [0.0, 6.0])
