@@ -3,6 +3,7 @@
 import json
 import re
 import shlex
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -139,6 +140,17 @@ def test_supplied_mesh_is_compared_and_kept(preprocess: Callable[..., str], capt
     assert read_scene_file(capture / "scene.json").bodies["object"].mesh == str(tmp_path / "my ball.ply")
     assert not (capture / "mesh.ply").exists()
     assert json.loads((capture / "overlaps.json").read_text())["mean"] > 0.97
+
+
+def test_report_of_an_earlier_run_is_removed(preprocess: Callable[..., str], capture: Path, tmp_path: Path) -> None:
+    mesh().save(tmp_path / "ball.ply")
+    shutil.rmtree(capture / "masks")
+    for name in ("overlaps.json", "overlays.png"):
+        (capture / name).write_text("of masks")
+    printed = preprocess(f"mesh={tmp_path / 'ball.ply'}", "overwrite=true")
+    assert f"results: {capture / 'scene.json'}\n" in printed
+    assert not (capture / "overlaps.json").exists()
+    assert not (capture / "overlays.png").exists()
 
 
 def test_options_of_the_hull_are_refused_beside_a_mesh(preprocess: Callable[..., str], tmp_path: Path) -> None:

@@ -118,7 +118,7 @@ class Request(Composition):
             NerfroError: a file exists, and `overwrite` is false.
         """
         refuse_existing(self.files, self.config.overwrite)
-        for name in (INDEX, FIGURES) if self.config.overwrite else ():
+        for name in (INDEX, FIGURES, SHEET, REPORT) if self.config.overwrite else ():
             (self.out / name).unlink(missing_ok=True)
 
     def check(self) -> None:
