@@ -10,17 +10,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
 from PIL import Image
 
 from nerfro.capture import refinement
+from nerfro.capture.preprocess_options import _ray_bounds
 from nerfro.capture.refinement import DescentStage, RefinementSettings
 from nerfro.data.base import Frame, Views
-from nerfro.geometry.mesh import load_mesh
+from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.masks.mask_files import save_mask
 from nerfro.media.body_settings import BodySettings
 from nerfro.rendering.scene_file import read_scene_file
 from nerfro.silhouettes.silhouettes import mesh_silhouettes
 from tests.ball_photographs import NUM_VIEWS, RADIUS, SIZE, cameras, mesh, photographs, save
+from tests.cameras_at import cameras_at
 from tests.conftest import UTM
 
 
@@ -151,6 +154,17 @@ def test_report_of_an_earlier_run_is_removed(preprocess: Callable[..., str], cap
     assert f"results: {capture / 'scene.json'}\n" in printed
     assert not (capture / "overlaps.json").exists()
     assert not (capture / "overlays.png").exists()
+
+
+def test_bounds_of_the_rays_contain_a_mesh_of_few_vertices() -> None:
+    """The middle of a face is nearer than the corners, and another corner is farther away than the first one."""
+    corners = trimesh.creation.box((1.2, 1.2, 1.2))
+    cube = TriangleMesh(np.asarray(corners.vertices), np.asarray(corners.faces))
+    pose = np.column_stack([np.eye(3), [0, 0, 3.0]])[None]
+    nearest, farthest = 3 - 0.6, np.linalg.norm([0.6, 0.6, 3 + 0.6])
+    bounds = _ray_bounds(cameras_at(pose, SIZE, SIZE, 50.0, near=nearest + 0.01, far=farthest - 0.01), cube)
+    assert bounds == {"near": pytest.approx(0.8 * nearest, rel=0.01), "far": pytest.approx(1.2 * farthest, rel=0.01)}
+    assert not _ray_bounds(cameras_at(pose, SIZE, SIZE, 50.0, near=nearest - 0.01, far=farthest + 0.01), cube)
 
 
 def test_options_of_the_hull_are_refused_beside_a_mesh(preprocess: Callable[..., str], tmp_path: Path) -> None:

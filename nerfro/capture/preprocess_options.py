@@ -20,7 +20,7 @@ from nerfro.core.paths import EMBEDDED_PREFIX, resolve_path, user_path
 from nerfro.data.base import DataSource
 from nerfro.data.frames import require_root
 from nerfro.files.atomic import refuse_existing
-from nerfro.geometry.mesh import TriangleMesh, load_mesh, local_origin, num_decimals
+from nerfro.geometry.mesh import TriangleMesh, load_mesh, local_origin, num_decimals, subdivided
 from nerfro.geometry.space import corners_of_box
 from nerfro.media.body_settings import expanded
 from nerfro.registry.allowed import Count, Natural, NotNegative, plain, refuse_unused, validate
@@ -191,13 +191,18 @@ def surface_settings(
 
 def _ray_bounds(cameras: Cameras, mesh: TriangleMesh) -> dict[str, object]:
     """Determine bounds of the rays that enclose a surface, where those of the cameras cut it."""
-    offsets = cameras.camera_to_world[:, None, :, 3].double().numpy() - mesh.vertices[::16]
-    distance = np.linalg.norm(offsets, axis=-1)
+    # Points between the vertices of long edges, because the middle of a face may be the nearest one.
+    points = subdivided(mesh, 0.1 * float(np.ptp(mesh.bounds, axis=0).max())).vertices
+    centres = cameras.camera_to_world[:, :, 3].double().numpy()
+    # By camera, because all distances of a scan would take gigabytes.
+    distances = (np.linalg.norm(points - centre, axis=1) for centre in centres)
+    limits = np.array([(distance.min(), distance.max()) for distance in distances])
+    nearest, farthest = limits[:, 0].min(), limits[:, 1].max()
     bounds: dict[str, object] = {}
-    if cameras.near >= distance.min():
-        bounds["near"] = float(f"{0.8 * distance.min():.3g}")
-    if cameras.far <= distance.max():
-        bounds["far"] = float(f"{1.2 * distance.max():.3g}")
+    if cameras.near >= nearest:
+        bounds["near"] = float(f"{0.8 * nearest:.3g}")
+    if cameras.far <= farthest:
+        bounds["far"] = float(f"{1.2 * farthest:.3g}")
     return bounds
 
 
