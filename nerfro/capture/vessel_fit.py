@@ -42,11 +42,13 @@ class VesselFitSettings(AlgorithmSettings):
 
     Attributes:
         wall, foot, fillet: lengths of a typical glass, as fractions of its width.
-        max_fillet: largest fillet, as a fraction of the width.
+        max_fillet: largest candidate of the fillet, as a fraction of the width. Distances of the cavity are exact to
+            this depth and twice the typical wall.
         stem: a slice is part of a stem if it is narrower than this fraction of the widest slices below and above it.
         num_slices: number of slices in which a stem is searched.
         levels: levels of a liquid that are compared with an empty glass, as fractions of the height.
-        max_level: highest level, as a fraction of the height; a level of four digits stays below the height.
+        max_level: highest level, as a fraction of the height, and thickest foot, as a fraction of the level or of the
+            height: lengths of four digits stay below.
         rounds: half width of the grid of candidates in each round: a factor for lengths, and a fraction of the height
             for the level, and for the foot above a stem.
         num_candidates: number of candidates of each length in each round.
@@ -185,9 +187,21 @@ def fit_vessel(
     typical = {name: getattr(settings, name) * width for name in ("wall", "foot", "fillet")}
     typical["foot"] = max(typical["foot"], stem + typical["wall"]) if stem else typical["foot"]
     widest = typical | {"fillet": settings.max_fillet * width}  # distances are exact up to this depth
-    empty, filled = build(VesselLengths(**widest)), build(VesselLengths(**widest, level=0.5 * height))
-    work = 2 + len(settings.levels) + len(settings.rounds) * (len(typical) + 1) * settings.num_candidates
-    levels: list[dict[str, float]] = [{}, *({"level": level * height} for level in settings.levels)]
+    highest = settings.max_level * height
+    empty, filled = build(VesselLengths(**widest)), build(VesselLengths(**widest, level=highest))
+    heights = [level * height for level in settings.levels]
+    levels: list[dict[str, float]] = [{}, *({"level": h} for h in heights if h > typical["foot"])]
+    work = 1 + len(levels) + len(settings.rounds) * (len(typical) + 1) * settings.num_candidates
+
+    def limits(name: str) -> tuple[float, float]:
+        """Return the limits of the candidates: heights, or logarithms of other lengths."""
+        below_level = settings.max_level * lengths.get("level", height)
+        return {
+            "wall": (-np.inf, np.inf),
+            "foot": (stem, below_level) if stem else (-np.inf, np.log(below_level)),
+            "fillet": (-np.inf, np.log(widest["fillet"])),
+            "level": (lengths["foot"] / settings.max_level, highest),
+        }[name]
 
     def error_of(lengths: dict[str, float]) -> Float[np.ndarray, "V"]:
         return search.of(with_lengths(filled if "level" in lengths else empty, VesselLengths(**lengths)))
@@ -198,25 +212,26 @@ def fit_vessel(
         best = int(np.argmin([search.mean(error) for error in errors]))
         typical |= levels[best] if best and search.decreases(errors[0], errors[best], settings.num_errors) else {}
         lengths, standard_errors = dict(typical), dict[str, float]()
-        highest = settings.max_level * height
-        offsets = np.linspace(-1, 1, settings.num_candidates)
         for factor, fraction in settings.rounds:
             for name in typical:
                 is_height = name == "level" or (name == "foot" and stem > 0)
                 half_width = fraction * height if is_height else np.log(factor)
                 middle = lengths[name] if is_height else np.log(lengths[name])
-                grid = middle + half_width * offsets
-                grid += max(stem - grid[0], 0) if is_height else 0
-                values = grid.clip(max=highest) if is_height else np.exp(grid)
+                low, high = limits(name)
+                first = max(min(middle - half_width, high - 2 * half_width), low)
+                grid = np.linspace(first, min(first + 2 * half_width, high), settings.num_candidates)
+                values = grid if is_height else np.exp(grid)
                 sums = np.stack([error_of(lengths | {name: value}) for value in values.tolist()])
                 # Robust errors have narrow minima, which a quadratic function through all candidates would miss.
                 minimum = parabola_minimum(grid, mean_errors(sums, search.counts))[0]
                 minima = parabola_minimum(grid, mean_errors(sums, search.counts, search.samples))
                 spread = float(standard_error(minima, search.counts))
-                lengths[name] = float(np.clip(minimum, stem, highest) if is_height else np.exp(minimum))
+                lengths[name] = float(minimum if is_height else np.exp(minimum))
                 standard_errors[name] = spread if is_height else spread * lengths[name]
         uncertain = [name for name in typical if standard_errors[name] > settings.max_standard_error * lengths[name]]
         fitted = error_of(lengths) if uncertain else np.empty(0)
         without = {name: error_of(lengths | {name: typical[name]}) for name in uncertain}
         unknown = [name for name in uncertain if not search.decreases(without[name], fitted, settings.num_errors)]
-    return VesselFit(lengths | {name: typical[name] for name in unknown}, standard_errors, unknown)
+    lengths |= {name: typical[name] for name in unknown}
+    lengths["foot"] = min(lengths["foot"], settings.max_level * lengths.get("level", height))  # also a typical foot
+    return VesselFit(lengths, standard_errors, unknown)

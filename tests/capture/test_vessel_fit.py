@@ -11,7 +11,8 @@ import trimesh
 from torch import Tensor
 
 from nerfro.backgrounds.base import Background
-from nerfro.capture.object_errors import unsupported_bodies
+from nerfro.capture import vessel_fit
+from nerfro.capture.object_errors import ObjectErrors, unsupported_bodies
 from nerfro.capture.surroundings import Observations, Pixels, Surroundings
 from nerfro.capture.vessel_fit import VesselFitSettings, fit_vessel, stem_height
 from nerfro.core.types import Exits
@@ -25,6 +26,7 @@ from nerfro.media.vessel import VesselLengths, make_vessel, vessel
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.subdivision import pixel_rays
 from tests.ball_photographs import NUM_VIEWS, SIZE, cameras, sky
+from tests.ball_photographs import mesh as ball
 from tests.conftest import refused
 
 RADIUS, HEIGHT, NUM_PIXELS = 0.45, 1.0, 1000
@@ -135,6 +137,47 @@ def test_cavity_does_not_continue_into_a_stem(cylinder: Path) -> None:
     settings = VesselFitSettings(levels=(), rounds=((2.0, 0.1),), num_candidates=3)
     found = fit_vessel(build, 2 * RADIUS, HEIGHT, observations, stem=0.4, settings=settings)
     assert found.lengths["foot"] == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize("stem", [0.0, 0.12])
+def test_candidates_stay_within_the_limits_of_lengths(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stem: float
+) -> None:
+    """The errors of a shallow bowl are smallest for a larger fillet, and for a level below the foot."""
+    best = {"wall": 0.02, "foot": 0.2, "fillet": 0.8, "level": 0.05}
+    tried: list[VesselLengths] = []
+
+    class Errors(ObjectErrors):
+        def __init__(self, *_: object) -> None:
+            self.counts, self.samples = np.full(8, 10.0), np.ones((3, 8))
+
+        def of(self, medium: Bodies) -> np.ndarray:
+            lengths = medium.grids[1].lengths
+            assert isinstance(lengths, VesselLengths)
+            tried.append(lengths)
+            off = [
+                abs(np.log(getattr(lengths, name) / value)) for name, value in best.items() if getattr(lengths, name)
+            ]
+            return np.full(8, np.sum(off) + 9 * (lengths.level is None))
+
+        def mean(self, errors: np.ndarray) -> float:
+            return float(errors.mean())
+
+        def decreases(self, before: np.ndarray, after: np.ndarray, num_errors: float) -> bool:
+            return bool(after.mean() < before.mean())
+
+    monkeypatch.setattr(vessel_fit, "ObjectErrors", Errors)
+    height = 0.3
+    trimesh.creation.cylinder(0.5, height).export(tmp_path / "bowl.ply")
+    build = vessels_in(tmp_path / "bowl.ply")
+    observations = Observations(Views(cameras(), torch.zeros(NUM_VIEWS, 1, 1, 3), None, []), ball(), False)
+    found = fit_vessel(build, 1.0, height, observations, stem)
+    for lengths in tried:
+        lengths.require_within(height)
+        assert lengths.fillet <= VesselFitSettings.max_fillet * (1 + 1e-9)
+    assert found.lengths["fillet"] == pytest.approx(VesselFitSettings.max_fillet)
+    assert found.lengths["foot"] < found.lengths["level"]
+    build(VesselLengths(**{name: float(f"{length:.4g}") for name, length in found.lengths.items()}))
 
 
 @pytest.mark.parametrize(("factor", "unknown"), [(1.0, ["wall", "foot", "fillet"]), (2.0, [])])
