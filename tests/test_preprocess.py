@@ -171,6 +171,21 @@ def test_options_of_the_hull_are_refused_beside_a_mesh(preprocess: Callable[...,
     mesh().save(tmp_path / "ball.ply")
     printed = preprocess(f"mesh={tmp_path / 'ball.ply'}", "smoothing=0.5")
     assert "smoothing=0.5 has no effect with mesh=..., which replaces the hull; remove it" in printed
+    printed = preprocess(f"mesh={tmp_path / 'ball.ply'}", "box_min=[-1,-1,-1]", "box_max=[1,1,1]")
+    assert "box_min=[-1.0, -1.0, -1.0] has no effect with mesh=..." in printed
+
+
+def test_masks_that_the_border_cuts_are_compared_with_a_mesh(
+    preprocess: Callable[..., str], capture: Path, tmp_path: Path
+) -> None:
+    """Only a hull would be unbounded there."""
+    mesh().save(tmp_path / "ball.ply")
+    _change_masks(capture, lambda mask: mask[14:-14].copy())
+    for view in range(NUM_VIEWS):
+        path = capture / "train" / f"r_{view}.png"
+        Image.open(path).crop((0, 14, SIZE, SIZE - 14)).save(path)
+    printed = preprocess(f"mesh={tmp_path / 'ball.ply'}")
+    assert "train on it" in printed
 
 
 @pytest.mark.slow
@@ -247,6 +262,8 @@ def test_views_from_one_side_are_bounded_by_the_box(preprocess: Callable[..., st
 def test_options_out_of_range_are_refused(preprocess: Callable[..., str]) -> None:
     assert "resolution=8 is not allowed" in preprocess("resolution=8")
     assert "symmetry='plane' is not allowed; choose 'axis', 'auto'" in preprocess("symmetry=plane")
+    assert f"wrong_masks={NUM_VIEWS} is not allowed: two of the {NUM_VIEWS} views must" in preprocess("wrong_masks=30")
+    assert f"give at most {NUM_VIEWS - 2}," in preprocess("wrong_masks=10000000")
     assert "give both box_min and box_max" in preprocess("box_min=[0,0,0]")
     assert "add out=FOLDER" in preprocess("data.root=embedded:torus")
     assert "set medium=object or medium=vessel" in preprocess("refine=true", "medium=object_voxels")

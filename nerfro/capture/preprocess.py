@@ -116,7 +116,7 @@ def _fit_surface(request: Request, views: Views, mesh: TriangleMesh | None) -> t
         The surface, the views whose masks are no projections, and the silhouettes of these masks.
     """
     config, folder = request.config, request.out
-    all_silhouettes = read_silhouettes(views, request.box is not None)
+    all_silhouettes = read_silhouettes(views, is_bounded=mesh is not None or request.box is not None)
     methods = [None if frame.mask is None else method_of(frame.mask) for frame in views.frames]
     own = [i for i, method in enumerate(methods) if method in EVIDENCE]
     views, silhouettes = (views.select(own), all_silhouettes.select(own)) if own else (views, all_silhouettes)

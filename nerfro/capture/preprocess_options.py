@@ -32,7 +32,7 @@ from nerfro.silhouettes.upright import find_up
 
 MESH = "mesh.ply"
 INDEX, FIGURES = "index.json", "refinement.json"
-_OF_HULL = ("resolution", "keep", "smoothing", "symmetry")
+_OF_HULL = ("resolution", "box_min", "box_max", "keep", "smoothing", "symmetry")
 
 
 @dataclass

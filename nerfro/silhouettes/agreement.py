@@ -145,7 +145,17 @@ def _changed(silhouettes: Silhouettes, inverse: bool, turn: _Turn) -> Silhouette
 
 
 def choose_wrong_masks(silhouettes: Silhouettes, wrong_masks: int | None) -> int:
-    """Return the given number of views that may be wrong, or else the number for which the hull agrees best."""
+    """Return the given number of views that may be wrong, or else the number for which the hull agrees best.
+
+    Raises:
+        NerfroError: fewer than two views would have to be right.
+    """
+    most = max(0, len(silhouettes) - 2)
+    if wrong_masks is not None and wrong_masks > most:
+        raise NerfroError(
+            f"wrong_masks={wrong_masks} is not allowed: two of the {len(silhouettes)} views must be right; give at "
+            f"most {most}, better a sixth of the views"
+        )
     if wrong_masks is None:
         wrong_masks = better_wrong_masks(silhouettes, 0) or 0
         print(f"wrong_masks={wrong_masks}: with this number, a coarse hull agrees best with the masks")

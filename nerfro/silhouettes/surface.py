@@ -57,12 +57,12 @@ class SurfaceSettings(AlgorithmSettings):
     revolution: RevolutionSettings = field(default=RevolutionSettings(), repr=False)
 
 
-def read_silhouettes(views: Views, has_box: bool) -> Silhouettes:
+def read_silhouettes(views: Views, is_bounded: bool) -> Silhouettes:
     """Check the masks of views and compute their outlines.
 
     Args:
         views: views with masks.
-        has_box: whether the user gives a box, which bounds the hull where the image border cuts masks.
+        is_bounded: whether the user gives a box or a mesh, which bounds the object where the image border cuts masks.
 
     Raises:
         NerfroError: masks are missing, empty, full, inverted, too few, or all cut by the image border.
@@ -94,7 +94,7 @@ def read_silhouettes(views: Views, has_box: bool) -> Silhouettes:
     if len(views) < _FEW_VIEWS:
         warn(f"{len(views)} views give a coarse visual hull; 30 views from all sides are better")
     silhouettes = Silhouettes.of(views.cameras, masks)
-    if silhouettes.cut.all() and not has_box:
+    if silhouettes.cut.all() and not is_bounded:
         raise NerfroError(
             f"the image border cuts the object in all {len(views)} views, so no outline is complete; photograph the "
             "object from farther away, or give box_min= and box_max= to bound the hull"
