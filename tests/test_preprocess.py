@@ -156,6 +156,13 @@ def test_report_of_an_earlier_run_is_removed(preprocess: Callable[..., str], cap
     assert not (capture / "overlays.png").exists()
 
 
+def test_open_mesh_is_accepted_on_request(preprocess: Callable[..., str], tmp_path: Path) -> None:
+    ball = mesh()
+    TriangleMesh(ball.vertices, ball.faces[1:]).save(tmp_path / "open.ply")
+    assert "or set medium.accept_open_mesh=true" in preprocess(f"mesh={tmp_path / 'open.ply'}")
+    assert "train on it" in preprocess(f"mesh={tmp_path / 'open.ply'}", "medium.accept_open_mesh=true")
+
+
 def test_bounds_of_the_rays_contain_a_mesh_of_few_vertices() -> None:
     """The middle of a face is nearer than the corners, and another corner is farther away than the first one."""
     corners = trimesh.creation.box((1.2, 1.2, 1.2))

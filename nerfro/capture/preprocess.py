@@ -22,6 +22,7 @@ from nerfro.data.masks import EVIDENCE, REVOLUTION, masked_views, method_of, wit
 from nerfro.files.atomic import lock_folder
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.media.bodies import COLOURS
+from nerfro.registry.allowed import plain
 from nerfro.rendering.scene_file import Provenance, SceneFile, with_scene
 from nerfro.silhouettes.agreement import choose_wrong_masks, report_overlaps, require_consistent_poses
 from nerfro.silhouettes.surface import make_mesh, read_silhouettes
@@ -88,7 +89,7 @@ def _preprocess(request: Request) -> SceneFile:
     if config.vessel:
         solid = indexed.medium.bodies
         assert solid is not None  # see Request.check
-        vessel, fitted = find_vessel(solid, location, mesh, observations)
+        vessel, fitted = find_vessel(solid, plain(config.medium) | {"mesh": location}, mesh, observations)
         unsupported = unsupported_bodies(observations, solid, bool(indexed.provenance.doubts), fitted)
     estimated = settings | {"mesh": location} | indexed.index_settings
     origin = replace(_with_absorption_and_reflection(request, observations, indexed), unsupported=unsupported)

@@ -157,7 +157,8 @@ class Request(Composition):
         source: DataSource = build(self.config.data)
         if self.config.mesh is None:
             return source, None
-        mesh = load_mesh(resolve_path(self.config.mesh))
+        accept_open_mesh = self.config.medium.get("accept_open_mesh", False)
+        mesh = load_mesh(resolve_path(self.config.mesh), accept_open_mesh)
         source = source.with_origin(local_origin(mesh.vertices))
         return source, mesh.relative_to(source.origin)
 

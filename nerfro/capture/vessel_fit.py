@@ -7,8 +7,9 @@ reflections, the foot and the liquid.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -28,6 +29,7 @@ from nerfro.core.progress import counting_bar
 from nerfro.core.provenance import AlgorithmSettings
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.media.bodies import Bodies, GridSettings
+from nerfro.media.body_settings import expanded
 from nerfro.media.material import Material
 from nerfro.media.surfaces import MeshSurface, direction
 from nerfro.media.vessel import VesselLengths, extent, vessel, with_lengths
@@ -91,14 +93,14 @@ class VesselFit:
 
 
 def find_vessel(
-    medium: Bodies, location: str, mesh: TriangleMesh, observations: Observations
+    medium: Bodies, settings: Mapping[str, Any], mesh: TriangleMesh, observations: Observations
 ) -> tuple[dict[str, object], Bodies | None]:
     """Fit a vessel to the photographs, print its lengths, and return the settings of the medium, and the medium.
 
     Args:
         medium: solid body with the outer surface.
-        location: file of the outer surface.
-        mesh: the outer surface.
+        settings: settings of the medium, with the file of the outer surface as mesh of the first body.
+        mesh: the outer surface, in the coordinates that `observations.shift` refers to.
         observations: observations of the object and its surroundings.
 
     Returns:
@@ -109,9 +111,10 @@ def find_vessel(
     across = mesh.vertices - np.outer(mesh.vertices @ np.array(up), up)
     first = medium.grids[0]
     low, high = (first.box.double().numpy() + medium.origin).tolist()
-    grid, outer = GridSettings(len(first.distances), low, high), MeshSurface(location)
-
-    upwards = direction("up", up)
+    grid, upwards = GridSettings(len(first.distances), low, high), direction("up", up)
+    body = next(iter(expanded(settings).values()))
+    shading = body.shading or "auto", body.crease_degrees
+    outer = MeshSurface(str(body.mesh), settings.get("accept_open_mesh", False), *shading)
     lowest, highest = extent(outer, upwards)
     height = highest - lowest
 

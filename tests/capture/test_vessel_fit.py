@@ -14,7 +14,7 @@ from nerfro.backgrounds.base import Background
 from nerfro.capture import vessel_fit
 from nerfro.capture.object_errors import ObjectErrors, unsupported_bodies
 from nerfro.capture.surroundings import Observations, Pixels, Surroundings
-from nerfro.capture.vessel_fit import VesselFitSettings, fit_vessel, stem_height
+from nerfro.capture.vessel_fit import VesselFit, VesselFitSettings, find_vessel, fit_vessel, stem_height
 from nerfro.core.types import Exits
 from nerfro.data.base import Views
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
@@ -178,6 +178,20 @@ def test_candidates_stay_within_the_limits_of_lengths(
     assert found.lengths["fillet"] == pytest.approx(VesselFitSettings.max_fillet)
     assert found.lengths["foot"] < found.lengths["level"]
     build(VesselLengths(**{name: float(f"{length:.4g}") for name, length in found.lengths.items()}))
+
+
+def test_options_of_the_surface_apply_to_the_vessel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shape = trimesh.creation.cylinder(RADIUS, HEIGHT, sections=32)
+    shape.update_faces(np.arange(len(shape.faces)) > 0)  # open
+    shape.export(tmp_path / "glass.ply")
+    lengths = {"wall": 0.05, "foot": 0.1, "fillet": 0.1}
+    monkeypatch.setattr(vessel_fit, "fit_vessel", lambda *_: VesselFit(lengths, dict.fromkeys(lengths, 0.0), []))
+    settings = BOX | {"mesh": str(tmp_path / "glass.ply"), "accept_open_mesh": True, "crease_degrees": 80.0}
+    solid, mesh = make_bodies(**settings), load_mesh(tmp_path / "glass.ply", accept_open_mesh=True)
+    observations = Observations(Views(cameras(), torch.zeros(NUM_VIEWS, 1, 1, 3), None, []), mesh, False)
+    fitted = find_vessel(solid, settings, mesh, observations)[1]
+    assert fitted is not None
+    torch.testing.assert_close(fitted.grids[0].distances, solid.grids[0].distances, rtol=0, atol=0)
 
 
 @pytest.mark.parametrize(("factor", "unknown"), [(1.0, ["wall", "foot", "fillet"]), (2.0, [])])
