@@ -35,7 +35,7 @@ from nerfro.samplers.base import straight_path
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.samplers.subdivision import pixel_rays
-from nerfro.silhouettes.silhouettes import VALIDATION_EVERY, PixelBlocks, mesh_silhouettes
+from nerfro.silhouettes.silhouettes import MASK_NOISE, VALIDATION_EVERY, PixelBlocks, mesh_silhouettes
 
 # Least learned radiance of pixels that photographs clip at 1; the margin distinguishes them from other bright pixels.
 CLIPPED_RADIANCE = 1.1
@@ -97,9 +97,9 @@ class Pixels:
         return pixel_rays(self.cameras, self.index)
 
     def split(self) -> tuple[Pixels, Pixels]:
-        """Split the pixels into those of training and of validation views; without the latter, all pixels validate."""
+        """Split the pixels into those of training and of validation views; all are both if one of these has none."""
         validates = self.view % VALIDATION_EVERY == VALIDATION_EVERY - 1
-        return self[~validates], self[validates] if validates.any() else self
+        return (self, self) if validates.all() or not validates.any() else (self[~validates], self[validates])
 
     def some(self, count: int) -> Pixels:
         """Select at most `count` random pixels with a fixed seed."""
@@ -113,7 +113,8 @@ def robust_scale(surroundings: Surroundings) -> float:
     At a residual of half the standard deviation of the surroundings, the loss is 1/2 of its maximum and the weight 1/4.
     The loss is robust, because opaque objects inside the body spoil many pixels.
     """
-    return max(0.5 * float(surroundings.colours.std(0).mean()), 1e-3)
+    colours = surroundings.colours
+    return max(0.5 * float(colours.std(0, correction=min(1, len(colours) - 1)).mean()), 1e-3)
 
 
 def divide_pixels(
@@ -126,7 +127,7 @@ def divide_pixels(
 
     Args:
         views: photographs with poses.
-        mesh: surface of the object.
+        mesh: surface of the object, in the coordinates of the poses.
         settings: size of the photographs.
 
     Returns:
@@ -142,7 +143,11 @@ def divide_pixels(
     for view in range(len(views)):
         # Predictions are clipped as well, also for photographs in linear light.
         radiance = blocks.mean(to_linear(views.images[view].clamp(0, 1))).view(-1, 3)
-        coverage = blocks.mean(views.masks[view]) if silhouettes is None else silhouettes[view]  # type: ignore[index]
+        if silhouettes is None:
+            # Mattes and JPEG files rarely reach 0 and 1.
+            coverage = blocks.mean(((views.masks[view] - MASK_NOISE) / (1 - 2 * MASK_NOISE)).clamp(0, 1))  # type: ignore[index]
+        else:
+            coverage = silhouettes[view]
         # Largest fractions of the object and of the background in a neighbourhood of 3x3 pixels.
         covered, uncovered = (functional.max_pool2d(x[None, None], 3, 1, 1)[0, 0] for x in (coverage, 1 - coverage))
         usable = torch.ones_like(coverage) if views.usable is None else blocks.mean(views.usable[view])
@@ -362,7 +367,8 @@ def _learned(
                 background.sampler.update([background.field], Draws(0, step + 1, torch.arange(batch)))
     background.eval().requires_grad_(False)
     error = background(Exits.unbent(validation.rays)).clamp(max=1) - validation.radiance
-    unexplained = float(error.square().mean() / validation.radiance.var(0).mean().clamp(min=1e-4))
+    variance = validation.radiance.var(0, correction=min(1, len(validation) - 1))
+    unexplained = float(error.square().mean() / variance.mean().clamp(min=1e-4))
     return Surroundings(background, seen, unexplained, validation.radiance)
 
 

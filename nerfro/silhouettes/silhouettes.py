@@ -14,6 +14,8 @@ from nerfro.geometry.mesh import TriangleMesh
 
 # Fits exclude every so many-th view, for validation.
 VALIDATION_EVERY = 8
+# Coverages up to this number count as 0, and coverages from 1 minus this number on as 1.
+MASK_NOISE = 0.02
 
 
 def outline_distance(mask: Float[np.ndarray, "H W"], blur: float = 1.0, reach: float = 1.5) -> Float[np.ndarray, "H W"]:
@@ -55,7 +57,7 @@ def is_antialiased(masks: Float[np.ndarray, "*V H W"], distances: Float[np.ndarr
         masks: coverage of the pixels.
         distances: distances of the pixel centres to the outlines, in pixels.
     """
-    partial = ((masks > 0.02) & (masks < 0.98))[np.abs(distances) < 1]
+    partial = ((masks > MASK_NOISE) & (masks < 1 - MASK_NOISE))[np.abs(distances) < 1]
     return bool(partial.any() and partial.mean() > 0.2)
 
 
