@@ -10,7 +10,7 @@ from torch import Tensor
 
 from nerfro.core.cameras import Cameras, Window
 from nerfro.geometry.intersection import MeshIntersector
-from nerfro.geometry.mesh import TriangleMesh
+from nerfro.geometry.mesh import TriangleMesh, subdivided
 
 # Fits exclude every so many-th view, for validation.
 VALIDATION_EVERY = 8
@@ -114,7 +114,8 @@ class PixelBlocks:
 def mesh_silhouettes(mesh: TriangleMesh, cameras: Cameras, stride: int) -> Bool[Tensor, "V h w"]:
     """Test whether the rays through the centres of every stride-th pixel intersect a mesh."""
     margin = 8  # pixels around the projected vertices, because lens distortion bends edges between them
-    intersector, vertices = MeshIntersector(mesh.triangles), torch.from_numpy(mesh.vertices).float()
+    short = mesh if cameras.distortion is None else subdivided(mesh, np.ptp(mesh.bounds, axis=0).max() / 16)
+    intersector, vertices = MeshIntersector(mesh.triangles), torch.from_numpy(short.vertices).float()
     row, column = torch.meshgrid(
         torch.arange(0, cameras.height, stride), torch.arange(0, cameras.width, stride), indexing="ij"
     )

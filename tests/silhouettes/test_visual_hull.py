@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import ASSETS_DIR
 from nerfro.data.base import Views
+from nerfro.geometry.intersection import MeshIntersector
 from nerfro.geometry.mesh import TriangleMesh, load_mesh
 from nerfro.media.body_settings import make_bodies
 from nerfro.silhouettes import surface
@@ -21,7 +22,7 @@ from nerfro.silhouettes.mesh_match import require_match
 from nerfro.silhouettes.moving_mesh import MovingMesh
 from nerfro.silhouettes.rims import Rims, by_pixel_sides, find_rims, outlines_of
 from nerfro.silhouettes.silhouette_fit import fit_surface
-from nerfro.silhouettes.silhouettes import is_antialiased, outline_distance
+from nerfro.silhouettes.silhouettes import is_antialiased, mesh_silhouettes, outline_distance
 from nerfro.silhouettes.surface import make_mesh
 from nerfro.silhouettes.visual_hull import (
     Silhouettes,
@@ -31,6 +32,7 @@ from nerfro.silhouettes.visual_hull import (
     reaches_border,
     remove_strays,
 )
+from tests.cameras_at import cameras_at, poses_towards_origin
 from tests.conftest import refused
 from tests.exact_silhouettes import cameras_around, hull, odd_shape, photographed, photographed_softly, volume
 
@@ -63,6 +65,19 @@ def test_outline_of_a_coverage_mask_does_not_shrink_at_curves() -> None:
     error = (outline_distance(mask) - exact)[near]
     assert abs(error.mean()) < 0.03
     assert error.std() < 0.03
+
+
+def test_silhouette_is_complete_where_a_lens_bends_long_edges() -> None:
+    """Every ray of a picture is tested, beside those near the projected vertices."""
+    made = trimesh.creation.box((1.6, 1.6, 1.6))
+    box = TriangleMesh(np.asarray(made.vertices), np.asarray(made.faces))
+    poses = poses_towards_origin(np.array([[0.0, 0, 1]]), 2.6, (0.0, 1.0, 0.0))
+    lens = torch.zeros(1, 9)
+    lens[0, 0] = -0.2
+    cameras = replace(cameras_at(poses, 512, 512, 512.0, near=1.0, far=9.0), distortion=lens)
+    rays = cameras.image_rays(0)
+    hits = MeshIntersector(box.triangles).first_hits(rays.origins, rays.directions) >= 0
+    assert torch.equal(mesh_silhouettes(box, cameras, 1).flatten(), hits)
 
 
 def test_hull_of_a_ball_is_accurate_below_a_voxel() -> None:
