@@ -179,14 +179,15 @@ def carve_grid(
     values = torch.empty(0)
     for level in range(levels + 1):
         step = spacing * 2 ** (levels - level)
-        axes = [torch.from_numpy(box[0][a] + step * np.arange(cells[a] * 2**level + 1)) for a in range(3)]
-        points = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).float()
+        axes = [torch.from_numpy(box[0][a] + step * np.arange(cells[a] * 2**level + 1)).float() for a in range(3)]
+        shape = [len(axis) for axis in axes]
         if level == 0:
-            values, near = torch.empty(points.shape[:3]), torch.ones(points.shape[:3], dtype=torch.bool)
+            values, near = torch.empty(shape), torch.ones(shape, dtype=torch.bool)
         else:
-            values = F.interpolate(values[None, None], points.shape[:3], mode="trilinear", align_corners=True)[0, 0]
+            values = F.interpolate(values[None, None], shape, mode="trilinear", align_corners=True)[0, 0]
             near = values.abs() < settings.band * 2 * step
-        wanted = points[near]
+        index = near.nonzero(as_tuple=True)
+        wanted = torch.stack([axis[i] for axis, i in zip(axes, index, strict=True)], -1)
         carved = torch.empty(len(wanted))
         for start in range(0, len(wanted), settings.chunk):
             end = start + settings.chunk
