@@ -120,9 +120,9 @@ def _fit_surface(request: Request, views: Views, mesh: TriangleMesh | None) -> t
     all_silhouettes = read_silhouettes(views, is_bounded=mesh is not None or request.box is not None)
     methods = [None if frame.mask is None else method_of(frame.mask) for frame in views.frames]
     own = [i for i, method in enumerate(methods) if method in EVIDENCE]
-    views, silhouettes = (views.select(own), all_silhouettes.select(own)) if own else (views, all_silhouettes)
-    if len(views) < len(all_silhouettes):
-        num_projections = len(all_silhouettes) - len(views)
+    silhouettes, num_projections = all_silhouettes, len(views) - len(own)
+    if own and num_projections:
+        views, silhouettes = views.select(own), all_silhouettes.select(own)
         print(f"{num_projections} masks are projections of a hull, which shape the surface but are no evidence")
     wrong_masks = choose_wrong_masks(silhouettes, config.wrong_masks)
     require_consistent_poses(silhouettes, views.names, wrong_masks)

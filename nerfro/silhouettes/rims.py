@@ -145,7 +145,7 @@ def _nearest_outline_pixel(inside: np.ndarray) -> Int[np.ndarray, "H W"]:
     """Return the index of the outline pixel of a mask nearest to each pixel."""
     outline = inside & ~scipy.ndimage.binary_erosion(inside, border_value=1)
     rows, columns = scipy.ndimage.distance_transform_edt(~outline, return_distances=False, return_indices=True)
-    return rows.astype(np.int64) * inside.shape[1] + columns
+    return rows * inside.shape[1] + columns
 
 
 @dataclass(frozen=True)

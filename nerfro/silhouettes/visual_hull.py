@@ -55,8 +55,10 @@ class Silhouettes:
     @classmethod
     def of(cls, cameras: Cameras, masks: Float[Tensor, "V H W"]) -> Silhouettes:
         """Compute the outlines of masks."""
-        distances = np.stack([outline_distance(mask.numpy()) for mask in masks])
-        return cls(cameras, masks, torch.from_numpy(distances.astype(np.float32)), border_pixels(masks).any(1))
+        distances = torch.empty(masks.shape, dtype=torch.float32)
+        for view, mask in enumerate(masks):
+            distances[view] = torch.from_numpy(outline_distance(mask.numpy()))
+        return cls(cameras, masks, distances, border_pixels(masks).any(1))
 
     def __len__(self) -> int:
         return len(self.masks)
