@@ -136,6 +136,9 @@ def find_indices(
         surroundings: known surroundings.
         settings: range, grids and limits.
 
+    Returns:
+        The indices, their accuracy, and doubts about them.
+
     Raises:
         NerfroError: there are more than two bodies, or no ray of the pixels meets the medium.
     """
@@ -199,11 +202,14 @@ def _refine_minimum(
     settings, offsets, values = search.settings, _grid(plan.fine_steps, len(start)), start
     for radius in plan.fine_radii:
         num_pixels = plan.fine_pixels // (1 if radius == plan.fine_radii[-1] else 3)
+        candidates = np.empty(0)
         for _ in range(settings.max_grids):
             axes = radius * settings.range * search.valley(values)
             extent = np.abs(axes).sum(1)
             centre = values.clip(settings.lowest + extent, settings.highest - extent)
-            candidates = centre + offsets @ axes.T
+            previous, candidates = candidates, centre + offsets @ axes.T
+            if np.array_equal(previous, candidates):  # at an end of the range
+                break
             grid = _FineGrid(candidates, axes, *search.errors(candidates, num_pixels, True))
             minimum = grid.minima()[0][0]
             values = minimum.clip(settings.lowest, settings.highest)

@@ -3,10 +3,12 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
-from nerfro.capture.index_search import Estimate, find_indices
+from nerfro.capture import index_search
+from nerfro.capture.index_search import Estimate, IndexSettings, find_indices
 from nerfro.capture.surroundings import divide_pixels, learn_surroundings, robust_scale
 from nerfro.data.base import Views
 from tests.ball_photographs import INNER, NUM_VIEWS, SIZE, cameras, mesh, photographs, solid
@@ -25,6 +27,25 @@ def test_index_search_recovers_the_index_of_a_ball(ior: float, is_material: bool
     assert found.values[0] == pytest.approx(ior, rel=0.005)
     assert 0 < found.standard_errors[0] < 0.01 * ior
     assert (not found.doubts) == is_material
+
+
+def test_no_grid_is_evaluated_twice_at_an_end_of_the_range() -> None:
+    grids: list[tuple[int, bytes]] = []
+
+    class Falling(index_search._Search):
+        """Errors that decrease towards an index below the range."""
+
+        def __init__(self) -> None:
+            self.settings = IndexSettings()
+
+        def errors(self, candidates: np.ndarray, num_pixels: int, common: bool) -> tuple[np.ndarray, np.ndarray]:
+            grids.append((num_pixels, candidates.tobytes()))
+            return (candidates - 0.5) ** 2, np.ones(1)
+
+    search = Falling()
+    values, _ = index_search._refine_minimum(search, search.settings.plans[0], np.array([1.02]))
+    assert values.tolist() == [1.0]
+    assert len(set(grids)) == len(grids)
 
 
 @pytest.mark.parametrize(("num_views", "num_seen"), [(1, 1), (8, 4)])
