@@ -141,9 +141,9 @@ def make_mesh(
     settings.use()
     box = _object_box(silhouettes, wrong_masks, keep, settings) if corners is None else corners
     with fraction_bar("carving") as progress:
-        distances, corner, spacing = carve_grid(silhouettes, box, resolution, wrong_masks, progress, settings.hull)
+        distances, spacing = carve_grid(silhouettes, box, resolution, wrong_masks, progress, settings.hull)
     num_parts, num_kept = remove_strays(distances, keep)
-    mesh, revolution = extract_surface(distances, corner, spacing), None
+    mesh, revolution = extract_surface(distances, box[0], spacing), None
     if symmetry is not None and is_revolution:
         revolution = fit_revolution(mesh, silhouettes, settings=settings.revolution)
     if revolution is None and smoothing > 0:
@@ -196,16 +196,14 @@ def _object_box(
     initial = find_box(silhouettes, wrong_masks)
     for factor in (*settings.box_factors, 1.0):
         box = initial.mean(0) + factor * (initial - initial.mean(0))
-        distances, corner, spacing = carve_grid(
-            silhouettes, box, settings.coarse_voxels, wrong_masks, settings=settings.hull
-        )
+        distances, spacing = carve_grid(silhouettes, box, settings.coarse_voxels, wrong_masks, settings=settings.hull)
         remove_strays(distances, keep)
         if not reaches_border(distances):
             break
     require_hull(distances)
     inside = np.argwhere(distances < 0)
     low, high = inside.min(0) - settings.margin_voxels, inside.max(0) + settings.margin_voxels
-    return np.stack([corner + spacing * low, corner + spacing * high]).clip(*box)
+    return (box[0] + spacing * np.stack([low, high])).clip(*box)
 
 
 def _warn_of_open_hull(silhouettes: Silhouettes, box: Float[np.ndarray, "2 3"], one_side: float) -> None:

@@ -159,7 +159,7 @@ def carve_grid(
     wrong_masks: int = 0,
     progress: Callable[[float], None] = lambda done: None,
     settings: HullSettings = HullSettings(),
-) -> tuple[Float[np.ndarray, "X Y Z"], Float[np.ndarray, "3"], float]:
+) -> tuple[Float[np.ndarray, "X Y Z"], float]:
     """Evaluate the visual hull on a grid, coarse to fine near the surface.
 
     Args:
@@ -171,7 +171,7 @@ def carve_grid(
         settings: settings of the refinement.
 
     Returns:
-        Signed distances at the corners of the voxels (see `Silhouettes.carve`), the lower corner, and the voxel size.
+        Signed distances at the corners of the voxels (see `Silhouettes.carve`), and the voxel size in world units.
     """
     settings.use()
     extent, levels = np.asarray(box[1] - box[0], np.float64), settings.levels
@@ -196,16 +196,16 @@ def carve_grid(
             carved[start:end] = silhouettes.carve(wanted[start:end], wrong_masks)
             progress((level + min(end, len(wanted)) / len(wanted)) / (levels + 1))
         values[near] = carved
-    return values.numpy(), np.asarray(box[0], np.float64), spacing
+    return values.numpy(), spacing
 
 
 def carve_mesh(
     silhouettes: Silhouettes, box: Float[np.ndarray, "2 3"], resolution: int, wrong_masks: int = 0
 ) -> TriangleMesh | None:
     """Carve the visual hull without small components (see `carve_grid`); None if the hull is empty."""
-    distances, corner, spacing = carve_grid(silhouettes, box, resolution, wrong_masks)
+    distances, spacing = carve_grid(silhouettes, box, resolution, wrong_masks)
     remove_strays(distances)
-    return extract_surface(distances, corner, spacing) if (distances < 0).any() else None
+    return extract_surface(distances, box[0], spacing) if (distances < 0).any() else None
 
 
 def remove_strays(
@@ -244,17 +244,21 @@ def require_hull(distances: Float[np.ndarray, "X Y Z"]) -> None:
 
 
 def extract_surface(
-    distances: Float[np.ndarray, "X Y Z"], corner: Float[np.ndarray, "3"], spacing: float | Float[np.ndarray, "3"]
+    distances: Float[np.ndarray, "X Y Z"], corner: Float[np.ndarray, "3"], spacing: float
 ) -> TriangleMesh:
     """Extract the zero level as a mesh in world units, which is closed at the border of the grid.
+
+    Args:
+        distances: signed distances, negative inside.
+        corner: lower corner of the grid.
+        spacing: size of the voxels.
 
     Raises:
         NerfroError: no voxel is inside.
     """
     require_hull(distances)
-    padded = np.pad(distances, 1, constant_values=0.5 * np.max(spacing))
-    sides = tuple(np.broadcast_to(spacing, 3))
-    vertices, faces, _, _ = measure.marching_cubes(padded, 0.0, spacing=sides, gradient_direction="descent")
+    padded = np.pad(distances, 1, constant_values=0.5 * spacing)
+    vertices, faces, _, _ = measure.marching_cubes(padded, 0.0, spacing=3 * (spacing,), gradient_direction="descent")
     return merge_vertices(vertices.astype(np.float64) + corner - spacing, faces.astype(np.int64))
 
 

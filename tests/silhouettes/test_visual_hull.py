@@ -260,8 +260,9 @@ def test_hull_of_a_cut_object_is_independent_of_the_world_unit(scale: float) -> 
         cameras = cameras_around(6, 32, distance=4 * unit)
         silhouettes = photographed(made, cameras)
         assert silhouettes.cut.any()
-        distances, corner, spacing = carve_grid(silhouettes, unit * np.array([[-1.2] * 3, [1.2] * 3]), 24)
-        hulls.append(extract_surface(distances, corner, spacing).vertices / unit)
+        box = unit * np.array([[-1.2] * 3, [1.2] * 3])
+        distances, spacing = carve_grid(silhouettes, box, 24)
+        hulls.append(extract_surface(distances, box[0], spacing).vertices / unit)
     np.testing.assert_array_equal(*hulls)
 
 
