@@ -32,6 +32,7 @@ class MovingMesh:
     Attributes:
         faces: vertex indices of the triangles.
         edges: vertex indices of the edges.
+        degree: number of edges at each vertex.
         mean: sparse matrix that maps values at vertices to the mean over their neighbours.
     """
 
@@ -46,8 +47,8 @@ class MovingMesh:
         self._beyond = faces[self._beside].sum(-1) - self.edges.sum(-1, keepdims=True)
         both = np.concatenate([self.edges, self.edges[:, ::-1]])
         num_vertices = int(faces.max()) + 1
-        degree = np.bincount(both[:, 0], minlength=num_vertices)
-        self.mean = scipy.sparse.csr_matrix((1 / degree[both[:, 0]], both.T), (num_vertices, num_vertices))
+        self.degree = np.bincount(both[:, 0], minlength=num_vertices)
+        self.mean = scipy.sparse.csr_matrix((1 / self.degree[both[:, 0]], both.T), (num_vertices, num_vertices))
 
     def face_normals(self, vertices: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "F 3"]:
         """Compute triangle normals whose length is twice the area."""

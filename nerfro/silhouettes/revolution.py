@@ -43,7 +43,7 @@ class RevolutionSettings(AlgorithmSettings):
         bending: weight of bending relative to pixels.
         end_bending: factor of bending at the ends, where the masks show only thin slices.
         corner: bending at which its weight is one quarter, as a fraction of the height: objects have few, sharp
-            corners.
+            corners. At the lower end, `end_bending` divides this bending; at the upper end, the weight stays 1.
         max_step: longest step, as a fraction of the height.
         min_radius: smallest radius, as a fraction of the height.
         edge: radius of the rounded edges, in pixels.
@@ -282,8 +282,19 @@ class _Fit:
         apart = self.body(parameters).least_distance(points) / (self._width * lengths)
         return torch.where(self._side * apart > 0, 0.0, apart)
 
+    @torch.no_grad()
     def _nearest_lengths(self, parameters: Float[Tensor, " parameters"]) -> Float[Tensor, " points"]:
-        return _nearest_lengths(self.body(parameters), self._origins, self._directions, self._settings)
+        """Find the arc length along each ray at which the distance to the body is smallest."""
+        body, settings, origins, directions = self.body(parameters), self._settings, self._origins, self._directions
+        middle = body.foot + 0.5 * body.height * body.axis
+        reach = torch.sqrt((0.5 * body.height) ** 2 + body.radii.max() ** 2)
+        lengths = ((middle - origins) * directions).sum(-1)
+        for count in (settings.ray_samples, settings.closer_samples, settings.closer_samples):
+            candidates = lengths[:, None] + reach * torch.linspace(-1, 1, count)
+            distances = body.distance(origins[:, None] + candidates[..., None] * directions[:, None])
+            lengths = candidates.gather(1, distances.argmin(1, keepdim=True))[:, 0]
+            reach = reach * 2 / (count - 1)
+        return lengths
 
 
 def _cut(
@@ -381,19 +392,3 @@ def _outline_points(distances: Float[np.ndarray, "H W"], border: int) -> Float[n
     points = np.concatenate([np.empty((0, 2)), *find_contours(distances, 0)]).astype(np.float32)
     last = np.array(distances.shape) - 1 - border
     return points[((points >= border) & (points <= last)).all(1)]
-
-
-@torch.no_grad()
-def _nearest_lengths(
-    body: Profile, origins: Tensor, directions: Tensor, settings: RevolutionSettings
-) -> Float[Tensor, " points"]:
-    """Find the arc length along each ray at which the distance to the body is smallest."""
-    middle = body.foot + 0.5 * body.height * body.axis
-    reach = torch.sqrt((0.5 * body.height) ** 2 + body.radii.max() ** 2)
-    lengths = ((middle - origins) * directions).sum(-1)
-    for count in (settings.ray_samples, settings.closer_samples, settings.closer_samples):
-        candidates = lengths[:, None] + reach * torch.linspace(-1, 1, count)
-        distances = body.distance(origins[:, None] + candidates[..., None] * directions[:, None])
-        lengths = candidates.gather(1, distances.argmin(1, keepdim=True))[:, 0]
-        reach = reach * 2 / (count - 1)
-    return lengths

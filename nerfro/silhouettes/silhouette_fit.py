@@ -176,7 +176,6 @@ class _Fit:
         self.start, self.mesh, self.silhouettes = mesh.vertices, MovingMesh(mesh.faces), silhouettes
         self.size = float(np.ptp(mesh.vertices, axis=0).max())
         edges = self.mesh.edges
-        self.degree = np.bincount(edges.ravel())
         # Sparse matrix that maps values at vertices to differences along edges.
         signs, number = np.repeat([1.0, -1.0], len(edges)), np.tile(np.arange(len(edges)), 2)
         self.across = scipy.sparse.csr_matrix((signs, (number, edges.T.ravel())), (len(edges), len(mesh.vertices)))
@@ -293,14 +292,14 @@ class _Fit:
         normals, rims = surface.normals, find_rims(surface, self.silhouettes, outlines, settings.rims)
         if contour_error is not None:
             rims = by_pixel_sides(rims, self.silhouettes, contour_error, settings.pixel_sides)
-        curvature = _mean_curvature(surface, self.mesh.mean)
+        curvature = _mean_curvature(surface, self.mesh)
         typical = np.zeros_like(curvature.value)
         if prior.typical_curvature:
             typical = _typical_curvature(curvature.value, surface, settings.normal_distance * self.size, settings)
         excess = curvature.value - typical
         # While the prior is strong, large curvature may belong to the roofs of the visual hull instead of edges.
         stiffness = self._stiffness(excess, prior.edge * max(1.0, strength))
-        pressure = -self.degree * curvature.around / np.sqrt(curvature.around.mean()) * typical
+        pressure = -self.mesh.degree * curvature.around / np.sqrt(curvature.around.mean()) * typical
         per_observation = strength * len(rims.fraction)
         bending = per_observation * prior.bending * self.size**2 * (settings.reduced_bending if steady else 1)
         terms = [
@@ -333,7 +332,7 @@ class _Fit:
 
     def _change_term(self, surface: MeshGeometry, curvature: _Curvature) -> _Term:
         """Sum of squared changes of curvature along edges and flat sides."""
-        alike = scipy.sparse.diags(_along_edges(surface, self.mesh.mean, self.settings))
+        alike = scipy.sparse.diags(_along_edges(surface, self.mesh, self.settings))
         changes = curvature.change.T @ self.across.T @ alike @ self.across
         return _Term(changes @ curvature.change, -changes @ curvature.value)
 
@@ -383,7 +382,7 @@ def _split_views(outlines: Outlines) -> tuple[Outlines, Outlines]:
     return {view: outline for view, outline in outlines.items() if view not in validation}, validation
 
 
-def _mean_curvature(surface: MeshGeometry, mean: scipy.sparse.csr_matrix) -> _Curvature:
+def _mean_curvature(surface: MeshGeometry, mesh: MovingMesh) -> _Curvature:
     """Compute the curvature at vertices, see `_Curvature`.
 
     The mean of the neighbours of a vertex is displaced by r^2 H / 2 along the normal, with the mean curvature H and the
@@ -392,27 +391,25 @@ def _mean_curvature(surface: MeshGeometry, mean: scipy.sparse.csr_matrix) -> _Cu
     vertices, normals = surface.vertices, surface.normals
     both = np.concatenate([surface.edges, surface.edges[:, ::-1]])
     square = ((vertices[both[:, 0]] - vertices[both[:, 1]]) ** 2).sum(1)
-    around = np.bincount(both[:, 0], square) / np.bincount(both[:, 0])
+    around = np.bincount(both[:, 0], square) / mesh.degree
     typical = around.mean()
     # Marching cubes produces some very small triangles, whose curvature is noise.
     scale = scipy.sparse.diags(np.sqrt(typical) / around.clip(0.05 * typical))
-    umbrella = mean - scipy.sparse.identity(len(vertices))
+    umbrella = mesh.mean - scipy.sparse.identity(len(vertices))
     change = scale @ sum(n @ umbrella @ n for n in map(scipy.sparse.diags, normals.T))
     return _Curvature(change.tocsr(), scale @ (normals * (umbrella @ vertices)).sum(1), around)
 
 
-def _along_edges(
-    surface: MeshGeometry, mean: scipy.sparse.csr_matrix, settings: FitSettings
-) -> Float[np.ndarray, " edges"]:
+def _along_edges(surface: MeshGeometry, mesh: MovingMesh, settings: FitSettings) -> Float[np.ndarray, " edges"]:
     """Weight edges by their alignment with the direction of smallest curvature: 1 along, 0 across, 1 if undefined."""
     edges, num_vertices = surface.edges, len(surface.vertices)
     along, turn = (values[edges[:, 1]] - values[edges[:, 0]] for values in (surface.vertices, surface.normals))
     square = (along**2).sum(1)
     turning = turn[:, :, None] * turn[:, None, :] * (square.mean() / square)[:, None, None]
     sums = [np.bincount(edges.ravel(), np.repeat(products, 2), num_vertices) for products in turning.reshape(-1, 9).T]
-    around = np.stack(sums, -1) / np.bincount(edges.ravel(), minlength=num_vertices)[:, None]
+    around = np.stack(sums, -1) / mesh.degree[:, None]
     for _ in range(settings.blurs):
-        around = 0.5 * (around + mean @ around)
+        around = 0.5 * (around + mesh.mean @ around)
     size, direction = np.linalg.eigh(around.reshape(-1, 3, 3))
     # 0 for equal curvature in both directions, 1 for curvature in a single direction.
     single = (size[:, 2] - size[:, 1]) / (size[:, 2] + size[:, 1] + settings.min_turn**2)
