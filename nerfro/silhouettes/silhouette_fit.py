@@ -138,6 +138,9 @@ def fit_surface(
         silhouettes: silhouettes of the object.
         smoothing: factor of the selected strength; larger values suit masks drawn by hand.
         settings: priors, numbers of steps and limits.
+
+    Raises:
+        NerfroError: no view sees the surface.
     """
     settings.use()
     fit, creases = _Fit(mesh, silhouettes, settings), settings.creases
