@@ -122,7 +122,11 @@ def test_vessel_is_fitted_on_request(preprocess: Callable[..., str], capture: Pa
     assert command[3:] == [f"scene={capture / 'scene.json'}", "medium=vessel"]
     scene = read_scene_file(capture / "scene.json")
     assert (scene.settings()["medium.ior"], scene.settings(medium="vessel")["medium.ior"]) == (1.33, 1.52)
-    assert all(0 < scene.vessel[name] < RADIUS for name in ("wall", "foot", "fillet"))
+    line = next(line for line in printed.splitlines() if line.startswith("vessel, "))
+    shown = {name: float(value) for name, value in re.findall(r"(wall|foot|fillet|level) ([\d.]+)", line)}
+    lengths = {name: scene.vessel[name] for name in shown}
+    assert lengths == pytest.approx(shown, rel=0.005), "the scene file has the lengths that are printed"
+    assert ("level" in shown) == (scene.vessel["liquid_ior"] != 1)
 
 
 def test_existing_files_are_not_overwritten(preprocess: Callable[..., str], capture: Path) -> None:
