@@ -135,7 +135,7 @@ class RefinementSettings(AlgorithmSettings):
     contour_weight: float = 0.1
     roughness_weight: float = 0.1
     num_contour_points: int = 4000
-    edge_voxels: float = 2.0
+    edge_voxels: float = 4.0
     blur_samples: int = 32
     texels_per_deviation: float = 1.5
 
