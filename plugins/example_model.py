@@ -20,6 +20,8 @@ class Haze(RefractiveModel):
         options: options of `RefractiveModel`.
     """
 
+    empty_shows_background = False  # the haze changes rays that miss the field, too
+
     def __init__(self, density: Positive = 0.01, **options: Any) -> None:
         super().__init__(**options)
         self.log_density = nn.Parameter(torch.tensor(density).log())

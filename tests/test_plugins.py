@@ -33,6 +33,7 @@ from nerfro.geometry.space import Space
 from nerfro.losses.base import Loss
 from nerfro.media.base import Medium
 from nerfro.media.surfaces import Surface
+from nerfro.models.refractive import RefractiveModel
 from nerfro.registry.registration import KINDS, discover, find, plugins, register
 from nerfro.samplers.base import PathSampler, PointSampler
 from nerfro.samplers.paths.snell import Snell
@@ -258,6 +259,10 @@ def overflow(parameter: nn.Parameter) -> bool:
     return True
 
 
+def brightened(model: RefractiveModel, path: types.Path, batch: types.Batch | None = None) -> list[types.Rendering]:
+    return [replace(r, radiance=r.radiance + 0.1) for r in RefractiveModel.render_path(model, path, batch)]
+
+
 def lens(factor: float) -> dict[str, object]:
     """Members of a medium with n = 2 - |x|^2 in the unit ball, and grad n = `factor` x, which -2 makes correct."""
 
@@ -345,6 +350,7 @@ def test_medium_of_varying_index_keeps_its_contract(members: dict[str, object]) 
         ),
         ("sampler/points", PointSampler, {"forward": outside_of_edges, "num_levels": 1}, "lie between their edges"),
         ("data", DataSource, {"load": None, "splits": ["train"]}, "has the attribute `root`"),
+        ("model", RefractiveModel, {"render_path": brightened}, "set empty_shows_background = False"),
     ],
 )
 def test_check_names_the_violated_contract(kind: str, base: type, members: dict[str, object], contract: str) -> None:

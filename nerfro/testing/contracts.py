@@ -342,6 +342,13 @@ def _check_model(model: Renderer) -> None:
     _require(renderings[-1].radiance.shape == (NUM_RAYS, 3), "radiance is [R, 3]")
     renderings[-1].radiance.sum().backward()
     _require_gradients(model.scene.fields)
+    rays = example_rays()
+    missing = replace(rays, directions=-rays.directions)
+    _require(
+        torch.allclose(model.render(missing).radiance, model(missing)[-1].radiance, atol=1e-4),
+        "evaluation renders rays that miss the field as render_path does; set empty_shows_background = False if they "
+        "show more than the background",
+    )
 
 
 def _check_data(source: DataSource) -> None:
