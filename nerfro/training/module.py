@@ -27,7 +27,7 @@ from nerfro.rendering import Renderer, Scene
 from nerfro.training.checks import Updates
 from nerfro.training.config import build_each
 from nerfro.training.inputs import INPUTS, inputs_of
-from nerfro.training.run_folder import load_run, restore
+from nerfro.training.run_folder import first_not_finite, load_run, restore
 
 
 class TrainingModule(LightningModule):
@@ -107,6 +107,11 @@ class TrainingModule(LightningModule):
         return {**super().__getstate__(), "_callbacks": []}
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        if (name := first_not_finite(checkpoint["state_dict"])) is not None:
+            raise NerfroError(
+                f"the model diverged before step {self.global_step}: {name} has infinite numbers or NaN; an earlier "
+                "checkpoint is kept; set a lower optimizer.learning_rate, or another seed"
+            )
         if self._configuration is not None:
             checkpoint["nerfro_config"] = self._configuration
         if self._inputs is not None:

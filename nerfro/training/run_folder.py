@@ -218,8 +218,13 @@ def require_finite(weights: Mapping[str, Any], path: Path) -> None:
     for name, weight in weights.items():
         if not isinstance(weight, Tensor):
             raise NerfroError(f"{path} holds a {type(weight).__name__} as {name}; it is damaged")
-        if not weight.isfinite().all():
-            raise NerfroError(f"{path} holds infinite numbers or NaN in {name}; train the run again, with another seed")
+    if (infinite := first_not_finite(weights)) is not None:
+        raise NerfroError(f"{path} holds infinite numbers or NaN in {infinite}; train the run again, with another seed")
+
+
+def first_not_finite(weights: Mapping[str, Tensor]) -> str | None:
+    """Return the name of the first tensor with infinite numbers or NaN, if there is one."""
+    return next((name for name, weight in weights.items() if not weight.isfinite().all()), None)
 
 
 def require_optimizer_fits(checkpoint: Mapping[str, Any], optimizer: torch.optim.Optimizer, path: Path) -> None:

@@ -2,12 +2,13 @@
 
 import csv
 import importlib.util
+from collections.abc import Callable
 from pathlib import Path
 
 import lightning
 import pytest
 import torch
-from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint
+from lightning.pytorch.callbacks import Callback, EarlyStopping, ModelCheckpoint
 from lightning.pytorch.loggers import CSVLogger
 from lightning.pytorch.tuner import Tuner
 
@@ -16,6 +17,7 @@ from nerfro.core.paths import PLUGINS_DIR
 from nerfro.optimizers.config import OPTIMIZERS, OptimizerConfig
 from nerfro.training.data_module import RayDataModule
 from nerfro.training.module import TrainingModule
+from nerfro.training.run_folder import load_checkpoint
 from tests.conftest import refused
 
 QUIET = {"accelerator": "cpu", "enable_progress_bar": False, "enable_model_summary": False}
@@ -65,6 +67,33 @@ def test_score_that_is_never_computed_and_data_that_are_missing_are_refused(
     refused(message, trainer.fit, module, datamodule=data)
     data._load_test = None
     refused("the data have no test views", trainer.test, module, datamodule=data, verbose=False)
+
+
+ENDLESS = {"logger": False, "max_epochs": -1, "check_val_every_n_epoch": None, "limit_val_batches": 0, **QUIET}
+
+
+class AtStep(Callback):
+    """Act before the end of a training step."""
+
+    def __init__(self, step: int, act: Callable[[], object]) -> None:
+        self.step, self.act = step, act
+
+    def on_train_batch_end(self, trainer: lightning.Trainer, *_: object) -> None:
+        if trainer.global_step == self.step:
+            self.act()
+
+
+def test_diverged_model_does_not_replace_the_checkpoint(
+    built: tuple[TrainingModule, RayDataModule], tmp_path: Path
+) -> None:
+    module, data = built
+    texels = module.scene.background.texels.data
+    checkpoints = ModelCheckpoint(tmp_path, filename="last", every_n_train_steps=1, enable_version_counter=False)
+    callbacks = [AtStep(3, lambda: texels.fill_(torch.nan)), checkpoints]
+    trainer = lightning.Trainer(max_steps=9, callbacks=callbacks, **ENDLESS)
+    message = r"the model diverged before step 3: renderer\.scene\.background\.texels has infinite numbers or NaN"
+    refused(message, trainer.fit, module, datamodule=data)
+    assert load_checkpoint(tmp_path / "last.ckpt")[0]["global_step"] == 2
 
 
 def test_experiments_of_an_own_folder_are_built(tiny_default_run: list[str], tmp_path: Path, unchecked: None) -> None:
