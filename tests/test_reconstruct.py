@@ -597,6 +597,11 @@ def test_scene_file_selects_the_experiment(run_here: Runner, pretended: Pretende
         (("images=PHOTOS", "train=--help"), "train='--help': --help is a flag; give options of the form key=value"),
         (("images=PHOTOS/film",), "film holds no image, but .mp4 files; allowed are"),
         (("images=PHOTOS/two",), "2 photographs do not determine poses and shape"),
+        (("images=PHOTOS", "train=trainer.max_stepz=3"), "trainer.max_stepz is not a setting; did you mean max_steps?"),
+        (("images=PHOTOS", "train=+experiment=glas"), "experiment=glas does not exist; did you mean glass?"),
+        (("images=PHOTOS", "preprocess=foo=1"), "foo is not a setting; known: "),
+        (("images=PHOTOS", "mask=views=true"), "views is not a setting; did you mean view?"),
+        (("images=PHOTOS", 'train="name=\'abc"'), '"name=\'abc" has a quotation mark that is not closed'),
         (("images=PHOTOS", "outlines=none.json"), "none.json does not exist"),
     ],
 )

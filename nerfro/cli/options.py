@@ -177,7 +177,7 @@ def describe(command: str, schema: type) -> Described:
     if not has_groups(command):
         return Described(_page(command, list(schema_options(schema, {})), {}), _names(schema), {})
     store_schema(command, schema)
-    with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
+    with _outside_of_jobs(), initialize_config_dir(str(CONF_DIR), version_base="1.3"):
         config = compose(command, return_hydra_config=True)
         groups = [kind for kind in KINDS if isinstance(OmegaConf.select(config, kind.replace("/", ".")), DictConfig)]
         groups = list(dict.fromkeys([*groups, "logger", *ADDED_GROUPS])) if command == "train" else groups
@@ -206,6 +206,17 @@ def describe(command: str, schema: type) -> Described:
     selected = {group: f"{group}={config.hydra.runtime.choices.get(group, 'NAME')}" for group in choices}
     listed = {selected[group]: names for group, names in choices.items()} | added
     return Described(_page(command, options, listed), names, choices)
+
+
+@contextlib.contextmanager
+def _outside_of_jobs() -> Iterator[None]:
+    """Set the Hydra of a running job aside, because only one may be initialized at a time."""
+    outer = GlobalHydra.instance().hydra
+    GlobalHydra.instance().hydra = None
+    try:
+        yield
+    finally:
+        GlobalHydra.instance().hydra = outer
 
 
 def store_schema(command: str, schema: type) -> None:

@@ -10,9 +10,17 @@ from typing import Annotated, Any, Literal
 from annotated_types import Ge, Le
 from omegaconf import MISSING, DictConfig
 
-from nerfro.cli.overrides import is_given
+from nerfro.capture.preprocess_options import PreprocessConfig
+from nerfro.cli.options import describe, recall
+from nerfro.cli.overrides import full_key, is_given
 from nerfro.core.errors import NerfroError
+from nerfro.masks.options import MaskConfig
+from nerfro.poses.options import CalibrateConfig
 from nerfro.registry.allowed import Count, Natural
+from nerfro.training.config import TrainConfig
+
+# Stages with options of their own, and the dataclasses of these options.
+STAGES = {"calibrate": CalibrateConfig, "mask": MaskConfig, "preprocess": PreprocessConfig, "train": TrainConfig}
 
 
 @dataclass
@@ -61,20 +69,38 @@ class ReconstructConfig:
     train: str = ""
 
 
+def stage_options(stage: str, config: DictConfig) -> list[str]:
+    """Return the further options of a stage.
+
+    Raises:
+        NerfroError: a quotation mark is not closed.
+    """
+    try:
+        return shlex.split(config[stage])
+    except ValueError:
+        raise NerfroError(
+            f"{stage}={config[stage]!r} has a quotation mark that is not closed, or ends with a backslash"
+        ) from None
+
+
 def have_poses(config: DictConfig, overrides: list[str]) -> bool:
     """Check the options, and return whether the photographs have poses.
 
     Raises:
-        NerfroError: options are missing, contradict each other, or are flags for a stage.
+        NerfroError: options are missing, contradict each other, or are flags for a stage or unknown to it.
     """
-    for stage in ("calibrate", "mask", "preprocess", "train"):
-        for option in shlex.split(config[stage]):
+    for stage, schema in STAGES.items():
+        options = stage_options(stage, config)
+        for option in options:
             if option.startswith("-"):
                 raise NerfroError(
                     f"{stage}={config[stage]!r}: {option} is a flag; give options of the form key=value, which "
                     f"`nerfro {stage} --help` explains"
                 )
-    if config.hypothesis is not None and is_given("experiment", shlex.split(config.train)):
+        if options:
+            described = recall(stage) or describe(stage, schema)
+            described.require_known([full_key(option) for option in options])
+    if config.hypothesis is not None and is_given("experiment", stage_options("train", config)):
         raise NerfroError(
             f"hypothesis={config.hypothesis} and the experiment in train={config.train!r} both determine the training; "
             "give one of the two"
@@ -104,7 +130,7 @@ def common_options(config: DictConfig, overrides: list[str], photograph: Sequenc
         overrides: the command line.
         photograph: width and height of the photographs, in pixels; empty if unknown.
     """
-    extra = shlex.split(config.train)
+    extra = stage_options("train", config)
     # Telephones select an exposure for each photograph.
     options = [] if is_given("camera.exposure", extra) else ["camera.exposure=true"]
     if photograph and not is_given("data.downscale", overrides):

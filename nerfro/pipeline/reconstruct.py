@@ -6,7 +6,6 @@ Stages exchange values. Each leaves files, from which a repeated reconstruction 
 from __future__ import annotations
 
 import json
-import shlex
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -28,7 +27,7 @@ from nerfro.masks.mask_files import read_outlines
 from nerfro.masks.segment import segment
 from nerfro.pipeline.export import export
 from nerfro.pipeline.hypotheses import Hypothesis, hypotheses, worth_a_trial
-from nerfro.pipeline.options import ReconstructConfig, common_options, have_poses
+from nerfro.pipeline.options import ReconstructConfig, common_options, have_poses, stage_options
 from nerfro.pipeline.stage import Stage, is_older, move_aside
 from nerfro.pipeline.trials import PICTURE, Trial, decide, draw_trials, validation_views
 from nerfro.poses.calibrate import calibrate
@@ -89,13 +88,13 @@ def _calibrate(config: DictConfig, capture: Capture, out: Path) -> Capture:
             f"{len(photographs)} photographs do not determine poses and shape; take at least {_MIN_PHOTOGRAPHS}, "
             "better 60, from all sides"
         )
-    if not config.outlines and "view=true" not in shlex.split(config.mask) and not capture.masks:
+    if not config.outlines and "view=true" not in stage_options("mask", config) and not capture.masks:
         raise NerfroError(
             "the photographs have no masks; add mask='view=true' to draw the outline of the object in two to five "
             f"images in the browser, outlines={{{photographs[0].stem}:[[COLUMN,ROW],...],...}}, or masks=FOLDER"
         )
     settings = {"images": out / "images", "out": out, "target": "colmap", "overwrite": True}
-    settings |= {"mask_labels": capture.settings.get("mask_labels")} | values_of(shlex.split(config.calibrate))
+    settings |= {"mask_labels": capture.settings.get("mask_labels")} | values_of(stage_options("calibrate", config))
     options = options_of(CalibrateConfig, None, settings)
     stage = Stage("calibrate", as_overrides(changed_settings(options)), out / REPORT, out / PLOT)
     return replace(stage.run(lambda: calibrate(options), lambda: Capture(out)), settings=capture.settings)
@@ -104,7 +103,7 @@ def _calibrate(config: DictConfig, capture: Capture, out: Path) -> Capture:
 def _segment(config: DictConfig, capture: Capture) -> Capture:
     """Make the missing masks."""
     outlines = OmegaConf.to_container(config.outlines) if OmegaConf.is_config(config.outlines) else config.outlines
-    options = [*as_overrides({"outlines": outlines} if outlines else {}), *shlex.split(config.mask)]
+    options = [*as_overrides({"outlines": outlines} if outlines else {}), *stage_options("mask", config)]
     sheet = resolve_path(capture.root) / "masks.png"
     stage = Stage("mask", [*capture.overrides, *options], sheet, sheet)
     return stage.run(lambda: segment(capture, options), lambda: capture)
@@ -114,7 +113,7 @@ def _preprocess(composition: Composition, capture: Capture, folder: Path) -> Sce
     """Reconstruct surface and index in a folder."""
     root, medium = resolve_path(capture.root), composition.config.medium
     inputs = [*root.glob("transforms*.json"), *capture.masks]
-    own = shlex.split(composition.config.preprocess)
+    own = stage_options("preprocess", composition.config)
     automatic = [*as_overrides({"out": folder}), "refine=true", "wrong_masks=null", "overwrite=true"]
     automatic += [] if is_given("mesh", own) else ["symmetry=auto"]
     if "wall" not in medium and "shell_voxels" in medium and medium.get("bodies") is None:
