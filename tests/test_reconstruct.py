@@ -314,7 +314,8 @@ def test_photographs_pass_every_stage_once(
     assert (run.folder, run.scores.steps) == (pretended.out / "run", 1)
     assert pretended.names == ALL
     printed = capsys.readouterr().out
-    assert printed.count(" is kept (delete the file to repeat the stage)") == len(ALL)
+    assert printed.count(" is kept (delete it to repeat the stage)") == len(ALL)
+    assert f"train: done; {pretended.out / 'run'} is kept" in printed, "without its configuration, it starts again"
     assert printed.endswith(f"report: {pretended.out}/report/report.html\npage: {pretended.out}/page.html\n")
 
 
@@ -662,7 +663,7 @@ def test_posed_photographs_of_a_ball_become_a_scene(
     assert (out / "page.html").is_file()
     assert f"each hypothesis beside photographs: {out / 'trials' / 'hypotheses.png'}" in done.out
     # Surface, three trials, training, report and page.
-    assert run_here("reconstruct", *asked).out.count(" is kept (delete the file to repeat the stage)") == 7
+    assert run_here("reconstruct", *asked).out.count(" is kept (delete it to repeat the stage)") == 7
     assert (torch.initial_seed(), signal.getsignal(signal.SIGTERM)) == before
     command = next(line for line in done.out.splitlines() if line.endswith(f"hydra.run.dir={out}/run"))
     run_here("train", *shlex.split(command)[4:], f"hydra.run.dir={tmp_path / 'alone'}")

@@ -57,7 +57,9 @@ class Stage:
             Interrupted: the stage was interrupted.
         """
         if self.is_done:
-            print(f"{self.command}: done; {self.result} is kept (delete the file to repeat the stage)", flush=True)
+            # The other files of a run would resume its training.
+            kept = self.result.parent if self.command == "train" else self.result
+            print(f"{self.command}: done; {kept} is kept (delete it to repeat the stage)", flush=True)
             return read()
         print(f"\n{self.command}: {command_line(self.command, self.options)}", flush=True)
         try:
