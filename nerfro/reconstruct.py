@@ -14,13 +14,13 @@ from omegaconf import DictConfig
 import nerfro.cli.startup  # noqa: F401 - before the other imports, which take seconds
 from nerfro.cli.calls import Composition
 from nerfro.cli.entry import entry_point
-from nerfro.pipeline.options import ReconstructConfig
+from nerfro.pipeline.options import STAGES, ReconstructConfig
 from nerfro.pipeline.reconstruct import reconstruct_composed
 from nerfro.pipeline.stage import terminated_in_one_line
 from nerfro.rendering.scene_file import with_scene
 
 
-@entry_point("reconstruct", ReconstructConfig, expand=with_scene, verbatim=("calibrate", "mask", "preprocess", "train"))
+@entry_point("reconstruct", ReconstructConfig, expand=with_scene, verbatim=tuple(STAGES))
 def main(config: DictConfig) -> None:
     """Run all stages that are not done."""
     with terminated_in_one_line():

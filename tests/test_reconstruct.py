@@ -569,6 +569,7 @@ def test_failed_page_does_not_fail_the_reconstruction(reconstruct: Runner, prete
     pretended.ends["export"] = NerfroError("the index varies in space")
     done = reconstruct("trial_steps=0")
     assert "nerfro: warning: no page was written: export failed: the index varies in space; " in done.out
+    assert "correct the input, or run the printed command" in done.out, "no option has settings of the export"
     assert done.out.endswith(f"report: {pretended.out}/report/report.html\n")
 
 
@@ -596,13 +597,13 @@ def test_scene_file_selects_the_experiment(run_here: Runner, pretended: Pretende
         (("data.root=PHOTOS", "masks=PHOTOS"), "masks= needs images="),
         (("images=PHOTOS/none",), "none is not a folder; it should hold the images"),
         (("images=PHOTOS", "train=--help"), "train='--help': --help is a flag; give options of the form key=value"),
-        (("images=PHOTOS/film",), "film holds no image, but .mp4 files; allowed are"),
-        (("images=PHOTOS/two",), "2 photographs do not determine poses and shape"),
         (("images=PHOTOS", "train=trainer.max_stepz=3"), "trainer.max_stepz is not a setting; did you mean max_steps?"),
         (("images=PHOTOS", "train=+experiment=glas"), "experiment=glas does not exist; did you mean glass?"),
         (("images=PHOTOS", "preprocess=foo=1"), "foo is not a setting; known: "),
         (("images=PHOTOS", "mask=views=true"), "views is not a setting; did you mean view?"),
         (("images=PHOTOS", 'train="name=\'abc"'), '"name=\'abc" has a quotation mark that is not closed'),
+        (("images=PHOTOS/film",), "film holds no image, but .mp4 files; allowed are"),
+        (("images=PHOTOS/two",), "2 photographs do not determine poses and shape"),
         (("images=PHOTOS", "outlines=none.json"), "none.json does not exist"),
     ],
 )

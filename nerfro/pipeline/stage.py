@@ -18,6 +18,7 @@ import torch
 from nerfro.cli.failures import in_one_line
 from nerfro.cli.overrides import command_line
 from nerfro.core.errors import Interrupted, NerfroError
+from nerfro.pipeline.options import STAGES
 
 Value = TypeVar("Value")
 
@@ -75,9 +76,10 @@ class Stage:
         except Exception as error:
             if os.environ.get("NERFRO_DEBUG"):
                 raise
+            option = f"set {self.command}='OPTIONS', " if self.command in STAGES else ""
             raise NerfroError(
-                f"{self.command} failed: {in_one_line(error)}; correct the input, set {self.command}='OPTIONS', or run "
-                "the printed command with other options; then repeat this command, which keeps all completed stages"
+                f"{self.command} failed: {in_one_line(error)}; correct the input, {option}or run the printed command "
+                "with other options; then repeat this command, which keeps all completed stages"
             ) from error
         gc.collect()  # models refer to themselves
         print(f"{self.command}: done; look at {self.preview}", flush=True)
