@@ -339,4 +339,5 @@ class Depth(Loss):
         errors = ((middles - of_path).abs() / of_path).clamp(max=self.limit)
         expected = (rendering.weights * errors).sum(-1) + rendering.transmittance * self.limit
         per_pixel = batch.per_pixel(path.sum_polylines(expected))
-        return (per_pixel * counts).sum() / counts.sum().clamp(min=1)
+        # Gradients are averaged over processes, as in `BackgroundRegularizer`.
+        return (per_pixel * counts).sum() * rank_and_size()[1] / sum_over_processes(counts.sum()).clamp(min=1)

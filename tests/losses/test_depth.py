@@ -13,6 +13,7 @@ from nerfro.core.cameras import Cameras
 from nerfro.data.base import Views
 from nerfro.data.image_files import read_depths
 from nerfro.geometry.space import Unbounded
+from nerfro.losses import terms
 from nerfro.losses.terms import Depth
 from nerfro.testing import (
     example_batch,
@@ -41,6 +42,22 @@ def test_gradient_is_the_relative_distance_of_each_sample() -> None:
     torch.testing.assert_close(of_transmittance[4:], torch.full((20,), limit / 20))
     assert not of_weights[:4].any()
     assert not of_transmittance[:4].any()
+
+
+def test_loss_of_two_processes_is_that_of_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Gradients are averaged, and the parts of the batch have different numbers of known depths."""
+    rendering, scene = example_rendering(example_path(8)), example_run().renderer.scene
+    counts = 8, 6
+    depths = [4.0 * (torch.arange(8) < count)[:, None] for count in counts]
+    batches = [replace(example_batch(8), maps={"depth": depth}) for depth in depths]
+
+    def losses() -> torch.Tensor:
+        return torch.stack([Depth(refracted=True)([rendering], batch, scene) for batch in batches])
+
+    expected = (losses() * torch.tensor(counts)).sum() / sum(counts)
+    monkeypatch.setattr(terms, "rank_and_size", lambda: (0, 2))
+    monkeypatch.setattr(terms, "sum_over_processes", lambda count: torch.tensor(sum(counts)))
+    torch.testing.assert_close(losses().mean(), expected)
 
 
 def test_refracted_pixels_do_not_count_by_default() -> None:
