@@ -224,6 +224,7 @@ def test_signal_during_synchronization_is_not_lost() -> None:
         return decision
 
     trainer: Any = Mock(spec=Trainer, strategy=Mock(reduce_boolean_decision=agree), should_stop=False, world_size=1)
+    trainer.fit_loop = Mock()
     callback.stop(trainer)
     assert not callback.received
     callback.stop(trainer)
@@ -237,6 +238,7 @@ def test_processes_synchronize_a_few_times_per_second(tmp_path: Path) -> None:
     interruption, timer = StopOnSignal(), SharedTimer(timedelta(seconds=1000))
     checkpoints = Checkpoints(dirpath=tmp_path, train_time_interval=timedelta(seconds=1000))
     trainer: Any = Mock(spec=Trainer, strategy=others, should_stop=False, world_size=2, fast_dev_run=False)
+    trainer.fit_loop = Mock()
     trainer.state, trainer.sanity_checking, trainer.global_step = Mock(fn="fit"), False, 1
     timer.on_train_start(trainer, Mock(spec=LightningModule))
     begun = time.perf_counter()

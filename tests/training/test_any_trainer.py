@@ -2,6 +2,7 @@
 
 import csv
 import importlib.util
+import signal
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from lightning.pytorch.tuner import Tuner
 import nerfro
 from nerfro.core.paths import PLUGINS_DIR
 from nerfro.optimizers.config import OPTIMIZERS, OptimizerConfig
+from nerfro.training.callbacks import StopOnSignal
 from nerfro.training.data_module import RayDataModule
 from nerfro.training.module import TrainingModule
 from nerfro.training.run_folder import load_checkpoint
@@ -94,6 +96,15 @@ def test_diverged_model_does_not_replace_the_checkpoint(
     message = r"the model diverged before step 3: renderer\.scene\.background\.texels has infinite numbers or NaN"
     refused(message, trainer.fit, module, datamodule=data)
     assert load_checkpoint(tmp_path / "last.ckpt")[0]["global_step"] == 2
+
+
+def test_signal_ends_a_training_before_its_least_number_of_steps(built: tuple[TrainingModule, RayDataModule]) -> None:
+    module, data = built
+    callbacks = [AtStep(2, lambda: signal.raise_signal(signal.SIGTERM)), StopOnSignal()]
+    limits = {"min_steps": 8, "max_steps": 9, "min_epochs": 0, "enable_checkpointing": False}
+    trainer = lightning.Trainer(callbacks=callbacks, **limits, **ENDLESS)
+    trainer.fit(module, datamodule=data)
+    assert trainer.global_step == 2
 
 
 def test_experiments_of_an_own_folder_are_built(tiny_default_run: list[str], tmp_path: Path, unchecked: None) -> None:
