@@ -81,7 +81,7 @@ class RayDataModule(LightningDataModule):
         trainer: Any = self.trainer
         if trainer.check_val_every_n_epoch is not None and isinstance(trainer.val_check_interval, float):
             return Epoch(self.trainer, validation_interval(self.every) or 100)  # any number without validation
-        return itertools.count(self.trainer.global_step)
+        return itertools.count(self.trainer.global_step * self.trainer.accumulate_grad_batches)
 
     def batches_of(self, trainer: Trainer) -> PixelBatches:
         """Return the part of the batches that belongs to the process of a Trainer."""

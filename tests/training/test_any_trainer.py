@@ -15,6 +15,7 @@ from lightning.pytorch.tuner import Tuner
 
 import nerfro
 from nerfro.core.paths import PLUGINS_DIR
+from nerfro.core.types import Batch
 from nerfro.optimizers.config import OPTIMIZERS, OptimizerConfig
 from nerfro.training.callbacks import StopOnSignal
 from nerfro.training.data_module import RayDataModule
@@ -105,6 +106,25 @@ def test_signal_ends_a_training_before_its_least_number_of_steps(built: tuple[Tr
     trainer = lightning.Trainer(callbacks=callbacks, **limits, **ENDLESS)
     trainer.fit(module, datamodule=data)
     assert trainer.global_step == 2
+
+
+def test_resumed_training_with_accumulated_gradients_has_new_batches(
+    built: tuple[TrainingModule, RayDataModule], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (module, data), seen, step = built, list[int](), TrainingModule.training_step
+
+    def record(module: TrainingModule, batch: Batch, index: int) -> dict[str, torch.Tensor]:
+        seen.append(batch.draws.step)
+        return step(module, batch, index)
+
+    monkeypatch.setattr(TrainingModule, "training_step", record)
+    options = {"accumulate_grad_batches": 2, "enable_checkpointing": False, **ENDLESS}
+    trainer = lightning.Trainer(max_steps=2, **options)
+    trainer.fit(module, datamodule=data)
+    trainer.save_checkpoint(tmp_path / "last.ckpt")
+    resumed = lightning.Trainer(max_steps=4, **options)
+    resumed.fit(module, datamodule=data, ckpt_path=tmp_path / "last.ckpt", weights_only=True)
+    assert seen == [*range(8)]
 
 
 def test_experiments_of_an_own_folder_are_built(tiny_default_run: list[str], tmp_path: Path, unchecked: None) -> None:
