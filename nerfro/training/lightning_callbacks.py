@@ -38,7 +38,7 @@ def early_stopping(
         monitor: logged value, such as val/psnr.
         min_delta: smallest change that counts as an improvement.
         patience: number of validations without an improvement before the training stops.
-        mode: whether small or large values are good; None for max with PSNR and SSIM, else min.
+        mode: whether small or large values are good; None for max with PSNR, else min.
         check_finite: stop when the value is NaN or infinite.
         stopping_threshold: stop as soon as the value is better.
         divergence_threshold: stop as soon as the value is worse.
@@ -73,7 +73,7 @@ def model_checkpoint(
 
     Args:
         monitor: logged value that ranks the checkpoints, such as val/psnr; None saves the latest ones.
-        mode: whether the smallest or the largest values are best; None for max with PSNR and SSIM, else min.
+        mode: whether the smallest or the largest values are best; None for max with PSNR, else min.
         save_top_k: number of checkpoints that are kept; -1 keeps all.
         filename: name of the files, in which {step} and {val/psnr} stand for values.
         dirpath: folder; None for `checkpoints` of the run.
@@ -106,4 +106,4 @@ def weight_averaging(decay: Share = 0.999, every: Count = 1, start: Natural = 0)
 
 
 def _mode(monitor: str) -> Mode:
-    return "max" if monitor.endswith(("psnr", "ssim")) else "min"
+    return "max" if monitor.endswith("psnr") else "min"

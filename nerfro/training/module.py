@@ -274,7 +274,7 @@ class TrainingModule(LightningModule):
 
 
 def require_monitored(trainer: Trainer) -> None:
-    """Refuse callbacks that monitor a score of validation if the run has no validation.
+    """Refuse callbacks that monitor a score that validation does not log, or any score if the run has no validation.
 
     Raises:
         NerfroError: a callback waits for a score that is never computed.
@@ -283,6 +283,11 @@ def require_monitored(trainer: Trainer) -> None:
     validates = data.validation is not None and data.every > 0 and trainer.limit_val_batches != 0  # type: ignore[attr-defined]
     for callback in trainer.callbacks:  # type: ignore[attr-defined]
         monitor = str(getattr(callback, "monitor", None))
+        if monitor.startswith("val/") and monitor != "val/psnr":
+            raise NerfroError(
+                f"{type(callback).__name__} monitors {monitor}, but validation logs only val/psnr; values that a "
+                "callback of your own logs need another prefix"
+            )
         if monitor.startswith("val/") and not validates:
             raise NerfroError(
                 f"{type(callback).__name__} monitors {monitor}, but the run has no validation; give validation views "

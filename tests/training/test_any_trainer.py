@@ -65,6 +65,8 @@ def test_score_that_is_never_computed_and_data_that_are_missing_are_refused(
     module, data = built
     trainer = lightning.Trainer(max_steps=2, logger=False, callbacks=[EarlyStopping("val/psnr")], **QUIET)
     refused("needs pixels and views; add datamodule=data", trainer.fit, module, [0])
+    other = lightning.Trainer(max_steps=2, logger=False, callbacks=[EarlyStopping("val/ssim")], **QUIET)
+    refused("EarlyStopping monitors val/ssim, but validation logs only val/psnr", other.fit, module, datamodule=data)
     data.validation = None
     message = "EarlyStopping monitors val/psnr, but the run has no validation; give"
     refused(message, trainer.fit, module, datamodule=data)
