@@ -217,7 +217,7 @@ def validated(where: str) -> Callable[[Class], Class]:
 def setting_type(hint: Any) -> Any:
     """Convert an annotation to the type by which pydantic validates a setting; None if it is no setting.
 
-    Settings are int, float, bool, str, `Literal`, their optional, list and dict forms, and all of these `Annotated`.
+    Settings are int, float, bool, str, `Literal`, their unions, list and dict forms, and all of these `Annotated`.
     """
     origin, args = get_origin(hint), get_args(hint)
     if hint in (int, float, str):
@@ -234,8 +234,8 @@ def setting_type(hint: Any) -> Any:
         arguments = (inner, *limits)
         return None if inner is None else Annotated[arguments]
     if origin in (Union, types.UnionType):
-        inner = setting_type(_without_none(args)) if type(None) in args and len(args) == 2 else None
-        return None if inner is None else Union[inner, None]  # noqa: UP007 - for a variable
+        members = tuple(arg if arg is type(None) else setting_type(arg) for arg in args)
+        return None if None in members else Union[members]  # noqa: UP007 - for a variable
     if origin in (list, tuple, Sequence):
         element = Any if args[0] is Any else setting_type(args[0])
         if element is None:

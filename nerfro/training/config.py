@@ -158,7 +158,7 @@ class TrainerConfig:
     gradient_clip_val: Positive | None = None
     gradient_clip_algorithm: Annotated[Literal["norm", "value"] | None, OnlyWith("gradient_clip_val")] = None
     log_every_n_steps: Count = 50
-    deterministic: Any = None
+    deterministic: Literal[True, False, "warn"] | None = None
     benchmark: bool | None = None
     detect_anomaly: bool | None = None
     profiler: Literal["simple", "advanced", "pytorch"] | None = None
@@ -169,7 +169,7 @@ class TrainerConfig:
     overfit_batches: Natural = 0
     limit_test_batches: Count | None = None
     inference_mode: bool | None = None
-    fast_dev_run: Any = False
+    fast_dev_run: Natural | bool = False
     accumulate_grad_batches: Annotated[Any, Refused("batches depend on the step; set batches.size")] = None
     barebones: Annotated[Any, Refused("set logger=none trainer.enable_checkpointing=false")] = None
     callbacks: Annotated[Any, Refused("choose callbacks by name, as in +callbacks=learning_rate_monitor")] = None

@@ -92,6 +92,29 @@ def test_unsupported_arguments_are_refused_with_a_reason(name: str) -> None:
     assert message == f"trainer.{name}=3 is not allowed; {REFUSED[name]}"
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "advice"),
+    [
+        ("deterministic", "foo", "choose True, False, 'warn'"),
+        ("fast_dev_run", "abc", "take a number, not text"),
+        ("fast_dev_run", -1, "take at least 0"),
+        ("fast_dev_run", 1.5, "take an integer, at least 0"),
+    ],
+)
+def test_settings_of_several_types_refuse_other_values(name: str, value: object, advice: str) -> None:
+    message = refused("is not allowed", validate, TrainerConfig, {name: value}, "trainer.")
+    assert message == f"trainer.{name}={value!r} is not allowed; {advice}"
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("deterministic", "warn"), ("deterministic", False), ("fast_dev_run", True), ("fast_dev_run", 1)],
+)
+def test_settings_of_several_types_keep_each_of_their_values(name: str, value: object) -> None:
+    setting = getattr(validate(TrainerConfig, {name: value}), name)
+    assert (setting, type(setting)) == (value, type(value))
+
+
 # A value that differs from the default for each argument that a run hands to Lightning's Trainer.
 PASSED = {
     "accelerator": "cpu", "benchmark": True, "detect_anomaly": True, "deterministic": True, "devices": 1,
