@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -103,7 +104,13 @@ class EnvironmentMap(Background):
         if len(resolutions) == 0:
             raise NerfroError("background=envmap: resolutions is empty; give one or more")
         fitted = [] if fitted_resolutions is None else fitted_resolutions
-        self.levels = cube_map.CubeLevels((*resolutions, *fitted))
+        levels = [*resolutions, *fitted]
+        if any(finer <= coarser for coarser, finer in itertools.pairwise(levels)):
+            raise NerfroError(
+                f"background=envmap: the levels {levels} do not ascend; give resolutions, and then fitted_resolutions, "
+                "in ascending order"
+            )
+        self.levels = cube_map.CubeLevels(tuple(levels))
         self._groups = cube_map.CubeLevels(tuple(resolutions)), cube_map.CubeLevels(tuple(fitted))
         of_descent, of_fits = (torch.zeros(levels.num_texels, 3) for levels in self._groups)
         self.texels = nn.Parameter(of_descent)
@@ -115,7 +122,8 @@ class EnvironmentMap(Background):
 
     @classmethod
     def derive(cls, settings: DictConfig, views: Views, space: Space) -> dict[str, Any]:
-        if space.infinite or settings.background.resolutions is not None:
+        given = settings.background.resolutions, settings.background.fitted_resolutions
+        if space.infinite or given != (None, None):
             return {}
         fits = _is_fitted(settings)
         pixels = 0.5 * math.pi * float(views.cameras.fx.double().median())

@@ -163,6 +163,11 @@ def test_finer_image_is_averaged_and_not_sampled() -> None:
     torch.testing.assert_close(colours, torch.full_like(colours, 0.4), rtol=0, atol=0.01)
 
 
+@pytest.mark.parametrize("levels", [([64, 4],), ([4, 64], [32]), ([8], [8])])
+def test_levels_that_do_not_ascend_are_refused(levels: tuple[list[int], ...]) -> None:
+    refused("do not ascend; give resolutions, and then fitted_resolutions", EnvironmentMap, *levels)
+
+
 def test_bad_files_are_refused(tmp_path: Path) -> None:
     refused("does not exist", EnvironmentMap, image=str(tmp_path / "none.hdr"))
     refused("allowed are", EnvironmentMap, image=str(tmp_path / "sky.tiff"))

@@ -102,6 +102,8 @@ def test_finest_texel_follows_the_pixel(
     })  # fmt: skip
     settings = {**config.background} | EnvironmentMap.derive(config, views, Unbounded())
     resolutions, fitted = settings["resolutions"], settings["fitted_resolutions"]
+    config.background.fitted_resolutions = [512]
+    assert EnvironmentMap.derive(config, views, Unbounded()) == {}, "given levels are kept"
     assert max(resolutions) == descent
     assert max([*resolutions, *(fitted or ())]) == finest
     if given is None and side < 4000 and fits:
