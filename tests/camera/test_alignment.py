@@ -12,7 +12,7 @@ from benchmarks.cameras import disturbed
 from nerfro.camera.refined import gauss_newton
 from nerfro.camera.refined.gauss_newton import PriorInformation
 from nerfro.camera.refined.outlines import align_to_outlines
-from nerfro.camera.refined.panorama import align
+from nerfro.camera.refined.panorama import PanoramaSettings, align
 from nerfro.camera.refined.refined import RefinedCamera, motion_between
 from nerfro.core.cameras import Cameras
 from nerfro.core.light import to_linear, to_srgb
@@ -119,7 +119,11 @@ def test_resumed_step_on_a_gpu_uses_the_prior_of_a_cpu_checkpoint() -> None:
 
 
 def panorama(
-    camera: RefinedCamera, given: Cameras, box: Tensor = BOX, gains: Tensor | None = None
+    camera: RefinedCamera,
+    given: Cameras,
+    box: Tensor = BOX,
+    gains: Tensor | None = None,
+    settings: PanoramaSettings | None = None,
 ) -> PriorInformation | None:
     def photographed(pixels: Tensor) -> Tensor:
         colours = PHOTOGRAPHS[pixels]
@@ -127,7 +131,7 @@ def panorama(
         return colours if gains is None else to_srgb(to_linear(colours) * gains[view, None])
 
     camera.begin(given)
-    return align(camera, given, photographed, lambda rays: misses(box, rays))
+    return align(camera, given, photographed, lambda rays: misses(box, rays), settings or PanoramaSettings())
 
 
 def rotation_errors(camera: RefinedCamera) -> Tensor:
@@ -147,6 +151,21 @@ def test_sky_alignment_recovers_rotations(brightness: float) -> None:
     assert panorama(camera, DISTURBED, gains=gains) is not None
     assert not bool(camera.motion[:, 3:].any())
     assert float(rotation_errors(camera).median()) < (0.03 if brightness == 0 else 0.06)
+
+
+def test_memory_of_the_sky_alignment_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No projection has more points than directions are allowed, and fewer directions suffice."""
+    sizes, project = list[int](), Cameras.project
+
+    def record(cameras: Cameras, points: Tensor) -> tuple[Tensor, Tensor]:
+        sizes.append(len(cameras) * len(points))
+        return project(cameras, points)
+
+    monkeypatch.setattr(Cameras, "project", record)
+    camera = RefinedCamera()
+    panorama(camera, DISTURBED, settings=PanoramaSettings(max_directions=100 * NUM_VIEWS))
+    assert 50 * NUM_VIEWS < max(sizes) <= 100 * NUM_VIEWS
+    assert float(rotation_errors(camera).median()) < 0.06
 
 
 def test_sky_alignment_recovers_the_shared_focal_length() -> None:

@@ -49,6 +49,7 @@ class PanoramaSettings(AlgorithmSettings):
     Attributes:
         levels: steps from coarse to fine: the blur limits the details, and thereby the distance over which derivatives
             are valid.
+        max_directions: largest number of directions of all photographs together, which bounds the memory.
         width: photographs are downscaled to this width in pixels; the alignment is accurate to a few hundredths of a
             pixel.
         min_blur: smallest standard deviation of the blur, in pixels.
@@ -65,6 +66,7 @@ class PanoramaSettings(AlgorithmSettings):
         PanoramaLevel(1 / 128, 200, 3),
         PanoramaLevel(0.0, 300, 3),
     )
+    max_directions: int = 30_000
     width: int = 256
     min_blur: float = 0.7
     min_sky: float = 0.9
@@ -103,7 +105,8 @@ def align(
     for level in track("panorama", steps):
         blur = max(level.blur * images.shape[-1], settings.min_blur)
         usable_images = _blurred_sky(camera.estimated(cameras), images, of_sky, blur, settings.min_sky)
-        overlap = _find_overlap(camera, cameras, *usable_images, level.num_directions, generator)
+        num_directions = min(level.num_directions, settings.max_directions // len(cameras))
+        overlap = _find_overlap(camera, cameras, *usable_images, num_directions, generator)
         if overlap is None:
             continue  # if little sky is visible, strongly blurred pixels always contain other objects
         matrix, vector, variance = _equations(overlap, gains, camera.exposure is not None, settings)
@@ -212,14 +215,19 @@ def _find_overlap(
     directions = _draw_directions(estimated, usable, num, generator)
     # The sky is infinitely far away, so the positions of the cameras do not matter.
     distant = replace(estimated, camera_to_world=F.pad(estimated.camera_to_world[..., :3], (0, 1)))
-    position, depth = distant.project(directions)
-    visible = _visible(position, depth, usable)
+    # View by view, because most directions are outside of most views.
+    views = [distant.select([view]) for view in range(len(images))]
+    visible = torch.cat([_visible(one, directions, usable[[view]]) for view, one in enumerate(views)])
+    visible &= visible.sum(0) > 1
     view, direction = visible.nonzero(as_tuple=True)
     if len(view) == 0:
         return None
 
+    def positions(directions: Float[Tensor, "directions 3"]) -> Float[Tensor, "O 2"]:
+        return torch.cat([one.project(directions)[0][0, seen] for one, seen in zip(views, visible, strict=True)])
+
     def sampled(directions: Float[Tensor, "directions 3"]) -> Float[Tensor, "O 3"]:
-        return _sample(images, view, distant.project(directions)[0][visible])
+        return _sample(images, view, positions(directions))
 
     angle = 1 / estimated.fx.mean()  # of a pixel
     by_direction = images.new_zeros(len(view), 3, 3)
@@ -227,11 +235,13 @@ def _find_overlap(
         ends = [sampled(directions + side * angle * axis) for side in (0.5, -0.5)]
         by_direction += ((ends[0] - ends[1]) / angle)[..., None] * axis[direction, None]
     # A rotation of the camera moves the image in the opposite direction, hence the negative sign.
-    position = position[visible] * position.new_tensor([cameras.width / width, cameras.height / height])
+    position = positions(directions)
+    colour = _sample(images, view, position)
+    position = position * position.new_tensor([cameras.width / width, cameras.height / height])
     pixel = position.floor()
     rays = cameras.rays(view, pixel[:, 1], pixel[:, 0], position - pixel)
     slopes = -camera.slopes(rays, view, torch.zeros_like(by_direction), by_direction)
-    return _Overlap(view, direction, sampled(directions), torch.cat([slopes[..., :3], slopes[..., 6:]], -1))
+    return _Overlap(view, direction, colour, torch.cat([slopes[..., :3], slopes[..., 6:]], -1))
 
 
 def _blurred_sky(
@@ -262,15 +272,15 @@ def _draw_directions(
 
 
 def _visible(
-    position: Float[Tensor, "V directions 2"], depth: Float[Tensor, "V directions"], usable: Bool[Tensor, "V 1 h w"]
+    cameras: Cameras, directions: Float[Tensor, "directions 3"], usable: Bool[Tensor, "V 1 h w"]
 ) -> Bool[Tensor, "V directions"]:
-    """Test whether directions are seen at usable pixels away from the border, and in at least two views."""
+    """Test whether directions are seen at usable pixels away from the border."""
+    position, depth = cameras.project(directions)
     height, width = usable.shape[-2:]
     column, row = position.floor().long().unbind(-1)
     visible = (depth > 0) & (column >= 1) & (column < width - 1) & (row >= 1) & (row < height - 1)
     views = torch.arange(len(usable), device=usable.device)[:, None]
-    visible &= usable[views, 0, row.clamp(0, height - 1), column.clamp(0, width - 1)]
-    return visible & (visible.sum(0) > 1)
+    return visible & usable[views, 0, row.clamp(0, height - 1), column.clamp(0, width - 1)]
 
 
 def _sample(
