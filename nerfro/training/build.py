@@ -108,11 +108,12 @@ class Training:
     data: RayDataModule
 
     @classmethod
-    def start(cls, config: DictConfig) -> Training:
+    def start(cls, config: DictConfig, resumes: bool = False) -> Training:
         """Set the seed, read the training views, and build the model.
 
         Args:
             config: configuration of the run, see `TrainConfig`; missing settings are derived from the data.
+            resumes: whether a checkpoint will replace all values, so that `init_from` is not read.
 
         Raises:
             NerfroError: a component cannot be built, or medium and data set have different origins.
@@ -122,17 +123,19 @@ class Training:
         require_data(config)
         source = build_data(config)
         views = source.load("train")
-        return cls(source, views, *_build(config, source, views))
+        return cls(source, views, *_build(config, source, views, resumes))
 
 
-def _build(config: DictConfig, source: DataSource, training: Views) -> tuple[DictConfig, TrainingModule, RayDataModule]:
+def _build(
+    config: DictConfig, source: DataSource, training: Views, resumes: bool
+) -> tuple[DictConfig, TrainingModule, RayDataModule]:
     """Build the module and the data of a run, and derive its missing settings."""
     validation = source.load("val").checked() if config.evaluation.every > 0 and "val" in source.splits else None
     medium = build_medium(config)
     config = derived(config, medium, training)
     renderer = build_model(config, medium)
     renderer.scene.begin(training.cameras)
-    if config.init_from is not None:
+    if config.init_from is not None and not resumes:
         print(initialize_from(renderer, config.init_from, config.init_include), flush=True)
     if renderer.path_sampler.needs_medium and (medium.origin != source.origin).any():
         raise NerfroError(

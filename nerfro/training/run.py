@@ -87,7 +87,7 @@ def _train(config: DictConfig, folder: Path, checkpoint: Path | None) -> RunMetr
     """Train and evaluate; everything that can be refused is refused before training starts."""
     quieten_lightning()
     require_accelerator(config.trainer.accelerator)
-    training = Training.start(config)
+    training = Training.start(config, resumes=checkpoint is not None)
     accelerator = choose_accelerator(training.config, training.module, training.data)
     config, split = with_values(training.config, {"trainer.accelerator": accelerator}), config.evaluation.split
     test = training.views if split is None else training.source.load(split).checked()

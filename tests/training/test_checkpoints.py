@@ -1,5 +1,6 @@
 """Best checkpoints, averages of weights, and initial values from another run, from the command line."""
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -44,3 +45,13 @@ def test_matching_parameters_of_another_run_are_initial_values(
     patterns = "init_include=[backgroud.*]"
     error = train(*SHORT, *other, patterns, "hydra.run.dir=" + str(tmp_path / "again"), code=1).error
     assert "init_include: backgroud.* matches no learned parameter" in error
+
+
+def test_run_is_resumed_without_the_run_of_its_initial_values(train: Runner, trained_run: Path, tmp_path: Path) -> None:
+    shutil.copytree(trained_run, tmp_path / "other")
+    options = [*SHORT, f"init_from={tmp_path / 'other'}", "init_include=[background.*]"]
+    train(*options, "trainer.max_steps=1")
+    shutil.rmtree(tmp_path / "other")
+    resumed = train(*options, "trainer.max_steps=2", "ckpt_path=last")
+    assert "2 steps in" in resumed.out
+    assert "loaded" not in resumed.out
