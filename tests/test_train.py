@@ -13,6 +13,7 @@ from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio
 
 from nerfro.data.formats.transforms import BlenderData
+from nerfro.training.run_folder import LAST_CHECKPOINT
 from tests.conftest import UTM, Runner, moved_mesh, train_in, weights_of
 
 
@@ -147,6 +148,15 @@ def test_evaluation_of_the_checkpoint_equals_that_of_the_run(run: Path, evaluate
     for name in ("test_000.png", "test_001.png"):
         assert np.array_equal(read(run / "images" / name), read(again / "images" / name))
         assert (again / "errors" / name).is_file()
+
+
+def test_scores_of_a_checkpoint_outside_of_a_run_are_beside_it(
+    run: Path, evaluate_here: Runner, tmp_path: Path
+) -> None:
+    (tmp_path / "best").mkdir()
+    shutil.copy(run / LAST_CHECKPOINT, tmp_path / "best" / "step9.ckpt")
+    evaluate_here(f"checkpoint={tmp_path / 'best' / 'step9.ckpt'}")
+    assert (tmp_path / "best" / "evaluate_test" / "metrics.json").is_file()
 
 
 HEIGHT, WIDTH = 24, 40

@@ -48,7 +48,8 @@ def _evaluate_checkpoint(options: EvaluateConfig, path: Path) -> RunMetrics:
         trained.evaluation.chunk_size = options.chunk_size
     trained.evaluation.subdivision.update(changed_settings(options.subdivision))
     device = find_device(options.device)
-    with own_folder(options, path.parent.parent / f"evaluate_{options.split}") as folder:
+    run = path.parent.parent if (path.parent.parent / CONFIG_FILE).is_file() else path.parent
+    with own_folder(options, run / f"evaluate_{options.split}") as folder:
         scene = scene_of(checkpoint, trained, device)
         views = scene.views(options.split).checked()
         metrics = ImageMetrics()
