@@ -98,7 +98,7 @@ class ColourSpace(Enum):
         return self.to_srgb(radiance, gains).clamp(0, 1)
 
     def to_radiance(self, rgb: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        """Decode sRGB values in [0, 1], the inverse of `to_srgb` without gains."""
+        """Decode sRGB values, which may lie outside [0, 1], the inverse of `to_srgb` without gains."""
         return rgb if self is ColourSpace.SRGB else to_linear(rgb)
 
     def to_linear(self, radiance: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
@@ -120,7 +120,7 @@ class ColourSpace(Enum):
 
         Args:
             radiance: predicted radiance in this colour space.
-            rgb: values of the photograph, sRGB in [0, 1].
+            rgb: values of the photograph, sRGB, which lie outside [0, 1] only in photographs in linear light.
 
         Returns:
             Prediction and target. The prediction is not clipped.

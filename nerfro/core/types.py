@@ -432,7 +432,7 @@ class Pixels:
     Attributes:
         number: number of each pixel in the data set, view * H * W + row * W + column.
         view: number of the training view of each pixel.
-        rgb: colour of each pixel in its photograph, sRGB in [0, 1].
+        rgb: colour of each pixel in its photograph, sRGB as in `Views.images`.
         draws: random numbers of the step, with an index for each pixel.
         cameras: all training cameras.
         window: all training cameras, cropped to the window of the first steps (`batches.precrop_steps`).
@@ -462,7 +462,7 @@ class Batch:
         ray_pixel: pixel of each ray, as an index from 0 to Q - 1.
         pixel_number: number of each pixel in the data set, view * H * W + row * W + column.
         view: number of the training view of each pixel.
-        rgb: colour of each pixel in its photograph, sRGB in [0, 1].
+        rgb: colour of each pixel in its photograph, sRGB as in `Views.images`.
         teaches_background: pixels from which the background learns; diverging rays of other pixels would cause noise.
         cameras: all training cameras, cropped to the window of the first steps (`batches.precrop_steps`); for losses
             that need further directions.

@@ -28,7 +28,7 @@ class ValidationPixels:
     Attributes:
         cameras: cameras of the validation views.
         index: numbers of the pixels, view * H * W + row * W + column.
-        rgb: colours in the photographs, sRGB in [0, 1].
+        rgb: colours in the photographs, sRGB as in `Views.images`.
         contrasts: contrast to the neighbouring pixels, see `subdivision.contrast`.
     """
 

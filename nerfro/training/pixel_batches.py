@@ -169,7 +169,7 @@ class PixelBatches:
         return transfer(torch.from_numpy(numbers), cameras.device)
 
     def photographed(self, pixels: Int[Tensor, "Q"]) -> Float[Tensor, "Q 3"]:
-        """Return the colours of pixels by number (view, row, column), sRGB in [0, 1]."""
+        """Return the colours of pixels by number (view, row, column), sRGB as in `Views.images`."""
         return self._pixels[pixels.cpu()].to(pixels.device)
 
     def _draw(self, generator: np.random.Generator, window: Window) -> tuple[np.ndarray | np.int64, np.ndarray]:
