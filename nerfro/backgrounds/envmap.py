@@ -6,7 +6,6 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -204,15 +203,6 @@ class EnvironmentMap(Background):
             values += change
             residual -= cube_map.lookup(face, coordinates, change, of_level, (n,))
             del change
-
-    @torch.no_grad()
-    def to_lat_long(self, height: int) -> Float[Tensor, "H 2*H 3"]:
-        """Render an equirectangular image of linear radiance: z up, +x in the middle (see `lat_long.directions`)."""
-        return self(Exits(lat_long.directions(height).to(self.texels.device)))
-
-    def save_lat_long(self, path: Path | str, height: int = 512) -> None:
-        """Write an equirectangular image: clipped sRGB for .png, linear radiance for .hdr and .exr."""
-        lat_long.save_lat_long(path, self.to_lat_long(height).cpu())
 
     @torch.no_grad()
     def set_lat_long(self, radiance: Float[Tensor, "H 2*H 3"]) -> None:

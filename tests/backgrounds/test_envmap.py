@@ -171,7 +171,7 @@ def test_levels_that_do_not_ascend_are_refused(levels: tuple[list[int], ...]) ->
 def test_bad_files_are_refused(tmp_path: Path) -> None:
     refused("does not exist", EnvironmentMap, image=str(tmp_path / "none.hdr"))
     refused("allowed are", EnvironmentMap, image=str(tmp_path / "sky.tiff"))
-    refused(r"use \.png", lambda: EnvironmentMap([4]).save_lat_long(tmp_path / "sky.jpg", 8))
+    refused(r"use \.png", lat_long.save_lat_long, tmp_path / "sky.jpg", torch.zeros(8, 16, 3))
     (tmp_path / "broken.hdr").write_bytes(b"#?RADIANCE\n")
     refused("cannot be read", EnvironmentMap, image=str(tmp_path / "broken.hdr"))
     save_png(tmp_path / "square.png", torch.zeros(4, 4, 3))
