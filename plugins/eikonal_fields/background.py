@@ -59,8 +59,7 @@ class BackgroundGrids:
         outside = (~inside_box(vertices, *hidden)).nonzero().squeeze(1)
         for index in outside.split(_POINTS_AT_ONCE):
             radiance[index] = _mean_radiance(field, vertices[index])
-        cube = torch.tensor([[-_SKY_SIDE] * 3, [_SKY_SIDE] * 3], device=box.device)
-        directions = torch.nn.functional.normalize(_vertices(cube, resolution), dim=-1)
+        directions = torch.nn.functional.normalize(_vertices(_cube(box.device), resolution), dim=-1)
         sky = torch.cat([background(Exits(chunk)).float() for chunk in directions.split(_POINTS_AT_ONCE)])
         sides = (resolution,) * 3
         return cls(radiance.view(*sides, 4), box, sky.view(*sides, 3))
@@ -77,8 +76,12 @@ class BackgroundGrids:
 
     def sky_towards(self, directions: Float[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
         """Look up the colour of the background in unit directions."""
-        cube = torch.tensor([[-_SKY_SIDE] * 3, [_SKY_SIDE] * 3], device=directions.device)
-        return trilinear(self.sky, cube, directions)
+        return trilinear(self.sky, _cube(directions.device), directions)
+
+
+def _cube(device: torch.device) -> Float[Tensor, "2 3"]:
+    """Return the corners of the cube of the sky, on a device."""
+    return torch.tensor([[-_SKY_SIDE] * 3, [_SKY_SIDE] * 3], device=device)
 
 
 def _vertices(box: Float[Tensor, "2 3"], resolution: int) -> Float[Tensor, "points 3"]:
