@@ -5,9 +5,8 @@ import math
 import pytest
 import torch
 
-from nerfro.core.compositing import volume_weights
+from nerfro.core.compositing import composite, volume_weights
 from nerfro.core.types import FieldValues, Path, Samples
-from nerfro.rendering import composite
 from nerfro.samplers.base import straight_path
 from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import NUM_RAYS, example_path, example_rays, example_samples

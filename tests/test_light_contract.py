@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from nerfro.backgrounds.envmap import EnvironmentMap
+from nerfro.core.compositing import composite
 from nerfro.core.light import to_linear, to_srgb
 from nerfro.core.types import Exits, FieldValues, Path
 from nerfro.files import lat_long
@@ -18,7 +19,6 @@ from nerfro.losses.terms import BackgroundRegularizer, Distortion, Photometric
 from nerfro.models.refractive import RefractiveModel
 from nerfro.optimizers.config import GroupConfig, OptimizerConfig
 from nerfro.paper.hierarchical import Hierarchical
-from nerfro.rendering import composite
 from nerfro.samplers.base import straight_path
 from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.samplers.points.stratified import Stratified

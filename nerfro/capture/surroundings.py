@@ -18,6 +18,7 @@ from nerfro.backgrounds import cube_map
 from nerfro.backgrounds.base import Background
 from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.core.cameras import Cameras
+from nerfro.core.compositing import composite
 from nerfro.core.draws import Draws
 from nerfro.core.errors import NerfroError
 from nerfro.core.light import to_linear
@@ -30,7 +31,6 @@ from nerfro.fields.hash_grid import HashGridField
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.geometry.space import Contracted
 from nerfro.media.bodies import Bodies
-from nerfro.rendering import composite
 from nerfro.samplers.base import straight_path
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.points.density_grid import DensityGridSampler

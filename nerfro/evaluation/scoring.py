@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from nerfro.camera.base import fit_gain
 from nerfro.core.errors import NerfroError
-from nerfro.core.light import to_linear, tone_mapped
+from nerfro.core.light import ColourSpace, to_linear, tone_mapped
 from nerfro.core.progress import duration, track
 from nerfro.data.base import Views
 from nerfro.data.image_files import Alpha, is_linear
@@ -48,7 +48,7 @@ from nerfro.evaluation.results import (
     ViewScores,
 )
 from nerfro.files.images import round_to_8bit, save_image, save_png, sheet
-from nerfro.rendering import ColourSpace, Renderer
+from nerfro.rendering import Renderer
 from nerfro.samplers.subdivision import Subdivision
 
 

@@ -6,12 +6,13 @@ from typing import Any, Literal
 
 from omegaconf import DictConfig
 
+from nerfro.core.compositing import composite
 from nerfro.core.light import Colour
 from nerfro.core.types import Batch, Path, Rendering
 from nerfro.data.base import Views
 from nerfro.geometry.space import Space
 from nerfro.registry.registration import register
-from nerfro.rendering import Components, Renderer, composite
+from nerfro.rendering import Components, Renderer
 
 
 @register("model", "refractive")

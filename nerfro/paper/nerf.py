@@ -15,6 +15,7 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from nerfro.backgrounds.base import Background
+from nerfro.core.compositing import composite
 from nerfro.core.types import Batch, Exits, FieldValues, Path, Rendering, Samples
 from nerfro.data.base import Views
 from nerfro.fields.base import Field, evaluate_selected
@@ -31,7 +32,7 @@ from nerfro.paper.mlp import (
 )
 from nerfro.registry.allowed import Depth, Positive, Width
 from nerfro.registry.registration import register
-from nerfro.rendering import Components, Renderer, composite
+from nerfro.rendering import Components, Renderer
 
 
 class EncodedField(Field):

@@ -19,6 +19,7 @@ import torch
 
 from nerfro.backgrounds.base import Background
 from nerfro.camera.base import CameraModel
+from nerfro.core.compositing import composite
 from nerfro.core.draws import Draws
 from nerfro.core.types import Exits, FieldValues, Path, Rendering, Samples
 from nerfro.data.base import DataSource
@@ -32,7 +33,7 @@ from nerfro.media.base import Medium
 from nerfro.media.distance_grid import DistanceGrid
 from nerfro.media.surfaces import Grid, Surface
 from nerfro.registry.registration import Plugin, build
-from nerfro.rendering import Renderer, composite
+from nerfro.rendering import Renderer
 from nerfro.samplers.base import PathSampler, PointSampler, straight_path
 from nerfro.samplers.points.stratified import point_samples
 from nerfro.testing.examples import (

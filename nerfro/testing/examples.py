@@ -11,6 +11,7 @@ import torch
 from nerfro.backgrounds.base import ConstantBackground
 from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.core.cameras import Cameras
+from nerfro.core.compositing import composite
 from nerfro.core.draws import Draws
 from nerfro.core.types import Batch, FieldValues, Path, Rays, Rendering, Samples
 from nerfro.data.base import DataSource, Views
@@ -21,7 +22,7 @@ from nerfro.media.bodies import Bodies, Body, GridSettings
 from nerfro.media.material import Material
 from nerfro.media.surfaces import BallSurface
 from nerfro.models.refractive import RefractiveModel
-from nerfro.rendering import Components, RayTracer, composite
+from nerfro.rendering import Components, RayTracer
 from nerfro.samplers.base import Straight
 from nerfro.samplers.paths.snell import Snell
 from nerfro.samplers.points.stratified import Stratified, point_samples

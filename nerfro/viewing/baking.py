@@ -18,11 +18,11 @@ from torch import Tensor
 
 from nerfro.backgrounds.base import Background
 from nerfro.core.errors import NerfroError
-from nerfro.core.light import to_srgb
+from nerfro.core.light import ColourSpace, to_srgb
 from nerfro.core.types import Exits
 from nerfro.files.images import data_uri
 from nerfro.media.distance_grid import BLOCK
-from nerfro.rendering import ColourSpace, Renderer
+from nerfro.rendering import Renderer
 from nerfro.viewing.trained_scene import absorption_of
 from nerfro.viewing.volume import MIN_OPTICAL_DEPTH, Volume
 

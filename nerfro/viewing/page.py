@@ -14,13 +14,13 @@ from torch import Tensor
 
 from nerfro.core.cameras import Cameras, up_direction
 from nerfro.core.errors import NerfroError
+from nerfro.core.light import ColourSpace
 from nerfro.core.paths import ASSETS_DIR, scene_name
 from nerfro.data.lazy_images import LazyImages
 from nerfro.files.atomic import write_atomically
 from nerfro.files.images import data_uri, to_8bit
 from nerfro.files.templates import fill_template
 from nerfro.geometry.space import Box, Space
-from nerfro.rendering import ColourSpace
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.viewing.baking import Baked, bake_sky, bake_surface, bake_volume
 from nerfro.viewing.exports import EXPORTS, Export, ExportConfig

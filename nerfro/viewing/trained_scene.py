@@ -18,7 +18,7 @@ from nerfro.backgrounds.base import ConstantBackground
 from nerfro.backgrounds.envmap import EnvironmentMap
 from nerfro.core.cameras import Cameras
 from nerfro.core.errors import NerfroError
-from nerfro.core.light import to_srgb
+from nerfro.core.light import ColourSpace, to_srgb
 from nerfro.core.paths import user_path
 from nerfro.core.progress import track
 from nerfro.core.types import Exits, FieldValues, Samples
@@ -33,7 +33,7 @@ from nerfro.files import lat_long
 from nerfro.files.images import data_uri, to_8bit
 from nerfro.geometry.mesh import TriangleMesh
 from nerfro.media.base import Vacuum
-from nerfro.rendering import ColourSpace, Renderer, Scene
+from nerfro.rendering import Renderer, Scene
 from nerfro.samplers.base import Straight
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.viewing.surface import surface_of

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from omegaconf import DictConfig
 from torch import Tensor
 
+from nerfro.core.compositing import composite
 from nerfro.core.errors import NerfroError
 from nerfro.core.types import Batch, FieldValues, Path, Rays, Rendering, Samples
 from nerfro.data.base import Views
@@ -19,7 +20,7 @@ from nerfro.fields.base import Field
 from nerfro.geometry.space import Space, inside_box
 from nerfro.registry.allowed import Count, Positive, Share
 from nerfro.registry.registration import register
-from nerfro.rendering import Components, Renderer, composite
+from nerfro.rendering import Components, Renderer
 from nerfro.samplers.base import straight_path
 
 from .background import BackgroundGrids

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d
 
 from nerfro.backgrounds.envmap import EnvironmentMap
-from nerfro.core.light import to_srgb
+from nerfro.core.light import ColourSpace, to_srgb
 from nerfro.core.types import Batch, Path, Rendering, Samples
 from nerfro.losses.terms import (
     BackgroundRegularizer,
@@ -23,7 +23,7 @@ from nerfro.losses.terms import (
 from nerfro.models.refractive import RefractiveModel
 from nerfro.paper.losses import Smoothness, tile_roughness
 from nerfro.registry.registration import create, discover, find
-from nerfro.rendering import ColourSpace, Renderer, Scene
+from nerfro.rendering import Renderer, Scene
 from nerfro.samplers.points.stratified import point_samples
 from nerfro.testing import NUM_RAYS, example_batch, example_components, example_draws, example_path, example_rendering
 from tests.paper import small_components

@@ -6,10 +6,11 @@ from unittest.mock import Mock
 import pytest
 import torch
 
+from nerfro.core.compositing import composite
 from nerfro.core.types import FieldValues, Path, Rays, Rendering, Samples
 from nerfro.losses.base import Loss
 from nerfro.losses.terms import Backdrop, NearCamera, Opaque
-from nerfro.rendering import Scene, composite
+from nerfro.rendering import Scene
 from nerfro.samplers.base import Straight
 from nerfro.testing import example_batch, example_path, example_space
 from tests.closed_forms import Ball

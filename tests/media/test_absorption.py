@@ -7,10 +7,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from nerfro.core.compositing import composite
 from nerfro.core.types import FieldValues, Path, Rays
 from nerfro.models.refractive import RefractiveModel
 from nerfro.paper.eikonal import Eikonal
-from nerfro.rendering import composite
 from nerfro.samplers.points.stratified import point_samples
 from nerfro.testing import example_components, example_rays
 from tests.closed_forms import Ball, beam, random_rays

@@ -9,13 +9,14 @@ from torch.nn.functional import normalize
 
 from nerfro.backgrounds.base import Background, ConstantBackground
 from nerfro.backgrounds.envmap import EnvironmentMap
+from nerfro.core.compositing import composite
 from nerfro.core.draws import Draws
 from nerfro.core.types import Exits, Path
 from nerfro.fields.hash_grid import HashGridField
 from nerfro.geometry.space import Box, Contracted, Space
 from nerfro.models.refractive import RefractiveModel
 from nerfro.paper.nerf import MipNerfModel
-from nerfro.rendering import Components, composite
+from nerfro.rendering import Components
 from nerfro.samplers.points.density_grid import DensityGridSampler
 from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import example_rays

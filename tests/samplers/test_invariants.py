@@ -8,6 +8,7 @@ import torch
 import trimesh
 from torch import Tensor
 
+from nerfro.core.compositing import composite
 from nerfro.core.types import FieldValues, Path, Rays, Rendering
 from nerfro.geometry.interpolation import intersect_box
 from nerfro.media.base import Medium, Vacuum
@@ -15,7 +16,6 @@ from nerfro.media.body_settings import make_bodies
 from nerfro.paper.eikonal import Eikonal, RayState, kick_drift_kick, leapfrog
 from nerfro.paper.hierarchical import Hierarchical
 from nerfro.paper.voxel_grid import VoxelGrid
-from nerfro.rendering import composite
 from nerfro.samplers.base import PathSampler, PointSampler, Straight
 from nerfro.samplers.points.stratified import Stratified
 from nerfro.testing import example_rays

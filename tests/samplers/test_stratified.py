@@ -8,12 +8,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from nerfro.core.compositing import composite
 from nerfro.core.draws import Draws
 from nerfro.core.errors import NerfroError
 from nerfro.core.types import FieldValues, Path, Rendering
 from nerfro.paper.eikonal import Eikonal
 from nerfro.paper.hierarchical import Hierarchical, blur_weights
-from nerfro.rendering import composite
 from nerfro.samplers.base import straight_path
 from nerfro.samplers.points.stratified import LAST_FRACTION, Stratified, invert_cdf, midpoints, spread_uniform
 from nerfro.testing import example_draws, example_path, example_rays

@@ -12,12 +12,12 @@ import pytest
 import torch
 
 from nerfro.camera.base import GivenCamera
-from nerfro.core.light import to_srgb
+from nerfro.core.light import ColourSpace, to_srgb
 from nerfro.core.types import Rays, mean_per_pixel
 from nerfro.data.base import Views
 from nerfro.data.formats.transforms import BlenderData
 from nerfro.evaluation.validation import ValidationPixels
-from nerfro.rendering import ColourSpace, RayTracer, Renderer, Scene
+from nerfro.rendering import RayTracer, Renderer, Scene
 from nerfro.samplers.points.stratified import Stratified
 from nerfro.samplers.subdivision import Subdivision
 from nerfro.training.callbacks import OverfittingWarning
