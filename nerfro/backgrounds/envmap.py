@@ -76,11 +76,13 @@ class EnvironmentMap(Background):
     to an even grey or to a given image.
 
     Args:
-        resolutions: texels along each side of a face (90 degrees) of each level. None derives the finest level from the
-            width of a pixel of the photographs. If a volume covers all of space, the background shows only what is far
-            behind the photographed scene, and None has levels from 4 to 256 texels.
+        resolutions: texels along each side of a face (90 degrees) of each level, ascending. None derives the finest
+            level from the width of a pixel of the photographs. If a volume covers all of space, the background shows
+            only what is far behind the photographed scene, and None has levels from 4 to 256 texels, as with given
+            `fitted_resolutions`.
         fitted_resolutions: the same of finer levels, which only the fits of `phase=background` change. Gradient descent
-            would visit all their texels in each step. None derives the levels from the photographs, too.
+            would visit all their texels in each step. None derives the levels from the photographs, too, unless
+            `resolutions` is given.
         image: initial equirectangular image with z up (.png, .jpg, .hdr or .exr); None for grey.
 
     Attributes:
