@@ -46,17 +46,17 @@ COMMAND = re.compile(
 )
 JOB_FILE = re.compile(r"^```bash\n(.*?)^```", re.DOTALL | re.MULTILINE)
 FLAG = re.compile(r" (?:--cfg \w+|-p \S+|-m|\.\.\.)(?= |$)", re.MULTILINE)
-# The schema of a command, and its options that are texts.
-ENTRY_POINT = re.compile(r'^@entry_point\("(\w+)", (\w+).*?(?:verbatim=\((.*)\))?\)', re.MULTILINE)
+ENTRY_POINT = re.compile(r'^@entry_point\("(\w+)", (\w+)', re.MULTILINE)
 
 
 @functools.cache
 def entry_points() -> dict[str, tuple[type, tuple[str, ...]]]:
+    """The schema of each command, and its options that are texts: the options of stages."""
     found = {}
     for file in PACKAGE_DIR.glob("*.py"):
-        for command, schema, verbatim in ENTRY_POINT.findall(file.read_text(encoding="utf-8")):
-            cls = getattr(import_module(f"nerfro.{file.stem}"), schema)
-            found[command] = cls, tuple(re.findall(r"\w+", verbatim))
+        for command, schema in ENTRY_POINT.findall(file.read_text(encoding="utf-8")):
+            module = import_module(f"nerfro.{file.stem}")
+            found[command] = getattr(module, schema), tuple(getattr(module, "STAGES", ()))
     return found
 
 

@@ -17,7 +17,6 @@ from hydra._internal.hydra import Hydra
 from hydra._internal.sources_registry import SourcesRegistry
 from hydra._internal.utils import create_config_search_path
 from hydra.core.config_search_path import ConfigSearchPath, SearchPathQuery
-from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.plugins.config_source import ConfigResult
@@ -25,7 +24,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, flag_override
 from omegaconf.errors import MissingMandatoryValue
 
-from nerfro.cli.options import ADDED_GROUPS, store_schema, usage
+from nerfro.cli.options import ADDED_GROUPS, global_hydra, store_schema, usage
 from nerfro.cli.overrides import SHORT_NAMES, full_key
 from nerfro.core.errors import NerfroError
 from nerfro.core.paths import CONF_DIR, refuse_root, user_path
@@ -104,13 +103,9 @@ class Composer:
             path = f"file://{os.path.abspath(folder)}"
             search_path.prepend("command-line", path, SearchPathQuery(provider="schema"))
         version.setbase("1.3")  # jobs stay in the current directory
-        current = GlobalHydra.instance()
-        outer = current.hydra
-        current.hydra = Hydra(self.command, _ConfigLoader(self.checked, search_path))
-        try:
-            yield current.hydra
-        finally:
-            current.hydra = outer
+        hydra = Hydra(self.command, _ConfigLoader(self.checked, search_path))
+        with global_hydra(hydra):
+            yield hydra
 
 
 @contextlib.contextmanager

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, cast, get_args
 
 from hydra import compose, initialize_config_dir
+from hydra._internal.hydra import Hydra
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, OmegaConf
@@ -177,7 +178,7 @@ def describe(command: str, schema: type) -> Described:
     if not has_groups(command):
         return Described(_page(command, list(schema_options(schema, {})), {}), _names(schema), {})
     store_schema(command, schema)
-    with _outside_of_jobs(), initialize_config_dir(str(CONF_DIR), version_base="1.3"):
+    with global_hydra(None), initialize_config_dir(str(CONF_DIR), version_base="1.3"):
         config = compose(command, return_hydra_config=True)
         groups = [kind for kind in KINDS if isinstance(OmegaConf.select(config, kind.replace("/", ".")), DictConfig)]
         groups = list(dict.fromkeys([*groups, "logger", *ADDED_GROUPS])) if command == "train" else groups
@@ -209,14 +210,14 @@ def describe(command: str, schema: type) -> Described:
 
 
 @contextlib.contextmanager
-def _outside_of_jobs() -> Iterator[None]:
-    """Set the Hydra of a running job aside, because only one may be initialized at a time."""
+def global_hydra(hydra: Hydra | None) -> Iterator[None]:
+    """Replace the Hydra of the process, of which there is only one, for example that of a running job."""
     outer = GlobalHydra.instance().hydra
-    GlobalHydra.instance().hydra = None
+    GlobalHydra.instance().hydra = hydra
     try:
         yield
     finally:
-        GlobalHydra.instance().hydra = outer
+        GlobalHydra.instance().hydra = outer  # of an instance that `initialize_config_dir` may have replaced
 
 
 def store_schema(command: str, schema: type) -> None:

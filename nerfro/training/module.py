@@ -107,7 +107,7 @@ class TrainingModule(LightningModule):
         return {**super().__getstate__(), "_callbacks": []}
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        if (name := first_not_finite(checkpoint["state_dict"])) is not None:
+        if (name := first_not_finite(self.state_dict())) is not None:
             raise NerfroError(
                 f"the model diverged before step {self.global_step}: {name} has infinite numbers or NaN; an earlier "
                 "checkpoint is kept; set a lower optimizer.learning_rate, or another seed"

@@ -182,7 +182,12 @@ def test_only_walls_that_bend_rays_in_wrong_directions_are_named(
 def test_training_warns_of_thin_walls(tmp_path: Path, tiny_default_run: list[str], run_here: Runner) -> None:
     mesh = _hollow_ball(tmp_path / "hollow.ply", 0.05)
     done = run_here(
-        "train", *tiny_default_run, f"medium.mesh={mesh}", "sampler.path.interface=sdf", "trainer.max_steps=1"
+        "train",
+        *tiny_default_run,
+        f"medium.mesh={mesh}",
+        "sampler.path.interface=sdf",
+        "trainer.max_steps=1",
+        f"hydra.run.dir={tmp_path / 'run'}",
     )
     assert "bounds walls of about" in done.out
 
