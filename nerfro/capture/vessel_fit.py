@@ -196,16 +196,6 @@ def fit_vessel(
     levels: list[dict[str, float]] = [{}, *({"level": h} for h in heights if h > typical["foot"])]
     work = 1 + len(levels) + len(settings.rounds) * (len(typical) + 1) * settings.num_candidates
 
-    def limits(name: str) -> tuple[float, float]:
-        """Return the limits of the candidates: heights, or logarithms of other lengths."""
-        below_level = settings.max_level * lengths.get("level", height)
-        return {
-            "wall": (-np.inf, np.inf),
-            "foot": (stem, below_level) if stem else (-np.inf, np.log(below_level)),
-            "fillet": (-np.inf, np.log(widest["fillet"])),
-            "level": (lengths["foot"] / settings.max_level, highest),
-        }[name]
-
     def error_of(lengths: dict[str, float]) -> Float[np.ndarray, "V"]:
         return search.of(with_lengths(filled if "level" in lengths else empty, VesselLengths(**lengths)))
 
@@ -220,7 +210,7 @@ def fit_vessel(
                 is_height = name == "level" or (name == "foot" and stem > 0)
                 half_width = fraction * height if is_height else np.log(factor)
                 middle = lengths[name] if is_height else np.log(lengths[name])
-                low, high = limits(name)
+                low, high = _limits(name, lengths, widest["fillet"], height, stem, settings)
                 first = max(min(middle - half_width, high - 2 * half_width), low)
                 grid = np.linspace(first, min(first + 2 * half_width, high), settings.num_candidates)
                 values = grid if is_height else np.exp(grid)
@@ -238,3 +228,24 @@ def fit_vessel(
     lengths |= {name: typical[name] for name in unknown}
     lengths["foot"] = min(lengths["foot"], settings.max_level * lengths.get("level", height))  # also a typical foot
     return VesselFit(lengths, standard_errors, unknown)
+
+
+def _limits(
+    name: str,
+    lengths: Mapping[str, float],
+    max_fillet: float,
+    height: float,
+    stem: float,
+    settings: VesselFitSettings,
+) -> tuple[float, float]:
+    """Return the limits of the candidates for a length: heights, or logarithms of other lengths."""
+    below_level = settings.max_level * lengths.get("level", height)
+    match name:
+        case "foot":
+            return (stem, below_level) if stem else (-np.inf, np.log(below_level))
+        case "fillet":
+            return -np.inf, np.log(max_fillet)
+        case "level":
+            return lengths["foot"] / settings.max_level, settings.max_level * height
+        case _:
+            return -np.inf, np.inf

@@ -239,7 +239,7 @@ class StopOnSignal(Callback):
         """End training if a signal has arrived; returns whether training ends. All processes must call this method."""
         if self._agreements.due(trainer) and trainer.strategy.reduce_boolean_decision(self._signalled, all=False):
             self.received = trainer.should_stop = True
-            trainer.fit_loop.epoch_loop.min_steps = None  # otherwise, Lightning would go on until `min_steps`
+            trainer.fit_loop.epoch_loop.min_steps = None  # otherwise, Lightning continues until `min_steps`
         return self.received
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
